@@ -1,0 +1,49 @@
+# Everything runs from .venv; `make setup` makes it. UV is used where it is installed, plain pip otherwise.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.hvt-setup
+UV     := $(shell command -v uv 2>/dev/null)
+
+.PHONY: setup demo test check lint type format bench clean help
+
+help:            ## list the targets
+	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+setup: $(STAMP)  ## put everything into .venv
+
+$(STAMP): pyproject.toml
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+ifdef UV
+	@uv pip install --quiet --python $(BIN)/python --editable '.[all]' --group dev
+else
+	@$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
+	@$(BIN)/python -m pip install --quiet --editable '.[all]' --group dev
+endif
+	@touch $(STAMP)
+
+demo: setup      ## edge and ground as two processes on the drawn scene: demo.rrd and a summary
+	@$(BIN)/python deploy/demo.py
+
+test: setup      ## all tests, on real x265, Zenoh, ONNX models and recordings
+	@$(BIN)/python -m pytest
+
+lint: setup
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/lint-imports
+
+type: setup
+	@$(BIN)/mypy
+
+check: lint type ## lint, format, import arrows, types
+
+format: setup    ## write what `make check` wants to see
+	@$(BIN)/ruff format
+	@$(BIN)/ruff check --fix
+
+bench: setup     ## speed and memory as ratios against a peer or a floor, measured in one run
+	@$(BIN)/python -m bench
+
+clean:
+	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

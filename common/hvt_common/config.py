@@ -1,0 +1,257 @@
+"""One frozen dataclass per process, filled from defaults, then a TOML file, then flags; validated once.
+
+A field is declared with `option`, which names its kind (how text becomes a value and back) and its help line.
+Every value passes through its kind whether it comes from the file or from the command line, so both say the
+same sentence when it is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import difflib
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn, Protocol, TypeVar
+
+import tomli_w
+
+from hvt_common.errors import UserError
+from hvt_common.units import parse_bitrate, parse_duration_s, parse_share, parse_size
+
+__all__ = [
+    "BITRATE",
+    "DURATION",
+    "PATH",
+    "SHARE",
+    "SIZE",
+    "TEXT",
+    "Kind",
+    "Loaded",
+    "choice",
+    "integer",
+    "load",
+    "number",
+    "option",
+    "switch",
+    "to_toml",
+]
+
+_Config = TypeVar("_Config")
+
+
+class _Parse(Protocol):
+    def __call__(self, text: str, *, name: str) -> Any: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """How a setting's text becomes its value (`UserError` when it cannot), and the value text again."""
+
+    metavar: str
+    parse: _Parse
+    show: Callable[[Any], str | int | float] = str
+
+
+def _plain(text: str, *, name: str) -> str:
+    if not text.strip():
+        raise UserError(f"{name} is empty: leave it out or give it a value")
+    return text
+
+
+def _path(text: str, *, name: str) -> Path:
+    return Path(_plain(text, name=name)).expanduser()
+
+
+TEXT = Kind("TEXT", _plain)
+PATH = Kind("FILE", _path)
+BITRATE = Kind("RATE", parse_bitrate, lambda bps: f"{bps / 1000:g}kbps")
+DURATION = Kind("TIME", parse_duration_s, lambda seconds: f"{seconds:g}s")
+SHARE = Kind("SHARE", parse_share, float)
+SIZE = Kind("WxH", parse_size, lambda size: f"{size[0]}x{size[1]}")
+
+
+def integer(low: int, high: int, *, unit: str = "") -> Kind:
+    """A whole number within ``low … high``."""
+
+    def parse(text: str, *, name: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            raise UserError(
+                f"{name} {text!r} is not accepted: give a whole number from {low} to {high}{unit}"
+            )
+        return value
+
+    return Kind("N", parse, int)
+
+
+def number(low: float, high: float, *, unit: str = "") -> Kind:
+    """A finite number within ``low … high``."""
+
+    def parse(text: str, *, name: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise UserError(f"{name} {text!r} is not accepted: give a number from {low:g} to {high:g}{unit}")
+        return value
+
+    return Kind("X", parse, float)
+
+
+def choice(*accepted: str) -> Kind:
+    """One of a few words."""
+
+    def parse(text: str, *, name: str) -> str:
+        if text not in accepted:
+            raise UserError(f"{name} {text!r} is not known: choose one of {', '.join(accepted)}")
+        return text
+
+    return Kind("|".join(accepted), parse)
+
+
+def option(kind: Kind, default: Any, help_line: str, *, many: bool = False, shown_default: str = "") -> Any:
+    """Declare a dataclass field that is also a flag ``--its-name`` and a TOML key ``its-name``.
+
+    With ``many`` the flag may be given several times and the value is a tuple.
+    """
+    metadata = {"kind": kind, "help": help_line, "many": many, "shown_default": shown_default}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def switch(help_line: str, *, default: bool = False) -> Any:
+    """Declare a yes/no field: ``--name`` and ``--no-name``."""
+    return dataclasses.field(default=default, metadata={"help": help_line, "switch": True})
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """What the command line asked for."""
+
+    values: Mapping[str, Any]
+    """Field name → value, only for those that the file or the flags set."""
+    print_config: bool
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message} (--help lists what is accepted)")
+
+
+def load(
+    config_class: type[_Config], argv: Sequence[str] | None, *, program: str, description: str
+) -> tuple[_Config, Loaded]:
+    """Build the configuration of a process; ``--help`` and ``--version`` print and exit with 0.
+
+    Raises:
+        UserError: an unknown flag or key, a value that its kind does not take, an unreadable file.
+    """
+    parser = _flags(config_class, program=program, description=description)
+    given = vars(parser.parse_args(argv))
+    print_config = bool(given.pop("print_config", False))
+    file = given.pop("config", None)
+    values: dict[str, Any] = {}
+    if file is not None:
+        values.update(_from_file(config_class, Path(file)))
+    for field in dataclasses.fields(config_class):  # type: ignore[arg-type]
+        if field.name in given:
+            values[field.name] = _value(field, given[field.name], name=_flag(field))
+    return config_class(**values), Loaded(values=values, print_config=print_config)
+
+
+def to_toml(config: Any) -> str:
+    """The whole configuration as a TOML file that ``--config`` reads back to the same values."""
+    table: dict[str, Any] = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if value is None or value == ():
+            continue  # TOML has no null; a key that is absent means the same
+        key = field.name.replace("_", "-")
+        if field.metadata.get("switch"):
+            table[key] = value
+        elif field.metadata["many"]:
+            table[key] = [field.metadata["kind"].show(item) for item in value]
+        else:
+            table[key] = field.metadata["kind"].show(value)
+    return tomli_w.dumps(table)
+
+
+def _flag(field: dataclasses.Field[Any]) -> str:
+    return "--" + field.name.replace("_", "-")
+
+
+def _flags(config_class: type, *, program: str, description: str) -> argparse.ArgumentParser:
+    from hvt_common import __version__  # noqa: PLC0415  (only the version line needs it)
+
+    parser = _Parser(
+        prog=program,
+        description=description,
+        argument_default=argparse.SUPPRESS,
+        allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"{program} {__version__}")
+    parser.add_argument("--config", metavar="FILE", help="TOML file with these settings; flags go over it")
+    parser.add_argument("--print-config", action="store_true", help="print the settings as TOML and exit")
+    for field in dataclasses.fields(config_class):
+        help_line = field.metadata["help"].replace("%", "%%")
+        if field.metadata.get("switch"):
+            parser.add_argument(_flag(field), action=argparse.BooleanOptionalAction, help=help_line)
+            continue
+        kind: Kind = field.metadata["kind"]
+        shown = field.metadata["shown_default"] or _shown(kind, field.default)
+        parser.add_argument(
+            _flag(field),
+            metavar=kind.metavar,
+            action="append" if field.metadata["many"] else "store",
+            help=f"{help_line} [{shown}]" if shown else help_line,
+        )
+    return parser
+
+
+def _shown(kind: Kind, default: object) -> str:
+    if default is None or default == ():
+        return ""
+    if isinstance(default, tuple) and kind is not SIZE:
+        return " ".join(str(kind.show(item)) for item in default)
+    return str(kind.show(default)).replace("%", "%%")
+
+
+def _value(field: dataclasses.Field[Any], given: Any, *, name: str) -> Any:
+    if field.metadata.get("switch"):
+        if not isinstance(given, bool):
+            raise UserError(f"{name} {given!r} is not accepted: give true or false")
+        return given
+    kind: Kind = field.metadata["kind"]
+    if field.metadata["many"]:
+        items = given if isinstance(given, list) else [given]
+        return tuple(kind.parse(str(item), name=name) for item in items)
+    if isinstance(given, list | dict | bool):
+        raise UserError(f"{name} {given!r} is not accepted: give one value, {kind.metavar}")
+    return kind.parse(str(given), name=name)
+
+
+def _from_file(config_class: type, file: Path) -> dict[str, Any]:
+    fields = {field.name.replace("_", "-"): field for field in dataclasses.fields(config_class)}
+    try:
+        table = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"--config {file} does not exist: give a TOML file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"--config {file} cannot be read ({error}): give a TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"--config {file} is not valid TOML: {error}") from None
+    values: dict[str, Any] = {}
+    for key, given in table.items():
+        field = fields.get(key.replace("_", "-"))
+        if field is None:
+            near = difflib.get_close_matches(key, fields, n=1) or sorted(fields)
+            raise UserError(f"--config {file} has an unknown key {key!r}: did you mean {', '.join(near)}?")
+        values[field.name] = _value(field, given, name=f"{key} in {file}")
+    return values

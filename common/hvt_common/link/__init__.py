@@ -1,0 +1,1 @@
+"""Everything that knows Zenoh and bytes."""

@@ -1,0 +1,63 @@
+"""Quantities as people write them (``800kbps``, ``2s``, ``1280x720``); each parser raises `UserError`."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from hvt_common.errors import UserError
+
+__all__ = ["bitrate_text", "parse_bitrate", "parse_duration_s", "parse_share", "parse_size"]
+
+_NUMBER = r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)"
+_BITRATE = re.compile(_NUMBER + r"\s*(bps|bit/s|kbps|kbit/s|k|Mbps|Mbit/s|M)?", re.IGNORECASE)
+_DURATION = re.compile(_NUMBER + r"\s*(ms|s|min|m|h)?")
+_SIZE = re.compile(r"([0-9]{1,5})\s*[xX]\s*([0-9]{1,5})")
+_BITRATE_UNITS = {"": 1, "b": 1, "k": 1_000, "m": 1_000_000}
+_DURATION_UNITS = {"": 1.0, "ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+_LIMIT_BPS = 1_000_000_000
+
+
+def parse_bitrate(text: str, *, name: str) -> int:
+    """``800kbps`` → 800000 bits a second; a bare number is bits a second."""
+    match = _BITRATE.fullmatch(text.strip())
+    bps = 0.0
+    if match:
+        bps = float(match[1]) * _BITRATE_UNITS[(match[2] or "")[:1].lower()]
+    if not match or not 1 <= bps <= _LIMIT_BPS:
+        raise UserError(f"{name} {text!r} is not a bitrate: write 800kbps, 0.8Mbps or 800000 (bits a second)")
+    return round(bps)
+
+
+def parse_duration_s(text: str, *, name: str) -> float:
+    """``500ms`` → 0.5 seconds; a bare number is seconds."""
+    match = _DURATION.fullmatch(text.strip())
+    if not match:
+        raise UserError(f"{name} {text!r} is not a duration: write 2s, 500ms or 1min")
+    return float(match[1]) * _DURATION_UNITS[match[2] or ""]
+
+
+def parse_size(text: str, *, name: str) -> tuple[int, int]:
+    """``1280x720`` → (width, height) in pixels."""
+    match = _SIZE.fullmatch(text.strip())
+    if not match:
+        raise UserError(f"{name} {text!r} is not a size: write WIDTHxHEIGHT, for example 1280x720")
+    return int(match[1]), int(match[2])
+
+
+def parse_share(text: str, *, name: str) -> float:
+    """``0.8125`` or ``81.25%`` → a share of 0…1."""
+    stripped = text.strip()
+    percent = stripped.endswith("%")
+    try:
+        share = float(stripped.rstrip("%")) / (100 if percent else 1)
+    except ValueError:
+        share = math.nan
+    if not 0 <= share <= 1:
+        raise UserError(f"{name} {text!r} is not a share: write a number from 0 to 1, or a percentage")
+    return share
+
+
+def bitrate_text(bps: float) -> str:
+    """800000 → ``800 kbps``."""
+    return f"{bps / 1e6:.2f} Mbps" if bps >= 1e6 else f"{bps / 1e3:.0f} kbps"

@@ -1,0 +1,181 @@
+"""The values that pass from stage to stage. Nothing here knows bytes, Zenoh, codecs or models.
+
+Coordinate spaces: *source* pixels are those of the untouched camera frame, *base* pixels those of the
+resampled frame that the base stream carries (``--size``). `View` maps one to the other. Boxes are always
+``x1, y1, x2, y2`` with ``x2, y2`` exclusive, float32. Colour images are uint8 ``(height, width, 3)`` in
+BGR order.
+Times ending in ``_ns`` are Unix time in nanoseconds unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = [
+    "AccessUnit",
+    "Boxes",
+    "Detections",
+    "Fit",
+    "Frame",
+    "Image",
+    "Posterior",
+    "Still",
+    "Tracks",
+    "View",
+]
+
+Boxes = npt.NDArray[np.float32]
+"""(N, 4) float32, x1 y1 x2 y2; the name says the space (``boxes_base_px``, ``boxes_source_px``)."""
+
+Image = npt.NDArray[np.uint8]
+"""(height, width, 3) uint8, BGR."""
+
+Fit = Literal["letterbox", "crop"]
+"""How a source of another aspect ratio is brought into the base frame: padded with black, or cut to fill."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The affine map between source and base pixels: ``base = source * scale + offset`` for each axis.
+
+    The scale is the same on both axes (pixels stay square), so a box keeps its aspect ratio.
+    """
+
+    source_size: tuple[int, int]
+    """(width, height) of the source frame in pixels."""
+    base_size: tuple[int, int]
+    """(width, height) of the base frame in pixels."""
+    scale: float
+    offset_px: tuple[float, float]
+    """(x, y) in base pixels."""
+
+    @classmethod
+    def fitted(cls, source_size: tuple[int, int], base_size: tuple[int, int], *, fit: Fit) -> View:
+        """The map that centres the source in the base frame, whole (letterbox) or filling it (crop)."""
+        ratios = (base_size[0] / source_size[0], base_size[1] / source_size[1])
+        scale = min(ratios) if fit == "letterbox" else max(ratios)
+        offset = (
+            (base_size[0] - source_size[0] * scale) / 2,
+            (base_size[1] - source_size[1] * scale) / 2,
+        )
+        return cls(source_size=source_size, base_size=base_size, scale=scale, offset_px=offset)
+
+    def to_base(self, boxes_source_px: Boxes) -> Boxes:
+        """Map (N, 4) boxes from source to base pixels; not clipped."""
+        return (boxes_source_px * self.scale + self._shift()).astype(np.float32)
+
+    def to_source(self, boxes_base_px: Boxes) -> Boxes:
+        """Map (N, 4) boxes from base to source pixels; not clipped."""
+        return ((boxes_base_px - self._shift()) / self.scale).astype(np.float32)
+
+    def _shift(self) -> npt.NDArray[np.float32]:
+        return np.array([*self.offset_px, *self.offset_px], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame of the base rate, as the source hands it on."""
+
+    index: int
+    """0, 1, 2 … in this session; also the frame index of the access unit made from it."""
+    capture_ns: int
+    """When the camera took it; taken once, at the source."""
+    source_bgr: Image
+    """The untouched frame; stills are cropped from it."""
+    base_bgr: Image
+    """The same moment resampled to the base size; the encoder's input."""
+
+
+@dataclass(frozen=True, slots=True)
+class AccessUnit:
+    """One coded frame of the base stream, Annex B; a keyframe carries its parameter sets."""
+
+    frame_index: int
+    capture_ns: int
+    data: bytes
+    keyframe: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Detections:
+    """What a detector saw in one frame, best first."""
+
+    boxes_xyxy_px: Boxes
+    """(N, 4) in the pixels of the image that was given to the detector."""
+    confidences: npt.NDArray[np.float32]
+    """(N,) in 0…1."""
+    class_ids: npt.NDArray[np.int32]
+    """(N,) index into the detector's ``class_names``."""
+
+    def __len__(self) -> int:
+        return len(self.confidences)
+
+    @classmethod
+    def none(cls) -> Detections:
+        """No detections at all."""
+        return cls(np.empty((0, 4), np.float32), np.empty(0, np.float32), np.empty(0, np.int32))
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """The confirmed tracks at one frame, as parallel arrays ordered by id (oldest first)."""
+
+    frame_index: int
+    ids: npt.NDArray[np.int64]
+    """(N,) unique within one tracker, from 1."""
+    boxes_xyxy_px: Boxes
+    """(N, 4) in base pixels."""
+    confidences: npt.NDArray[np.float32]
+    """(N,) of the last detection that was matched, 0…1."""
+    class_ids: npt.NDArray[np.int32]
+    """(N,) the class the track's detections have voted for, weighted by confidence."""
+    born_frames: npt.NDArray[np.int64]
+    """(N,) frame index of the track's first detection."""
+    seen_frames: npt.NDArray[np.int64]
+    """(N,) frame index of the last detection that was matched; older than ``frame_index`` while predicted."""
+    started: npt.NDArray[np.bool_]
+    """(N,) True where the track was created, or found again after being lost, at this very frame."""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """A classifier's answer for one crop."""
+
+    class_name: str
+    confidence: float
+    """Probability of ``class_name``, 0…1."""
+    entropy_nats: float
+    """Entropy of the whole distribution; 0 is certain."""
+    probabilities: npt.NDArray[np.float32] = field(repr=False)
+    """(C,) over the classifier's ``class_names``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Still:
+    """A coded high-detail crop of one source frame."""
+
+    sequence: int
+    """0, 1, 2 … in this session."""
+    frame_index: int
+    capture_ns: int
+    track_id: int
+    """The edge's own track id."""
+    box_source_px: tuple[float, float, float, float]
+    """The track's box at that frame, source pixels."""
+    crop_source_px: tuple[int, int, int, int]
+    """The padded box that was cropped, whole source pixels, inside the frame."""
+    class_name: str
+    """What the edge's detector called it."""
+    confidence: float
+    reason: str
+    """Why the policy sent it, in a word or two."""
+    codec: str
+    quality_pct: int
+    data: bytes

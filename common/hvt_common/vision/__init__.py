@@ -1,0 +1,1 @@
+"""Everything that knows pixels: codecs, models, tracking."""

@@ -1,0 +1,1 @@
+"""The edge side: camera to link."""

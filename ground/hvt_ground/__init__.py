@@ -1,0 +1,1 @@
+"""The ground side: link to recording."""

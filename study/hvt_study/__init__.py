@@ -1,0 +1,1 @@
+"""The study: the stages that fly, in one process, without a network."""

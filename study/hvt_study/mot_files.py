@@ -1,0 +1,134 @@
+"""MOTChallenge text files: ``frame,id,x,y,w,h,score,…``, one box a line, frames from 1 (https://motchallenge.net)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.errors import UserError
+from hvt_common.values import Detections, Tracks
+
+__all__ = ["LAST_FRAME", "MotRows", "detections_by_frame", "read_mot", "rows_of_tracks", "write_mot"]
+
+LAST_FRAME: Final = 10_000_000
+"""Over 90 hours at 30 fps; a higher frame number is a mistake."""
+
+_COLUMNS: Final = 7
+_LARGEST: Final = 1e15
+_SHOWN_CHARS: Final = 60
+
+
+@dataclass(frozen=True, slots=True)
+class MotRows:
+    """The boxes of a file, in its order."""
+
+    frames: npt.NDArray[np.int64]
+    """(N,) frame numbers as in the file, usually from 1."""
+    ids: npt.NDArray[np.int64]
+    """(N,) track ids; -1 in files of detections."""
+    boxes_xywh_px: npt.NDArray[np.float64]
+    """(N, 4) left, top, width, height; sizes may be zero or negative in bad files."""
+    scores: npt.NDArray[np.float64]
+    """(N,) confidence, usually 0…1."""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+def read_mot(path: Path) -> MotRows:
+    """Read a file; columns after the score are ignored and blank lines skipped.
+
+    A `UserError` names the file that cannot be read, or the first line that is malformed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is not a text file; accepted are lines of frame,id,x,y,w,h,score") from None
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror or error}") from None
+    values = [
+        _numbers(line, path=path, number=number)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip()
+    ]
+    table = np.array(values, np.float64).reshape(-1, _COLUMNS)
+    return MotRows(
+        frames=table[:, 0].astype(np.int64),
+        ids=table[:, 1].astype(np.int64),
+        boxes_xywh_px=table[:, 2:6],
+        scores=table[:, 6],
+    )
+
+
+def detections_by_frame(rows: MotRows) -> Iterator[tuple[int, Detections]]:
+    """Every frame from 1 (or 0, where the file begins there) to the last, also those without detections.
+
+    Boxes become x1 y1 x2 y2 float32 in the order of the file; all classes are 0, which the format does not know.
+    """
+    if not len(rows):
+        return
+    order = np.argsort(rows.frames, kind="stable")
+    frames = rows.frames[order]
+    xywh = rows.boxes_xywh_px[order]
+    boxes = np.concatenate((xywh[:, :2], xywh[:, :2] + xywh[:, 2:]), axis=1).astype(np.float32)
+    scores = rows.scores[order].astype(np.float32)
+    first, last = min(1, int(frames[0])), int(frames[-1])
+    bounds = np.searchsorted(frames, np.arange(first, last + 2))
+    for frame in range(first, last + 1):
+        part = slice(bounds[frame - first], bounds[frame - first + 1])
+        yield frame, Detections(boxes[part], scores[part], np.zeros(len(scores[part]), np.int32))
+
+
+def rows_of_tracks(tracks: list[Tracks]) -> MotRows:
+    """All boxes of a list of frames as rows, by frame and then by id."""
+    boxes = np.concatenate([np.empty((0, 4)), *(each.boxes_xyxy_px.astype(np.float64) for each in tracks)])
+    boxes[:, 2:] -= boxes[:, :2]
+    return MotRows(
+        frames=np.repeat(
+            np.array([each.frame_index for each in tracks], np.int64), [len(each) for each in tracks]
+        ),
+        ids=np.concatenate([np.empty(0, np.int64), *(each.ids for each in tracks)]),
+        boxes_xywh_px=boxes,
+        scores=np.concatenate([np.empty(0), *(each.confidences.astype(np.float64) for each in tracks)]),
+    )
+
+
+def write_mot(path: Path, rows: MotRows) -> None:
+    """Write ``frame,id,x,y,w,h,score,-1,-1,-1`` lines; a `UserError` where the file cannot be written."""
+    lines = [
+        f"{frame},{track_id},{x:.4f},{y:.4f},{w:.4f},{h:.4f},{score:.4f},-1,-1,-1\n"
+        for frame, track_id, (x, y, w, h), score in zip(
+            rows.frames.tolist(),
+            rows.ids.tolist(),
+            rows.boxes_xywh_px.tolist(),
+            rows.scores.tolist(),
+            strict=True,
+        )
+    ]
+    try:
+        path.write_text("".join(lines), encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def _numbers(line: str, *, path: Path, number: int) -> list[float]:
+    """The first seven numbers of a line, checked."""
+    cells = line.split(",")
+    try:
+        values = [float(cell) for cell in cells[:_COLUMNS]]
+    except ValueError:
+        values = []
+    good = len(values) == _COLUMNS and all(abs(value) < _LARGEST for value in values)  # false for NaN
+    if good and values[0].is_integer() and 0 <= values[0] <= LAST_FRAME:
+        return values
+    shown = line.strip()
+    shown = shown if len(shown) <= _SHOWN_CHARS else shown[:_SHOWN_CHARS] + "…"
+    raise UserError(
+        f"{path}, line {number} is {shown!r}; accepted are finite numbers frame,id,x,y,w,h,score "
+        f"with a whole frame number from 0 to {LAST_FRAME}"
+    )
