@@ -1,0 +1,104 @@
+"""What the ground makes of a stream, as one sequence of values: recording, viewers and exports hang on these.
+
+All boxes are in base pixels. Every event carries the frame it belongs to and that frame's capture time, which
+are the two timelines of a recording.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Boxes, Image
+
+__all__ = ["Event", "Notice", "Overlay", "Refinement", "Traffic", "VideoSample"]
+
+
+@dataclass(frozen=True, slots=True)
+class VideoSample:
+    """One decodable access unit of the base stream, just as received (Annex B)."""
+
+    frame_index: int
+    capture_ns: int
+    data: bytes
+    keyframe: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """The ground's tracks at one frame, as parallel arrays ordered by track id."""
+
+    frame_index: int
+    capture_ns: int
+    track_ids: npt.NDArray[np.int64]
+    """(N,)"""
+    boxes_base_px: Boxes
+    """(N, 4) x1 y1 x2 y2."""
+    base_classes: tuple[str, ...]
+    """N names: what the detector says of the base stream."""
+    classes: tuple[str, ...]
+    """N names: the same after refinement; equal to the base class where no still has spoken."""
+    confidences: npt.NDArray[np.float32]
+    """(N,) of the class that is shown, 0…1."""
+    refined: npt.NDArray[np.bool_]
+    """(N,) True once a still has spoken on the track's class."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """A still that was decoded and classified, and what it did."""
+
+    frame_index: int
+    capture_ns: int
+    still_sequence: int
+    track_id: int | None
+    """The ground's track; None while or when no track matches."""
+    edge_track_id: int
+    box_base_px: tuple[float, float, float, float]
+    still: bytes
+    """The coded still as received."""
+    media_type: str
+    """``image/jpeg`` and the like."""
+    base_crop_bgr: Image | None
+    """The same padded crop of the decoded base frame, at base resolution; None when that frame is gone."""
+    class_before: str
+    class_after: str
+    confidence: float
+    reason: str
+    """Why the edge's method sent it."""
+    quality_pct: int
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """The link over the last second, and how old what we show is."""
+
+    frame_index: int
+    capture_ns: int
+    base_bps: float
+    roi_bps: float
+    total_bps: float
+    """Base, stills, metadata and transport overhead."""
+    budget_bps: float
+    receive_latency_ms: float | None
+    """Capture to receive, the newest frame; None where clocks do not allow it (lockstep)."""
+    overlay_latency_ms: float | None
+    """Capture to overlay."""
+    tracks: int
+    tracks_refined: int
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """Something an operator would want to read later: a gap, a keyframe request, a refinement, an end."""
+
+    frame_index: int
+    capture_ns: int
+    level: Literal["info", "warning", "error"]
+    text: str
+
+
+Event = VideoSample | Overlay | Refinement | Traffic | Notice

@@ -1,0 +1,93 @@
+"""The last seconds of what the ground decoded and tracked, by frame index.
+
+A still arrives after its frame: it is matched to the tracks of that very frame and shown beside (or pasted
+into) the decoded picture of it. Tracks are small and kept for `track_frames`. Pictures are large: 1280x720 BGR
+is 2.7 MB, so the default bound of 96 MiB is 36 frames, 2.4 s at 15 fps. They are kept just as given, without
+a lossy detour, because a residual still must be applied to exactly the pixels that the edge had; a caller
+that hands in planar YUV 4:2:0 gets the same back and keeps twice as many.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from hvt_common.values import Image, Tracks
+
+__all__ = ["History"]
+
+DEFAULT_MAX_BYTES = 96 * 1024 * 1024
+
+
+class History:
+    """Two bounded rings of one session, of pictures and of tracks; both grow by rising frame index only.
+
+    Args:
+        max_frames: how many pictures are kept at most.
+        max_bytes: how many bytes of pictures are kept at most; the newest picture is always kept.
+        track_frames: for how many frames the tracks are kept; at least the seconds that a still may be late.
+    """
+
+    def __init__(
+        self, *, max_frames: int = 45, max_bytes: int = DEFAULT_MAX_BYTES, track_frames: int = 300
+    ) -> None:
+        if min(max_frames, max_bytes, track_frames) < 1:
+            raise ValueError(f"bounds must be positive: {max_frames=}, {max_bytes=}, {track_frames=}")
+        self._max_frames = max_frames
+        self._max_bytes = max_bytes
+        self._track_frames = track_frames
+        self._frames: OrderedDict[int, Image] = OrderedDict()
+        self._frame_bytes = 0
+        self._tracks: OrderedDict[int, Tracks] = OrderedDict()
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the pictures held."""
+        return self._frame_bytes
+
+    @property
+    def oldest_tracked(self) -> int | None:
+        """Frame index of the oldest tracks held; None before the first."""
+        return next(iter(self._tracks), None)
+
+    @property
+    def newest_tracked(self) -> int | None:
+        """Frame index of the newest tracks held; None before the first."""
+        return next(reversed(self._tracks), None)
+
+    def add_frame(self, frame_index: int, image: Image) -> None:
+        """Keep a decoded picture (uint8; not copied, so hand over what nobody writes to again)."""
+        _require_rising(next(reversed(self._frames), None), frame_index)
+        self._frames[frame_index] = image
+        self._frame_bytes += image.nbytes
+        while len(self._frames) > 1 and self._frames_too_large():
+            _, dropped = self._frames.popitem(last=False)
+            self._frame_bytes -= dropped.nbytes
+
+    def add_tracks(self, tracks: Tracks) -> None:
+        """Keep the tracks of a frame; an empty `Tracks` says that the frame was seen and held nothing."""
+        _require_rising(self.newest_tracked, tracks.frame_index)
+        self._tracks[tracks.frame_index] = tracks
+        if len(self._tracks) > self._track_frames:
+            self._tracks.popitem(last=False)
+
+    def frame(self, frame_index: int) -> Image | None:
+        """The picture of that frame as it was given; None if it was never decoded or is gone."""
+        return self._frames.get(frame_index)
+
+    def tracks(self, frame_index: int) -> Tracks | None:
+        """The tracks at that frame; None if it was lost, is not tracked yet, or is gone."""
+        return self._tracks.get(frame_index)
+
+    def clear(self) -> None:
+        """Forget everything: a new session counts its frames from 0 again."""
+        self._frames.clear()
+        self._tracks.clear()
+        self._frame_bytes = 0
+
+    def _frames_too_large(self) -> bool:
+        return len(self._frames) > self._max_frames or self._frame_bytes > self._max_bytes
+
+
+def _require_rising(newest: int | None, frame_index: int) -> None:
+    if newest is not None and frame_index <= newest:
+        raise ValueError(f"frame {frame_index} after frame {newest}: frames rise; clear() begins a session")

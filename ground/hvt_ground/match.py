@@ -1,0 +1,199 @@
+"""Which track of the ground a still of the edge belongs to, at the still's own frame.
+
+Evidence is the IoU of the still's box with the track's box at that frame, and what earlier stills have shown:
+a track that this edge track was matched to before gains 0.10, one that belongs to another edge track loses
+0.25. Evidence of at least the threshold is needed. So two objects that stand close do not exchange their
+stills when the ground misses one of them for a moment, and yet a clear overlap corrects an old belief.
+
+Several stills of one frame are assigned together, one to one, for the greatest sum. If a free track fits
+nearly as well as the chosen one and is not merely a second box on the same object, the still is ambiguous and
+goes to neither; the detector's class only breaks ties.
+
+A track that the ground's detector saw by that frame, but confirmed only later, is compared at the first frame
+that has it.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from hvt_common.values import Boxes, Tracks
+
+__all__ = ["Candidate", "Matcher", "Wanted", "iou_matrix"]
+
+KNOWN_BONUS = 0.10
+OTHERS_PENALTY = 0.25
+CLASS_BONUS = 0.05
+AMBIGUITY_MARGIN = 0.08  # below KNOWN_BONUS: an earlier still decides between equals
+SAME_OBJECT_IOU = 0.70
+_REMEMBERED_TRACKS = 1024
+_REMEMBERED_FRAMES = 256
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A still for which a track is wanted."""
+
+    key: int
+    edge_track_id: int
+    """Negative where the still belongs to no track of the edge."""
+    box_base_px: tuple[float, float, float, float]
+    class_name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """What was found for a still: row ``row`` of ``tracks``, or nothing (``tracks`` is None)."""
+
+    tracks: Tracks | None = None
+    row: int = -1
+    ambiguous: bool = False
+
+
+class Matcher:
+    """Remembers which edge track is which ground track, for one session and in bounded memory.
+
+    Args:
+        iou: the threshold that the evidence must reach.
+        owned_frames: for how many frames after a still a ground track counts as the edge track's own.
+    """
+
+    def __init__(self, *, iou: float, owned_frames: int) -> None:
+        if not 0 < iou <= 1:
+            raise ValueError(f"the IoU threshold lies within 0…1, not {iou!r}")
+        self._iou = iou
+        self._owned_frames = owned_frames
+        self._ground_of: OrderedDict[int, tuple[int, int]] = (
+            OrderedDict()
+        )  # edge track → (ground track, frame)
+        self._edge_of: OrderedDict[int, tuple[int, int]] = OrderedDict()  # ground track → (edge track, frame)
+        self._claims: OrderedDict[int, dict[int, int]] = OrderedDict()  # frame → ground track → edge track
+
+    def match(
+        self, wanted: Sequence[Wanted], tracks: Tracks, *, later: Iterable[Tracks], class_names: Sequence[str]
+    ) -> dict[int, Candidate]:
+        """A `Candidate` for each key of ``wanted``, all of which are stills of the frame of ``tracks``.
+
+        ``later`` are the tracks of the following frames, in order, as far as a late confirmation counts.
+        ``class_names`` are those of ``tracks.class_ids``. Stills of one edge track go to one ground track.
+        """
+        groups = _by_edge_track(wanted)
+        frame_index = tracks.frame_index
+        found = self._assign(groups, tracks, np.arange(len(tracks)), frame_index, class_names)
+        known = tracks.ids
+        for after in later:
+            left = [group for group in groups if found[group[0].key].tracks is None]
+            if not left:
+                break
+            fresh = ~np.isin(after.ids, known) & (after.born_frames <= frame_index)
+            if fresh.any():
+                found |= self._assign(left, after, np.flatnonzero(fresh), frame_index, class_names)
+            known = np.union1d(known, after.ids)
+        return {want.key: found[group[0].key] for group in groups for want in group}
+
+    def _assign(
+        self,
+        groups: Sequence[Sequence[Wanted]],
+        tracks: Tracks,
+        rows: npt.NDArray[np.intp],
+        frame_index: int,
+        class_names: Sequence[str],
+    ) -> dict[int, Candidate]:
+        """One to one among the tracks in ``rows``, by the key of each group's first; finds are remembered."""
+        heads = [group[0] for group in groups]
+        found = {head.key: Candidate() for head in heads}
+        if not heads or not len(rows):
+            return found
+        boxes = tracks.boxes_xyxy_px[rows]
+        preference = self._preference(heads, tracks, rows, frame_index, class_names)
+        pairs = linear_sum_assignment(preference, maximize=True)
+        chosen = {int(r): int(c) for r, c in zip(*pairs, strict=True) if preference[r, c] > 0}
+        for r, c in chosen.items():
+            taken = [column for row, column in chosen.items() if row != r]
+            if _ambiguous(preference[r], c, taken, boxes):
+                found[heads[r].key] = Candidate(ambiguous=True)
+                continue
+            found[heads[r].key] = Candidate(tracks, int(rows[c]))
+            self._remember(heads[r].edge_track_id, int(tracks.ids[rows[c]]), frame_index)
+        return found
+
+    def _preference(
+        self,
+        heads: Sequence[Wanted],
+        tracks: Tracks,
+        rows: npt.NDArray[np.intp],
+        frame_index: int,
+        class_names: Sequence[str],
+    ) -> Floats:
+        """(heads, rows) how much each pair is preferred; 0 where the evidence does not reach the threshold."""
+        wanted_px = np.array([head.box_base_px for head in heads], np.float32)
+        evidence = iou_matrix(wanted_px, tracks.boxes_xyxy_px[rows])
+        same_class = np.zeros(evidence.shape, np.bool_)
+        claims = self._claims.get(frame_index, {})
+        for column, row in enumerate(rows):
+            ground_id, name = int(tracks.ids[row]), class_names[tracks.class_ids[row]]
+            claimed_by = claims.get(ground_id)
+            for line, head in enumerate(heads):
+                if claimed_by not in (None, head.edge_track_id):
+                    evidence[line, column] = -np.inf
+                elif evidence[line, column] > 0:
+                    evidence[line, column] += self._known(head.edge_track_id, ground_id, frame_index)
+                same_class[line, column] = head.class_name == name
+        evidence[evidence < self._iou] = 0.0
+        return evidence + CLASS_BONUS * (same_class & (evidence > 0))
+
+    def _known(self, edge_id: int, ground_id: int, frame_index: int) -> float:
+        """What earlier stills add to, or take from, the overlap of this pair."""
+        if edge_id >= 0 and self._ground_of.get(edge_id, (None, 0))[0] == ground_id:
+            return KNOWN_BONUS
+        owner, since = self._edge_of.get(ground_id, (edge_id, frame_index))
+        still_owned = self._ground_of.get(owner, (None, 0))[0] == ground_id
+        recent = abs(frame_index - since) <= self._owned_frames
+        return -OTHERS_PENALTY if owner != edge_id and still_owned and recent else 0.0
+
+    def _remember(self, edge_id: int, ground_id: int, frame_index: int) -> None:
+        if edge_id < 0:
+            return
+        self._claims.setdefault(frame_index, {})[ground_id] = edge_id
+        if len(self._claims) > _REMEMBERED_FRAMES:
+            self._claims.popitem(last=False)
+        for known, key, value in ((self._ground_of, edge_id, ground_id), (self._edge_of, ground_id, edge_id)):
+            if frame_index >= known.get(key, (0, -1))[1]:  # an older still does not overrule a newer one
+                known[key] = (value, frame_index)
+                known.move_to_end(key)
+            if len(known) > _REMEMBERED_TRACKS:
+                known.popitem(last=False)
+
+
+def iou_matrix(boxes_a_px: Boxes, boxes_b_px: Boxes) -> Floats:
+    """(A, B) intersection over union of two sets of boxes (x1 y1 x2 y2); 0 for boxes without area."""
+    a, b = boxes_a_px.astype(np.float64)[:, None], boxes_b_px.astype(np.float64)[None]
+    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
+    overlap = sides.clip(0).prod(-1)
+    union = (a[..., 2:] - a[..., :2]).clip(0).prod(-1) + (b[..., 2:] - b[..., :2]).clip(0).prod(-1) - overlap
+    iou: Floats = np.divide(overlap, union, out=np.zeros_like(overlap), where=union > 0)
+    return iou
+
+
+def _by_edge_track(wanted: Sequence[Wanted]) -> list[list[Wanted]]:
+    groups: dict[tuple[str, int], list[Wanted]] = {}
+    for want in wanted:
+        of_track = want.edge_track_id >= 0
+        groups.setdefault(("track", want.edge_track_id) if of_track else ("still", want.key), []).append(want)
+    return list(groups.values())
+
+
+def _ambiguous(preference: Floats, chosen: int, taken: Sequence[int], boxes: Boxes) -> bool:
+    """Whether a free track fits nearly as well and is another object."""
+    near = (preference > 0) & (preference >= preference[chosen] - AMBIGUITY_MARGIN)
+    near[[chosen, *taken]] = False
+    apart = iou_matrix(boxes[chosen : chosen + 1], boxes)[0] < SAME_OBJECT_IOU
+    return bool((near & apart).any())

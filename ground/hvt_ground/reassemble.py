@@ -1,0 +1,321 @@
+"""From the access units of one edge, as the link delivers them, to what a decoder may be given.
+
+After one lost P frame an HEVC decoder shows nothing, or garbage, until the next keyframe, and says so to
+nobody. So the rule is strict: the decoder gets runs that start with a keyframe and have no hole, in order,
+each unit once. Everything else is skipped and counted, and `Reassembler.wants_keyframe` says when to ask.
+
+Three things are decided here:
+
+*Reordering.* Zenoh keeps the order of a key on one link; on UDP or several links a unit may come late. A hole
+is given `REORDER_WAIT_NS`, and at most `REORDER_UNITS` units wait behind it, before it counts as lost. A
+keyframe never waits: what is missing before it no longer matters.
+
+*Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
+the present session has been silent for `SILENCE_NS`, and not more than once in `ADOPTION_INTERVAL_NS`: late
+units of the old session, a second edge of the same name or a flood of invented ids cannot make the picture
+jump to and fro. A session that was left may come back, but only beyond where it had been.
+
+*Plausibility.* A sequence number or frame index that is further ahead than `MAX_RATE_HZ` allows since the last
+progress (plus some slack) is not believed, so that one flipped bit cannot make all that follows look old. If
+nothing else comes for `RESTART_SILENCE_NS` it was we who were wrong, and the next keyframe starts afresh.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
+from typing import Generic, Literal, Protocol, TypeVar
+
+__all__ = ["AccessUnitHeader", "Arrival", "Counters", "Reassembler", "Verdict"]
+
+Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
+"""What to do with an access unit:
+
+decode
+    hand it to the decoder now.
+skip
+    fresh, but undecodable: a unit before it is lost, or no keyframe has come yet.
+duplicate
+    it has been here before.
+stale
+    older than what was already given up or shown: late, or replayed.
+foreign
+    of a session that is not (or no longer) the present one.
+implausible
+    its numbers cannot be true.
+"""
+
+REORDER_UNITS = 2
+REORDER_WAIT_NS = 100_000_000
+SILENCE_NS = 500_000_000
+ADOPTION_INTERVAL_NS = 1_000_000_000
+RESTART_SILENCE_NS = 2_000_000_000
+MAX_RATE_HZ = 240
+SEQUENCE_SLACK = 64
+FRAME_SLACK = (
+    4096  # after an outage a backlog comes at once, with all the frames the edge dropped in its holes
+)
+_WINDOW_MASK = (1 << SEQUENCE_SLACK) - 1
+_REMEMBERED_SESSIONS = 16
+_REQUEST_INTERVALS_NS = (300_000_000, 300_000_000, 600_000_000, 1_000_000_000)
+_COUNTER_OF: dict[Verdict, str] = {
+    "decode": "decodable",
+    "skip": "skipped",
+    "duplicate": "duplicates",
+    "stale": "replayed",
+    "foreign": "foreign",
+    "implausible": "implausible",
+}
+
+
+class AccessUnitHeader(Protocol):
+    """What is needed of the header of a base message."""
+
+    @property
+    def session_id(self) -> Hashable:
+        """Random, once for each start of the edge."""
+
+    @property
+    def sequence(self) -> int:
+        """0, 1, 2 … counts messages of the session, without holes at the sender."""
+
+    @property
+    def frame_index(self) -> int:
+        """Rises with the sequence; has holes where the edge dropped frames before encoding."""
+
+    @property
+    def keyframe(self) -> bool:
+        """True where a decoder can start."""
+
+
+H = TypeVar("H", bound=AccessUnitHeader)
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival(Generic[H]):
+    """One access unit and its verdict. A unit that waited comes out later, in a later call's list."""
+
+    verdict: Verdict
+    header: H
+    payload: bytes
+    received_ns: int
+    """``now_ns`` of the call that brought it."""
+    starts_run: bool = False
+    """A keyframe after a gap or of a new session: flush the decoder before it."""
+    starts_session: bool = False
+    """The first unit of another session, or of one whose count was lost: reset whatever counts frames."""
+    lost_before: int = 0
+    """How many units were given up just before this one; above 0 it is the end of a gap."""
+
+
+@dataclass(slots=True)
+class Counters:
+    """Totals since the start, over all sessions. Units still waiting behind a hole are in ``received`` only."""
+
+    received: int = 0
+    decodable: int = 0
+    skipped: int = 0
+    gaps: int = 0
+    """Holes in the sequence that were given up."""
+    lost: int = 0
+    """Units missing in those holes."""
+    duplicates: int = 0
+    replayed: int = 0
+    """Verdict stale: late or replayed."""
+    foreign: int = 0
+    implausible: int = 0
+    corrupt: int = 0
+    """Reported by the caller: the header could not be read, or the CRC was wrong."""
+    sessions: int = 0
+    """Adopted; one that starts afresh after numbers that could not be believed counts again."""
+    keyframe_requests: int = 0
+
+
+class Reassembler(Generic[H]):
+    """Order, gaps, duplicates and sessions of the base stream of one edge.
+
+    ``now_ns`` is any clock that does not go back (monotonic); the same one in all calls.
+    """
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self._session: Hashable = None
+        self._adopted_ns: int | None = None
+        self._left: OrderedDict[Hashable, int] = OrderedDict()  # session id → the sequence it had reached
+        self._first = 0
+        self._next = 0
+        self._last_frame = -1
+        self._recent = 0  # bit i: the sequence _next - 1 - i has been here
+        self._held: dict[int, Arrival[H]] = {}
+        self._synced = False
+        self._progress_ns = 0
+        self._unshown = False  # something came since the last progress that could not be used
+        self._requested_ns: int | None = None
+        self._requests_in_gap = 0
+
+    @property
+    def session_id(self) -> Hashable:
+        """Of the session that is shown; None before the first keyframe. Stills of others are not wanted."""
+        return self._session
+
+    def accept(self, header: H, payload: bytes, *, now_ns: int) -> list[Arrival[H]]:
+        """Take one access unit whose CRC is right; return all that is now settled, in order."""
+        self.counters.received += 1
+        unit = Arrival("decode", header, payload, now_ns)
+        if self._adopted_ns is None or header.session_id != self._session:
+            return self._accept_outsider(unit, "foreign", patience_ns=SILENCE_NS)
+        if self._first <= header.sequence < self._next or header.sequence in self._held:
+            return [self._settle_old(unit)]
+        if not self._plausible(header, now_ns):
+            return self._accept_outsider(unit, "implausible", patience_ns=RESTART_SILENCE_NS)
+        self._held[header.sequence] = unit
+        return self._release(now_ns)
+
+    def corrupt(self) -> None:
+        """Count a message of the base stream that could not be read or whose CRC was wrong."""
+        self.counters.corrupt += 1
+        self._unshown = True
+
+    def decoder_failed(self) -> None:
+        """The decoder showed nothing for a unit it was given: skip to the next keyframe."""
+        self._synced = False
+
+    def wants_keyframe(self, now_ns: int) -> bool:
+        """Whether to ask the edge for a keyframe now: something comes, and nothing can be shown of it.
+
+        Before anything has come it is False: an edge starts with a keyframe anyway. The requests of one gap
+        are 0.3 s, 0.6 s and then 1 s apart; `keyframe_requested` notes each.
+        """
+        if self._requested_ns is not None:
+            interval_ns = _REQUEST_INTERVALS_NS[min(self._requests_in_gap, len(_REQUEST_INTERVALS_NS) - 1)]
+            if now_ns - self._requested_ns < interval_ns:
+                return False
+        if self._adopted_ns is None:
+            return self._unshown
+        if not self._synced or self._hole_overdue(now_ns):
+            return True
+        return self._unshown and now_ns - self._progress_ns >= SILENCE_NS
+
+    def keyframe_requested(self, now_ns: int) -> None:
+        """Note that a request went out."""
+        self.counters.keyframe_requests += 1
+        self._requests_in_gap += 1
+        self._requested_ns = now_ns
+
+    # Within the session: a hole waits, then is given up.
+
+    def _release(self, now_ns: int) -> list[Arrival[H]]:
+        """Everything that need not wait any longer: at most ``REORDER_UNITS`` units stay behind a hole."""
+        released: list[Arrival[H]] = []
+        keyframe = max(
+            (sequence for sequence, unit in self._held.items() if unit.header.keyframe), default=-1
+        )
+        while self._held:
+            first = min(self._held)
+            lost = first - self._next
+            if (
+                lost
+                and first > keyframe
+                and len(self._held) <= REORDER_UNITS
+                and not self._hole_overdue(now_ns)
+            ):
+                break
+            if lost:
+                self._give_up(lost)
+            verdict = self._take(unit := self._held.pop(first), now_ns)
+            released.append(self._judged(unit, verdict, lost_before=lost))
+        return released
+
+    def _give_up(self, lost: int) -> None:
+        """Count the next ``lost`` sequence numbers as lost."""
+        self.counters.gaps += 1
+        self.counters.lost += lost
+        self._recent = self._recent << min(lost, SEQUENCE_SLACK) & _WINDOW_MASK
+        self._next += lost
+        self._synced = False
+
+    def _take(self, unit: Arrival[H], now_ns: int) -> Verdict:
+        """The unit that is due: to the decoder, or skipped until a keyframe."""
+        header = unit.header
+        self._recent = (self._recent << 1 | 1) & _WINDOW_MASK
+        self._next = header.sequence + 1
+        if header.frame_index <= self._last_frame:  # two units that waited contradict each other
+            self._synced = False
+            return "implausible"
+        self._last_frame = header.frame_index
+        self._progress_ns = now_ns
+        self._unshown = False
+        if not self._synced and not header.keyframe:
+            return "skip"
+        return "decode"
+
+    def _settle_old(self, unit: Arrival[H]) -> Arrival[H]:
+        age = self._next - 1 - unit.header.sequence  # negative: waiting behind a hole, so it is here already
+        seen = age < 0 or (age < SEQUENCE_SLACK and self._recent >> age & 1)
+        return self._judged(unit, "duplicate" if seen else "stale")
+
+    def _plausible(self, header: H, now_ns: int) -> bool:
+        ahead = (now_ns - self._progress_ns) * MAX_RATE_HZ // 1_000_000_000
+        steps = header.sequence - self._next, header.frame_index - self._last_frame
+        return 0 <= steps[0] <= SEQUENCE_SLACK + ahead and 0 < steps[1] <= FRAME_SLACK + ahead
+
+    def _hole_overdue(self, now_ns: int) -> bool:
+        return any(now_ns - unit.received_ns >= REORDER_WAIT_NS for unit in self._held.values())
+
+    # Between sessions.
+
+    def _accept_outsider(self, unit: Arrival[H], refusal: Verdict, *, patience_ns: int) -> list[Arrival[H]]:
+        """A unit that does not continue the session: adopted with a keyframe when the session is silent."""
+        header, now_ns = unit.header, unit.received_ns
+        if header.sequence < self._left.get(header.session_id, 0):
+            return [self._judged(unit, "stale")]
+        self._unshown = True
+        if self._adopted_ns is None:
+            too_soon, refusal = False, "skip"
+        else:
+            silent_ns, adopted_ns = now_ns - self._progress_ns, now_ns - self._adopted_ns
+            too_soon = silent_ns < patience_ns or adopted_ns < ADOPTION_INTERVAL_NS
+        if too_soon or not header.keyframe:
+            return [self._judged(unit, refusal)]
+        settled = self._leave()
+        self._adopt(header, now_ns)
+        verdict = self._take(unit, now_ns)
+        return [*settled, self._judged(unit, verdict, starts_session=True)]
+
+    def _leave(self) -> list[Arrival[H]]:
+        """End the present session, if any; what waited behind a hole is skipped."""
+        settled = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
+        self._held.clear()
+        self._synced = False
+        return settled
+
+    def _adopt(self, header: H, now_ns: int) -> None:
+        if self._adopted_ns is not None and header.session_id != self._session:
+            self._left[self._session] = self._next
+            self._left.move_to_end(self._session)
+            if len(self._left) > _REMEMBERED_SESSIONS:
+                self._left.popitem(last=False)
+        self._left.pop(header.session_id, None)
+        self._session, self._adopted_ns = header.session_id, now_ns
+        self._first = self._next = header.sequence
+        self._last_frame, self._recent = header.frame_index - 1, 0
+        self.counters.sessions += 1
+
+    def _judged(
+        self, unit: Arrival[H], verdict: Verdict, *, lost_before: int = 0, starts_session: bool = False
+    ) -> Arrival[H]:
+        """The unit with its verdict, counted."""
+        name = _COUNTER_OF[verdict]
+        setattr(self.counters, name, getattr(self.counters, name) + 1)
+        starts_run = verdict == "decode" and not self._synced
+        if verdict == "decode":
+            self._synced = True
+            self._requests_in_gap = 0
+        return replace(
+            unit,
+            verdict=verdict,
+            starts_run=starts_run,
+            starts_session=starts_session,
+            lost_before=lost_before,
+        )

@@ -1,0 +1,101 @@
+"""The last seconds of pictures and tracks: found by frame, bounded, and never mixed up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hvt_common.values import Tracks
+from hvt_ground.history import History
+
+
+def picture(value, *, height=4, width=6):
+    """A picture of one value."""
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def tracks(frame_index):
+    """No tracks, at that frame."""
+    none = np.empty(0, np.int64)
+    return Tracks(
+        frame_index=frame_index,
+        ids=none,
+        boxes_xyxy_px=np.empty((0, 4), np.float32),
+        confidences=np.empty(0, np.float32),
+        class_ids=np.empty(0, np.int32),
+        born_frames=none,
+        seen_frames=none,
+        started=np.empty(0, np.bool_),
+    )
+
+
+def test_a_frame_is_found_by_its_index_just_as_it_was():
+    """A still would be shown beside, or pasted into, the picture of another moment."""
+    history = History(max_frames=3)
+    for index in (2, 5, 6):
+        history.add_frame(index, picture(index))
+    assert [int(history.frame(index)[0, 0, 0]) for index in (2, 5, 6)] == [2, 5, 6]
+    assert history.frame(3) is None
+    history.add_frame(9, picture(9))
+    assert history.frame(2) is None
+    assert history.frame(5) is not None
+
+
+def test_pictures_stay_within_their_bytes():
+    """A ground that runs for hours would run out of memory."""
+    one = picture(0).nbytes
+    history = History(max_frames=100, max_bytes=3 * one)
+    for index in range(50):
+        history.add_frame(index, picture(index))
+        assert history.size_bytes <= 3 * one
+    assert [index for index in range(50) if history.frame(index) is not None] == [47, 48, 49]
+    history.add_frame(50, picture(50, height=40))
+    assert history.frame(50) is not None, "the newest is kept even if it is too large by itself"
+    assert history.frame(49) is None
+    assert history.size_bytes == picture(50, height=40).nbytes
+
+
+def test_the_default_holds_two_seconds_of_720p():
+    """Stills that wait two seconds on a thin link would have no picture to be compared with."""
+    history = History()
+    image = np.zeros((720, 1280, 3), np.uint8)
+    for index in range(60):
+        history.add_frame(index, image)
+    assert history.frame(30) is not None
+    assert history.size_bytes <= 96 * 1024 * 1024
+
+
+def test_tracks_are_found_by_frame_and_bounded():
+    """A still would be matched to the tracks of another frame: the wrong object is refined."""
+    history = History(track_frames=4)
+    assert history.oldest_tracked is None
+    assert history.newest_tracked is None
+    for index in (0, 1, 3, 4, 8):
+        history.add_tracks(tracks(index))
+    assert (history.oldest_tracked, history.newest_tracked) == (1, 8)
+    assert history.tracks(3).frame_index == 3
+    assert history.tracks(0) is None
+    assert history.tracks(2) is None
+
+
+def test_a_new_session_begins_with_clear():
+    """Frames of two flights would be mixed under one index."""
+    history = History()
+    history.add_frame(7, picture(7))
+    history.add_tracks(tracks(7))
+    with pytest.raises(ValueError, match="frame 7 after frame 7"):
+        history.add_frame(7, picture(0))
+    with pytest.raises(ValueError, match="frame 0 after frame 7"):
+        history.add_tracks(tracks(0))
+    history.clear()
+    assert history.size_bytes == 0
+    assert history.frame(7) is None
+    history.add_frame(0, picture(0))
+    history.add_tracks(tracks(0))
+    assert history.newest_tracked == 0
+
+
+def test_bounds_must_be_positive():
+    """A bound of nothing would show stills without their base crop and say nothing about it."""
+    with pytest.raises(ValueError, match="max_frames=0"):
+        History(max_frames=0)
