@@ -1,0 +1,94 @@
+"""What a detector costs beside the bare onnxruntime call: `python bench/detector.py`.
+
+Both run in turn on the same image, and the median of the ratios of neighbours is shown: a busy machine slows both
+alike.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.vision.classify import open_classifier
+from hvt_common.vision.detect import OnnxDetector
+from hvt_common.vision.model import ModelSettings, open_model
+from hvt_common.vision.motion import MotionDetector
+
+DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
+BAR = 1.10
+MODELS = (
+    ("yolox_nano", (416, 416), 150),
+    ("yolov5su_visdrone_640", (640, 640), 15),
+    ("yolov5su_visdrone_736x1280", (1280, 736), 9),
+)
+
+
+def rows() -> list[dict]:
+    """One row a measure: measure, value, bar, holds (bar and holds are None where there is none)."""
+    picture = cv2.imread(str(DATA / "visdrone/0000001_02999_d_0000005.jpg"))
+    image = cv2.resize(picture, (1280, 720), interpolation=cv2.INTER_AREA)
+    result = []
+    for name, size, rounds in MODELS:
+        ratio, bare_ms = _wrapper_against_bare(DATA / f"models/{name}.onnx", image, size, rounds)
+        result.append(
+            _row(f"{name} {size[0]}x{size[1]}: detector / bare call ({bare_ms:.1f} ms)", ratio, BAR)
+        )
+    result.append(_row("motion detector on 1280x720, ms a call", _motion_ms(image), None))
+    result.append(_row("MobileNetV2 classifier, ms a crop in a batch of 8", _classifier_ms(image), None))
+    return result
+
+
+def _wrapper_against_bare(
+    path: Path, image: npt.NDArray[np.uint8], size: tuple[int, int], rounds: int
+) -> tuple[float, float]:
+    model = open_model(path, settings=ModelSettings(threads=2))
+    detector = OnnxDetector(model, size=size)
+    tensor = np.random.default_rng(0).uniform(0, 1, (1, 3, size[1], size[0])).astype(np.float32)
+    for _ in range(3):
+        detector.detect(image)
+        model.run(tensor)
+    bare, whole = [], []
+    for _ in range(rounds):
+        bare.append(_ms(lambda: model.run(tensor)))
+        whole.append(_ms(lambda: detector.detect(image)))
+    return statistics.median(w / b for w, b in zip(whole, bare, strict=True)), statistics.median(bare)
+
+
+def _motion_ms(image: npt.NDArray[np.uint8]) -> float:
+    detector = MotionDetector()
+    shifts = [np.float32([[1, 0, 3 * i], [0, 1, i]]) for i in range(16)]
+    images = [cv2.warpAffine(image, shift, (1280, 720), borderMode=cv2.BORDER_REFLECT) for shift in shifts]
+    return statistics.median([_ms(lambda i=i: detector.detect(i)) for i in images][7:])
+
+
+def _classifier_ms(image: npt.NDArray[np.uint8]) -> float:
+    classifier = open_classifier(str(DATA / "models/mobilenet_v2_imagenet.onnx"))
+    crops = [image[100 : 160 + 8 * i, 200 : 300 + 10 * i] for i in range(8)]
+    classifier.classify(crops)
+    return statistics.median(_ms(lambda: classifier.classify(crops)) for _ in range(8)) / 8
+
+
+def _ms(call) -> float:
+    start = time.perf_counter()
+    call()
+    return (time.perf_counter() - start) * 1e3
+
+
+def _row(measure: str, value: float, bar: float | None) -> dict:
+    return {
+        "measure": measure,
+        "value": round(value, 3),
+        "bar": bar,
+        "holds": None if bar is None else value <= bar,
+    }
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(row)

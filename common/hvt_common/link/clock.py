@@ -1,0 +1,60 @@
+"""How far the other side's clock is from ours, from the four times of a question and its answer. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+__all__ = ["ClockOffset"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    at_ns: int
+    offset_ns: int
+    round_trip_ns: int
+
+
+class ClockOffset:
+    """The offset of a remote clock: of the recent exchanges, the one with the shortest round trip speaks.
+
+    With ``t0`` asked (ours), ``t1`` received and ``t2`` answered (theirs), ``t3`` heard (ours), the offset is
+    ``((t1 - t0) + (t2 - t3)) / 2`` and the round trip ``(t3 - t0) - (t2 - t1)`` (RFC 5905, section 8). The true
+    offset lies within half a round trip of the estimate, whatever the two directions each took.
+    """
+
+    def __init__(self, *, window_ns: int = 60_000_000_000, keep: int = 64) -> None:
+        """Samples older than ``window_ns`` before the newest are forgotten; never more than ``keep`` are held."""
+        self._window_ns = window_ns
+        self._samples: deque[_Sample] = deque(maxlen=keep)
+
+    def add(self, *, t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> bool:
+        """Take one exchange; False if its times contradict each other (a stepped or hostile clock)."""
+        held_ns = t2_ns - t1_ns
+        round_trip_ns = (t3_ns - t0_ns) - held_ns
+        if held_ns < 0 or round_trip_ns < 0:
+            return False
+        offset_ns = ((t1_ns - t0_ns) + (t2_ns - t3_ns)) // 2
+        self._samples.append(_Sample(t3_ns, offset_ns, round_trip_ns))
+        while self._samples[0].at_ns <= t3_ns - self._window_ns:
+            self._samples.popleft()
+        return True
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Remote clock minus ours; None before the first sample."""
+        best = self._best()
+        return None if best is None else best.offset_ns
+
+    @property
+    def error_ns(self) -> int | None:
+        """Half the round trip of the sample that speaks: the offset is right within this. None before the first."""
+        best = self._best()
+        return None if best is None else (best.round_trip_ns + 1) // 2
+
+    def to_local_ns(self, remote_ns: int) -> int:
+        """A time of the remote clock as ours would have shown it; unchanged before the first sample."""
+        return remote_ns - (self.offset_ns or 0)
+
+    def _best(self) -> _Sample | None:
+        return min(self._samples, key=lambda sample: sample.round_trip_ns, default=None)

@@ -1,0 +1,157 @@
+"""The key table: every stream of HVT, its direction and how Zenoh is to deliver it. Nothing else knows a key.
+
+Keys are ``hvt/<edge>/<row>``. This file knows strings only; `session` turns the names into Zenoh's own values.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+from types import MappingProxyType
+
+from hvt_common.errors import UserError
+
+__all__ = [
+    "DELIVERIES",
+    "MSGPACK_ENCODING",
+    "ROOT",
+    "Delivery",
+    "Direction",
+    "EdgeKeys",
+    "Row",
+    "check_edge_pattern",
+    "matches",
+    "parse_key",
+    "selector",
+]
+
+ROOT = "hvt"
+
+MSGPACK_ENCODING = "application/octet-stream"
+"""Zenoh has no short code for MessagePack; spelling it out would cost 22 bytes in each message."""
+
+_EDGE_ID = re.compile(r"[a-z0-9-]{1,32}")
+_EDGE_PATTERN = re.compile(r"[a-z0-9*-]{1,64}")
+
+
+class Row(StrEnum):
+    """The last part of a key."""
+
+    BASE = "base"
+    ROI = "roi"
+    TRACKS = "tracks"
+    STATUS = "status"
+    INFO = "info"
+    CONTROL = "control"
+    FEEDBACK = "feedback"
+    ALIVE = "alive"
+
+
+class Direction(Enum):
+    """Who speaks."""
+
+    EDGE_TO_GROUND = "edge to ground"
+    GROUND_TO_EDGE = "ground to edge"
+    GROUND_ASKS = "ground asks, edge answers"
+    PRESENCE = "liveliness token of the edge"
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """How one row crosses the link."""
+
+    direction: Direction
+    carries: str
+    priority: str
+    """Name of a Zenoh priority. BLOCK and DROP rows never share one: on one priority they disturb each other."""
+    congestion: str
+    """``BLOCK`` where the application owns a bounded queue of its own, ``DROP`` where the latest value wins."""
+    encoding: str = MSGPACK_ENCODING
+    reliability: str = "RELIABLE"
+    express: bool = False
+    """Always False: sending without batching makes loss worse on a saturated link."""
+
+
+DELIVERIES: Mapping[Row, Delivery] = MappingProxyType(
+    {
+        Row.BASE: Delivery(
+            Direction.EDGE_TO_GROUND,
+            "one HEVC access unit, Annex B; attachment BaseHeader",
+            "DATA_HIGH",
+            "BLOCK",
+            encoding="video/h265",
+        ),
+        Row.ROI: Delivery(
+            Direction.EDGE_TO_GROUND,
+            "one coded still; attachment RoiHeader",
+            "BACKGROUND",
+            "BLOCK",
+            encoding="image/jpeg",
+        ),
+        Row.TRACKS: Delivery(
+            Direction.EDGE_TO_GROUND, "the edge's own tracks (reserved)", "DATA_LOW", "DROP"
+        ),
+        Row.STATUS: Delivery(Direction.EDGE_TO_GROUND, "Status", "INTERACTIVE_LOW", "DROP"),
+        Row.INFO: Delivery(Direction.GROUND_ASKS, "empty question, Info", "INTERACTIVE_HIGH", "BLOCK"),
+        Row.CONTROL: Delivery(
+            Direction.GROUND_ASKS, "ControlRequest, ControlAnswer", "INTERACTIVE_HIGH", "BLOCK"
+        ),
+        Row.FEEDBACK: Delivery(Direction.GROUND_TO_EDGE, "Feedback", "INTERACTIVE_LOW", "DROP"),
+        Row.ALIVE: Delivery(Direction.PRESENCE, "nothing", "DATA", "BLOCK"),
+    }
+)
+"""The one table. `Delivery.encoding` of `Row.ROI` is that of the default codec; another still codec says its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeKeys:
+    """The keys of one edge. Raises UserError for an id outside ``[a-z0-9-]{1,32}``."""
+
+    edge: str
+
+    def __post_init__(self) -> None:
+        if _EDGE_ID.fullmatch(self.edge) is None:
+            raise UserError(
+                f"edge id {self.edge!r} is not usable: 1 to 32 characters of a-z, 0-9 and '-' are accepted"
+            )
+
+    def key(self, row: Row) -> str:
+        """The full key, such as ``hvt/uav-1/base``."""
+        return f"{ROOT}/{self.edge}/{row}"
+
+
+def check_edge_pattern(pattern: str) -> str:
+    """Return the pattern of ``--edges`` unchanged; raise UserError unless it is edge-id characters and ``*``."""
+    if _EDGE_PATTERN.fullmatch(pattern) is None:
+        raise UserError(
+            f"edge pattern {pattern!r} is not usable: characters of a-z, 0-9 and '-', and '*' for any run of them"
+        )
+    return pattern
+
+
+def selector(row: Row, *, edges: str = "*") -> str:
+    """The Zenoh key expression of one row for all edges that ``edges`` matches, such as ``hvt/uav-$*/base``.
+
+    The pattern travels to the sender, so edges that nobody asked for cost no line bytes.
+    """
+    pattern = re.sub(r"\*+", "*", check_edge_pattern(edges))
+    chunk = pattern if pattern == "*" else pattern.replace("*", "$*")
+    return f"{ROOT}/{chunk}/{row}"
+
+
+def matches(edge: str, *, edges: str) -> bool:
+    """Whether the pattern of ``--edges`` covers this edge id; the same rule as `selector`."""
+    return re.fullmatch(re.escape(edges).replace(r"\*", ".*"), edge) is not None
+
+
+def parse_key(key: str) -> tuple[str, Row] | None:
+    """The edge id and row of a received key; None for any key that is not ours."""
+    parts = key.split("/")
+    if len(parts) != 3 or parts[0] != ROOT or _EDGE_ID.fullmatch(parts[1]) is None:
+        return None
+    try:
+        return parts[1], Row(parts[2])
+    except ValueError:
+        return None

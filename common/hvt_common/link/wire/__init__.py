@@ -1,0 +1,45 @@
+"""Every message of HVT as bytes, and back. docs/wire.md is the same for people of other languages."""
+
+from __future__ import annotations
+
+from hvt_common.link.wire.dialogue import (
+    MAX_STILL_RESULTS,
+    Command,
+    ControlAnswer,
+    ControlRequest,
+    Feedback,
+    StillResult,
+)
+from hvt_common.link.wire.fields import WireError
+from hvt_common.link.wire.reports import Health, Info, Status
+from hvt_common.link.wire.sealed import (
+    MAX_PAYLOAD_BYTES,
+    WIRE_VERSION,
+    CorruptError,
+    Message,
+    UnknownVersionError,
+    kinds,
+)
+from hvt_common.link.wire.stream import BaseHeader, Flags, RoiHeader
+
+__all__ = [
+    "MAX_PAYLOAD_BYTES",
+    "MAX_STILL_RESULTS",
+    "WIRE_VERSION",
+    "BaseHeader",
+    "Command",
+    "ControlAnswer",
+    "ControlRequest",
+    "CorruptError",
+    "Feedback",
+    "Flags",
+    "Health",
+    "Info",
+    "Message",
+    "RoiHeader",
+    "Status",
+    "StillResult",
+    "UnknownVersionError",
+    "WireError",
+    "kinds",
+]

@@ -1,0 +1,92 @@
+"""What the ground says: requests that the edge answers, and its running report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import ClassVar
+
+from hvt_common.link.wire.fields import I63, U32, U64, Flag, Int, ListOf, MapOf, Scalar, Scaled, Text, carried
+from hvt_common.link.wire.sealed import Message, Nested
+
+__all__ = ["MAX_STILL_RESULTS", "Command", "ControlAnswer", "ControlRequest", "Feedback", "StillResult"]
+
+MAX_STILL_RESULTS = 32
+_COUNT = Int(0, 2**53 - 1)
+
+
+class Command(StrEnum):
+    """What a ground may ask for; an edge answers a command that it does not serve with a reason."""
+
+    KEYFRAME = "keyframe"
+    STILL = "still"
+    SET_BUDGET = "set-budget"
+    SET_METHOD = "set-method"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlRequest(Message):
+    """Payload of a question on ``control``."""
+
+    session_id: int = carried(Int(0, U64))
+    """The session it is meant for; 0 for whichever runs."""
+    command: str = carried(Text(24))
+    """A `Command`, or a word of some later version."""
+    arguments: Mapping[str, int | float | str] = carried(MapOf(Scalar(), 8, key_bytes=16))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlAnswer(Message):
+    """Payload of the answer on ``control``."""
+
+    session_id: int = carried(Int(0, U64))
+    accepted: bool = carried(Flag())
+    reason: str = carried(Text(200))
+    """One sentence; empty where accepted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StillResult:
+    """What the ground made of one still."""
+
+    still_sequence: int = carried(Int(0, U32))
+    track_id: int = carried(Int(-1, U32))
+    """The edge's track, as the still said."""
+    class_name: str = carried(Text(64))
+    confidence: float = carried(Scaled(0, 1, 1000))
+    entropy_nats: float = carried(Scaled(0, 20, 1000))
+    ground_track_id: int = carried(Int(-1, U32))
+    """The ground's track that it refined; -1 where it matched none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Feedback(Message):
+    """Payload of ``feedback``: a receiver report, counts since the receiver met this session."""
+
+    MAX_BYTES: ClassVar[int] = 4096
+
+    session_id: int = carried(Int(0, U64))
+    receiver_id: int = carried(Int(0, U64))
+    """Random, new at each start of the ground: several grounds may report on one edge."""
+    sequence: int = carried(Int(0, U32))
+    send_ns: int = carried(Int(0, I63))
+    """The ground's clock."""
+    last_frame_index: int = carried(Int(-1, U32))
+    """The last frame that the ground is done with; -1 before the first. A lockstep edge waits for it."""
+    base_messages: int = carried(_COUNT)
+    base_bytes: int = carried(_COUNT)
+    roi_messages: int = carried(_COUNT)
+    roi_bytes: int = carried(_COUNT)
+    lost: int = carried(_COUNT)
+    """Messages of base and roi that never came."""
+    corrupt: int = carried(_COUNT)
+    """Messages that came and could not be used."""
+    delay_p50_ms: float = carried(Scaled(-1, 3_600_000, 10))
+    """Median capture to receive since the last report, clocks reconciled; -1 where unknown."""
+    clock_offset_ns: int = carried(Int(-I63, I63))
+    """Edge clock minus ground clock, as the ground estimates it."""
+    clock_error_ns: int = carried(Int(-1, I63))
+    """The estimate is right within this; -1 where there is none."""
+    stills: tuple[StillResult, ...] = carried(ListOf(Nested(StillResult), MAX_STILL_RESULTS))
+    """New since the last report."""

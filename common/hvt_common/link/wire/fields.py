@@ -1,0 +1,279 @@
+"""The kinds of field a message may have. Each one checks the same bounds when it packs and when it parses.
+
+`Kind.encode` takes one of our own values and raises ValueError when it is out of bounds: that is a bug here.
+`Kind.decode` takes whatever MessagePack held and raises `WireError`: that is somebody else's bad message.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+__all__ = [
+    "I63",
+    "U32",
+    "U64",
+    "Choice",
+    "Flag",
+    "Int",
+    "Kind",
+    "ListOf",
+    "MapOf",
+    "Real",
+    "Scalar",
+    "Scaled",
+    "Text",
+    "TupleOf",
+    "WireError",
+    "carried",
+]
+
+U32 = 2**32 - 1
+U64 = 2**64 - 1
+I63 = 2**63 - 1
+
+
+class WireError(Exception):
+    """A message that cannot be used; the text says what was wrong with it. Count it, skip it, go on."""
+
+
+class Kind:
+    """A field's type, bounds and coding. Kinds say `_encode`, `_decode` and `_describe`."""
+
+    __slots__ = ()
+
+    def encode(self, value: Any) -> Any:
+        """The value as MessagePack is to hold it; ValueError when it is out of bounds."""
+        try:
+            raw = self._encode(value)
+            self._decode(raw)  # what we send is held to the same rules as what we receive
+        except (WireError, TypeError, ValueError, OverflowError, AttributeError) as error:
+            raise ValueError(f"{value!r} cannot be sent as {self.describe()}: {error}") from error
+        return raw
+
+    def decode(self, raw: Any) -> Any:
+        """The value of what MessagePack held; WireError when of another type or out of bounds."""
+        return self._decode(raw)
+
+    def describe(self) -> str:
+        """Type and bounds in a few words, as docs/wire.md prints them."""
+        return self._describe()
+
+    def _encode(self, value: Any) -> Any:
+        return value
+
+    def _decode(self, raw: Any) -> Any:
+        raise NotImplementedError
+
+    def _describe(self) -> str:
+        raise NotImplementedError
+
+
+def carried(kind: Kind) -> Any:
+    """A dataclass field that crosses the wire as ``kind``; fields are sent in the order they are declared."""
+    return field(metadata={"wire": kind})
+
+
+@dataclass(frozen=True, slots=True)
+class Int(Kind):
+    """A whole number in ``low … high``; a boolean is not a number."""
+
+    low: int
+    high: int
+
+    def _encode(self, value: Any) -> Any:
+        return value.__index__()
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is not int:
+            raise WireError(f"{type(raw).__name__} in place of a whole number")
+        if not self.low <= raw <= self.high:
+            raise WireError(f"{raw} is outside {self.low}…{self.high}")
+        return raw
+
+    def _describe(self) -> str:
+        return f"int {_power(self.low)}…{_power(self.high)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Scaled(Kind):
+    """A real number in ``low … high`` sent as a whole number of ``1/per``."""
+
+    low: float
+    high: float
+    per: int
+
+    def _encode(self, value: Any) -> Any:
+        return round(float(value) * self.per)
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is not int:
+            raise WireError(f"{type(raw).__name__} in place of a whole number of 1/{self.per}")
+        if not self.low * self.per <= raw <= self.high * self.per:
+            raise WireError(f"{raw}/{self.per} is outside {self.low:g}…{self.high:g}")
+        return raw / self.per
+
+    def _describe(self) -> str:
+        return f"int, {self.per} for 1; {self.low:g}…{self.high:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Real(Kind):
+    """A finite 64-bit float in ``low … high``."""
+
+    low: float
+    high: float
+
+    def _encode(self, value: Any) -> Any:
+        return float(value)
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is not float or not math.isfinite(raw):
+            raise WireError(f"{raw!r:.40} in place of a finite float")
+        if not self.low <= raw <= self.high:
+            raise WireError(f"{raw:g} is outside {self.low:g}…{self.high:g}")
+        return raw
+
+    def _describe(self) -> str:
+        return f"float {self.low:g}…{self.high:g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Flag(Kind):
+    """True or False."""
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is not bool:
+            raise WireError(f"{type(raw).__name__} in place of a boolean")
+        return raw
+
+    def _describe(self) -> str:
+        return "bool"
+
+
+@dataclass(frozen=True, slots=True)
+class Text(Kind):
+    """Printable UTF-8 of at most ``max_bytes``: received text ends up on terminals and in file names."""
+
+    max_bytes: int
+
+    def _encode(self, value: Any) -> Any:
+        return value[:]  # also makes a plain str of a StrEnum
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is not str:
+            raise WireError(f"{type(raw).__name__} in place of text")
+        if len(raw) > self.max_bytes or len(raw.encode("utf-8", "surrogatepass")) > self.max_bytes:
+            raise WireError(f"text of {len(raw)} characters is longer than {self.max_bytes} bytes")
+        if not raw.isprintable():
+            raise WireError(f"text {raw!r:.40} has characters that do not print")
+        return raw
+
+    def _describe(self) -> str:
+        return f"str ≤ {self.max_bytes} B"
+
+
+@dataclass(frozen=True, slots=True)
+class Choice(Kind):
+    """One of a few words, sent as its position."""
+
+    words: tuple[str, ...]
+
+    def _encode(self, value: Any) -> Any:
+        return self.words.index(value)
+
+    def _decode(self, raw: Any) -> Any:
+        return self.words[Int(0, len(self.words) - 1).decode(raw)]
+
+    def _describe(self) -> str:
+        return "int: " + ", ".join(f"{number} {word}" for number, word in enumerate(self.words))
+
+
+@dataclass(frozen=True, slots=True)
+class Scalar(Kind):
+    """A parameter's value: a whole number of 64 bits, a finite float or short text."""
+
+    max_bytes: int = 64
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is str:
+            return Text(self.max_bytes).decode(raw)
+        if type(raw) is float:
+            return Real(-1e300, 1e300).decode(raw)
+        return Int(-I63, I63).decode(raw)
+
+    def _describe(self) -> str:
+        return f"int, finite float or str ≤ {self.max_bytes} B"
+
+
+@dataclass(frozen=True, slots=True)
+class ListOf(Kind):
+    """At most ``max_items`` of one kind, as a tuple."""
+
+    inner: Kind
+    max_items: int
+
+    def _encode(self, value: Any) -> Any:
+        return [self.inner.encode(item) for item in value]
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is not list:
+            raise WireError(f"{type(raw).__name__} in place of a list")
+        if len(raw) > self.max_items:
+            raise WireError(f"list of {len(raw)} where at most {self.max_items} are allowed")
+        return tuple(self.inner.decode(item) for item in raw)
+
+    def _describe(self) -> str:
+        return f"array ≤ {self.max_items} of {self.inner.describe()}"
+
+
+@dataclass(frozen=True, slots=True)
+class TupleOf(Kind):
+    """Exactly ``length`` of one kind."""
+
+    inner: Kind
+    length: int
+
+    def _encode(self, value: Any) -> Any:
+        return [self.inner.encode(item) for item in value]
+
+    def _decode(self, raw: Any) -> Any:
+        items = ListOf(self.inner, self.length).decode(raw)
+        if len(items) != self.length:
+            raise WireError(f"{len(items)} numbers in place of {self.length}")
+        return items
+
+    def _describe(self) -> str:
+        return f"array of {self.length}: {self.inner.describe()}"
+
+
+@dataclass(frozen=True, slots=True)
+class MapOf(Kind):
+    """At most ``max_items`` named values; names are `Text` of at most ``key_bytes``."""
+
+    inner: Kind
+    max_items: int
+    key_bytes: int = 32
+
+    def _encode(self, value: Any) -> Any:
+        return {key: self.inner.encode(item) for key, item in value.items()}
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is not dict:
+            raise WireError(f"{type(raw).__name__} in place of a map")
+        if len(raw) > self.max_items:
+            raise WireError(f"map of {len(raw)} where at most {self.max_items} are allowed")
+        name = Text(self.key_bytes)
+        return {name.decode(key): self.inner.decode(item) for key, item in raw.items()}
+
+    def _describe(self) -> str:
+        return f"map ≤ {self.max_items}: str ≤ {self.key_bytes} B to {self.inner.describe()}"
+
+
+def _power(number: int) -> str:
+    """Large bounds as powers of two, for people."""
+    for bits in (16, 32, 53, 63, 64):
+        if abs(number) == 2**bits - 1:
+            return f"{'−' if number < 0 else ''}(2^{bits} − 1)"  # noqa: RUF001
+    return str(number)

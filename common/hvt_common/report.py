@@ -1,0 +1,92 @@
+"""What a run says of itself: a status line while it goes on, a table and a JSON file at its end."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from hvt_common.errors import UserError
+
+__all__ = ["StatusLine", "check_writable", "print_table", "write_json"]
+
+_PLAIN_EVERY = 5
+
+
+class StatusLine:
+    """One line on a terminal, rewritten in place; elsewhere a line now and then, so that logs stay short."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._console = Console(stderr=True, highlight=False)
+        self._quiet = quiet
+        self._updates = 0
+        self._live: Live | None = None
+        if self._console.is_terminal and not quiet:
+            self._live = Live(console=self._console, auto_refresh=False, transient=True)
+
+    def show(self, text: str) -> None:
+        """Replace the line (call about once a second)."""
+        if self._live is not None:
+            self._live.update(Text(text, overflow="ellipsis", no_wrap=True), refresh=True)
+        elif not self._quiet:
+            if self._updates % _PLAIN_EVERY == 0:
+                print(text, file=sys.stderr, flush=True)
+            self._updates += 1
+
+    def note(self, text: str) -> None:
+        """Say something that stays, above the line."""
+        if not self._quiet:
+            self._console.print(text, markup=False, soft_wrap=True)
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+
+def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Print name and value pairs as a table."""
+    table = Table(title=title, show_header=False, title_justify="left", title_style="bold")
+    table.add_column(style="cyan", no_wrap=True)
+    table.add_column()
+    for name, value in rows:
+        table.add_row(name, value)
+    Console(highlight=False).print(table)
+
+
+def check_writable(path: Path | None, *, name: str) -> None:
+    """Raise `UserError` now where a file could not be written at the end of the run."""
+    if path is None:
+        return
+    if path.is_dir():
+        raise UserError(f"{name} {path} is a folder: name a file")
+    if not path.absolute().parent.is_dir():
+        raise UserError(
+            f"{name} {path} is in a folder that does not exist: make {path.absolute().parent} first"
+        )
+    try:
+        with path.open("ab"):
+            pass
+    except OSError as error:
+        raise UserError(f"{name} {path} cannot be written ({error.strerror}): name a file that can") from None
+
+
+def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:
+    """Write the summary; whole or not at all."""
+    scratch = path.with_name(path.name + ".part")
+    scratch.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    scratch.replace(path)

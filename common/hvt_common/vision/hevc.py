@@ -1,0 +1,71 @@
+"""Decode the base stream, one access unit in, one picture out. The same decoder runs at the edge and the ground."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import av
+import av.error
+import numpy as np
+from av.video.codeccontext import VideoCodecContext
+from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
+
+from hvt_common.values import Image
+
+__all__ = ["MAX_SIDE_PX", "UNBIASED", "BaseDecoder"]
+
+UNBIASED = (
+    Interpolation.AREA
+    | Interpolation.ACCURATE_RND
+    | Interpolation.FULL_CHR_H_INT
+    | Interpolation.FULL_CHR_H_INP
+)
+"""How libswscale converts between BGR and YUV. Its default rounding shifts every pixel by about two levels, which
+costs the base 0.9 dB at 650 kbps; this takes 2.5 ms a 720p frame more to decode and none to encode."""
+
+MAX_SIDE_PX = 8192
+"""HEVC level 6.2 ends near here; a larger picture from the network is not decoded."""
+
+
+class BaseDecoder:
+    """Decodes HEVC access units in order.
+
+    Slice threading is the only kind that returns each picture at once; frame threading lags by one or two. After a
+    loss libavcodec returns nothing, or garbage, without an error: the caller starts again at a keyframe
+    (`reset`) and never feeds a unit whose predecessor is missing.
+    """
+
+    def __init__(self) -> None:
+        self._context = self._open()
+        self._to_bgr = VideoReformatter()
+
+    def decode(self, data: bytes) -> Image | None:
+        """Return the picture, uint8 (H, W, 3) BGR in base pixels, or None where the unit cannot be decoded."""
+        try:
+            pictures = self._context.decode(av.Packet(data))
+        except av.error.FFmpegError:
+            return None
+        if not pictures:
+            return None
+        picture = pictures[-1]
+        if max(picture.width, picture.height) > MAX_SIDE_PX:
+            return None
+        bgr = self._to_bgr.reformat(
+            picture,
+            format="bgr24",
+            src_colorspace=Colorspace.ITU709,
+            src_color_range=ColorRange.MPEG,
+            dst_color_range=ColorRange.JPEG,
+            interpolation=UNBIASED,
+        )
+        return cast("Image", np.asarray(bgr.to_ndarray(), np.uint8))
+
+    def reset(self) -> None:
+        """Forget all reference pictures; the next unit has to be a keyframe."""
+        self._context = self._open()
+
+    @staticmethod
+    def _open() -> VideoCodecContext:
+        context = av.CodecContext.create("hevc", "r")
+        context.thread_type = "SLICE"
+        return context

@@ -1,0 +1,107 @@
+"""Class names from a text file or from a model's own metadata."""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from hvt_common.errors import UserError
+
+__all__ = ["MAX_LABELS", "MAX_LABEL_CHARS", "first_synonym", "metadata_labels", "read_labels"]
+
+MAX_LABELS = 100_000
+MAX_LABEL_CHARS = 200
+_MAX_FILE_BYTES = 8 << 20
+_MAX_METADATA_CHARS = 1 << 20
+
+
+def read_labels(path: Path) -> tuple[str, ...]:
+    """Read class names: UTF-8 text, one name a line, the first line is class 0.
+
+    Blank lines at the end are ignored; spaces around a name too. A name may occur twice (ImageNet has two cranes).
+
+    Raises:
+        UserError: Missing, not readable, not text, empty, a blank line in the middle, too many or too long names.
+    """
+    names = [line.strip() for line in _read_text(path).rstrip().splitlines()]
+    if names == []:
+        raise UserError(f"labels file {path} is empty; one class name a line is expected")
+    if len(names) > MAX_LABELS:
+        raise UserError(f"labels file {path} has {len(names)} lines; at most {MAX_LABELS} are accepted")
+    for number, name in enumerate(names, start=1):
+        if not name:
+            raise UserError(
+                f"labels file {path} has no name in line {number}; one class name a line is expected"
+            )
+        if len(name) > MAX_LABEL_CHARS:
+            raise UserError(
+                f"labels file {path} has {len(name)} characters in line {number}; at most {MAX_LABEL_CHARS} fit"
+            )
+        if not name.isprintable():
+            raise UserError(
+                f"labels file {path} is not text in line {number}; one class name a line is expected"
+            )
+    return tuple(names)
+
+
+def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
+    """Class names that a model carries: ``names`` as Ultralytics writes it, or a JSON list in ``classes``.
+
+    ``names`` is a Python literal (``{0: 'car', 1: 'bus'}`` or a list), read without executing anything. Metadata
+    that is malformed counts as none: it is a courtesy of whoever exported the model, not an input of the user.
+    """
+    return _literal_names(metadata.get("names", "")) or _json_names(metadata.get("classes", ""))
+
+
+def first_synonym(label: str) -> str:
+    """The first of comma-separated synonyms: ``beach wagon, station wagon, …`` is shown as ``beach wagon``."""
+    return label.partition(",")[0].strip() or label
+
+
+def _read_text(path: Path) -> str:
+    if not path.is_file():
+        state = "is not a file" if path.exists() else "does not exist"
+        raise UserError(f"labels file {path} {state}; a text file with one class name a line is expected")
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_FILE_BYTES + 1)
+        if len(content) > _MAX_FILE_BYTES:
+            raise UserError(
+                f"labels file {path} is larger than {_MAX_FILE_BYTES} bytes, which is what is accepted"
+            )
+        return content.decode("utf-8-sig")
+    except OSError as error:
+        raise UserError(f"labels file {path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"labels file {path} is not UTF-8 text (byte {error.start})") from error
+
+
+def _literal_names(text: str) -> tuple[str, ...] | None:
+    if not text or len(text) > _MAX_METADATA_CHARS:
+        return None
+    try:
+        value = ast.literal_eval(text)
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return None
+    if isinstance(value, dict):
+        if sorted(map(str, value)) != sorted(map(str, range(len(value)))):
+            return None
+        value = [item for _, item in sorted(value.items(), key=lambda pair: int(pair[0]))]
+    return _names(value)
+
+
+def _json_names(text: str) -> tuple[str, ...] | None:
+    if not text or len(text) > _MAX_METADATA_CHARS:
+        return None
+    try:
+        return _names(json.loads(text))
+    except (ValueError, RecursionError):
+        return None
+
+
+def _names(value: object) -> tuple[str, ...] | None:
+    if not isinstance(value, list | tuple) or not 0 < len(value) <= MAX_LABELS:
+        return None
+    return tuple(str(item)[:MAX_LABEL_CHARS] for item in value)

@@ -1,0 +1,418 @@
+"""The order of the stages at the edge. Nothing else knows it."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any, cast
+
+from hvt_common import __version__
+from hvt_common.errors import UserError
+from hvt_common.link.keys import EdgeKeys
+from hvt_common.link.ledger import Ledger
+from hvt_common.link.session import open_session
+from hvt_common.link.wire import Command, ControlAnswer, ControlRequest, Feedback, Health, Info, Status
+from hvt_common.link.zenoh_config import LinkSettings
+from hvt_common.report import StatusLine, check_writable
+from hvt_common.units import bitrate_text
+from hvt_common.values import Fit, Frame
+from hvt_edge.base_stage import BaseStage
+from hvt_edge.build import (
+    SECOND_NS,
+    make_budget,
+    make_chooser,
+    make_detector,
+    make_encoder,
+    make_keyframes,
+    make_sight,
+)
+from hvt_edge.clock import SteadyClock, realtime_admits
+from hvt_edge.config import EdgeConfig
+from hvt_edge.feedback import FeedbackInbox
+from hvt_edge.publish import EdgeLink
+from hvt_edge.record_base import BaseRecorder
+from hvt_edge.scene.truth import write_truth
+from hvt_edge.send import Sender
+from hvt_edge.source import Source, open_source
+from hvt_edge.sources.demo import DemoSource
+from hvt_edge.still_stage import StillStage, StillWorker
+from hvt_edge.summary import EdgeRun, summary
+
+__all__ = ["Edge"]
+
+_LOCKSTEP_AHEAD_S = 1.0
+"""How far a lockstep edge runs ahead of the ground, in media time: what a ground reports counts so much later."""
+_GROUND_GONE_S = 20.0
+_GOODBYE_S = 1.5
+_MILLION = 1_000_000
+
+
+@contextmanager
+def _closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
+    """Close a live source as soon as ``stop`` is set: one whose signal is lost would keep its reader waiting."""
+
+    def wait() -> None:
+        stop.wait()
+        source.close()
+
+    threading.Thread(target=wait, name="hvt-stop", daemon=True).start()
+    try:
+        yield
+    finally:
+        stop.set()
+
+
+@dataclass(slots=True)
+class _Counts:
+    """What the frame loop counts."""
+
+    captured: int = 0
+    encoded: int = 0
+    dropped: int = 0
+    encode_ns: int = 0
+    first_index: int | None = None
+    last_index: int = -1
+
+
+class Edge:
+    """One run of one edge: build it, `run` it once."""
+
+    def __init__(self, config: EdgeConfig, *, stop: threading.Event) -> None:
+        self._config = config
+        self._stop = stop
+        self._lockstep = config.pace == "lockstep"
+        self._clock = SteadyClock()
+        self._session_id = secrets.randbits(64)
+        self._counts = _Counts()
+        self._ledger = Ledger(window_ns=round(config.window * SECOND_NS))
+        self._keyframes = make_keyframes(config)
+        self._inbox = FeedbackInbox()
+        self._in_flight: deque[tuple[int, set[int]]] = deque()
+        self._newest_answered = -1
+        self._ground_follows = False
+        self._started_ns = 0
+        self._now_ns = 0
+        self._status_sequence = 0
+
+    def run(self) -> dict[str, Any]:
+        """Play the source to its end or until ``stop`` is set; return the summary.
+
+        Raises:
+            UserError: before anything is sent, where a setting, a file or a port cannot be used.
+        """
+        config = self._config
+        check_writable(config.summary, name="--summary")
+        detector = make_detector(config)
+        with ExitStack() as stack:
+            source = stack.enter_context(self._open_source())
+            self._write_truth(source)
+            recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
+            encoder = make_encoder(config)
+            budget = make_budget(config)
+            line = stack.enter_context(StatusLine(quiet=config.quiet))
+            link = self._open_link(stack, source, detector.class_names)
+            sender = Sender(
+                link,
+                ledger=self._ledger,
+                budget=budget,
+                edge_id=config.edge_id,
+                session_id=self._session_id,
+                lockstep=self._lockstep,
+            )
+            base = BaseStage(
+                encoder,
+                keyframes=self._keyframes,
+                sender=sender,
+                recorder=recorder,
+                first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
+            )
+            chooser = make_chooser(
+                config,
+                view=source.view,
+                class_names=detector.class_names,
+                most_bytes=(config.budget_bps - config.base_bps) // 8,
+                on_fate=sender.fate,
+            )
+            stills = StillStage(
+                make_sight(config, detector=detector, view=source.view),
+                chooser,
+                sender=sender,
+                keyframes=self._keyframes,
+                media_type="image/jpeg",
+            )
+            self._wait_for_ground(link, source, line)
+            self._started_ns = self._clock()
+            try:
+                self._play(source, base, stills, sender, line, link)
+            finally:
+                stills.close()
+                self._say_goodbye(sender, stills, link)
+        return summary(self._facts(stills, link), self._ledger)
+
+    def _open_source(self) -> Source:
+        config = self._config
+        assert config.source is not None, "check() refuses a missing source"
+        return open_source(
+            config.source,
+            size=config.size,
+            fps=config.fps,
+            fit=cast("Fit", config.fit),
+            seed=config.seed,
+            max_frames=config.max_frames,
+            source_fps=config.source_fps,
+        )
+
+    def _write_truth(self, source: Source) -> None:
+        if self._config.truth is None:
+            return
+        if not isinstance(source, DemoSource):
+            raise UserError(
+                f"--truth {self._config.truth} is for --source demo: no other source knows its truth"
+            )
+        check_writable(self._config.truth, name="--truth")
+        write_truth(source.scene, self._config.truth, fps=self._config.fps, view=source.view)
+
+    def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> EdgeLink:
+        config = self._config
+        settings = LinkSettings(
+            role="edge",
+            listen=config.listen,
+            connect=config.connect,
+            zenoh_config=config.zenoh_config,
+            insecure=config.insecure,
+        )
+        session = stack.enter_context(open_session(settings))
+        return stack.enter_context(
+            EdgeLink(
+                session,
+                EdgeKeys(config.edge_id),
+                answer_info=lambda received_ns: self._info(source, class_names, received_ns),
+                answer_control=self._control,
+                hear=self._hear,
+            )
+        )
+
+    def _wait_for_ground(self, link: EdgeLink, source: Source, line: StatusLine) -> None:
+        """A recorded source can wait for its audience; a camera cannot."""
+        if source.live or link.heard():
+            return
+        deadline_s = time.monotonic() + self._config.wait
+        line.note(f"{self._config.edge_id}: waiting up to {self._config.wait:g} s for a ground (--wait)")
+        while not link.heard() and not self._stop.is_set():
+            if time.monotonic() >= deadline_s:
+                line.note(f"{self._config.edge_id}: no ground yet; playing on, one may join at any time")
+                return
+            self._stop.wait(0.02)
+
+    # The frame loop
+
+    def _play(
+        self,
+        source: Source,
+        base: BaseStage,
+        stills: StillStage,
+        sender: Sender,
+        line: StatusLine,
+        link: EdgeLink,
+    ) -> None:
+        self._ground_follows = link.heard()
+        next_status_ns = 0
+        with ExitStack() as stack:
+            worker = None
+            if source.live:
+                stack.enter_context(_closing_on(self._stop, source))
+            if not self._lockstep:
+                worker = stack.enter_context(StillWorker(stills, hear=self._inbox.take, clock=self._clock))
+            for frame in source.frames(start_ns=self._started_ns):
+                if self._stop.is_set():
+                    break
+                self._counts.captured += 1
+                if self._lockstep:
+                    self._step_lockstep(frame, base, stills)
+                elif not self._step_realtime(frame, base, worker, live=source.live):
+                    continue
+                if self._now_ns >= next_status_ns:
+                    next_status_ns = self._now_ns + SECOND_NS
+                    self._report(sender, stills, line, link)
+
+    def _step_realtime(
+        self, frame: Frame, base: BaseStage, worker: StillWorker | None, *, live: bool
+    ) -> bool:
+        assert worker is not None
+        on_time = live or realtime_admits(frame, clock=self._clock, fps=self._config.fps, stop=self._stop)
+        self._note_index(frame)
+        if not on_time or worker.full:
+            self._counts.dropped += 1
+            return False
+        self._now_ns = self._clock()
+        began_ns = time.perf_counter_ns()
+        unit = base.encode(frame, now_ns=self._now_ns)
+        self._counts.encode_ns += time.perf_counter_ns() - began_ns
+        self._now_ns = self._clock()
+        base.send(unit, now_ns=self._now_ns, send_ns=self._now_ns)
+        self._counts.encoded += 1
+        worker.offer(frame, unit)
+        return True
+
+    def _step_lockstep(self, frame: Frame, base: BaseStage, stills: StillStage) -> None:
+        """One frame, all stages in this thread, every window in media time."""
+        self._note_index(frame)
+        self._follow_ground(frame.index, stills)
+        self._now_ns = frame.capture_ns
+        began_ns = time.perf_counter_ns()
+        unit = base.encode(frame, now_ns=self._now_ns)
+        encoded_ns = time.perf_counter_ns()
+        base.send(unit, now_ns=self._now_ns, send_ns=self._clock())
+        # Media time stands for the time of sending, so that both ledgers see the same windows.
+        sent = stills.step(frame, unit, clock=lambda: frame.capture_ns, now_ns=self._now_ns)
+        self._counts.encode_ns += encoded_ns - began_ns
+        self._counts.encoded += 1
+        self._in_flight.append((frame.index, sent))
+
+    def _follow_ground(self, frame_index: int, stills: StillStage) -> None:
+        """Stay a fixed number of frames ahead, and take in the results of exactly the frames behind that."""
+        ahead = max(1, round(_LOCKSTEP_AHEAD_S * self._config.fps))
+        while self._in_flight and self._in_flight[0][0] <= frame_index - ahead:
+            done_index, sent = self._in_flight.popleft()
+            if self._ground_follows and not self._inbox.wait_for(
+                frame_index=done_index, stills=sent, timeout_s=_GROUND_GONE_S
+            ):
+                self._ground_follows = False  # it is gone, or it never classifies: do not wait again
+            self._newest_answered = max([self._newest_answered, *sent])
+        stills.hear(self._inbox.take_up_to(self._newest_answered))
+
+    def _note_index(self, frame: Frame) -> None:
+        if self._counts.first_index is None:
+            self._counts.first_index = frame.index
+        self._counts.last_index = frame.index
+
+    # What others ask and are told
+
+    def _hear(self, feedback: Feedback) -> None:
+        if feedback.session_id == self._session_id:
+            self._inbox.receive(feedback, now_ns=self._clock())
+
+    def _control(self, request: ControlRequest) -> ControlAnswer:
+        reason = ""
+        if request.session_id not in (0, self._session_id):
+            reason = "that session has ended"
+        elif request.command == Command.KEYFRAME:
+            self._keyframes.request(self._now_ns)
+        else:
+            reason = f"this edge does not serve {request.command!r}"
+        return ControlAnswer(session_id=self._session_id, accepted=not reason, reason=reason)
+
+    def _info(self, source: Source, class_names: tuple[str, ...], received_ns: int) -> bytes:
+        config, view = self._config, source.view
+        info = Info(
+            session_id=self._session_id,
+            edge=config.edge_id,
+            software=__version__,
+            started_ns=self._started_ns,
+            source_size=view.source_size,
+            base_size=view.base_size,
+            view_scale=view.scale,
+            view_offset_px=view.offset_px,
+            fps=config.fps,
+            codec="hevc",
+            pace=config.pace,
+            method=config.method,
+            budget_bps=config.budget_bps,
+            base_bps=config.base_bps,
+            window_ns=self._ledger.window_ns,
+            class_names=class_names[:2048],
+            received_ns=received_ns,
+            answered_ns=time.time_ns(),
+        )
+        return info.pack()
+
+    def _report(self, sender: Sender, stills: StillStage, line: StatusLine, link: EdgeLink) -> None:
+        sender.status(self._status("running", sender, stills), now_ns=self._now_ns)
+        media_s = self._duration_s()
+        rate_bps = self._ledger.window_bytes(None, self._now_ns) * 8 * SECOND_NS / self._ledger.window_ns
+        sent = sum(self._ledger.fates("sent").values())
+        heard = "a ground listens" if link.heard() else "no ground listens"
+        line.show(
+            f"{self._config.edge_id} {media_s:6.1f} s  {bitrate_text(rate_bps)} of "
+            f"{bitrate_text(self._config.budget_bps)}  {self._config.method}  stills {sent}, {stills.waiting} "
+            f"waiting  tracks {stills.tracks}  {heard}"
+        )
+
+    def _status(self, state: str, sender: Sender, stills: StillStage) -> Status:
+        account, counts, ledger = self._ledger.summary(self._duration_s()), self._counts, self._ledger
+        age_ns = None if self._inbox.received_ns is None else self._clock() - self._inbox.received_ns
+        self._status_sequence += 1
+        return Status(
+            session_id=self._session_id,
+            sequence=self._status_sequence - 1,
+            state=state,
+            send_ns=self._clock(),
+            media_ns=max(0, self._now_ns - self._started_ns),
+            last_base_sequence=sender.base_sequence,
+            last_still_sequence=sender.still_sequence,
+            base_bytes=account.base_bytes,
+            roi_bytes=account.roi_bytes,
+            meta_bytes=account.meta_bytes,
+            overhead_bytes=account.overhead_bytes,
+            base_messages=account.messages["base"],
+            roi_messages=account.messages["roi"],
+            meta_messages=account.messages["meta"],
+            worst_window_bps=(
+                account.worst_window_bps.base,
+                account.worst_window_bps.roi,
+                account.worst_window_bps.total,
+            ),
+            sent=ledger.fates("sent"),
+            deferred=ledger.fates("deferred"),
+            dropped=ledger.fates("dropped"),
+            health=Health(
+                frames_captured=counts.captured,
+                frames_encoded=counts.encoded,
+                frames_dropped=counts.dropped,
+                keyframes=self._keyframes.sent,
+                tracks=stills.tracks,
+                base_queue=0,
+                still_queue=stills.waiting,
+                encode_ms=counts.encode_ns / max(1, counts.encoded) / _MILLION,
+                detect_ms=stills.sight_ms,
+                feedback_age_ms=-1 if age_ns is None else max(0, age_ns // _MILLION),
+            ),
+        )
+
+    def _say_goodbye(self, sender: Sender, stills: StillStage, link: EdgeLink) -> None:
+        """Let the ground finish, then tell it that this was all."""
+        if self._lockstep:
+            self._follow_ground(self._counts.last_index + 10**9, stills)
+        sender.status(self._status("ended", sender, stills), now_ns=self._now_ns)
+        if link.heard():  # what is still in a queue would be lost with the session
+            base, roi = sender.base_sequence + 1, sender.still_sequence + 1
+            self._inbox.wait_for_messages(base=base, roi=roi, timeout_s=_GOODBYE_S)
+
+    def _duration_s(self) -> float:
+        if self._counts.first_index is None:
+            return 0.0
+        return (self._counts.last_index - self._counts.first_index + 1) / self._config.fps
+
+    def _facts(self, stills: StillStage, link: EdgeLink) -> EdgeRun:
+        counts, config = self._counts, self._config
+        return EdgeRun(
+            edge=config.edge_id,
+            session=f"{self._session_id:016x}",
+            method=config.method,
+            frames=counts.encoded,
+            frames_dropped=counts.dropped,
+            duration_s=self._duration_s(),
+            budget_bps=config.budget_bps,
+            base_bps=config.base_bps,
+            keyframes=self._keyframes.sent,
+            keyframe_requests=self._keyframes.requests,
+            tracks=stills.tracks,
+            encode_ms=counts.encode_ns / max(1, counts.encoded) / _MILLION,
+            sight_ms=stills.sight_ms,
+            unusable_messages=link.unusable,
+        )

@@ -1,0 +1,49 @@
+"""``hvt-edge``: camera to link."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+
+from hvt_common.config import load, to_toml
+from hvt_common.errors import exit_with_sentence
+from hvt_common.report import print_table, write_json
+from hvt_edge.app import Edge
+from hvt_edge.config import EdgeConfig, check
+from hvt_edge.summary import table
+
+__all__ = ["main"]
+
+_DESCRIPTION = (
+    "Publish a camera or clip over Zenoh: a low-bitrate HEVC base stream, and sharp stills of what matters, "
+    "within a hard bit budget."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the edge; return 0, or 2 after a sentence on what is wrong."""
+    return exit_with_sentence(_run, program="hvt-edge", argv=argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    config, asked = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
+    if asked.print_config:
+        print(to_toml(config), end="")
+        return 0
+    config = check(config)
+    logging.basicConfig(level=logging.WARNING, format="hvt-edge: %(message)s")
+    stop = threading.Event()
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, lambda *_: stop.set())
+    content = Edge(config, stop=stop).run()
+    if config.summary is not None:
+        write_json(config.summary, content)
+    print_table(f"{config.edge_id}: sent", table(content))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

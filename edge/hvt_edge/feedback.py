@@ -1,0 +1,79 @@
+"""What grounds report back, in the order and at the pace in which the edge takes it in."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+from hvt_common.link.wire import Feedback, StillResult
+
+__all__ = ["FeedbackInbox"]
+
+_MAX_RESULTS = 1024
+
+
+class FeedbackInbox:
+    """Filled from Zenoh's callback, emptied by the frame loop.
+
+    In real time results are taken as they come. In lockstep the loop waits until the ground has done with frame
+    ``n - k`` and all stills of it, and takes exactly those: when a result counts follows from the input alone, and
+    the same input gives the same stills.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._results: deque[StillResult] = deque(maxlen=_MAX_RESULTS)
+        self._last_frame_index = -1
+        self._answered: set[int] = set()
+        self._base_messages = 0
+        self._roi_messages = 0
+        self.received_ns: int | None = None
+        """When the last report came, this side's clock."""
+
+    def receive(self, feedback: Feedback, *, now_ns: int) -> None:
+        """Take in one report (any thread)."""
+        with self._changed:
+            self.received_ns = now_ns
+            self._last_frame_index = max(self._last_frame_index, feedback.last_frame_index)
+            self._base_messages = max(self._base_messages, feedback.base_messages)
+            self._roi_messages = max(self._roi_messages, feedback.roi_messages)
+            for result in feedback.stills:
+                if result.still_sequence not in self._answered:
+                    self._answered.add(result.still_sequence)
+                    self._results.append(result)
+            if len(self._answered) > 2 * _MAX_RESULTS:  # a ground that answers what was never asked
+                self._answered = set(sorted(self._answered)[-_MAX_RESULTS:])
+            self._changed.notify_all()
+
+    def take(self) -> list[StillResult]:
+        """Return and forget all results so far."""
+        with self._changed:
+            results = list(self._results)
+            self._results.clear()
+            return results
+
+    def take_up_to(self, sequence: int) -> list[StillResult]:
+        """Return and forget the results of stills up to this one, in the order of the stills."""
+        with self._changed:
+            ready = sorted(
+                (one for one in self._results if one.still_sequence <= sequence),
+                key=lambda one: one.still_sequence,
+            )
+            self._results = deque(
+                (one for one in self._results if one.still_sequence > sequence), maxlen=_MAX_RESULTS
+            )
+            return ready
+
+    def wait_for(self, *, frame_index: int, stills: set[int], timeout_s: float) -> bool:
+        """Wait until a ground is done with this frame and has answered these stills; False after the time-out."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._last_frame_index >= frame_index and stills <= self._answered, timeout_s
+            )
+
+    def wait_for_messages(self, *, base: int, roi: int, timeout_s: float) -> bool:
+        """Wait until a ground has received so many messages of each; False after the time-out."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._base_messages >= base and self._roi_messages >= roi, timeout_s
+            )

@@ -1,0 +1,74 @@
+"""When the next base frame becomes a keyframe: at the start, on a long schedule, and when a ground asks.
+
+A keyframe is the largest message there is, so it is announced: while one is due, stills are held, and it is sent
+as soon as it fits the budget's window. A scheduled one can wait until it does; one that a ground asked for waits
+``patience_ns`` at the most, so that a ground that joins late sees a picture within a second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["KeyframePlan", "KeyframeSettings"]
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeSettings:
+    """Times in nanoseconds; ``interval_ns`` of 0 sends keyframes on demand only."""
+
+    interval_ns: int = 10 * _SECOND_NS
+    patience_ns: int = 3 * _SECOND_NS // 5
+    scheduled_patience_ns: int = 2 * _SECOND_NS
+    rest_ns: int = _SECOND_NS // 2
+    """After a keyframe, requests are taken as answered by it for so long: they crossed it on the way."""
+
+
+class KeyframePlan:
+    """Decides frame by frame; time is an argument."""
+
+    def __init__(self, settings: KeyframeSettings = KeyframeSettings()) -> None:
+        self._settings = settings
+        self._last_ns: int | None = None
+        self._due_ns: int | None = None
+        self._asked_ns: int | None = None
+        self.requests = 0
+        self.sent = 0
+
+    def request(self, now_ns: int) -> bool:
+        """A ground wants a keyframe; False where the newest one is so fresh that it serves."""
+        self.requests += 1
+        if self._last_ns is not None and now_ns - self._last_ns < self._settings.rest_ns:
+            return False
+        if self._due_ns is None:
+            self._due_ns = now_ns
+        if self._asked_ns is None:
+            self._asked_ns = now_ns
+        return True
+
+    def due(self, now_ns: int) -> bool:
+        """Tell whether a keyframe is to come: stills are held from now on until it has gone."""
+        if self._last_ns is None:
+            return True
+        interval_ns = self._settings.interval_ns
+        if self._due_ns is None and interval_ns and now_ns - self._last_ns >= interval_ns:
+            self._due_ns = now_ns
+        return self._due_ns is not None
+
+    def now(self, now_ns: int, *, fits: bool) -> bool:
+        """Tell whether this very frame is to be the keyframe; ``fits``: the budget's window has room for it."""
+        if not self.due(now_ns):
+            return False
+        return fits or not self._patient(now_ns)
+
+    def done(self, now_ns: int) -> None:
+        """A keyframe has just been encoded."""
+        self._last_ns, self._due_ns, self._asked_ns = now_ns, None, None
+        self.sent += 1
+
+    def _patient(self, now_ns: int) -> bool:
+        settings = self._settings
+        if self._asked_ns is not None:
+            return now_ns - self._asked_ns < settings.patience_ns
+        return self._due_ns is not None and now_ns - self._due_ns < settings.scheduled_patience_ns

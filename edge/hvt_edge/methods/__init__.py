@@ -1,0 +1,22 @@
+"""Scheduling policies: which tracks deserve a still at this step."""
+
+from __future__ import annotations
+
+from hvt_edge.methods.base import Method, Request, Step
+from hvt_edge.methods.cost import CostEstimate, CostModel
+from hvt_edge.methods.registry import METHODS, MethodEntry, method
+from hvt_edge.methods.selectors import SELECTORS, Selector, select
+
+__all__ = [
+    "METHODS",
+    "SELECTORS",
+    "CostEstimate",
+    "CostModel",
+    "Method",
+    "MethodEntry",
+    "Request",
+    "Selector",
+    "Step",
+    "method",
+    "select",
+]

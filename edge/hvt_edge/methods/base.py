@@ -1,0 +1,72 @@
+"""What a method is: a pure function from the candidates of a step to wishes for stills, most wanted first.
+
+To add one: a frozen dataclass with its parameters in a file of its own, and one row in `registry`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from hvt_edge.candidates import Candidate
+from hvt_edge.methods.cost import CostEstimate
+
+__all__ = ["Method", "Request", "Step", "ranked"]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What every method may know of the moment beside the candidates."""
+
+    frame_index: int
+    now_ns: int
+    fps: float
+    """Frames a second of the base stream."""
+    base_size: tuple[int, int]
+    """(width, height) in base pixels."""
+    cost: CostEstimate
+    """What a still is expected to cost, learnt from those already sent."""
+    room_bytes: float
+    """What the rolling budget would admit now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A wish for a still of one candidate."""
+
+    candidate: Candidate
+    reason: str
+    """In a word or two, for the ledger, the wire and the viewer."""
+    score: float
+    """The queue sends the highest first; comparable within one method only."""
+
+
+class Method(Protocol):
+    """A scheduling policy."""
+
+    @property
+    def name(self) -> str:
+        """As ``--method`` and the tables say it."""
+        ...
+
+    @property
+    def video_only(self) -> bool:
+        """True where no still is ever wanted, so that the base stream may take the whole budget."""
+        ...
+
+    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
+        """The wishes of this step, most wanted first, at most one a track; the same for the same input."""
+        ...
+
+
+def ranked(
+    candidates: Iterable[Candidate], *, score: Callable[[Candidate], float | None], reason: str
+) -> list[Request]:
+    """Requests for those with a score, highest first; ties go to the older track, whatever the order they came in."""
+    wanted = [
+        Request(candidate, reason, value)
+        for candidate in candidates
+        if (value := score(candidate)) is not None
+    ]
+    return sorted(wanted, key=lambda request: (-request.score, request.candidate.track_id))

@@ -1,0 +1,99 @@
+"""The edge's end of the link: what it declares, sends and hears. Knows Zenoh; knows nothing of frames."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from hvt_common.link.keys import EdgeKeys, Row
+from hvt_common.link.session import declare_publisher, serve
+from hvt_common.link.wire import ControlAnswer, ControlRequest, Feedback, WireError
+
+__all__ = ["EdgeLink"]
+
+_log = logging.getLogger(__name__)
+
+_PUBLISHED = (Row.BASE, Row.ROI, Row.STATUS)
+
+
+class EdgeLink:
+    """Publishers of base, roi and status; queryables info and control; a subscriber of feedback; the alive token.
+
+    ``answer_info(received_ns)``, ``answer_control(request)`` and ``hear(feedback)`` run in Zenoh's callbacks and
+    must be quick.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: EdgeKeys,
+        *,
+        answer_info: Callable[[int], bytes],
+        answer_control: Callable[[ControlRequest], ControlAnswer],
+        hear: Callable[[Feedback], None],
+    ) -> None:
+        self._keys = keys
+        self._answer_info = answer_info
+        self._answer_control = answer_control
+        self._hear = hear
+        self.unusable = 0
+        """Messages from grounds that were skipped: damaged, foreign or of another version."""
+        self._publishers = {row: declare_publisher(session, row, keys=keys) for row in _PUBLISHED}
+        serve(session, Row.INFO, keys=keys, answer=self._info)
+        serve(session, Row.CONTROL, keys=keys, answer=self._control)
+        self._feedback = session.declare_subscriber(keys.key(Row.FEEDBACK), self._on_feedback)
+        # Last: who sees the token may ask at once.
+        self._token = session.liveliness().declare_token(keys.key(Row.ALIVE))
+
+    def heard(self) -> bool:
+        """Whether a ground subscribes to all that is sent."""
+        # Zenoh's own stub calls the status a bool.
+        return all(one.matching_status.matching for one in self._publishers.values())  # type: ignore[attr-defined]
+
+    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+        """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
+        try:
+            self._publishers[row].put(payload, attachment=attachment, encoding=encoding or None)
+        except zenoh.ZError as error:
+            _log.debug("%s was not sent: %s", row, error)
+
+    def close(self) -> None:
+        """Withdraw the token, so that grounds see the end."""
+        self._token.undeclare()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _info(self, _question: bytes) -> bytes:
+        return self._answer_info(time.time_ns())
+
+    def _control(self, question: bytes) -> bytes | None:
+        try:
+            request = ControlRequest.parse(question)
+        except WireError as error:
+            self._skip("control", error)
+            return None
+        return self._answer_control(request).pack()
+
+    def _on_feedback(self, sample: zenoh.Sample) -> None:
+        try:
+            feedback = Feedback.parse(sample.payload.to_bytes())
+        except WireError as error:
+            self._skip("feedback", error)
+            return
+        self._hear(feedback)
+
+    def _skip(self, row: str, error: WireError) -> None:
+        self.unusable += 1
+        if self.unusable.bit_count() == 1:  # 1, 2, 4, 8 …: a flood does not fill the log
+            _log.warning("%s message skipped (%d so far): %s", row, self.unusable, error)

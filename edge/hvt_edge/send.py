@@ -1,0 +1,178 @@
+"""The one place where bytes leave the edge: header, ledger and budget of every message in one step.
+
+Thread-safe: base frames and stills may come from two threads. ``now_ns`` is the time that windows go by: the wall
+clock in real time, media time in lockstep, so that the same input gives the same stills.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Protocol
+
+from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row
+from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.link.wire import BaseHeader, Flags, RoiHeader, Status
+from hvt_common.values import AccessUnit, Still
+from hvt_edge.budget import RollingBudget
+
+__all__ = [
+    "BASE_ATTACHMENT_BYTES",
+    "STATUS_BYTES",
+    "STILL_ATTACHMENT_BYTES",
+    "Outlet",
+    "Sender",
+    "base_overhead_bps",
+]
+
+BASE_ATTACHMENT_BYTES = 48
+"""What a `BaseHeader` takes, give or take two."""
+STILL_ATTACHMENT_BYTES = 128
+"""What a `RoiHeader` takes at most, with the names that detectors and methods use."""
+STATUS_BYTES = 320
+"""What a `Status` takes."""
+
+
+class Outlet(Protocol):
+    """Where bytes go: the link, or in the study nowhere."""
+
+    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+        """Hand over one message; may block while the link is full."""
+        ...
+
+
+def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
+    """What headers, framing and ``status`` take of ``base_bps``: the encoder gets the rest."""
+    payload = round(base_bps / 8 / fps)
+    key = EdgeKeys(edge_id).key(Row.BASE)
+    encoding = DELIVERIES[Row.BASE].encoding
+    per_frame = BASE_ATTACHMENT_BYTES + overhead_bytes(
+        payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding
+    )
+    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Row.STATUS))
+    return 8 * (per_frame * fps + per_second)
+
+
+class Sender:
+    """Sends access units, stills and status, and accounts for each."""
+
+    def __init__(
+        self,
+        outlet: Outlet,
+        *,
+        ledger: Ledger,
+        budget: RollingBudget,
+        edge_id: str,
+        session_id: int,
+        lockstep: bool,
+    ) -> None:
+        self._outlet = outlet
+        self._ledger = ledger
+        self._budget = budget
+        self._keys = EdgeKeys(edge_id)
+        self._session_id = session_id
+        self._flags = Flags.LOCKSTEP if lockstep else Flags(0)
+        self._lock = threading.Lock()
+        self.base_sequence = -1
+        """Of the last access unit sent; -1 before the first."""
+        self.still_sequence = -1
+
+    def base(self, unit: AccessUnit, *, now_ns: int, send_ns: int) -> int:
+        """Send one access unit; return its line bytes."""
+        with self._lock:
+            self.base_sequence += 1
+            header = BaseHeader(
+                session_id=self._session_id,
+                sequence=self.base_sequence,
+                frame_index=unit.frame_index,
+                capture_ns=unit.capture_ns,
+                send_delay_ns=send_ns - unit.capture_ns,
+                flags=self._flags | ((Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0),
+            )
+            attachment = header.pack(unit.data)
+            line_bytes = self._count(Row.BASE, Channel.BASE, unit.data, attachment, now_ns=now_ns)
+            self._budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe)
+        self._outlet.put(Row.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Row.BASE].encoding)
+        return line_bytes
+
+    def still_room_bytes(self, now_ns: int) -> int:
+        """Payload that a still may take now."""
+        with self._lock:
+            room = self._budget.still_room(now_ns)
+        line = overhead_bytes(
+            room, STILL_ATTACHMENT_BYTES, key=self._keys.key(Row.ROI), encoding="image/jpeg"
+        )
+        return max(0, room - STILL_ATTACHMENT_BYTES - line)
+
+    def still(self, still: Still, *, media_type: str, now_ns: int, send_ns: int) -> None:
+        """Send one still that `still_room_bytes` admitted."""
+        with self._lock:
+            self.still_sequence = still.sequence
+            attachment = self._still_header(still, send_ns=send_ns).pack(still.data)
+            line_bytes = self._count(
+                Row.ROI, Channel.ROI, still.data, attachment, now_ns=now_ns, encoding=media_type
+            )
+            self._budget.record_still(line_bytes, now_ns=now_ns)
+        self._outlet.put(Row.ROI, still.data, attachment=attachment, encoding=media_type)
+
+    def status(self, status: Status, *, now_ns: int) -> None:
+        """Send the once-a-second report."""
+        payload = status.pack()
+        with self._lock:
+            line_bytes = self._count(Row.STATUS, Channel.META, payload, b"", now_ns=now_ns)
+            self._budget.record_metadata(line_bytes, now_ns=now_ns)
+        self._outlet.put(Row.STATUS, payload, encoding=DELIVERIES[Row.STATUS].encoding)
+
+    def keyframe_fits(self, line_bytes: int, *, now_ns: int) -> bool:
+        """Tell whether a keyframe of so many line bytes leaves the budget whole."""
+        with self._lock:
+            return self._budget.keyframe_fits(line_bytes, now_ns=now_ns)
+
+    def fate(self, fate: str, reason: str) -> None:
+        """Note what became of a candidate: ``sent``, ``deferred`` or ``dropped``, and why."""
+        assert fate in ("sent", "deferred", "dropped")
+        with self._lock:
+            self._ledger.record_fate(fate, reason)  # type: ignore[arg-type]
+
+    def _still_header(self, still: Still, *, send_ns: int) -> RoiHeader:
+        return RoiHeader(
+            session_id=self._session_id,
+            sequence=still.sequence,
+            frame_index=still.frame_index,
+            capture_ns=still.capture_ns,
+            send_delay_ns=send_ns - still.capture_ns,
+            flags=int(self._flags),
+            track_id=still.track_id,
+            box_source_px=still.box_source_px,
+            crop_source_px=still.crop_source_px,
+            class_name=still.class_name[:64],
+            confidence=still.confidence,
+            reason=still.reason,
+            codec=still.codec,
+            quality_pct=still.quality_pct,
+            parameters={},
+        )
+
+    def _count(
+        self,
+        row: Row,
+        channel: Channel,
+        payload: bytes,
+        attachment: bytes,
+        *,
+        now_ns: int,
+        encoding: str = "",
+    ) -> int:
+        overhead = overhead_bytes(
+            len(payload),
+            len(attachment),
+            key=self._keys.key(row),
+            encoding=encoding or DELIVERIES[row].encoding,
+        )
+        self._ledger.count(
+            channel,
+            payload_bytes=len(payload),
+            attachment_bytes=len(attachment),
+            overhead_bytes=overhead,
+            at_ns=now_ns,
+        )
+        return len(payload) + len(attachment) + overhead

@@ -1,0 +1,200 @@
+"""The order of things at the ground: link, one receiver an edge, sessions, recordings. Nothing else knows it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from hvt_common.errors import UserError
+from hvt_common.link.keys import check_edge_pattern
+from hvt_common.link.session import open_session
+from hvt_common.link.wire import Info
+from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
+from hvt_common.report import StatusLine, check_writable
+from hvt_common.units import bitrate_text
+from hvt_ground.build import Models, make_sight, recording_path
+from hvt_ground.config import GroundConfig
+from hvt_ground.live_view import LiveView
+from hvt_ground.receive import EdgeReceiver
+from hvt_ground.record import Recorder, RecorderSettings
+from hvt_ground.session import GroundSession
+from hvt_ground.subscribe import GroundLink
+from hvt_ground.summary import summary
+
+__all__ = ["Ground"]
+
+_TICK_S = 0.1
+_CLOCK_EVERY_TICKS = 200
+
+
+class Ground:
+    """One run of a ground: build it, `run` it once."""
+
+    def __init__(self, config: GroundConfig, *, stop: threading.Event) -> None:
+        self._config = config
+        self._stop = stop
+        self._receivers: dict[str, EdgeReceiver] = {}
+        self._view: LiveView | None = None
+        self._paths: set[Path] = set()
+        self._models: Models | None = None
+        self._began_s = time.monotonic()
+
+    def run(self) -> list[dict[str, Any]]:
+        """Serve edges until ``stop`` is set, or with ``--once`` until they have ended; return a summary a session.
+
+        Raises:
+            UserError: before anything is received, where a setting, a file or a port cannot be used.
+        """
+        config = self._config
+        check_edge_pattern(config.edges)
+        check_writable(config.summary, name="--summary")
+        self._check_record()
+        self._models = Models(config)
+        with ExitStack() as stack:
+            if config.view or config.serve:
+                self._view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
+            settings = LinkSettings(
+                role="ground",
+                listen=config.listen,
+                connect=config.connect,
+                zenoh_config=config.zenoh_config,
+                insecure=config.insecure,
+            )
+            session = stack.enter_context(open_session(settings))
+            line = stack.enter_context(StatusLine(quiet=config.quiet))
+            link = stack.enter_context(GroundLink(session, edges=config.edges))
+            self._say_where(line)
+            try:
+                self._serve(link, line)
+            finally:
+                self._close_receivers()
+        return self._summaries()
+
+    def _check_record(self) -> None:
+        record = self._config.record
+        if record is None or record.is_dir():
+            return
+        if record.suffix == ".rrd":
+            check_writable(record, name="--record")
+        elif record.exists():
+            raise UserError(
+                f"--record {record} is neither a folder nor named .rrd: give FILE.rrd or a folder"
+            )
+        else:
+            try:
+                record.mkdir(parents=True)
+            except OSError as error:
+                raise UserError(
+                    f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
+                ) from None
+
+    def _say_where(self, line: StatusLine) -> None:
+        config = self._config
+        if config.connect:
+            line.note(f"hvt-ground: connecting to {', '.join(config.connect)}")
+        if config.listen or not (config.connect or config.zenoh_config):
+            line.note(f"hvt-ground: listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
+        if self._view is not None and self._view.page:
+            line.note(f"hvt-ground: watch at {self._view.page}")
+
+    # Serving
+
+    def _serve(self, link: GroundLink, line: StatusLine) -> None:
+        ticks = 0
+        while not self._stop.wait(_TICK_S):
+            for port in link.ports():
+                if port.edge not in self._receivers:
+                    self._receivers[port.edge] = EdgeReceiver(port, open_session=self._open_session)
+            for receiver in self._receivers.values():
+                if receiver.error is not None:
+                    raise receiver.error
+            ticks += 1
+            if ticks % 10 == 0:
+                line.show(self._status_text())
+            if ticks % _CLOCK_EVERY_TICKS == 0:
+                self._refresh_clocks()
+            if self._config.once and self._all_ended():
+                return
+
+    def _all_ended(self) -> bool:
+        receivers = list(self._receivers.values())
+        if not any(receiver.done for receiver in receivers):
+            waited_s = time.monotonic() - self._began_s
+            return self._config.wait > 0 and not receivers and waited_s > self._config.wait
+        return all(receiver.idle and not receiver.port.present.is_set() for receiver in receivers)
+
+    def _refresh_clocks(self) -> None:
+        for receiver in self._receivers.values():
+            if not receiver.idle and receiver.port.present.is_set():
+                receiver.refresh_clock()
+
+    def _close_receivers(self) -> None:
+        for receiver in self._receivers.values():
+            receiver.close()
+        for receiver in self._receivers.values():
+            if receiver.error is not None:
+                raise receiver.error
+
+    def _open_session(self, info: Info, receiver: EdgeReceiver) -> GroundSession:
+        config, models = self._config, self._models
+        assert models is not None, "run() opens them"
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        path = recording_path(config.record, edge=info.edge, stamp=stamp, taken=self._paths)
+        recorder = Recorder(
+            RecorderSettings(
+                path=path,
+                edge_id=info.edge,
+                session=f"{info.session_id:016x}",
+                base_size=info.base_size,
+                fps=info.fps,
+                budget_bps=info.budget_bps,
+                facts={
+                    "method": info.method,
+                    "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
+                    "source": f"{info.source_size[0]}x{info.source_size[1]}",
+                    "base": f"{info.base_size[0]}x{info.base_size[1]} at {info.fps:g} fps, {info.codec}",
+                    "detector": config.detector,
+                    "classifier": config.classifier or "detector",
+                },
+                clocked=info.pace == "realtime",
+                live_url=self._view.url if self._view is not None else None,
+            )
+        )
+        return GroundSession(
+            info,
+            recorder=recorder,
+            recording=path,
+            sight_of=lambda emit: make_sight(config, models, info=info, emit=emit),
+            to_local_ns=receiver.clock_offset.to_local_ns,
+            clock=time.time_ns,
+            report=receiver.report_now,
+        )
+
+    # Saying
+
+    def _status_text(self) -> str:
+        parts = []
+        for edge, receiver in sorted(self._receivers.items()):
+            session = receiver.session
+            if session is None:
+                parts.append(f"{edge}: {'ended' if receiver.done else 'waiting for a keyframe'}")
+                continue
+            latency_ms = session.overlay_latency.percentile(50)
+            age = "" if latency_ms is None or session.lockstep else f"  {latency_ms:.0f} ms"
+            total = session.ledger.summary(session.duration_s).total_bps
+            parts.append(
+                f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
+                f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}  tracks "
+                f"{session.sight.tracks}, {session.sight.refined} refined{age}"
+            )
+        return " | ".join(parts) or "no edge yet"
+
+    def _summaries(self) -> list[dict[str, Any]]:
+        return [
+            summary(session, receiver.reassembler.counters, unusable=receiver.unusable)
+            for _, receiver in sorted(self._receivers.items())
+            for session in receiver.done
+        ]

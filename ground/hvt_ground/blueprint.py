@@ -1,0 +1,114 @@
+"""The screen a recording opens as, and the names of what is on it."""
+
+from __future__ import annotations
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from hvt_ground.gallery import CANVAS
+
+__all__ = [
+    "BITRATE",
+    "CAPTIONS",
+    "EVENTS",
+    "LATENCY",
+    "OVERFLOW",
+    "REFINED",
+    "SESSION",
+    "STILLS",
+    "TRACKS",
+    "TRACK_COUNT",
+    "VIDEO",
+    "screen",
+]
+
+VIDEO = "/base/video"
+TRACKS = "/base/tracks"
+REFINED = "/base/refined"
+STILLS = "/stills"
+CAPTIONS = "/stills/captions"
+OVERFLOW = "/stills/more"
+BITRATE = "/link/bitrate"
+LATENCY = "/link/latency"
+TRACK_COUNT = "/link/tracks"
+EVENTS = "/events"
+SESSION = "/session"
+
+_PAPER = (14, 17, 22)
+"""Background behind pictures."""
+
+
+def screen(
+    *, base_size: tuple[int, int], fps: float, budget_bps: float, clocked: bool, live: bool
+) -> rrb.Blueprint:
+    """Video with boxes, plots below; gallery of stills, session facts and events to the right.
+
+    Args:
+        base_size: (width, height) of the base stream in pixels.
+        fps: The base stream's rate; the viewer plays a frame timeline at it.
+        budget_bps: The budget in all; sets the height of the bitrate plot.
+        clocked: Whether latencies are known; without them their plot is left out.
+        live: Follow the newest data, rather than play from the beginning.
+    """
+    left = rrb.Vertical(_video(base_size), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
+    right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.35, 0.45, 1.1])
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right, column_shares=[1.72, 1.0]),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(
+            state="collapsed",
+            timeline="frame",
+            fps=fps,
+            play_state="following" if live else "playing",
+            loop_mode="off" if live else "all",
+        ),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _video(base_size: tuple[int, int]) -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(
+        origin="/base",
+        name="Base stream and tracks",
+        background=_PAPER,
+        visual_bounds=rrb.VisualBounds2D(x_range=[0, base_size[0]], y_range=[0, base_size[1]]),
+    )
+
+
+def _gallery() -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(
+        origin=STILLS,
+        contents=[f"{STILLS}/**", f"- {OVERFLOW}/**"],
+        name="Base crop | still",
+        background=_PAPER,
+        visual_bounds=rrb.VisualBounds2D(x_range=[0, CANVAS[0]], y_range=[0, CANVAS[1]]),
+        defaults=[rr.EncodedImage.from_fields(media_type="image/jpeg")],
+    )
+
+
+def _plots(budget_bps: float, *, clocked: bool) -> rrb.Horizontal:
+    # Nearly twice the budget: room for the legend, and an overshoot is seen to be one.
+    plots = [_plot(BITRATE, "Link, kbit/s", rrb.ScalarAxis(range=(0.0, 1.8 * budget_bps / 1000)))]
+    if clocked:
+        plots.append(_plot(LATENCY, "Latency, ms"))
+    plots.append(_plot(TRACK_COUNT, "Tracks"))
+    return rrb.Horizontal(*plots, column_shares=[1.5, *[1.0] * (len(plots) - 1)])
+
+
+def _plot(origin: str, name: str, axis_y: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
+    corner = rrb.Corner2D.RightBottom if origin == TRACK_COUNT else rrb.Corner2D.LeftTop
+    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=corner, axis_y=axis_y)
+
+
+def _session() -> rrb.TextDocumentView:
+    return rrb.TextDocumentView(origin=SESSION, name="Session")
+
+
+def _events() -> rrb.TextLogView:
+    return rrb.TextLogView(
+        origin=EVENTS,
+        name="Events",
+        columns=rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["body"]),
+    )

@@ -1,0 +1,111 @@
+"""From settings to stages: everything at the ground that is made for one session and needs no network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, cast
+
+from hvt_common.errors import UserError
+from hvt_common.link.wire import Info
+from hvt_common.vision.classify import Classifier, open_classifier
+from hvt_common.vision.detect import Detector, open_detector
+from hvt_common.vision.track import ByteTracker, TrackerSettings
+from hvt_ground.classify_stills import CropReader, NoReader, Redetection, StillReader
+from hvt_ground.config import GroundConfig
+from hvt_ground.events import Event
+from hvt_ground.refine import Refiner
+from hvt_ground.sight import GroundSight
+
+__all__ = ["Models", "make_sight", "recording_path"]
+
+MOTION = "motion"
+
+
+class Models:
+    """Opens detector and classifier once to check them, then one set a session: they keep buffers and state."""
+
+    def __init__(self, config: GroundConfig) -> None:
+        self._config = config
+        self._ready: tuple[Detector, Classifier | None] | None = self._open()
+
+    def take(self) -> tuple[Detector, Classifier | None]:
+        """A detector, and a classifier where one is wanted, that nobody else uses."""
+        ready, self._ready = self._ready, None
+        return ready or self._open()
+
+    def _open(self) -> tuple[Detector, Classifier | None]:
+        config = self._config
+        detector = open_detector(
+            config.detector,
+            labels=config.detector_labels,
+            confidence=min(config.confidence, TrackerSettings().low_confidence),
+            nms_iou=config.nms_iou,
+            threads=config.threads,
+        )
+        if config.classifier in (None, "detector"):
+            if config.classifier == "detector" and config.detector == MOTION:
+                raise UserError(
+                    "--classifier detector needs a detector that knows classes: give --detector FILE.onnx too"
+                )
+            return detector, None
+        return detector, open_classifier(config.classifier, labels=config.labels, threads=config.threads)
+
+
+def make_sight(
+    config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]
+) -> GroundSight:
+    """The eyes of one session."""
+    detector, classifier = models.take()
+    reader: StillReader
+    if classifier is not None:
+        reader = CropReader(classifier)
+    elif config.detector == MOTION:
+        reader = NoReader()
+    else:
+        reader = Redetection(detector, view=info.view)
+    tracker = ByteTracker(
+        TrackerSettings(
+            track_confidence=config.confidence,
+            low_confidence=min(config.confidence, TrackerSettings().low_confidence),
+            new_confidence=config.confidence,
+            camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion),
+        ),
+        fps=info.fps,
+    )
+    return GroundSight(
+        detector,
+        tracker,
+        reader=reader,
+        refiner=Refiner(
+            cast('Literal["replace", "fuse"]', config.refine),
+            fps=info.fps,
+            detector_classes=detector.class_names,
+            classifier_classes=reader.class_names,
+        ),
+        view=info.view,
+        detect_every=config.detect_every,
+        emit=emit,
+    )
+
+
+def recording_path(record: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
+    """Where a session is recorded, and note it in ``taken``.
+
+    ``record`` is the file or folder of ``--record``; ``stamp`` the time of the session's beginning. A file that the
+    user named is written anew, but each session of this process gets one of its own: the first takes the name, others
+    have the edge's id in it.
+    """
+    if record is None or record.is_dir() or record.suffix != ".rrd":
+        first = (record or Path()) / f"hvt-{edge}-{stamp}.rrd"
+        further = first
+    else:
+        first, further = record, record.with_name(f"{record.stem}-{edge}.rrd")
+    count, path = 1, first
+    while path in taken or (path != record and path.exists()):
+        path = (
+            further if count == 1 and further != first else further.with_name(f"{further.stem}-{count}.rrd")
+        )
+        count += 1
+    taken.add(path)
+    return path

@@ -1,0 +1,53 @@
+"""``hvt-ground``: link to recording."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+
+from hvt_common.config import load, to_toml
+from hvt_common.errors import exit_with_sentence
+from hvt_common.report import print_table, write_json
+from hvt_ground.app import Ground
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.summary import table
+
+__all__ = ["main"]
+
+_DESCRIPTION = (
+    "Receive what edges publish over Zenoh: decode, detect, track, refine classes by the stills, and record "
+    "all of it for the Rerun viewer."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the ground; return 0, or 2 after a sentence on what is wrong."""
+    return exit_with_sentence(_run, program="hvt-ground", argv=argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    config, asked = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
+    if asked.print_config:
+        print(to_toml(config), end="")
+        return 0
+    config = check(config)
+    logging.basicConfig(level=logging.WARNING, format="hvt-ground: %(message)s")
+    stop = threading.Event()
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, lambda *_: stop.set())
+    sessions = Ground(config, stop=stop).run()
+    if config.summary is not None:
+        edges = {content["edge"] for content in sessions}
+        write_json(config.summary, sessions[0] if len(sessions) == 1 and len(edges) == 1 else sessions)
+    for content in sessions:
+        print_table(f"{content['edge']}: received", table(content))
+    if not sessions:
+        print("hvt-ground: no edge was heard")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,359 @@
+"""Writes what the ground makes of a stream as one Rerun recording, and shows it live.
+
+Everything is timed by two timelines, ``frame`` (sequence) and ``capture_time`` (timestamp). See docs/recording.md for
+the entities and for what keeps the file small.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from rerun.chunk import Chunk
+
+from hvt_common.units import bitrate_text
+from hvt_ground import blueprint as names
+from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.gallery import SLOTS, Gallery, placed
+from hvt_ground.live_view import LiveSink
+from hvt_ground.overlay_encoding import LAYERS, Identity, Layer, OverlayEncoder
+from hvt_ground.palette import AMBER, GREY, VERMILLION, Rgb, class_colour
+from hvt_ground.rrd_file import RrdEncoder, RrdFile
+from hvt_ground.rrd_tables import (
+    Captions,
+    CodedIdentity,
+    Picture,
+    Table,
+    Text,
+    box_columns,
+    caption_columns,
+    confidence_columns,
+    hidden_picture_columns,
+    identity_columns,
+    label_columns,
+    line_columns,
+    picture_columns,
+    text_columns,
+    video_columns,
+)
+from hvt_ground.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
+from hvt_ground.unchanging import class_chunk, unchanging_chunks
+
+__all__ = ["APPLICATION_ID", "FOLD_BYTES", "Recorder", "RecorderSettings"]
+
+log = logging.getLogger(__name__)
+
+APPLICATION_ID = "hvt"
+FOLD_BYTES = 3 << 19
+"""Payload of the journal at which it is folded; a fold costs some 50 kB, and this much is held in memory."""
+
+FIXED_BYTES = 100_000
+"""About what the blueprint and the static values cost."""
+
+HIDDEN_CROP_RATIO = 1.25
+"""A still that is not shown keeps its base crop while the recording is smaller than this times the bytes received."""
+
+DIMMED = 0.75
+"""Brightness of the boxes that no still has spoken on, beside those one has."""
+
+_LAYER_PATHS: dict[Layer, str] = {"tracks": names.TRACKS, "refined": names.REFINED}
+_NOTICE_COLOURS: dict[str, Rgb] = {"info": GREY, "warning": AMBER, "error": VERMILLION}
+_NOTICE_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderSettings:
+    """What a recording is of, and where it goes."""
+
+    path: Path | None
+    """The file; None shows without recording."""
+    edge_id: str
+    session: str
+    """The edge's session id, hexadecimal."""
+    base_size: tuple[int, int]
+    """(width, height) of the base stream in pixels."""
+    fps: float
+    budget_bps: float
+    title: str = ""
+    """Heading of the session panel; the edge's id where empty."""
+    facts: Mapping[str, str] = field(default_factory=dict)
+    """Further lines of the session panel: ``{"method": "M5", "source": "clip.mp4"}``."""
+    clocked: bool = True
+    """Whether latencies will be known; False leaves their plot out."""
+    live_url: str | None = None
+    """Where a viewer listens, from `hvt_ground.live_view`; None shows nothing live."""
+
+
+class Recorder:
+    """Records the events of one edge's session. Several may run in one process; `log` may be called by any thread.
+
+    When `log` returns, the event is in the file: killing the process loses nothing that was logged. A live viewer
+    that goes away is left behind with one warning.
+
+    Raises:
+        UserError: the file cannot be created, or (from `log` and `close`) written any further.
+    """
+
+    def __init__(self, settings: RecorderSettings) -> None:
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._overlays = OverlayEncoder()
+        self._gallery = Gallery()
+        self._captions: Captions = (("", GREY),) * SLOTS
+        self._class_ids: dict[str, int] = {}
+        self._classes_written: dict[Layer, int] = dict.fromkeys(LAYERS, 0)
+        self._contexts: dict[Layer, Chunk] = {}
+        self._tables: dict[tuple[str, str], Table[Any]] = {}
+        self._pending_bytes = 0
+        self._received_bytes = 0
+        self._logged_bytes = FIXED_BYTES
+        self._last_sample: int | None = None
+        self._closed = False
+        self._file = RrdFile(settings.path) if settings.path is not None else None
+        recording_id = f"{settings.edge_id}-{settings.session}"
+        name = settings.title or settings.edge_id
+        self._encoder = RrdEncoder(application_id=APPLICATION_ID, recording_id=recording_id, name=name)
+        self._live = (
+            LiveSink(settings.live_url, application_id=APPLICATION_ID, recording_id=recording_id, name=name)
+            if settings.live_url is not None
+            else None
+        )
+        self._open()
+
+    @property
+    def size_bytes(self) -> int:
+        """The size of the file so far; 0 without one."""
+        return self._file.size_bytes if self._file is not None else 0
+
+    def log(self, event: Event) -> None:
+        """Record an event. An access unit that no decoder could use at its place is left out."""
+        with self._lock:
+            if self._closed:
+                return
+            match event:
+                case VideoSample():
+                    chunks = self._sample(event)
+                case Overlay():
+                    chunks = self._overlay(event)
+                case Refinement():
+                    chunks = self._refinement(event)
+                case Traffic():
+                    chunks = self._traffic(event)
+                case Notice():
+                    chunks = self._notice(event)
+            self._write(chunks)
+
+    def close(self) -> None:
+        """Fold what is left and close the file and the viewer's connection; a second call does nothing."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            try:
+                self._fold()
+            finally:
+                if self._file is not None:
+                    self._file.close()
+                self._encoder.close()
+                if self._live is not None:
+                    self._live.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # -- the file ---------------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        settings = self._settings
+        chunks = unchanging_chunks(title=settings.title or settings.edge_id, facts=_facts(settings))
+        for sink in (self._encoder, self._live):
+            if sink is None:
+                continue
+            screen = names.screen(
+                base_size=settings.base_size,
+                fps=settings.fps,
+                budget_bps=settings.budget_bps,
+                clocked=settings.clocked,
+                live=sink is self._live,
+            )
+            data = sink.blueprint(screen) + sink.chunks(chunks)
+            if sink is self._encoder and self._file is not None:
+                self._file.fold(self._encoder.header + data)
+
+    def _write(self, chunks: list[Chunk]) -> None:
+        if not chunks:
+            return
+        if self._live is not None:
+            self._live.chunks(chunks)
+        if self._file is None:
+            return
+        self._file.append(self._encoder.chunks(chunks))
+        if self._pending_bytes >= FOLD_BYTES:
+            self._fold()
+
+    def _fold(self) -> None:
+        chunks = [*self._contexts.values()]
+        chunks += [chunk for table in self._tables.values() if (chunk := table.take()) is not None]
+        self._contexts.clear()
+        self._pending_bytes = 0
+        if chunks and self._file is not None:
+            self._file.fold(self._encoder.chunks(chunks))
+
+    def _row(self, path: str, columns: Any, event: Event, value: Any, *, size_bytes: int = 64) -> Chunk:
+        """Add a row to the table of this entity and these columns; ``size_bytes`` is about what it will cost folded."""
+        key = (path, columns.__name__)
+        table = self._tables.get(key)
+        if table is None:
+            table = self._tables[key] = Table(path, columns)
+        self._pending_bytes += size_bytes
+        self._logged_bytes += size_bytes
+        return table.add(event.frame_index, event.capture_ns, value)
+
+    # -- the events -------------------------------------------------------------------------------------------
+
+    def _sample(self, sample: VideoSample) -> list[Chunk]:
+        if not self._decodable(sample):
+            log.debug("frame %d left out of the recording: not decodable there", sample.frame_index)
+            return []
+        self._last_sample = sample.frame_index
+        size = len(sample.data)
+        self._earn(size)
+        return [self._row(names.VIDEO, video_columns, sample, sample.data, size_bytes=size)]
+
+    def _decodable(self, sample: VideoSample) -> bool:
+        """Rerun shows garbage for what its decoder cannot use, so begin at a keyframe and never go back."""
+        if self._last_sample is None:
+            return sample.keyframe and _has_parameter_sets(sample.data)
+        return sample.frame_index > self._last_sample and bool(sample.data)
+
+    def _overlay(self, overlay: Overlay) -> list[Chunk]:
+        chunks = []
+        for update in self._overlays.encode(overlay):
+            path = _LAYER_PATHS[update.layer]
+            if update.geometry is not None:
+                size = 6 * len(update.geometry.centres_px)
+                chunks.append(self._row(path, box_columns, overlay, update.geometry, size_bytes=size))
+            if update.identity is not None:
+                chunks += self._identity(overlay, update.layer, update.identity)
+            if update.labels is not None:
+                size = 5 * len(update.labels)
+                chunks.append(self._row(path, label_columns, overlay, update.labels, size_bytes=size))
+            if update.confidences_pct is not None:
+                chunks.append(self._row(path, confidence_columns, overlay, update.confidences_pct))
+        return chunks
+
+    def _identity(self, overlay: Overlay, layer: Layer, identity: Identity) -> list[Chunk]:
+        coded = CodedIdentity(
+            track_ids=identity.track_ids,
+            before=tuple(self._class_id(name) for name in identity.classes_before),
+            after=tuple(self._class_id(name) for name in identity.classes_after),
+        )
+        chunks = []
+        if self._classes_written[layer] != len(self._class_ids):
+            self._classes_written[layer] = len(self._class_ids)
+            self._contexts[layer] = class_chunk(
+                _LAYER_PATHS[layer], self._class_ids, share=1.0 if layer == "refined" else DIMMED
+            )
+            chunks.append(self._contexts[layer])
+        size = 2 * len(identity.track_ids)
+        chunks.append(self._row(_LAYER_PATHS[layer], identity_columns, overlay, coded, size_bytes=size))
+        return chunks
+
+    def _class_id(self, name: str) -> int:
+        return self._class_ids.setdefault(name, len(self._class_ids))
+
+    def _refinement(self, refinement: Refinement) -> list[Chunk]:
+        changed = refinement.class_before != refinement.class_after
+        colour = class_colour(refinement.class_after)
+        told = Text(event_text(refinement), "INFO", colour if changed else GREY)
+        chunks = [self._row(names.EVENTS, text_columns, refinement, told, size_bytes=len(told.text))]
+        still = still_picture(refinement)
+        if still is None:
+            return chunks
+        self._earn(len(refinement.still))
+        base = base_picture(refinement, limit_bytes=round(0.8 * len(refinement.still)))
+        slot = self._gallery.take(refinement.capture_ns, changed=changed)
+        if slot is None:
+            return chunks + self._hidden_pair(refinement, base, still)
+        # A slot's old base crop must not stand beside a new still: the frame's absence is shown as a blank.
+        chunks += self._pair(refinement, slot, base or BLANK, still)
+        captions = list(self._captions)
+        captions[slot] = (caption(refinement), colour)
+        self._captions = tuple(captions)
+        return [
+            *chunks,
+            self._row(names.CAPTIONS, caption_columns, refinement, self._captions, size_bytes=160),
+        ]
+
+    def _hidden_pair(self, refinement: Refinement, base: Coded | None, still: Coded) -> list[Chunk]:
+        """All slots are held: kept where it can be found but not seen, the base crop as far as bytes allow."""
+        data = still[0]
+        path = names.OVERFLOW
+        chunks = [self._row(f"{path}/still", hidden_picture_columns, refinement, data, size_bytes=len(data))]
+        if base is not None and self._logged_bytes < HIDDEN_CROP_RATIO * self._received_bytes:
+            data = base[0]
+            chunks.append(
+                self._row(f"{path}/base", hidden_picture_columns, refinement, data, size_bytes=len(data))
+            )
+        return chunks
+
+    def _earn(self, received_bytes: int) -> None:
+        self._received_bytes += received_bytes
+        self._overlays.earn(received_bytes)
+
+    def _pair(self, refinement: Refinement, slot: int, base: Coded, still: Coded) -> list[Chunk]:
+        chunks = []
+        for name, (data, size) in (("base", base), ("still", still)):
+            picture = Picture(data, placed(slot, size, right=name == "still"))
+            path = f"{names.STILLS}/{slot}/{name}"
+            chunks.append(self._row(path, picture_columns, refinement, picture, size_bytes=len(data)))
+        return chunks
+
+    def _traffic(self, traffic: Traffic) -> list[Chunk]:
+        rates = (traffic.total_bps, traffic.base_bps, traffic.roi_bps, traffic.budget_bps)
+        latencies = (traffic.receive_latency_ms, traffic.overlay_latency_ms)
+        chunks = [
+            self._row(names.BITRATE, line_columns, traffic, tuple(bps / 1000 for bps in rates)),
+            self._row(
+                names.TRACK_COUNT,
+                line_columns,
+                traffic,
+                (float(traffic.tracks), float(traffic.tracks_refined)),
+            ),
+        ]
+        if any(latency is not None for latency in latencies):
+            values = tuple(np.nan if latency is None else latency for latency in latencies)
+            chunks.append(self._row(names.LATENCY, line_columns, traffic, values))
+        return chunks
+
+    def _notice(self, notice: Notice) -> list[Chunk]:
+        text = Text(notice.text, _NOTICE_LEVELS[notice.level], _NOTICE_COLOURS[notice.level])
+        return [self._row(names.EVENTS, text_columns, notice, text, size_bytes=len(notice.text))]
+
+
+def _facts(settings: RecorderSettings) -> dict[str, str]:
+    width, height = settings.base_size
+    return {
+        "edge": settings.edge_id,
+        "session": settings.session,
+        "base": f"{width}x{height} at {settings.fps:g} fps, HEVC",
+        "budget": bitrate_text(settings.budget_bps),
+        **settings.facts,
+    }
+
+
+def _has_parameter_sets(access_unit: bytes) -> bool:
+    """Whether VPS, SPS and PPS (NAL types 32, 33, 34 of H.265 table 7-1) precede the picture in an Annex B unit."""
+    kinds = {(unit[0] >> 1) & 0x3F for unit in access_unit.split(b"\x00\x00\x01")[1:] if unit}
+    return {32, 33, 34} <= kinds

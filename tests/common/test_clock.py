@@ -1,0 +1,70 @@
+"""Clock offset between the two sides."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_common.link.clock import ClockOffset
+
+MS = 1_000_000
+delays = st.integers(0, 5_000 * MS)
+
+
+def exchange(
+    clock: ClockOffset, *, at_ns: int, offset_ns: int, out_ns: int, held_ns: int, back_ns: int
+) -> bool:
+    """A question at ``at_ns`` to a clock that is ``offset_ns`` ahead."""
+    heard = at_ns + out_ns
+    return clock.add(
+        t0_ns=at_ns,
+        t1_ns=heard + offset_ns,
+        t2_ns=heard + held_ns + offset_ns,
+        t3_ns=heard + held_ns + back_ns,
+    )
+
+
+def test_an_even_path_gives_the_exact_offset():
+    """Latency in the summary would be wrong by the difference of the clocks."""
+    clock = ClockOffset()
+    assert clock.offset_ns is None
+    assert clock.error_ns is None
+    assert clock.to_local_ns(5) == 5
+    assert exchange(clock, at_ns=0, offset_ns=-70 * MS, out_ns=4 * MS, held_ns=9 * MS, back_ns=4 * MS)
+    assert clock.offset_ns == -70 * MS
+    assert clock.error_ns == 4 * MS
+    assert clock.to_local_ns(1_000 * MS) == 1_070 * MS
+
+
+@given(
+    offset=st.integers(-(10**18), 10**18),
+    paths=st.lists(st.tuples(delays, delays, delays), min_size=1, max_size=20),
+)
+@settings(deadline=None)
+def test_the_truth_is_within_the_stated_error(offset, paths):
+    """The stated error would be a lie, and with it every latency."""
+    clock = ClockOffset(window_ns=10**15)
+    for number, (out, held, back) in enumerate(paths):
+        assert exchange(
+            clock, at_ns=number * 10**11, offset_ns=offset, out_ns=out, held_ns=held, back_ns=back
+        )
+    assert abs(clock.offset_ns - offset) <= clock.error_ns
+    assert clock.error_ns == (min(out + back for out, _, back in paths) + 1) // 2
+
+
+def test_the_shortest_round_trip_speaks_until_it_is_old():
+    """One exchange behind a keyframe would bend all latencies; an old one would hide a drift for ever."""
+    clock = ClockOffset(window_ns=60_000 * MS)
+    exchange(clock, at_ns=0, offset_ns=0, out_ns=MS, held_ns=0, back_ns=MS)
+    exchange(clock, at_ns=1_000 * MS, offset_ns=0, out_ns=300 * MS, held_ns=0, back_ns=MS)
+    assert clock.offset_ns == 0
+    exchange(clock, at_ns=61_000 * MS, offset_ns=8 * MS, out_ns=2 * MS, held_ns=0, back_ns=2 * MS)
+    assert clock.offset_ns == 8 * MS
+
+
+def test_contradictory_times_are_left_out():
+    """A stepped clock would give a negative round trip, which always wins."""
+    clock = ClockOffset()
+    assert not clock.add(t0_ns=10, t1_ns=0, t2_ns=100, t3_ns=20)
+    assert not clock.add(t0_ns=0, t1_ns=50, t2_ns=40, t3_ns=90)
+    assert clock.offset_ns is None

@@ -1,0 +1,439 @@
+"""The wire format: every message there and back, and nothing but WireError for anything else."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from pathlib import Path
+
+import msgpack
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.strategies import SearchStrategy
+
+from hvt_common.link.wire import (
+    MAX_PAYLOAD_BYTES,
+    MAX_STILL_RESULTS,
+    BaseHeader,
+    ControlAnswer,
+    ControlRequest,
+    CorruptError,
+    Feedback,
+    Flags,
+    Health,
+    Info,
+    Message,
+    RoiHeader,
+    Status,
+    StillResult,
+    UnknownVersionError,
+    WireError,
+    kinds,
+)
+from hvt_common.link.wire.fields import (
+    I63,
+    U32,
+    U64,
+    Choice,
+    Flag,
+    Int,
+    Kind,
+    ListOf,
+    MapOf,
+    Real,
+    Scalar,
+    Scaled,
+    Text,
+    TupleOf,
+)
+from hvt_common.link.wire.sealed import Nested
+from hvt_common.values import View
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "wire.md"
+MESSAGES: tuple[type[Message], ...] = (
+    BaseHeader,
+    RoiHeader,
+    Info,
+    Status,
+    ControlRequest,
+    ControlAnswer,
+    Feedback,
+)
+
+BASE = BaseHeader(
+    session_id=0x1234567890ABCDEF,
+    sequence=9_000,
+    frame_index=9_100,
+    capture_ns=1_790_000_000_123_456_789,
+    send_delay_ns=31_000_000,
+    flags=Flags.KEYFRAME | Flags.PARAMETER_SETS,
+)
+ROI = RoiHeader(
+    session_id=0x1234567890ABCDEF,
+    sequence=311,
+    frame_index=9_100,
+    capture_ns=1_790_000_000_123_456_789,
+    send_delay_ns=-5,
+    flags=0,
+    track_id=57,
+    box_source_px=(-3.125, 10.0, 90.875, 64.5),
+    crop_source_px=(0, 2, 105, 73),
+    class_name="van",
+    confidence=0.613,
+    reason="small",
+    codec="jpeg",
+    quality_pct=65,
+    parameters={"base": 9_099, "gain": 1.5, "how": "residual"},
+)
+HEALTH = Health(
+    frames_captured=9_101,
+    frames_encoded=9_001,
+    frames_dropped=100,
+    keyframes=61,
+    tracks=204,
+    base_queue=1,
+    still_queue=3,
+    encode_ms=36.4,
+    detect_ms=57.1,
+    feedback_age_ms=412,
+)
+STATUS = Status(
+    session_id=0x1234567890ABCDEF,
+    sequence=600,
+    state="running",
+    send_ns=1_790_000_600_000_000_000,
+    media_ns=606_000_000_000,
+    last_base_sequence=9_000,
+    last_still_sequence=311,
+    base_bytes=49_000_000,
+    roi_bytes=9_000_000,
+    meta_bytes=500_000,
+    overhead_bytes=2_300_000,
+    base_messages=9_001,
+    roi_messages=312,
+    meta_messages=602,
+    worst_window_bps=(712_000, 148_000, 800_000),
+    sent={"small": 200, "uncertain": 112},
+    deferred={"budget": 1_900},
+    dropped={"stale": 44, "border": 3, "queue full": 2},
+    health=HEALTH,
+)
+INFO = Info(
+    session_id=7,
+    edge="uav-1",
+    software="0.1.0",
+    started_ns=1,
+    source_size=(3840, 2160),
+    base_size=(1280, 720),
+    view_scale=1 / 3,
+    view_offset_px=(0.0, 0.0),
+    fps=15.0,
+    codec="hevc",
+    pace="realtime",
+    method="M5",
+    budget_bps=800_000,
+    base_bps=650_000,
+    window_ns=1_000_000_000,
+    class_names=("pedestrian", "people", "bicycle", "Straßenbahn"),
+    received_ns=2,
+    answered_ns=3,
+)
+FEEDBACK = Feedback(
+    session_id=7,
+    receiver_id=U64,
+    sequence=1,
+    send_ns=5,
+    last_frame_index=-1,
+    base_messages=0,
+    base_bytes=0,
+    roi_messages=0,
+    roi_bytes=0,
+    lost=0,
+    corrupt=0,
+    delay_p50_ms=-1,
+    clock_offset_ns=-I63,
+    clock_error_ns=-1,
+    stills=(
+        StillResult(
+            still_sequence=4,
+            track_id=57,
+            class_name="minivan",
+            confidence=0.9,
+            entropy_nats=0.25,
+            ground_track_id=12,
+        ),
+    ),
+)
+REQUEST = ControlRequest(session_id=0, command="keyframe", arguments={})
+ANSWER = ControlAnswer(session_id=7, accepted=False, reason="this edge does not know set-method")
+EXAMPLES: tuple[Message, ...] = (BASE, ROI, INFO, STATUS, REQUEST, ANSWER, FEEDBACK)
+
+
+def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911 - one case for each kind
+    """Any value that a field of this kind may have."""
+    match kind:
+        case Int(low, high):
+            return st.integers(low, high)
+        case Scaled(low, high, per):
+            return st.integers(round(low * per), round(high * per)).map(lambda raw: raw / per)
+        case Real(low, high):
+            return st.floats(low, high)
+        case Flag():
+            return st.booleans()
+        case Text(max_bytes):
+            return st.text(st.characters(codec="utf-8").filter(str.isprintable), max_size=max_bytes // 4)
+        case Choice(words):
+            return st.sampled_from(words)
+        case Scalar(max_bytes):
+            return st.integers(-I63, I63) | st.floats(-1e300, 1e300) | value_of(Text(max_bytes))
+        case TupleOf(inner, length):
+            return st.tuples(*[value_of(inner)] * length)
+        case ListOf(inner, max_items):
+            return st.lists(value_of(inner), max_size=min(max_items, 6)).map(tuple)
+        case MapOf(inner, max_items, key_bytes):
+            return st.dictionaries(value_of(Text(key_bytes)), value_of(inner), max_size=min(max_items, 6))
+        case Nested(of):
+            return st.builds(of, **{name: value_of(inner) for name, inner in kinds(of)})
+    raise AssertionError(kind)
+
+
+def message_of(message: type[Message]) -> SearchStrategy:
+    """Any value of a message type."""
+    fields = {name: value_of(kind) for name, kind in kinds(message)}
+    if message is RoiHeader:
+        corner, side = st.integers(0, 16000), st.integers(1, 16000)
+        crop = st.tuples(corner, corner, side, side)
+        fields["crop_source_px"] = crop.map(lambda box: (box[0], box[1], box[0] + box[2], box[1] + box[3]))
+        fields["box_source_px"] = crop.map(lambda box: (-box[0] / 8, 0.0, box[2] / 8, box[3] / 8))
+    return st.builds(message, **fields)
+
+
+any_message = st.sampled_from(MESSAGES).flatmap(message_of)
+
+
+@given(message=any_message, payload=st.binary(max_size=200))
+@settings(max_examples=300, deadline=None)
+def test_every_message_survives_the_wire(message, payload):
+    """A user would see boxes, classes or counts other than those the edge meant."""
+    assert type(message).parse(message.pack(payload), payload) == message
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_examples_survive_the_wire(message):
+    """The same with values as they are in flight."""
+    assert type(message).parse(message.pack()) == message
+
+
+def test_typical_sizes_are_small():
+    """Metadata would eat the bits that stills need."""
+    assert len(BASE.pack()) <= 40
+    assert len(ROI.pack()) <= 125
+    assert len(STATUS.pack()) <= 240
+    assert len(REQUEST.pack()) <= 20
+
+
+@given(data=st.binary(max_size=600), message=st.sampled_from(MESSAGES))
+@example(data=b"", message=BaseHeader)
+@example(data=b"\x91" * 600, message=Info)
+@example(data=b"\x91" * 60_000, message=Info)
+@example(data=b"\xdd\xff\xff\xff\xff", message=Info)
+@example(data=b"\xdf\xff\xff\xff\xff", message=Status)
+@example(data=b"\xc6\xff\xff\xff\xff", message=Status)
+@example(data=b"\xc1", message=Status)
+@example(data=b"\xd6\xff\x00\x00\x00\x00", message=Status)
+@example(data=b"\xc7\x0c\xff" + b"\xff" * 12, message=Status)
+@example(data=b"\x92\x01\xa2\xff\xfe", message=Feedback)
+@example(data=b"\x92\x01\x81\x91\x01\x02", message=Feedback)
+@example(data=b"\x91\xc3", message=BaseHeader)
+@settings(max_examples=400, deadline=None)
+def test_arbitrary_bytes_are_a_wire_error(data, message):
+    """One hostile or broken sender would end the process."""
+    with pytest.raises(WireError):
+        message.parse(data, data)
+
+
+@given(
+    values=st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers(-(2**63), U64)
+        | st.floats()
+        | st.text(max_size=80)
+        | st.binary(max_size=20),
+        lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+        max_leaves=30,
+    ),
+    message=st.sampled_from(MESSAGES),
+)
+@settings(max_examples=300, deadline=None)
+def test_well_formed_nonsense_with_a_good_checksum_is_a_wire_error_or_bounded(values, message):
+    """A sender that packs and seals rightly but fills fields wrongly would get through."""
+    data = sealed([1, *(values if isinstance(values, list) else [values])])
+    try:
+        parsed = message.parse(data)
+    except WireError:
+        return
+    assert message.parse(parsed.pack()) == parsed
+
+
+@given(message=any_message, payload=st.binary(max_size=60), seed=st.integers(0, 2**30))
+@settings(max_examples=200, deadline=None)
+def test_a_flipped_bit_is_noticed(message, payload, seed):
+    """A corrupt access unit would be decoded to garbage, or a still would refine the wrong track."""
+    whole = bytearray(message.pack(payload) + payload)
+    length = len(whole) - len(payload)
+    bit = seed % (len(whole) * 8)
+    whole[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(WireError):
+        type(message).parse(bytes(whole[:length]), bytes(whole[length:]))
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_every_truncation_and_extension_is_noticed(message):
+    """Half a message would pass for a whole one."""
+    data = message.pack(b"payload")
+    for length in range(len(data)):
+        with pytest.raises(WireError):
+            type(message).parse(data[:length], b"payload")
+    with pytest.raises(WireError):
+        type(message).parse(data + b"\x00", b"payload")
+    with pytest.raises(CorruptError):
+        type(message).parse(data, b"payloa")
+
+
+def sealed(array: list) -> bytes:
+    """An array with a right checksum, made without the code under test."""
+    body = msgpack.packb([*array, U32])[:-5]
+    return body + b"\xce" + struct.pack(">I", zlib.crc32(body))
+
+
+def base_fields(**changed: object) -> bytes:
+    """A good `BaseHeader` with some fields changed, made without the code under test."""
+    fields = {
+        "session_id": 1,
+        "sequence": 2,
+        "frame_index": 3,
+        "capture_ns": 4,
+        "send_delay_ns": 5,
+        "flags": 1,
+    }
+    return sealed([1, *(fields | changed).values()])
+
+
+def test_the_independent_packing_is_accepted():
+    """The refusals below would prove nothing if the whole were refused anyway."""
+    header = BaseHeader.parse(base_fields())
+    assert (header.session_id, header.send_ns, header.flags) == (1, 9, 1)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"flags": True}, "BaseHeader.flags: bool in place of a whole number"),
+        ({"flags": 256}, "BaseHeader.flags: 256 is outside 0…255"),
+        ({"sequence": -1}, "BaseHeader.sequence: -1 is outside"),
+        ({"sequence": 2.0}, "BaseHeader.sequence: float in place of a whole number"),
+        ({"sequence": "2"}, "BaseHeader.sequence: str in place of a whole number"),
+        ({"sequence": None}, "BaseHeader.sequence: NoneType in place"),
+        ({"sequence": [2]}, "BaseHeader.sequence: list in place"),
+        ({"capture_ns": 2**63}, "BaseHeader.capture_ns: 9223372036854775808 is outside"),
+        ({"extra": 1}, "BaseHeader has 7 fields in place of 6"),
+    ],
+)
+def test_a_wrong_field_is_named(changed, said):
+    """Whoever writes another sender would search in the dark."""
+    with pytest.raises(WireError, match=re.escape(said)):
+        BaseHeader.parse(base_fields(**changed))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 0.0, 1e9, 15, True, "15"])
+def test_a_frame_rate_that_is_none_is_refused(bad):
+    """NaN or zero frames a second would reach divisions on the ground."""
+    values = [kind.encode(getattr(INFO, name)) for name, kind in kinds(Info)]
+    values[[name for name, _ in kinds(Info)].index("fps")] = bad
+    with pytest.raises(WireError, match=re.escape("Info.fps")):
+        Info.parse(sealed([1, *values]))
+
+
+@pytest.mark.parametrize("bad", ["\x1b[2J", "a\nb", "x" * 65, "ü" * 33, "\u202e"])
+def test_text_that_is_long_or_does_not_print_is_refused(bad):
+    """A class name could clear the operator's terminal."""
+    values = [kind.encode(getattr(ROI, name)) for name, kind in kinds(RoiHeader)]
+    values[[name for name, _ in kinds(RoiHeader)].index("class_name")] = bad
+    with pytest.raises(WireError, match=re.escape("RoiHeader.class_name: text")):
+        RoiHeader.parse(sealed([1, *values]))
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [("crop_source_px", [5, 5, 5, 9]), ("crop_source_px", [0, 9, 5, 9]), ("box_source_px", [80, 0, 8, 8])],
+)
+def test_an_empty_crop_or_inverted_box_is_refused(name, bad):
+    """The crop's area divides on the ground."""
+    values = [kind.encode(getattr(ROI, field)) for field, kind in kinds(RoiHeader)]
+    values[[field for field, _ in kinds(RoiHeader)].index(name)] = bad
+    with pytest.raises(WireError, match="RoiHeader: "):
+        RoiHeader.parse(sealed([1, *values]))
+
+
+def test_another_version_is_told_apart():
+    """A newer edge would be reported as corrupt instead of as newer."""
+    with pytest.raises(UnknownVersionError, match="schema version 2, only 1 is known"):
+        BaseHeader.parse(sealed([2, "anything"]))
+    with pytest.raises(WireError, match=r"begins with a version"):
+        BaseHeader.parse(sealed([True, 1, 2, 3, 4, 5, 6]))
+
+
+def test_oversized_messages_are_not_looked_at():
+    """Memory would follow whatever a stranger sends."""
+    with pytest.raises(WireError, match="longer than 80"):
+        BaseHeader.parse(bytes(81))
+    with pytest.raises(WireError, match="payload of"):
+        BaseHeader.parse(BASE.pack(), bytes(MAX_PAYLOAD_BYTES + 1))
+
+
+def test_our_own_values_out_of_bounds_are_a_bug_and_say_so():
+    """A wrong value would be sent and refused on the other side, far from its cause."""
+    with pytest.raises(ValueError, match=r"^-1 cannot be sent as int"):
+        BaseHeader(session_id=-1, sequence=0, frame_index=0, capture_ns=0, send_delay_ns=0, flags=0).pack()
+    with pytest.raises(ValueError, match=rf"array ≤ {MAX_STILL_RESULTS}"):
+        Feedback(
+            **{name: getattr(FEEDBACK, name) for name, _ in kinds(Feedback) if name != "stills"},
+            stills=FEEDBACK.stills * (MAX_STILL_RESULTS + 1),
+        ).pack()
+
+
+def test_quantised_fields_are_rounded_not_refused():
+    """Boxes and confidences come with more digits than the wire carries."""
+    header = RoiHeader(
+        **{
+            name: getattr(ROI, name)
+            for name, _ in kinds(RoiHeader)
+            if name not in ("confidence", "box_source_px")
+        },
+        confidence=0.61349,
+        box_source_px=(1.06, 2.0, 9.07, 12.99),
+    )
+    parsed = RoiHeader.parse(header.pack(b"x"), b"x")
+    assert parsed.confidence == 0.613
+    assert parsed.box_source_px == (1.0, 2.0, 9.125, 13.0)
+
+
+def test_info_gives_the_view():
+    """Stills would be pasted at the wrong place in the base frame."""
+    view = Info.parse(INFO.pack()).view
+    assert view == View.fitted((3840, 2160), (1280, 720), fit="crop")
+
+
+@pytest.mark.parametrize("message", [*MESSAGES, Health, StillResult], ids=lambda message: message.__name__)
+def test_the_document_lists_every_field_with_its_bounds(message):
+    """Whoever writes a subscriber from docs/wire.md would read the wrong field."""
+    section = DOCUMENT.read_text(encoding="utf-8").split(f"### `{message.__name__}`", 1)[1].split("\n#", 1)[0]
+    rows = re.findall(r"^\| (\d+) \| `(\w+)` \| ([^|]+) \|", section, re.MULTILINE)
+    first = 1 if issubclass(message, Message) else 0
+    expected = [
+        (str(number), name, kind.describe()) for number, (name, kind) in enumerate(kinds(message), first)
+    ]
+    assert [(number, name, bounds.strip()) for number, name, bounds in rows] == expected

@@ -1,0 +1,136 @@
+"""Reads a recording back, for tests: what a viewer would show at a frame, as plain values."""
+
+from __future__ import annotations
+
+import warnings
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import Chunk, RrdReader
+
+__all__ = ["ReadBox", "Recording"]
+
+STATIC = -(1 << 62)
+
+
+@dataclass(frozen=True)
+class ReadBox:
+    """One track as the recording tells it."""
+
+    box_px: tuple[float, float, float, float]
+    class_before: str
+    class_after: str
+    confidence_pct: int
+    refined: bool
+    label: str
+
+
+class Recording:
+    """All rows of an .rrd file, by entity and component."""
+
+    def __init__(self, path: Path) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the SDK warns that there is no footer, which is on purpose
+            self.reader = RrdReader(path)
+            self.chunks: list[Chunk] = list(self.reader.stream())
+            self.blueprints = len(self.reader.blueprints())
+        self.timelines = {name for chunk in self.chunks for name in chunk.timeline_names}
+        self._rows: dict[tuple[str, str], list[tuple[int, int, Any]]] = {}
+        for chunk in self.chunks:
+            for component, frame, capture_ns, value in _rows(chunk):
+                self._rows.setdefault((chunk.entity_path, component), []).append((frame, capture_ns, value))
+        for rows in self._rows.values():
+            rows.sort(key=lambda row: row[0])
+
+    def rows(self, entity: str, component: str) -> list[tuple[int, int, Any]]:
+        """(frame, capture_ns, value) in order of frames; a static value has frame `STATIC`."""
+        return self._rows.get((entity, component), [])
+
+    def latest(self, entity: str, component: str, frame: int) -> Any:
+        """What a viewer shows of a component at a frame: its latest row, or the static one; None before the first."""
+        rows = self.rows(entity, component)
+        at = bisect_right([row[0] for row in rows], frame)
+        return rows[at - 1][2] if at else None
+
+    def video(self) -> list[tuple[int, int, bytes]]:
+        """(frame, capture_ns, access unit)."""
+        return [(f, ns, bytes(v[0])) for f, ns, v in self.rows("/base/video", "VideoStream:sample")]
+
+    def events(self) -> list[tuple[int, str, str]]:
+        """(frame, level, text)."""
+        texts = self.rows("/events", "TextLog:text")
+        levels = self.rows("/events", "TextLog:level")
+        return [(f, level[0], text[0]) for (f, _, text), (_, _, level) in zip(texts, levels, strict=True)]
+
+    def lines(self, entity: str) -> list[tuple[int, list[float]]]:
+        """(frame, one value a line) of a plot, such as ``/link/bitrate``."""
+        return [(f, list(v)) for f, _, v in self.rows(entity, "Scalars:scalars")]
+
+    def stills(self) -> list[tuple[int, bytes]]:
+        """(frame, picture) of every still, shown or not."""
+        return self._pictures("still")
+
+    def base_crops(self) -> list[tuple[int, bytes]]:
+        """(frame, picture) of every base crop."""
+        return self._pictures("base")
+
+    def boxes(self, frame: int) -> dict[int, ReadBox]:
+        """Every track a viewer shows at a frame, by its id."""
+        found: dict[int, ReadBox] = {}
+        for entity, refined in (("/base/tracks", False), ("/base/refined", True)):
+            found |= self._layer(entity, frame, refined=refined)
+        return found
+
+    def _layer(self, entity: str, frame: int, *, refined: bool) -> dict[int, ReadBox]:
+        ids = self.latest(entity, "track_id", frame) or []
+        centres = self.latest(entity, "Boxes2D:centers", frame) or []
+        halves = self.latest(entity, "Boxes2D:half_sizes", frame) or []
+        before = self.latest(entity, "class_before", frame) or []
+        after = self.latest(entity, "Boxes2D:class_ids", frame) or []
+        confidences = self.latest(entity, "confidence_pct", frame) or []
+        labels = (self.latest(entity, "Boxes2D:labels", frame) or []) if refined else [""] * len(ids)
+        names = self._class_names(entity)
+        rows = zip(ids, centres, halves, before, after, confidences, labels, strict=True)
+        return {
+            track: ReadBox(
+                box_px=(c[0] - h[0], c[1] - h[1], c[0] + h[0], c[1] + h[1]),
+                class_before=names[b],
+                class_after=names[a],
+                confidence_pct=p,
+                refined=refined,
+                label=label,
+            )
+            for track, c, h, b, a, p, label in rows
+        }
+
+    def _class_names(self, entity: str) -> dict[int, str]:
+        rows = self.rows(entity, "AnnotationContext:context")
+        return {i["class_id"]: i["class_description"]["info"]["label"] for i in rows[-1][2][0]} if rows else {}
+
+    def _pictures(self, name: str) -> list[tuple[int, bytes]]:
+        found = []
+        for (entity, component), rows in self._rows.items():
+            hidden = entity == "/stills/more" and name == "still"
+            if component == "EncodedImage:blob" and (entity.endswith(f"/{name}") or hidden):
+                found += [(frame, bytes(value[0])) for frame, _, value in rows]
+        return sorted(found)
+
+
+def _rows(chunk: Chunk) -> Iterator[tuple[str, int, int, Any]]:
+    batch = chunk.to_record_batch()
+    frames = [STATIC] * chunk.num_rows
+    captures = [STATIC] * chunk.num_rows
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        if name == "frame":
+            frames = column.to_pylist()
+        elif name == "capture_time":
+            captures = column.cast("int64").to_pylist()
+    for field, column in zip(batch.schema, batch.columns, strict=True):
+        component = (field.metadata or {}).get(b"rerun:component", b"").decode()
+        if component:
+            for frame, capture_ns, value in zip(frames, captures, column.to_pylist(), strict=True):
+                if value is not None:
+                    yield component, frame, capture_ns, value
