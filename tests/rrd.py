@@ -108,7 +108,9 @@ class Recording:
 
     def _class_names(self, entity: str) -> dict[int, str]:
         rows = self.rows(entity, "AnnotationContext:context")
-        return {i["class_id"]: i["class_description"]["info"]["label"] for i in rows[-1][2][0]} if rows else {}
+        return (
+            {i["class_id"]: i["class_description"]["info"]["label"] for i in rows[-1][2][0]} if rows else {}
+        )
 
     def _pictures(self, name: str) -> list[tuple[int, bytes]]:
         found = []

@@ -123,6 +123,7 @@ class Edge:
                 edge_id=config.edge_id,
                 session_id=self._session_id,
                 lockstep=self._lockstep,
+                wait_until=self._wait_until,
             )
             base = BaseStage(
                 encoder,
@@ -254,7 +255,7 @@ class Edge:
         unit = base.encode(frame, now_ns=self._now_ns)
         self._counts.encode_ns += time.perf_counter_ns() - began_ns
         self._now_ns = self._clock()
-        base.send(unit, now_ns=self._now_ns, send_ns=self._now_ns)
+        base.send(unit, now_ns=self._now_ns)
         self._counts.encoded += 1
         worker.offer(frame, unit)
         return True
@@ -267,9 +268,8 @@ class Edge:
         began_ns = time.perf_counter_ns()
         unit = base.encode(frame, now_ns=self._now_ns)
         encoded_ns = time.perf_counter_ns()
-        base.send(unit, now_ns=self._now_ns, send_ns=self._clock())
-        # Media time stands for the time of sending, so that both ledgers see the same windows.
-        sent = stills.step(frame, unit, clock=lambda: frame.capture_ns, now_ns=self._now_ns)
+        base.send(unit, now_ns=self._now_ns)
+        sent = stills.step(frame, unit, clock=lambda: frame.capture_ns)
         self._counts.encode_ns += encoded_ns - began_ns
         self._counts.encoded += 1
         self._in_flight.append((frame.index, sent))
@@ -285,6 +285,11 @@ class Edge:
                 self._ground_follows = False  # it is gone, or it never classifies: do not wait again
             self._newest_answered = max([self._newest_answered, *sent])
         stills.hear(self._inbox.take_up_to(self._newest_answered))
+
+    def _wait_until(self, at_ns: int) -> None:
+        """Let the budget's window make room; media time needs no waiting."""
+        if not self._lockstep and (wait_ns := at_ns - self._clock()) > 0:
+            self._stop.wait(wait_ns / SECOND_NS)
 
     def _note_index(self, frame: Frame) -> None:
         if self._counts.first_index is None:
@@ -332,7 +337,7 @@ class Edge:
         return info.pack()
 
     def _report(self, sender: Sender, stills: StillStage, line: StatusLine, link: EdgeLink) -> None:
-        sender.status(self._status("running", sender, stills), now_ns=self._now_ns)
+        self._send_status("running", sender, stills)
         media_s = self._duration_s()
         rate_bps = self._ledger.window_bytes(None, self._now_ns) * 8 * SECOND_NS / self._ledger.window_ns
         sent = sum(self._ledger.fates("sent").values())
@@ -343,16 +348,20 @@ class Edge:
             f"waiting  tracks {stills.tracks}  {heard}"
         )
 
-    def _status(self, state: str, sender: Sender, stills: StillStage) -> Status:
+    def _send_status(self, state: str, sender: Sender, stills: StillStage) -> None:
+        now_ns = self._now_ns if self._lockstep else self._clock()
+        sender.status(lambda at_ns: self._status(state, sender, stills, at_ns), now_ns=now_ns)
+        self._status_sequence += 1
+
+    def _status(self, state: str, sender: Sender, stills: StillStage, at_ns: int) -> Status:
         account, counts, ledger = self._ledger.summary(self._duration_s()), self._counts, self._ledger
         age_ns = None if self._inbox.received_ns is None else self._clock() - self._inbox.received_ns
-        self._status_sequence += 1
         return Status(
             session_id=self._session_id,
-            sequence=self._status_sequence - 1,
+            sequence=self._status_sequence,
             state=state,
-            send_ns=self._clock(),
-            media_ns=max(0, self._now_ns - self._started_ns),
+            send_ns=at_ns,
+            media_ns=max(0, at_ns - self._started_ns),
             last_base_sequence=sender.base_sequence,
             last_still_sequence=sender.still_sequence,
             base_bytes=account.base_bytes,
@@ -388,7 +397,7 @@ class Edge:
         """Let the ground finish, then tell it that this was all."""
         if self._lockstep:
             self._follow_ground(self._counts.last_index + 10**9, stills)
-        sender.status(self._status("ended", sender, stills), now_ns=self._now_ns)
+        self._send_status("ended", sender, stills)
         if link.heard():  # what is still in a queue would be lost with the session
             base, roi = sender.base_sequence + 1, sender.still_sequence + 1
             self._inbox.wait_for_messages(base=base, roi=roi, timeout_s=_GOODBYE_S)

@@ -39,8 +39,8 @@ class BaseStage:
             self._recorder.write(unit)
         return unit
 
-    def send(self, unit: AccessUnit, *, now_ns: int, send_ns: int) -> None:
+    def send(self, unit: AccessUnit, *, now_ns: int) -> None:
         """Send the unit; blocks while the link is full, and frames are then dropped before they are encoded."""
-        line_bytes = self._sender.base(unit, now_ns=now_ns, send_ns=send_ns)
+        line_bytes = self._sender.base(unit, now_ns=now_ns)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes

@@ -1,6 +1,8 @@
-"""The hard bit budget: what a still may cost now so that no rolling window ever exceeds the total.
+"""The hard bit budget: what a still may cost now, and when a base frame may go.
 
-Two limits hold at once, both in line bytes (payload, attachment and transport overhead):
+No rolling window ever exceeds the total.
+
+Two limits hold for stills at once, both in line bytes (payload, attachment and transport overhead):
 
 * **the share**: stills earn ``B_r = B_tot - B_v`` all the time and may save up what they do not spend, but no
   more than ``carry_s`` seconds of it (a token bucket);
@@ -11,7 +13,9 @@ Two limits hold at once, both in line bytes (payload, attachment and transport o
   that memory, because they come only when the edge decides: before one, stills are held until it
   fits (`keyframe_fits`).
 
-So stills yield where the base overshoots, and never the other way round.
+So stills yield where the base overshoots. What no forecast sees, a base frame that is suddenly large after stills
+have taken their share, waits the few milliseconds until the window has room (`earliest_ns`): nothing is dropped, and
+the total holds all the same.
 """
 
 from __future__ import annotations
@@ -50,6 +54,7 @@ class RollingBudget:
         self._step_ns = round(_SECOND_NS / settings.fps)
         self._steps = max(1, round(settings.window_ns / self._step_ns))
         self._events: deque[tuple[int, int]] = deque()
+        self._last_ns = 0
         self._base_steps: deque[int] = deque(maxlen=self._steps * _MEMORY_WINDOWS)
         self._burst = np.zeros(self._steps + 1)
         self._tokens = self._cap = (settings.total_bps - settings.base_bps) * settings.carry_s / 8
@@ -63,6 +68,7 @@ class RollingBudget:
     def record_base(self, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
         """Count one base message (or metadata that rides beside it)."""
         self._record(line_bytes, now_ns)
+        self._last_ns = max(self._last_ns, now_ns)
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
         self._burst = self._recent_bursts()
 
@@ -76,6 +82,23 @@ class RollingBudget:
         self._tokens -= line_bytes
         self._record(line_bytes, now_ns)
 
+    def earliest_ns(self, line_bytes: int, *, now_ns: int) -> int:
+        """Return when a message of so many line bytes may go: now, or as soon as its window has room.
+
+        Messages keep their order: never before what was recorded last. A message that no window can hold goes one
+        window from now at the latest.
+        """
+        now_ns = max(now_ns, self._last_ns)
+        window_ns = self._settings.window_ns
+        held = sum(size for at_ns, size in self._events if at_ns > now_ns - window_ns)
+        for at_ns, size in sorted(self._events):
+            if held + line_bytes <= self._total:
+                break
+            if at_ns > now_ns - window_ns:
+                held -= size
+                now_ns = at_ns + window_ns
+        return now_ns
+
     def still_room(self, now_ns: int) -> int:
         """Return how many line bytes a still may take now; 0 where it has to wait."""
         self._refill(now_ns)
@@ -87,7 +110,8 @@ class RollingBudget:
 
     def _record(self, line_bytes: int, now_ns: int) -> None:
         self._events.append((now_ns, line_bytes))
-        while self._events[0][0] <= now_ns - self._settings.window_ns:
+        # Twice the window: a still may be asked about a little before a base message that waits.
+        while self._events[0][0] <= now_ns - 2 * self._settings.window_ns:
             self._events.popleft()
 
     def _refill(self, now_ns: int) -> None:

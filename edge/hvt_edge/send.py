@@ -1,12 +1,14 @@
 """The one place where bytes leave the edge: header, ledger and budget of every message in one step.
 
 Thread-safe: base frames and stills may come from two threads. ``now_ns`` is the time that windows go by: the wall
-clock in real time, media time in lockstep, so that the same input gives the same stills.
+clock in real time, media time in lockstep, so that the same input gives the same stills. It is also the time of
+sending that goes on the wire, so that the ground's ledger sees the very same windows.
 """
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Protocol
 
 from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row
@@ -53,7 +55,10 @@ def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
 
 
 class Sender:
-    """Sends access units, stills and status, and accounts for each."""
+    """Sends access units, stills and status, and accounts for each.
+
+    ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep.
+    """
 
     def __init__(
         self,
@@ -64,6 +69,7 @@ class Sender:
         edge_id: str,
         session_id: int,
         lockstep: bool,
+        wait_until: Callable[[int], None],
     ) -> None:
         self._outlet = outlet
         self._ledger = ledger
@@ -71,26 +77,30 @@ class Sender:
         self._keys = EdgeKeys(edge_id)
         self._session_id = session_id
         self._flags = Flags.LOCKSTEP if lockstep else Flags(0)
+        self._wait_until = wait_until
         self._lock = threading.Lock()
         self.base_sequence = -1
         """Of the last access unit sent; -1 before the first."""
         self.still_sequence = -1
 
-    def base(self, unit: AccessUnit, *, now_ns: int, send_ns: int) -> int:
-        """Send one access unit; return its line bytes."""
+    def base(self, unit: AccessUnit, *, now_ns: int) -> int:
+        """Send one access unit as soon as the budget's window has room for it; return its line bytes."""
+        line_bytes = self._line_bytes(Row.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
+            at_ns = self._budget.earliest_ns(line_bytes, now_ns=now_ns)
             self.base_sequence += 1
             header = BaseHeader(
                 session_id=self._session_id,
                 sequence=self.base_sequence,
                 frame_index=unit.frame_index,
                 capture_ns=unit.capture_ns,
-                send_delay_ns=send_ns - unit.capture_ns,
+                send_delay_ns=at_ns - unit.capture_ns,
                 flags=self._flags | ((Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0),
             )
             attachment = header.pack(unit.data)
-            line_bytes = self._count(Row.BASE, Channel.BASE, unit.data, attachment, now_ns=now_ns)
-            self._budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe)
+            line_bytes = self._count(Row.BASE, Channel.BASE, unit.data, attachment, at_ns=at_ns)
+            self._budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
+        self._wait_until(at_ns)
         self._outlet.put(Row.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Row.BASE].encoding)
         return line_bytes
 
@@ -103,23 +113,27 @@ class Sender:
         )
         return max(0, room - STILL_ATTACHMENT_BYTES - line)
 
-    def still(self, still: Still, *, media_type: str, now_ns: int, send_ns: int) -> None:
-        """Send one still that `still_room_bytes` admitted."""
+    def still(self, still: Still, *, media_type: str, now_ns: int) -> None:
+        """Send one still that `still_room_bytes` admitted at this very time."""
         with self._lock:
             self.still_sequence = still.sequence
-            attachment = self._still_header(still, send_ns=send_ns).pack(still.data)
+            attachment = self._still_header(still, send_ns=now_ns).pack(still.data)
             line_bytes = self._count(
-                Row.ROI, Channel.ROI, still.data, attachment, now_ns=now_ns, encoding=media_type
+                Row.ROI, Channel.ROI, still.data, attachment, at_ns=now_ns, encoding=media_type
             )
             self._budget.record_still(line_bytes, now_ns=now_ns)
         self._outlet.put(Row.ROI, still.data, attachment=attachment, encoding=media_type)
 
-    def status(self, status: Status, *, now_ns: int) -> None:
-        """Send the once-a-second report."""
-        payload = status.pack()
+    def status(self, make: Callable[[int], Status], *, now_ns: int) -> None:
+        """Send the once-a-second report, made for the moment at which it may go."""
+        size_bytes = self._line_bytes(Row.STATUS, make(now_ns).pack(), 0)
         with self._lock:
-            line_bytes = self._count(Row.STATUS, Channel.META, payload, b"", now_ns=now_ns)
-            self._budget.record_metadata(line_bytes, now_ns=now_ns)
+            at_ns = self._budget.earliest_ns(size_bytes, now_ns=now_ns)
+        payload = make(at_ns).pack()
+        with self._lock:
+            line_bytes = self._count(Row.STATUS, Channel.META, payload, b"", at_ns=at_ns)
+            self._budget.record_metadata(line_bytes, now_ns=at_ns)
+        self._wait_until(at_ns)
         self._outlet.put(Row.STATUS, payload, encoding=DELIVERIES[Row.STATUS].encoding)
 
     def keyframe_fits(self, line_bytes: int, *, now_ns: int) -> bool:
@@ -153,26 +167,24 @@ class Sender:
         )
 
     def _count(
-        self,
-        row: Row,
-        channel: Channel,
-        payload: bytes,
-        attachment: bytes,
-        *,
-        now_ns: int,
-        encoding: str = "",
+        self, row: Row, channel: Channel, payload: bytes, attachment: bytes, *, at_ns: int, encoding: str = ""
     ) -> int:
-        overhead = overhead_bytes(
-            len(payload),
-            len(attachment),
-            key=self._keys.key(row),
-            encoding=encoding or DELIVERIES[row].encoding,
-        )
+        line_bytes = self._line_bytes(row, payload, len(attachment), encoding=encoding)
         self._ledger.count(
             channel,
             payload_bytes=len(payload),
             attachment_bytes=len(attachment),
-            overhead_bytes=overhead,
-            at_ns=now_ns,
+            overhead_bytes=line_bytes - len(payload) - len(attachment),
+            at_ns=at_ns,
         )
-        return len(payload) + len(attachment) + overhead
+        return line_bytes
+
+    def _line_bytes(self, row: Row, payload: bytes, attachment_bytes: int, *, encoding: str = "") -> int:
+        """Payload, attachment and what the transport adds."""
+        overhead = overhead_bytes(
+            len(payload),
+            attachment_bytes,
+            key=self._keys.key(row),
+            encoding=encoding or DELIVERIES[row].encoding,
+        )
+        return len(payload) + attachment_bytes + overhead

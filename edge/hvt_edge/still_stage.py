@@ -55,30 +55,25 @@ class StillStage:
         return self._sight_ns / max(1, self._steps) / 1e6
 
     def step(
-        self,
-        frame: Frame,
-        unit: AccessUnit,
-        *,
-        clock: Callable[[], int],
-        now_ns: int,
-        hurry: bool = False,
+        self, frame: Frame, unit: AccessUnit, *, clock: Callable[[], int], hurry: bool = False
     ) -> set[int]:
         """See the frame, choose, send the stills that fit; return their sequence numbers.
 
-        ``clock`` gives the wall time of sending.
+        ``clock`` tells the time that windows go by.
         """
         began_ns = time.perf_counter_ns()
         seen = self._sight.see(frame, unit, hurry=hurry)
         self._sight_ns += time.perf_counter_ns() - began_ns
         self._steps += 1
         self._count_tracks(seen.tracks.ids.tolist())
-        self._chooser.consider(seen, now_ns=now_ns, room_bytes=self._sender.still_room_bytes(now_ns))
+        now_ns = clock()
+        room = partial(self._sender.still_room_bytes, now_ns)
+        self._chooser.consider(seen, now_ns=now_ns, room_bytes=room())
         sent: set[int] = set()
         if self._keyframes.due(now_ns):
             return sent
-        room = partial(self._sender.still_room_bytes, now_ns)
         for still in self._chooser.stills(now_ns=now_ns, room_bytes=room):
-            self._sender.still(still, media_type=self._media_type, now_ns=now_ns, send_ns=clock())
+            self._sender.still(still, media_type=self._media_type, now_ns=now_ns)
             sent.add(still.sequence)
         return sent
 
@@ -160,7 +155,7 @@ class StillWorker:
             while (item := self._frames.get()) is not None:
                 behind = self._frames.qsize() >= _BEHIND_FRAMES
                 self._stage.hear(self._hear())
-                self._stage.step(*item, clock=self._clock, now_ns=self._clock(), hurry=behind)
+                self._stage.step(*item, clock=self._clock, hurry=behind)
         except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
             self._error = error
 

@@ -56,7 +56,7 @@ FOLD_BYTES = 3 << 19
 FIXED_BYTES = 100_000
 """About what the blueprint and the static values cost."""
 
-HIDDEN_CROP_RATIO = 1.25
+HIDDEN_CROP_RATIO = 1.3
 """A still that is not shown keeps its base crop while the recording is smaller than this times the bytes received."""
 
 DIMMED = 0.75
@@ -211,7 +211,7 @@ class Recorder:
             self._file.fold(self._encoder.chunks(chunks))
 
     def _row(self, path: str, columns: Any, event: Event, value: Any, *, size_bytes: int = 64) -> Chunk:
-        """Add a row to the table of this entity and these columns; ``size_bytes`` is about what it will cost folded."""
+        """Add a row to the table of this entity and these columns; ``size_bytes``: its cost once folded, about."""
         key = (path, columns.__name__)
         table = self._tables.get(key)
         if table is None:
@@ -282,7 +282,7 @@ class Recorder:
         if still is None:
             return chunks
         self._earn(len(refinement.still))
-        base = base_picture(refinement, limit_bytes=round(0.8 * len(refinement.still)))
+        base = base_picture(refinement, still_size=still[1], limit_bytes=round(0.8 * len(refinement.still)))
         slot = self._gallery.take(refinement.capture_ns, changed=changed)
         if slot is None:
             return chunks + self._hidden_pair(refinement, base, still)

@@ -155,11 +155,7 @@ def picture_columns(rows: Sequence[Picture]) -> Columns:
         translation=[(row.place.x, row.place.y, 0.0) for row in rows],
         scale=[(row.place.scale, row.place.scale, 1.0) for row in rows],
     )
-    # Enlarged like this, the base crop is as smooth as it can honestly be.
-    smooth = rr.EncodedImage.columns(
-        magnification_filter=[rr.components.MagnificationFilter.Bicubic] * len(rows)
-    )
-    return [*hidden_picture_columns([row.data for row in rows]), *smooth, *places]
+    return [*hidden_picture_columns([row.data for row in rows]), *places]
 
 
 def hidden_picture_columns(rows: Sequence[bytes]) -> Columns:

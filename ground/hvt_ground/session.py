@@ -12,7 +12,7 @@ from hvt_common.latency import LatencyStats
 from hvt_common.link.inbox import Received
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
-from hvt_common.link.wire import BaseHeader, Flags, Info, RoiHeader, Status, StillResult
+from hvt_common.link.wire import BaseHeader, Info, RoiHeader, Status, StillResult
 from hvt_common.vision.hevc import BaseDecoder
 from hvt_ground.events import Event, Notice, Traffic, VideoSample
 from hvt_ground.record import Recorder
@@ -91,7 +91,7 @@ class GroundSession:
 
     def base(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
         """Take one access unit; False where the decoder could make nothing of it."""
-        at_ns = header.capture_ns if header.flags & Flags.LOCKSTEP else header.send_ns
+        at_ns = header.send_ns
         self._count(Row.BASE, Channel.BASE, item, at_ns=at_ns)
         self.frames_received += 1
         if self._first_index is None:
@@ -110,7 +110,8 @@ class GroundSession:
             return False
         self.frames_decoded += 1
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
-        reference_ns = self._reference_ns(header)
+        # In lockstep capture and sending are media time and say nothing of delay: count from here.
+        reference_ns = item.received_ns if self.lockstep else self._to_local_ns(header.capture_ns)
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
         self._offer(Picture(header.frame_index, header.capture_ns, reference_ns, image))
         self._traffic(at_ns)
@@ -123,7 +124,7 @@ class GroundSession:
         self._still_sequences.add(header.sequence)
         if len(self._still_sequences) > 8192:
             self._still_sequences = set(sorted(self._still_sequences)[-4096:])
-        self._count(Row.ROI, Channel.ROI, item, at_ns=header.send_ns)  # media time in lockstep
+        self._count(Row.ROI, Channel.ROI, item, at_ns=header.send_ns)
         self.stills_received += 1
         self.ledger.record_fate("received", header.reason)
         still = ReceivedStill(header, item.payload, media_type)
@@ -138,8 +139,7 @@ class GroundSession:
 
     def status(self, status: Status, item: Received) -> None:
         """Take the edge's report."""
-        at_ns = self.info.started_ns + status.media_ns if self.lockstep else status.send_ns
-        self._count(Row.STATUS, Channel.META, item, at_ns=at_ns)
+        self._count(Row.STATUS, Channel.META, item, at_ns=status.send_ns)
         self.last_status = status
 
     def note(self, level: str, text: str) -> None:
@@ -257,10 +257,6 @@ class GroundSession:
             ),
             at_ns=at_ns,
         )
-
-    def _reference_ns(self, header: BaseHeader) -> int:
-        """When latency begins, on our clock: media time says nothing of delay, so lockstep counts from sending."""
-        return self._to_local_ns(header.send_ns if self.lockstep else header.capture_ns)
 
     def _traffic(self, at_ns: int) -> None:
         """Twice a second of the stream, how full the link was and how old the picture is."""

@@ -30,7 +30,7 @@ class Picture:
     frame_index: int
     capture_ns: int
     reference_ns: int
-    """The moment on our clock that latency counts from: capture, or in lockstep the sending."""
+    """The moment on our clock that latency counts from: capture, or in lockstep the receiving."""
     image_bgr: Image
 
 
@@ -189,14 +189,6 @@ class GroundSight:
         before, after = settled.class_before, settled.class_after
         self._emit(
             self._refinement(settled.still.carried, settled.track_id, before, after, settled.confidence)
-        )
-        if settled.outcome != "matched":
-            return
-        change = f"{before} → {after}" if before != after else f"{after} confirmed"
-        self._notice(
-            "info",
-            f"track {settled.track_id}: {change} ({settled.confidence:.2f}) by still {settled.still.sequence} "
-            f"of frame {settled.still.frame_index}",
         )
 
     def _refinement(

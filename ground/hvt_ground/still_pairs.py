@@ -45,18 +45,23 @@ def still_picture(refinement: Refinement) -> Coded | None:
         return None
     size = (pixels.shape[1], pixels.shape[0])
     return (
-        refinement.still if refinement.media_type == "image/jpeg" else _jpeg(pixels, quality_pct=90)
+        refinement.still
+        if refinement.media_type == "image/jpeg"
+        else _jpeg(pixels.astype(np.uint8), quality_pct=90)
     ), size
 
 
-def base_picture(refinement: Refinement, *, limit_bytes: int) -> Coded | None:
-    """The base crop as JPEG at base resolution (the viewer enlarges it), the best quality within ``limit_bytes``.
+def base_picture(refinement: Refinement, *, still_size: tuple[int, int], limit_bytes: int) -> Coded | None:
+    """The base crop as JPEG of the best quality within ``limit_bytes``, or the lowest where none fits.
 
-    The lowest quality is taken where none fits; None where the frame was gone.
+    Where the still is finer than the base, the crop is enlarged to its size (bicubic): the viewer would show large
+    pixels, and the eye should compare detail. None where the frame was gone.
     """
     crop = refinement.base_crop_bgr
     if crop is None or crop.size == 0:
         return None
+    if still_size[0] > 1.1 * crop.shape[1]:
+        crop = cv2.resize(crop, still_size, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
     data = b""
     for quality in _QUALITIES_PCT:
         data = _jpeg(crop, quality_pct=quality)

@@ -101,7 +101,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         ("keyframes", f"{content['keyframe_requests']} asked for"),
     ]
     if latency["p50"] is not None:
-        since = "sending" if content["pace"] == "lockstep" else "capture"
+        since = "receiving" if content["pace"] == "lockstep" else "capture"
         spread = f"p50 {latency['p50']:.0f} ms, p95 {latency['p95']:.0f}, max {latency['max']:.0f}"
         rows.append(("latency", f"{since} to overlay: {spread}"))
     if content["recording"]:

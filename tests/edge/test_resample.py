@@ -67,7 +67,7 @@ def test_four_hours_do_not_drift(source, base):
 
 
 def test_matroska_milliseconds_do_not_make_frames_slip():
-    """Half rate of a 30 fps Matroska clip would repeat and lose frames at random, because 66.67 ms is stored as 67."""
+    """Half rate of a 30 fps Matroska clip would repeat and lose frames, because 66.67 ms is stored as 67."""
     rounded = [Fraction(round(n * 1000 / 30), 1000) for n in range(300)]
     slipped = [n for _, n in played(rounded, 15, tail_s=Fraction(1, 30))]
     exact = [n for _, n in played(rounded, 15, tail_s=Fraction(1, 30), slack_s=Fraction(1, 1000))]

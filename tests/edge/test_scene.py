@@ -175,6 +175,8 @@ def test_traffic_does_not_drive_through_itself(scene):
         gaps = np.linalg.norm(places[within, None, :2] - places[within, :2], axis=2)
         close = np.triu(gaps < cast.reach_m[within, None] + cast.reach_m[within], 1)
         assert close.sum() > 50  # stalls are close to one another
+        itself, _ = cv2.intersectConvexConvex(cv2.convexHull(hulls[0]), cv2.convexHull(hulls[0]))
+        assert itself > 0.5
         for i, j in within[np.argwhere(close)]:
             overlap, _ = cv2.intersectConvexConvex(cv2.convexHull(hulls[i]), cv2.convexHull(hulls[j]))
             assert overlap < 0.1, (t_s, cast.class_ids[[i, j]], places[[i, j]])

@@ -275,9 +275,9 @@ def _roadside(layout: Layout, rng: _Rng) -> None:
         y = layout.main_y + side * offset
         for x in np.arange(6.0, WORLD_M[0] - 4, 14.0):
             if abs(x - layout.side_x) > 14 and rng.random() < 0.6:
-                reach = float(rng.uniform(2.2, 3.9))
+                reach = float(rng.uniform(2.4, 4.8))
                 layout.trees.append(
-                    Tree(float(x + rng.normal(0, 2)), y + side * 0.6, reach, int(rng.integers(8)))
+                    Tree(float(x + rng.normal(0, 2)), y - side * 0.4, reach, int(rng.integers(8)))
                 )
         layout.walks.append((0.0, y, layout.side_x - 9, y))
         layout.walks.append((layout.side_x + 9, y, WORLD_M[0], y))
