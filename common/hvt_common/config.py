@@ -10,9 +10,12 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import difflib
+import re
+import sys
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, NoReturn, Protocol, TypeVar
 
@@ -58,17 +61,27 @@ class Kind:
 def _plain(text: str, *, name: str) -> str:
     if not text.strip():
         raise UserError(f"{name} is empty: leave it out or give it a value")
+    if "\0" in text:
+        raise UserError(f"{name} {text!r} has a character that no name may have: write plain text")
     return text
 
 
 def _path(text: str, *, name: str) -> Path:
-    return Path(_plain(text, name=name)).expanduser()
+    try:
+        return Path(_plain(text, name=name)).expanduser()
+    except RuntimeError:
+        raise UserError(f"{name} {text!r} begins with a user that this machine does not know") from None
+
+
+def _decimal(number: float) -> str:
+    """All digits of a number, without an exponent."""
+    return format(Decimal(repr(number)).normalize(), "f")
 
 
 TEXT = Kind("TEXT", _plain)
 PATH = Kind("FILE", _path)
-BITRATE = Kind("RATE", parse_bitrate, lambda bps: f"{bps / 1000:g}kbps")
-DURATION = Kind("TIME", parse_duration_s, lambda seconds: f"{seconds:g}s")
+BITRATE = Kind("RATE", parse_bitrate, lambda bps: f"{_decimal(bps / 1000)}kbps")
+DURATION = Kind("TIME", parse_duration_s, lambda seconds: f"{_decimal(seconds)}s")
 SHARE = Kind("SHARE", parse_share, float)
 SIZE = Kind("WxH", parse_size, lambda size: f"{size[0]}x{size[1]}")
 
@@ -153,7 +166,7 @@ def load(
         UserError: an unknown flag or key, a value that its kind does not take, an unreadable file.
     """
     parser = _flags(config_class, program=program, description=description)
-    given = vars(parser.parse_args(argv))
+    given = vars(parser.parse_args(_with_joined_values(sys.argv[1:] if argv is None else argv)))
     print_config = bool(given.pop("print_config", False))
     file = given.pop("config", None)
     values: dict[str, Any] = {}
@@ -163,6 +176,17 @@ def load(
         if field.name in given:
             values[field.name] = _value(field, given[field.name], name=_flag(field))
     return config_class(**values), Loaded(values=values, print_config=print_config)
+
+
+def _with_joined_values(argv: Sequence[str]) -> list[str]:
+    """``--budget -5kbps`` as ``--budget=-5kbps``: argparse would take the value for a flag, and not name it."""
+    joined: list[str] = []
+    for word in argv:
+        if re.match(r"-[\d.]", word) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def to_toml(config: Any) -> str:
@@ -231,10 +255,15 @@ def _value(field: dataclasses.Field[Any], given: Any, *, name: str) -> Any:
     kind: Kind = field.metadata["kind"]
     if field.metadata["many"]:
         items = given if isinstance(given, list) else [given]
-        return tuple(kind.parse(str(item), name=name) for item in items)
+        return tuple(kind.parse(_one(item, name=name), name=name) for item in items)
+    return kind.parse(_one(given, name=name), name=name)
+
+
+def _one(given: Any, *, name: str) -> str:
+    """The text of one plain value; of a list, a table or a truth value there is none."""
     if isinstance(given, list | dict | bool):
-        raise UserError(f"{name} {given!r} is not accepted: give one value, {kind.metavar}")
-    return kind.parse(str(given), name=name)
+        raise UserError(f"{name} {given!r} is not accepted: give one value, as --help shows")
+    return str(given)
 
 
 def _from_file(config_class: type, file: Path) -> dict[str, Any]:
@@ -244,7 +273,8 @@ def _from_file(config_class: type, file: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise UserError(f"--config {file} does not exist: give a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"--config {file} cannot be read ({error}): give a TOML file") from None
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise UserError(f"--config {file} cannot be read ({reason}): give a TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"--config {file} is not valid TOML: {error}") from None
     values: dict[str, Any] = {}

@@ -25,7 +25,7 @@ class StatusLine:
     """One line on a terminal, rewritten in place; elsewhere a line now and then, so that logs stay short."""
 
     def __init__(self, *, quiet: bool) -> None:
-        self._console = Console(stderr=True, highlight=False)
+        self._console = Console(stderr=True, highlight=False, emoji=False)
         self._quiet = quiet
         self._updates = 0
         self._live: Live | None = None
@@ -60,16 +60,16 @@ class StatusLine:
 
 def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Print name and value pairs as a table."""
-    table = Table(title=title, show_header=False, title_justify="left", title_style="bold")
+    table = Table(title=Text(title), show_header=False, title_justify="left", title_style="bold")
     table.add_column(style="cyan", no_wrap=True)
     table.add_column()
     for name, value in rows:
-        table.add_row(name, value)
+        table.add_row(Text(name), Text(value))  # not markup: a path may have brackets in it
     Console(highlight=False).print(table)
 
 
 def check_writable(path: Path | None, *, name: str) -> None:
-    """Raise `UserError` now where a file could not be written at the end of the run."""
+    """Raise `UserError` now where a file could not be written later; leaves what is there as it was."""
     if path is None:
         return
     if path.is_dir():
@@ -78,15 +78,25 @@ def check_writable(path: Path | None, *, name: str) -> None:
         raise UserError(
             f"{name} {path} is in a folder that does not exist: make {path.absolute().parent} first"
         )
+    real = path.resolve()
+    if real.exists() and not real.is_file():  # /dev/stdout or a pipe: opening it to see may block
+        return
+    fresh = not real.exists()
     try:
-        with path.open("ab"):
+        with real.open("ab"):
             pass
+        if fresh:
+            real.unlink()
     except OSError as error:
         raise UserError(f"{name} {path} cannot be written ({error.strerror}): name a file that can") from None
 
 
 def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:
-    """Write the summary; whole or not at all."""
+    """Write the summary; into a file whole or not at all."""
+    text = json.dumps(content, indent=2) + "\n"
+    if path.exists() and not path.is_file():  # /dev/stdout or a pipe: to be written to, not to be replaced
+        path.write_text(text, encoding="utf-8")
+        return
     scratch = path.with_name(path.name + ".part")
-    scratch.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    scratch.write_text(text, encoding="utf-8")
     scratch.replace(path)

@@ -12,10 +12,11 @@ __all__ = ["bitrate_text", "parse_bitrate", "parse_duration_s", "parse_share", "
 _NUMBER = r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)"
 _BITRATE = re.compile(_NUMBER + r"\s*(bps|bit/s|kbps|kbit/s|k|Mbps|Mbit/s|M)?", re.IGNORECASE)
 _DURATION = re.compile(_NUMBER + r"\s*(ms|s|min|m|h)?")
-_SIZE = re.compile(r"([0-9]{1,5})\s*[xX]\s*([0-9]{1,5})")
+_SIZE = re.compile(r"([0-9]{1,9})\s*[xX]\s*([0-9]{1,9})")
 _BITRATE_UNITS = {"": 1, "b": 1, "k": 1_000, "m": 1_000_000}
 _DURATION_UNITS = {"": 1.0, "ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 _LIMIT_BPS = 1_000_000_000
+_LIMIT_S = 10_000_000.0
 
 
 def parse_bitrate(text: str, *, name: str) -> int:
@@ -32,9 +33,12 @@ def parse_bitrate(text: str, *, name: str) -> int:
 def parse_duration_s(text: str, *, name: str) -> float:
     """``500ms`` → 0.5 seconds; a bare number is seconds."""
     match = _DURATION.fullmatch(text.strip())
-    if not match:
-        raise UserError(f"{name} {text!r} is not a duration: write 2s, 500ms or 1min")
-    return float(match[1]) * _DURATION_UNITS[match[2] or ""]
+    seconds = float(match[1]) * _DURATION_UNITS[match[2] or ""] if match else math.nan
+    if not 0 <= seconds <= _LIMIT_S:
+        raise UserError(
+            f"{name} {text!r} is not a duration: write 2s, 500ms or 1min, at most {_LIMIT_S:.0f} s"
+        )
+    return seconds
 
 
 def parse_size(text: str, *, name: str) -> tuple[int, int]:
@@ -48,9 +52,8 @@ def parse_size(text: str, *, name: str) -> tuple[int, int]:
 def parse_share(text: str, *, name: str) -> float:
     """``0.8125`` or ``81.25%`` → a share of 0…1."""
     stripped = text.strip()
-    percent = stripped.endswith("%")
     try:
-        share = float(stripped.rstrip("%")) / (100 if percent else 1)
+        share = float(stripped.removesuffix("%")) / (100 if stripped.endswith("%") else 1)
     except ValueError:
         share = math.nan
     if not 0 <= share <= 1:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from typing import Any, cast
 
 from hvt_common import __version__
@@ -16,11 +14,20 @@ from hvt_common.errors import UserError
 from hvt_common.link.keys import EdgeKeys
 from hvt_common.link.ledger import Ledger
 from hvt_common.link.session import open_session
-from hvt_common.link.wire import Command, ControlAnswer, ControlRequest, Feedback, Health, Info, Status
+from hvt_common.link.wire import (
+    Command,
+    ControlAnswer,
+    ControlRequest,
+    Feedback,
+    Health,
+    Info,
+    Status,
+    fitted_class_names,
+)
 from hvt_common.link.zenoh_config import LinkSettings
 from hvt_common.report import StatusLine, check_writable
 from hvt_common.units import bitrate_text
-from hvt_common.values import Fit, Frame
+from hvt_common.values import Fit
 from hvt_edge.base_stage import BaseStage
 from hvt_edge.build import (
     SECOND_NS,
@@ -31,23 +38,24 @@ from hvt_edge.build import (
     make_keyframes,
     make_sight,
 )
-from hvt_edge.clock import SteadyClock, realtime_admits
+from hvt_edge.clock import SteadyClock
 from hvt_edge.config import EdgeConfig
+from hvt_edge.counts import FrameCounts
 from hvt_edge.feedback import FeedbackInbox
+from hvt_edge.pace_lockstep import LockstepPace
+from hvt_edge.pace_realtime import RealtimePace
 from hvt_edge.publish import EdgeLink
 from hvt_edge.record_base import BaseRecorder
 from hvt_edge.scene.truth import write_truth
 from hvt_edge.send import Sender
 from hvt_edge.source import Source, open_source
 from hvt_edge.sources.demo import DemoSource
-from hvt_edge.still_stage import StillStage, StillWorker
+from hvt_edge.still_stage import StillStage
 from hvt_edge.summary import EdgeRun, summary
 
 __all__ = ["Edge"]
 
-_LOCKSTEP_AHEAD_S = 1.0
-"""How far a lockstep edge runs ahead of the ground, in media time: what a ground reports counts so much later."""
-_GROUND_GONE_S = 20.0
+_STILL_MEDIA_TYPE = "image/jpeg"
 _GOODBYE_S = 1.5
 _MILLION = 1_000_000
 
@@ -67,18 +75,6 @@ def _closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
         stop.set()
 
 
-@dataclass(slots=True)
-class _Counts:
-    """What the frame loop counts."""
-
-    captured: int = 0
-    encoded: int = 0
-    dropped: int = 0
-    encode_ns: int = 0
-    first_index: int | None = None
-    last_index: int = -1
-
-
 class Edge:
     """One run of one edge: build it, `run` it once."""
 
@@ -88,13 +84,10 @@ class Edge:
         self._lockstep = config.pace == "lockstep"
         self._clock = SteadyClock()
         self._session_id = secrets.randbits(64)
-        self._counts = _Counts()
+        self._counts = FrameCounts()
         self._ledger = Ledger(window_ns=round(config.window * SECOND_NS))
         self._keyframes = make_keyframes(config)
         self._inbox = FeedbackInbox()
-        self._in_flight: deque[tuple[int, set[int]]] = deque()
-        self._newest_answered = -1
-        self._ground_follows = False
         self._started_ns = 0
         self._now_ns = 0
         self._status_sequence = 0
@@ -106,16 +99,23 @@ class Edge:
             UserError: before anything is sent, where a setting, a file or a port cannot be used.
         """
         config = self._config
-        check_writable(config.summary, name="--summary")
+        for path, name in (
+            (config.summary, "--summary"),
+            (config.truth, "--truth"),
+            (config.record_base, "--record-base"),
+        ):
+            check_writable(path, name=name)
         detector = make_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(self._open_source())
-            self._write_truth(source)
-            recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
+            self._check_truth(source)
             encoder = make_encoder(config)
             budget = make_budget(config)
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = self._open_link(stack, source, detector.class_names)
+            # Files come after all that may be refused: a failed start leaves nothing behind.
+            self._write_truth(source)
+            recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
             sender = Sender(
                 link,
                 ledger=self._ledger,
@@ -136,7 +136,7 @@ class Edge:
                 config,
                 view=source.view,
                 class_names=detector.class_names,
-                most_bytes=(config.budget_bps - config.base_bps) // 8,
+                most_bytes=sender.most_still_bytes(media_type=_STILL_MEDIA_TYPE),
                 on_fate=sender.fate,
             )
             stills = StillStage(
@@ -144,7 +144,7 @@ class Edge:
                 chooser,
                 sender=sender,
                 keyframes=self._keyframes,
-                media_type="image/jpeg",
+                media_type=_STILL_MEDIA_TYPE,
             )
             self._wait_for_ground(link, source, line)
             self._started_ns = self._clock()
@@ -168,15 +168,15 @@ class Edge:
             source_fps=config.source_fps,
         )
 
-    def _write_truth(self, source: Source) -> None:
-        if self._config.truth is None:
-            return
-        if not isinstance(source, DemoSource):
+    def _check_truth(self, source: Source) -> None:
+        if self._config.truth is not None and not isinstance(source, DemoSource):
             raise UserError(
                 f"--truth {self._config.truth} is for --source demo: no other source knows its truth"
             )
-        check_writable(self._config.truth, name="--truth")
-        write_truth(source.scene, self._config.truth, fps=self._config.fps, view=source.view)
+
+    def _write_truth(self, source: Source) -> None:
+        if self._config.truth is not None and isinstance(source, DemoSource):
+            write_truth(source.scene, self._config.truth, fps=self._config.fps, view=source.view)
 
     def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> EdgeLink:
         config = self._config
@@ -221,80 +221,51 @@ class Edge:
         line: StatusLine,
         link: EdgeLink,
     ) -> None:
-        self._ground_follows = link.heard()
         next_status_ns = 0
         with ExitStack() as stack:
-            worker = None
             if source.live:
                 stack.enter_context(_closing_on(self._stop, source))
-            if not self._lockstep:
-                worker = stack.enter_context(StillWorker(stills, hear=self._inbox.take, clock=self._clock))
+            pace = self._make_pace(base, stills, source, link)
+            stack.enter_context(pace)
             for frame in source.frames(start_ns=self._started_ns):
                 if self._stop.is_set():
                     break
                 self._counts.captured += 1
-                if self._lockstep:
-                    self._step_lockstep(frame, base, stills)
-                elif not self._step_realtime(frame, base, worker, live=source.live):
-                    continue
+                pace.step(frame)
+                self._now_ns = pace.now_ns
                 if self._now_ns >= next_status_ns:
                     next_status_ns = self._now_ns + SECOND_NS
                     self._report(sender, stills, line, link)
 
-    def _step_realtime(
-        self, frame: Frame, base: BaseStage, worker: StillWorker | None, *, live: bool
-    ) -> bool:
-        assert worker is not None
-        on_time = live or realtime_admits(frame, clock=self._clock, fps=self._config.fps, stop=self._stop)
-        self._note_index(frame)
-        if not on_time or worker.full:
-            self._counts.dropped += 1
-            return False
-        self._now_ns = self._clock()
-        began_ns = time.perf_counter_ns()
-        unit = base.encode(frame, now_ns=self._now_ns)
-        self._counts.encode_ns += time.perf_counter_ns() - began_ns
-        self._now_ns = self._clock()
-        base.send(unit, now_ns=self._now_ns)
-        self._counts.encoded += 1
-        worker.offer(frame, unit)
-        return True
-
-    def _step_lockstep(self, frame: Frame, base: BaseStage, stills: StillStage) -> None:
-        """One frame, all stages in this thread, every window in media time."""
-        self._note_index(frame)
-        self._follow_ground(frame.index, stills)
-        self._now_ns = frame.capture_ns
-        began_ns = time.perf_counter_ns()
-        unit = base.encode(frame, now_ns=self._now_ns)
-        encoded_ns = time.perf_counter_ns()
-        base.send(unit, now_ns=self._now_ns)
-        sent = stills.step(frame, unit, clock=lambda: frame.capture_ns)
-        self._counts.encode_ns += encoded_ns - began_ns
-        self._counts.encoded += 1
-        self._in_flight.append((frame.index, sent))
-
-    def _follow_ground(self, frame_index: int, stills: StillStage) -> None:
-        """Stay a fixed number of frames ahead, and take in the results of exactly the frames behind that."""
-        ahead = max(1, round(_LOCKSTEP_AHEAD_S * self._config.fps))
-        while self._in_flight and self._in_flight[0][0] <= frame_index - ahead:
-            done_index, sent = self._in_flight.popleft()
-            if self._ground_follows and not self._inbox.wait_for(
-                frame_index=done_index, stills=sent, timeout_s=_GROUND_GONE_S
-            ):
-                self._ground_follows = False  # it is gone, or it never classifies: do not wait again
-            self._newest_answered = max([self._newest_answered, *sent])
-        stills.hear(self._inbox.take_up_to(self._newest_answered))
+    def _make_pace(
+        self, base: BaseStage, stills: StillStage, source: Source, link: EdgeLink
+    ) -> LockstepPace | RealtimePace:
+        fps = self._config.fps
+        if self._lockstep:
+            return LockstepPace(
+                base,
+                stills,
+                inbox=self._inbox,
+                keyframes=self._keyframes,
+                fps=fps,
+                counts=self._counts,
+                follow=link.heard(),
+            )
+        return RealtimePace(
+            base,
+            stills,
+            inbox=self._inbox,
+            clock=self._clock,
+            fps=fps,
+            live=source.live,
+            counts=self._counts,
+            stop=self._stop,
+        )
 
     def _wait_until(self, at_ns: int) -> None:
         """Let the budget's window make room; media time needs no waiting."""
         if not self._lockstep and (wait_ns := at_ns - self._clock()) > 0:
             self._stop.wait(wait_ns / SECOND_NS)
-
-    def _note_index(self, frame: Frame) -> None:
-        if self._counts.first_index is None:
-            self._counts.first_index = frame.index
-        self._counts.last_index = frame.index
 
     # What others ask and are told
 
@@ -330,7 +301,7 @@ class Edge:
             budget_bps=config.budget_bps,
             base_bps=config.base_bps,
             window_ns=self._ledger.window_ns,
-            class_names=class_names[:2048],
+            class_names=fitted_class_names(class_names),
             received_ns=received_ns,
             answered_ns=time.time_ns(),
         )
@@ -338,7 +309,7 @@ class Edge:
 
     def _report(self, sender: Sender, stills: StillStage, line: StatusLine, link: EdgeLink) -> None:
         self._send_status("running", sender, stills)
-        media_s = self._duration_s()
+        media_s = self._counts.duration_s(self._config.fps)
         rate_bps = self._ledger.window_bytes(None, self._now_ns) * 8 * SECOND_NS / self._ledger.window_ns
         sent = sum(self._ledger.fates("sent").values())
         heard = "a ground listens" if link.heard() else "no ground listens"
@@ -354,7 +325,11 @@ class Edge:
         self._status_sequence += 1
 
     def _status(self, state: str, sender: Sender, stills: StillStage, at_ns: int) -> Status:
-        account, counts, ledger = self._ledger.summary(self._duration_s()), self._counts, self._ledger
+        account, counts, ledger = (
+            self._ledger.summary(self._counts.duration_s(self._config.fps)),
+            self._counts,
+            self._ledger,
+        )
         age_ns = None if self._inbox.received_ns is None else self._clock() - self._inbox.received_ns
         return Status(
             session_id=self._session_id,
@@ -387,7 +362,7 @@ class Edge:
                 tracks=stills.tracks,
                 base_queue=0,
                 still_queue=stills.waiting,
-                encode_ms=counts.encode_ns / max(1, counts.encoded) / _MILLION,
+                encode_ms=counts.encode_ms,
                 detect_ms=stills.sight_ms,
                 feedback_age_ms=-1 if age_ns is None else max(0, age_ns // _MILLION),
             ),
@@ -395,17 +370,10 @@ class Edge:
 
     def _say_goodbye(self, sender: Sender, stills: StillStage, link: EdgeLink) -> None:
         """Let the ground finish, then tell it that this was all."""
-        if self._lockstep:
-            self._follow_ground(self._counts.last_index + 10**9, stills)
         self._send_status("ended", sender, stills)
         if link.heard():  # what is still in a queue would be lost with the session
             base, roi = sender.base_sequence + 1, sender.still_sequence + 1
             self._inbox.wait_for_messages(base=base, roi=roi, timeout_s=_GOODBYE_S)
-
-    def _duration_s(self) -> float:
-        if self._counts.first_index is None:
-            return 0.0
-        return (self._counts.last_index - self._counts.first_index + 1) / self._config.fps
 
     def _facts(self, stills: StillStage, link: EdgeLink) -> EdgeRun:
         counts, config = self._counts, self._config
@@ -415,13 +383,13 @@ class Edge:
             method=config.method,
             frames=counts.encoded,
             frames_dropped=counts.dropped,
-            duration_s=self._duration_s(),
+            duration_s=self._counts.duration_s(self._config.fps),
             budget_bps=config.budget_bps,
             base_bps=config.base_bps,
             keyframes=self._keyframes.sent,
             keyframe_requests=self._keyframes.requests,
             tracks=stills.tracks,
-            encode_ms=counts.encode_ns / max(1, counts.encoded) / _MILLION,
+            encode_ms=counts.encode_ms,
             sight_ms=stills.sight_ms,
             unusable_messages=link.unusable,
         )

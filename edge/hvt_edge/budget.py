@@ -20,6 +20,7 @@ the total holds all the same.
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import deque
 from dataclasses import dataclass
 
@@ -31,6 +32,8 @@ __all__ = ["BudgetSettings", "RollingBudget"]
 _SECOND_NS = 1_000_000_000
 _MEMORY_WINDOWS = 5
 """How many windows of the base's recent behaviour the forecast looks back on."""
+_FORECASTS = 30
+"""At how many moments of the coming window the forecast is made, at most: what it costs stays bounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,17 +49,27 @@ class BudgetSettings:
 
 
 class RollingBudget:
-    """Admits stills. Time is an argument and never goes back."""
+    """Admits stills. Time is an argument.
+
+    Two threads may ask with clocks that differ a little, and a base message may be recorded for a time still to come:
+    the order of the calls does not matter as long as no time is more than a window behind another.
+    """
 
     def __init__(self, settings: BudgetSettings) -> None:
         self._settings = settings
         self._total = settings.total_bps * settings.window_ns / 8 / _SECOND_NS
         self._step_ns = round(_SECOND_NS / settings.fps)
-        self._steps = max(1, round(settings.window_ns / self._step_ns))
-        self._events: deque[tuple[int, int]] = deque()
+        steps = max(1, round(settings.window_ns / self._step_ns))
+        self._forecasts = np.unique(
+            np.linspace(0, steps, min(steps, _FORECASTS) + 1).round().astype(np.int64)
+        )
+        self._spans_ns = settings.window_ns - self._forecasts * self._step_ns
+        self._events: list[tuple[int, int]] = []
+        """(time, line bytes), in order of time."""
+        self._asked_ns: int | None = None
         self._last_ns = 0
-        self._base_steps: deque[int] = deque(maxlen=self._steps * _MEMORY_WINDOWS)
-        self._burst = np.zeros(self._steps + 1)
+        self._base_steps: deque[int] = deque(maxlen=steps * _MEMORY_WINDOWS)
+        self._burst = np.zeros(len(self._forecasts))
         self._tokens = self._cap = (settings.total_bps - settings.base_bps) * settings.carry_s / 8
         self._tokens_ns: int | None = None
 
@@ -65,16 +78,23 @@ class RollingBudget:
         """What one base frame takes on average at B_v, in line bytes."""
         return self._settings.base_bps / 8 / self._settings.fps
 
+    @property
+    def most_still_bytes(self) -> int:
+        """The most line bytes that `still_room` ever gives, while the base keeps to its share."""
+        spare_bps = self._settings.total_bps - self._settings.base_bps
+        return int(min(self._cap, spare_bps * self._settings.window_ns / 8 / _SECOND_NS))
+
     def record_base(self, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
-        """Count one base message (or metadata that rides beside it)."""
+        """Count one base message; ``now_ns`` is when `earliest_ns` lets it go."""
         self._record(line_bytes, now_ns)
         self._last_ns = max(self._last_ns, now_ns)
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
         self._burst = self._recent_bursts()
 
     def record_metadata(self, line_bytes: int, *, now_ns: int) -> None:
-        """Count a message that belongs to neither stream, such as ``status``."""
+        """Count a message that belongs to neither stream, such as ``status``; it waits as the base does."""
         self._record(line_bytes, now_ns)
+        self._last_ns = max(self._last_ns, now_ns)
 
     def record_still(self, line_bytes: int, *, now_ns: int) -> None:
         """Count one still; it was admitted by `still_room` at this very time."""
@@ -85,19 +105,20 @@ class RollingBudget:
     def earliest_ns(self, line_bytes: int, *, now_ns: int) -> int:
         """Return when a message of so many line bytes may go: now, or as soon as its window has room.
 
-        Messages keep their order: never before what was recorded last. A message that no window can hold goes one
-        window from now at the latest.
+        Messages keep their order: never before the base message or metadata recorded last. The wait beyond that is
+        one window at the most, also for a message that no window can hold.
         """
-        now_ns = max(now_ns, self._last_ns)
+        self._note_asked(now_ns)
         window_ns = self._settings.window_ns
-        held = sum(size for at_ns, size in self._events if at_ns > now_ns - window_ns)
-        for at_ns, size in sorted(self._events):
+        at_ns = max(now_ns, self._last_ns)
+        inside = [event for event in self._events if event[0] > at_ns - window_ns]
+        held = sum(size for _, size in inside)
+        for event_ns, size in inside:
             if held + line_bytes <= self._total:
                 break
-            if at_ns > now_ns - window_ns:
-                held -= size
-                now_ns = at_ns + window_ns
-        return now_ns
+            held -= size
+            at_ns = max(at_ns, event_ns + window_ns)
+        return at_ns
 
     def still_room(self, now_ns: int) -> int:
         """Return how many line bytes a still may take now; 0 where it has to wait."""
@@ -109,10 +130,14 @@ class RollingBudget:
         return self._window_room(now_ns) + self.base_step_bytes >= keyframe_bytes
 
     def _record(self, line_bytes: int, now_ns: int) -> None:
-        self._events.append((now_ns, line_bytes))
-        # Twice the window: a still may be asked about a little before a base message that waits.
-        while self._events[0][0] <= now_ns - 2 * self._settings.window_ns:
-            self._events.popleft()
+        insort(self._events, (now_ns, line_bytes))
+        # Twice the window before whoever asks: a still may be asked about while a base message waits for later.
+        oldest_ns = min(now_ns, self._asked_ns or now_ns) - 2 * self._settings.window_ns
+        while self._events[0][0] <= oldest_ns:
+            del self._events[0]
+
+    def _note_asked(self, now_ns: int) -> None:
+        self._asked_ns = max(now_ns, self._asked_ns or now_ns)
 
     def _refill(self, now_ns: int) -> None:
         if self._tokens_ns is not None:
@@ -125,20 +150,20 @@ class RollingBudget:
         """The least room over every window that would contain a message sent now.
 
         The window that ends ``k`` base frames from now holds the past bytes younger than the window less
-        ``k`` frames, and ``k`` frames of the base to come.
+        ``k`` frames, and ``k`` frames of the base to come. The first, of ``k`` = 0, also holds what was recorded for
+        later than now: with it the room is never more than any window has, whatever the base does.
         """
-        ages = np.array([now_ns - at_ns for at_ns, _ in self._events], np.int64)
-        sizes = np.array([size for _, size in self._events], np.float64)
-        steps = np.arange(self._steps + 1)
-        spans_ns = self._settings.window_ns - steps * self._step_ns
-        past = np.array([sizes[ages < span].sum() for span in spans_ns])
+        self._note_asked(now_ns)
+        times_ns = np.array([at_ns for at_ns, _ in self._events], np.int64)
+        upto = np.cumsum([0, *(size for _, size in self._events)])
+        past = upto[-1] - upto[np.searchsorted(times_ns, now_ns - self._spans_ns, side="right")]
         return float((self._total - past - self._burst).min())
 
     def _recent_bursts(self) -> npt.NDArray[np.float64]:
-        """Bytes that ``k`` base frames in a row may take, for k = 0 … frames in a window."""
-        sums = np.concatenate([[0.0], np.cumsum(self._base_steps)])
-        mean = np.arange(self._steps + 1, dtype=np.float64) * self.base_step_bytes
-        longest = min(self._steps, len(self._base_steps))
-        for count in range(1, longest + 1):
-            mean[count] = max(mean[count], float((sums[count:] - sums[:-count]).max()))
-        return mean
+        """Bytes that ``k`` base frames in a row may take, for each ``k`` of the forecast."""
+        upto = np.cumsum([0, *self._base_steps])
+        most = self._forecasts.astype(np.float64) * self.base_step_bytes
+        for index, count in enumerate(self._forecasts.tolist()):
+            if 0 < count < len(upto):
+                most[index] = max(most[index], float((upto[count:] - upto[:-count]).max()))
+        return most

@@ -8,7 +8,7 @@ from typing import Literal, cast
 from hvt_common.values import View
 from hvt_common.vision.detect import Detector, open_detector
 from hvt_common.vision.still_codec import JpegCodec
-from hvt_common.vision.track import ByteTracker, TrackerSettings
+from hvt_common.vision.track import ByteTracker, TrackerSettings, weak_confidence
 from hvt_edge.budget import BudgetSettings, RollingBudget
 from hvt_edge.candidates import TrackMemory
 from hvt_edge.choose import Chooser, ChooserSettings
@@ -39,19 +39,17 @@ def make_detector(config: EdgeConfig) -> Detector:
     return open_detector(
         config.detector,
         labels=config.labels,
-        confidence=min(config.confidence, TrackerSettings().low_confidence),
+        confidence=weak_confidence(config.confidence),
         nms_iou=config.nms_iou,
         threads=config.threads,
+        provider=config.provider,
     )
 
 
 def make_sight(config: EdgeConfig, *, detector: Detector, view: View) -> Sight:
     """Decoder, detector and tracker of the edge's own stream."""
-    settings = TrackerSettings(
-        track_confidence=config.confidence,
-        low_confidence=min(config.confidence, TrackerSettings().low_confidence),
-        new_confidence=config.confidence,
-        camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion),
+    settings = TrackerSettings.starting_at(
+        config.confidence, camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion)
     )
     return Sight(
         detector,

@@ -21,6 +21,9 @@ __all__ = ["Chooser", "ChooserSettings"]
 
 _FULL_SHARE = 0.9
 """With so much of the most a still can ever be given, it is no use to wait for more."""
+_PATIENCE_SHARE = 0.75
+"""After this share of the longest wait, the most useful wish is coded to whatever room there is: one that never
+gets the room it is expected to need must not hold up all others for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +65,8 @@ class Chooser:
         self._cost = CostModel()
         self._queue = StillQueue(settings.queue)
         self._base_frames: dict[int, Image] = {}
+        self._held_up: dict[int, int] = {}
+        """Track id → since when it has been the most useful and without room (ns)."""
         self._sequence = 0
 
     @property
@@ -105,13 +110,12 @@ class Chooser:
             self._on_fate("dropped", reason)
         while (waiting := self._queue.best()) is not None:
             limit_bytes = room_bytes()
-            expected_bytes = self._cost.estimate().of(waiting.request.candidate)
-            if limit_bytes < min(expected_bytes, self._settings.most_bytes * _FULL_SHARE):
+            if not self._may_go(waiting, limit_bytes, now_ns=now_ns):
                 break  # the most useful waits for its room; a lesser one does not slip in before it
             still = self._make(waiting, limit_bytes, now_ns=now_ns)
             if still is not None:
                 yield still
-        self._forget_base_frames()
+        self._forget()
 
     def record_feedback(
         self, track_id: int, *, class_name: str, confidence: float, entropy_nats: float
@@ -126,8 +130,18 @@ class Chooser:
         for _ in self._queue.clear():
             self._on_fate("dropped", "ended")
 
+    def _may_go(self, waiting: Waiting, limit_bytes: int, *, now_ns: int) -> bool:
+        """Whether there is as much room as it will need, or it has waited for that long enough."""
+        expected_bytes = self._cost.estimate().of(waiting.request.candidate)
+        if limit_bytes >= min(expected_bytes, self._settings.most_bytes * _FULL_SHARE):
+            return True
+        # By track, not by wish: methods wish again at each step, and every new wish takes the place of the last.
+        since_ns = self._held_up.setdefault(waiting.request.candidate.track_id, now_ns)
+        return now_ns - since_ns >= _PATIENCE_SHARE * self._settings.queue.max_age_ns
+
     def _make(self, waiting: Waiting, limit_bytes: int, *, now_ns: int) -> Still | None:
         self._queue.remove(waiting)
+        self._held_up.pop(waiting.request.candidate.track_id, None)
         candidate, frame = waiting.request.candidate, waiting.frame
         made = self._maker.make(
             frame,
@@ -158,6 +172,11 @@ class Chooser:
         )
         self._on_fate("sent", still.reason)
 
-    def _forget_base_frames(self) -> None:
-        wanted = {waiting.frame.index for waiting in self._queue}
-        self._base_frames = {index: image for index, image in self._base_frames.items() if index in wanted}
+    def _forget(self) -> None:
+        """Keep nothing of wishes that wait no more."""
+        frames = {waiting.frame.index for waiting in self._queue}
+        tracks = {waiting.request.candidate.track_id for waiting in self._queue}
+        self._base_frames = {index: image for index, image in self._base_frames.items() if index in frames}
+        self._held_up = {
+            track_id: since_ns for track_id, since_ns in self._held_up.items() if track_id in tracks
+        }

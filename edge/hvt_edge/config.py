@@ -22,8 +22,10 @@ from hvt_common.errors import UserError
 from hvt_common.link.keys import EdgeKeys
 from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
-from hvt_edge.encode import PRESETS, minimum_bps
+from hvt_common.vision.providers import PROVIDERS
+from hvt_edge.encode import PRESETS
 from hvt_edge.methods.registry import METHODS, method
+from hvt_edge.rate import least_base_bps
 from hvt_edge.source import check_shape
 
 __all__ = ["REGIMES", "EdgeConfig", "Regime", "check"]
@@ -91,6 +93,9 @@ class EdgeConfig:
         choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion"
     )
     threads: int = option(integer(1, 64), 2, "threads of the detector")
+    provider: str = option(
+        choice(*PROVIDERS), "auto", "what runs the detector; auto says what it took and why"
+    )
 
     preset: str = option(choice(*PRESETS), "veryfast", "x265 preset")
     keyframe_interval: float = option(DURATION, 10.0, "time between keyframes; 0 for on demand only")
@@ -148,7 +153,7 @@ def check(config: EdgeConfig) -> EdgeConfig:
             f"--window {config.window:g}s is not accepted: give one frame ({1 / config.fps:g}s) to 60s"
         )
     config = replace(config, budget=config.budget or regime.budget_bps, video_share=share)
-    least_bps = minimum_bps(config.size, config.fps)
+    least_bps = least_base_bps(config.size, config.fps, edge_id=config.edge_id)
     if config.base_bps < least_bps:
         raise UserError(
             f"--budget {bitrate_text(config.budget_bps)} leaves {bitrate_text(config.base_bps)} for video, but "

@@ -8,7 +8,8 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
 * ``keyint=-1``: no keyframe comes by itself. The edge asks for each one, so that stills can yield to it.
 * ``pools=1``: with a pool of several threads the row-level rate control sees a different order of rows each
   run, and the same input gives other bytes. One worker costs nothing measurable at zero latency.
-* ``open-gop=0`` makes a forced I frame an IDR; ``repeat-headers=1`` puts the parameter sets before it.
+* ``open-gop=0`` makes a forced I frame an IDR, but within ``min-keyint`` of the last one (a second, by default) it
+  stays a plain I frame that nobody can start at; ``repeat-headers=1`` puts the parameter sets before an IDR.
 * BT.709 limited range, signalled: viewers assume it for HD.
 """
 
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import av
-import av.logging
+import av.error
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import PictureType
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
@@ -33,10 +34,11 @@ PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
 VBV_S = 0.15
 """Depth of the VBV buffer in seconds of the base rate."""
 
-# At QP 51 a keyframe of a textured 1280x720 aerial picture still takes about 6 kB (0.052 bit a pixel), and
-# the frames after it about 2.5 kbit: x265 can go no lower, whatever the target says.
+# At QP 51 a keyframe of a textured 1280x720 aerial picture still takes about 6 kB (0.052 bit a pixel), and the frames
+# after it about 4 kbit: x265 can go no lower, whatever the target says. With a keyframe each 10 s a run of 10 s takes
+# 1.21 x a target of 58 kbps, 1.11 x 100, 1.06 x 150, 1.03 x 200.
 _KEYFRAME_FLOOR_BITS_PER_PX = 0.052
-_STREAM_FLOOR_BITS_PER_PX = 0.0042
+_STREAM_FLOOR_BITS_PER_PX = 0.0075
 
 
 def keyframe_floor_bytes(size: tuple[int, int]) -> int:
@@ -45,7 +47,7 @@ def keyframe_floor_bytes(size: tuple[int, int]) -> int:
 
 
 def minimum_bps(size: tuple[int, int], fps: float) -> int:
-    """The lowest base rate that x265 can follow at this size and frame rate."""
+    """The lowest payload rate that x265 can follow at this size and frame rate, within 1.1 x over ten seconds."""
     return round(size[0] * size[1] * fps * _STREAM_FLOOR_BITS_PER_PX)
 
 
@@ -64,7 +66,8 @@ class BaseEncoder:
     """Turns frames into access units, each at once."""
 
     def __init__(self, settings: EncoderSettings) -> None:
-        av.logging.set_level(av.logging.PANIC)  # libx265 reports what `log-level=none` does not silence
+        # Never `av.logging.set_level`: it makes a decoder's worker that logs wait for the GIL, while the thread that
+        # closes that decoder holds the GIL and waits for the worker. PyAV is silent by default.
         self._to_yuv = VideoReformatter()
         self._context = _open(settings)
         self._count = 0
@@ -81,10 +84,13 @@ class BaseEncoder:
         )
         picture.pts = self._count
         picture.pict_type = PictureType.I if keyframe else PictureType.NONE
-        first, self._count = self._count == 0, self._count + 1
-        data = b"".join(bytes(packet) for packet in self._context.encode(picture))
+        self._count += 1
+        (packet,) = self._context.encode(picture)  # zero latency: one in, one out
         return AccessUnit(
-            frame_index=frame.index, capture_ns=frame.capture_ns, data=data, keyframe=keyframe or first
+            frame_index=frame.index,
+            capture_ns=frame.capture_ns,
+            data=bytes(packet),
+            keyframe=packet.is_keyframe,
         )
 
 
@@ -92,6 +98,7 @@ def _open(settings: EncoderSettings) -> VideoCodecContext:
     kbps = max(1, settings.bitrate_bps // 1000)
     parameters = {
         "keyint": -1,
+        "min-keyint": 1,
         "scenecut": 0,
         "bframes": 0,
         "rc-lookahead": 0,

@@ -24,7 +24,8 @@ class FeedbackInbox:
         self._changed = threading.Condition()
         self._results: deque[StillResult] = deque(maxlen=_MAX_RESULTS)
         self._last_frame_index = -1
-        self._answered: set[int] = set()
+        self._answered: dict[int, None] = {}  # in the order in which they came
+        self._done_sequence = -1
         self._base_messages = 0
         self._roi_messages = 0
         self.received_ns: int | None = None
@@ -38,11 +39,12 @@ class FeedbackInbox:
             self._base_messages = max(self._base_messages, feedback.base_messages)
             self._roi_messages = max(self._roi_messages, feedback.roi_messages)
             for result in feedback.stills:
-                if result.still_sequence not in self._answered:
-                    self._answered.add(result.still_sequence)
+                sequence = result.still_sequence
+                if sequence > self._done_sequence and sequence not in self._answered:
+                    self._answered[sequence] = None
                     self._results.append(result)
-            if len(self._answered) > 2 * _MAX_RESULTS:  # a ground that answers what was never asked
-                self._answered = set(sorted(self._answered)[-_MAX_RESULTS:])
+            while len(self._answered) > 2 * _MAX_RESULTS:  # a ground may answer what was never asked
+                del self._answered[next(iter(self._answered))]
             self._changed.notify_all()
 
     def take(self) -> list[StillResult]:
@@ -53,8 +55,10 @@ class FeedbackInbox:
             return results
 
     def take_up_to(self, sequence: int) -> list[StillResult]:
-        """Return and forget the results of stills up to this one, in the order of the stills."""
+        """Return and forget the results of stills up to this one, in their order; more for these come too late."""
         with self._changed:
+            self._done_sequence = max(self._done_sequence, sequence)
+            self._answered = dict.fromkeys(one for one in self._answered if one > self._done_sequence)
             ready = sorted(
                 (one for one in self._results if one.still_sequence <= sequence),
                 key=lambda one: one.still_sequence,
@@ -68,7 +72,7 @@ class FeedbackInbox:
         """Wait until a ground is done with this frame and has answered these stills; False after the time-out."""
         with self._changed:
             return self._changed.wait_for(
-                lambda: self._last_frame_index >= frame_index and stills <= self._answered, timeout_s
+                lambda: self._last_frame_index >= frame_index and stills <= self._answered.keys(), timeout_s
             )
 
     def wait_for_messages(self, *, base: int, roi: int, timeout_s: float) -> bool:

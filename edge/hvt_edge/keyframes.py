@@ -21,8 +21,9 @@ class KeyframeSettings:
     interval_ns: int = 10 * _SECOND_NS
     patience_ns: int = 3 * _SECOND_NS // 5
     scheduled_patience_ns: int = 2 * _SECOND_NS
-    rest_ns: int = _SECOND_NS // 2
-    """After a keyframe, requests are taken as answered by it for so long: they crossed it on the way."""
+    rest_ns: int = 3 * _SECOND_NS // 10
+    """After a keyframe, requests are taken as answered by it for so long: they crossed it on the way. With the
+    second request of a ground (0.3 s after the first) and the patience it stays under a second."""
 
 
 class KeyframePlan:

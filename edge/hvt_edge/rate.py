@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from hvt_edge.encode import VBV_S, EncoderSettings
+from hvt_edge.encode import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.send import base_overhead_bps
 
-__all__ = ["encoder_settings"]
+__all__ = ["encoder_settings", "least_base_bps"]
 
 # The fullest rolling second over the target, keyframes on demand included, from 300 kbps up (see encode).
 _PEAK = 1.14
 _TIGHT_VBV_S = 0.1
 _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
+_KEYFRAME_EVERY_S = 10.0
+"""x265 never takes back about 50 kbit of its first keyframe and 20 kbit of each later one (1280x720, at any rate):
+1.6 % of 300 kbps in ten seconds. So much is asked for less."""
 
 
 def encoder_settings(
@@ -23,7 +26,7 @@ def encoder_settings(
     """
     tight = base_bps * _PEAK > total_bps
     line_bps = min(base_bps, total_bps / _TIGHT_PEAK) if tight else base_bps
-    payload_bps = line_bps - base_overhead_bps(line_bps, fps=fps, edge_id=edge_id)
+    payload_bps = line_bps - _beside_bps(line_bps, size=size, fps=fps, edge_id=edge_id)
     return EncoderSettings(
         size=size,
         fps=fps,
@@ -31,3 +34,15 @@ def encoder_settings(
         preset=preset,
         vbv_s=_TIGHT_VBV_S if tight else VBV_S,
     )
+
+
+def least_base_bps(size: tuple[int, int], fps: float, *, edge_id: str) -> int:
+    """The lowest B_v at which x265 can still follow its target."""
+    payload_bps = minimum_bps(size, fps)
+    return round(payload_bps + _beside_bps(payload_bps, size=size, fps=fps, edge_id=edge_id))
+
+
+def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
+    """What of the base's rate is not x265's to spend: headers, framing, ``status``, and its debt of keyframes."""
+    debt_bps = 8 * keyframe_floor_bytes(size) / _KEYFRAME_EVERY_S
+    return base_overhead_bps(line_bps, fps=fps, edge_id=edge_id) + debt_bps

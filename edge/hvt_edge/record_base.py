@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,8 @@ from hvt_common.values import AccessUnit
 
 __all__ = ["BaseRecorder"]
 
+_log = logging.getLogger(__name__)
+
 
 class BaseRecorder:
     """A remux, no second encode: access units go in as they were sent."""
@@ -26,16 +29,16 @@ class BaseRecorder:
         self._last_pts = -1
         # Short clusters, each flushed: a kill costs the last fifth of a second, and the file stays whole.
         options = {"cluster_time_limit": "200", "flush_packets": "1"}
-        try:
-            self._container = av.open(str(path), "w", format="matroska", options=options)
-        except (av.error.FFmpegError, OSError) as error:
-            raise UserError(
-                f"--record-base {path} cannot be written ({error}): name a file in a folder that exists"
-            ) from None
+        self._path = path
+        self._container = av.open(str(path), "w", format="matroska", options=options)
         self._stream: av.VideoStream | None = None
 
     def write(self, unit: AccessUnit) -> None:
-        """Append one access unit; the first has to be a keyframe."""
+        """Append one access unit; the first has to be a keyframe.
+
+        Raises:
+            UserError: the file cannot be written (any further).
+        """
         if self._stream is None:
             self._stream = self._open_stream(unit.data)
             self._start_ns = unit.capture_ns
@@ -48,11 +51,19 @@ class BaseRecorder:
         packet.pts = packet.dts = pts
         packet.time_base = self._time_base
         packet.is_keyframe = unit.keyframe
-        self._container.mux(packet)
+        try:
+            self._container.mux(packet)
+        except (av.error.FFmpegError, OSError) as error:
+            raise UserError(
+                f"--record-base {self._path} cannot be written ({error.strerror}): name a file that can"
+            ) from None
 
     def close(self) -> None:
         """Write the index and close the file."""
-        self._container.close()
+        try:
+            self._container.close()
+        except (av.error.FFmpegError, OSError) as error:
+            _log.warning("%s has no index: %s", self._path, error.strerror)
 
     def __enter__(self) -> Self:
         return self

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row
 from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
-from hvt_common.link.wire import BaseHeader, Flags, RoiHeader, Status
+from hvt_common.link.wire import BaseHeader, Flags, RoiHeader, Status, fitted_text
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.budget import RollingBudget
 
@@ -27,11 +27,13 @@ __all__ = [
 ]
 
 BASE_ATTACHMENT_BYTES = 48
-"""What a `BaseHeader` takes, give or take two."""
-STILL_ATTACHMENT_BYTES = 128
-"""What a `RoiHeader` takes at most, with the names that detectors and methods use."""
+"""What a `BaseHeader` takes at most."""
+STILL_ATTACHMENT_BYTES = 232
+"""What a `RoiHeader` takes at most; with the usual names it is half of that."""
 STATUS_BYTES = 320
 """What a `Status` takes."""
+_STATUS_GROWTH_BYTES = 16
+"""By how much one may grow when it is made for a later moment: its two times."""
 
 
 class Outlet(Protocol):
@@ -104,14 +106,15 @@ class Sender:
         self._outlet.put(Row.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Row.BASE].encoding)
         return line_bytes
 
-    def still_room_bytes(self, now_ns: int) -> int:
+    def still_room_bytes(self, now_ns: int, *, media_type: str) -> int:
         """Payload that a still may take now."""
         with self._lock:
             room = self._budget.still_room(now_ns)
-        line = overhead_bytes(
-            room, STILL_ATTACHMENT_BYTES, key=self._keys.key(Row.ROI), encoding="image/jpeg"
-        )
-        return max(0, room - STILL_ATTACHMENT_BYTES - line)
+        return self._payload_bytes(room, media_type)
+
+    def most_still_bytes(self, *, media_type: str) -> int:
+        """Payload of the largest still that `still_room_bytes` ever admits."""
+        return self._payload_bytes(self._budget.most_still_bytes, media_type)
 
     def still(self, still: Still, *, media_type: str, now_ns: int) -> None:
         """Send one still that `still_room_bytes` admitted at this very time."""
@@ -125,12 +128,14 @@ class Sender:
         self._outlet.put(Row.ROI, still.data, attachment=attachment, encoding=media_type)
 
     def status(self, make: Callable[[int], Status], *, now_ns: int) -> None:
-        """Send the once-a-second report, made for the moment at which it may go."""
-        size_bytes = self._line_bytes(Row.STATUS, make(now_ns).pack(), 0)
+        """Send the once-a-second report, made for the moment at which it may go.
+
+        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment.
+        """
         with self._lock:
+            size_bytes = _STATUS_GROWTH_BYTES + self._line_bytes(Row.STATUS, make(now_ns).pack(), 0)
             at_ns = self._budget.earliest_ns(size_bytes, now_ns=now_ns)
-        payload = make(at_ns).pack()
-        with self._lock:
+            payload = make(at_ns).pack()
             line_bytes = self._count(Row.STATUS, Channel.META, payload, b"", at_ns=at_ns)
             self._budget.record_metadata(line_bytes, now_ns=at_ns)
         self._wait_until(at_ns)
@@ -158,13 +163,20 @@ class Sender:
             track_id=still.track_id,
             box_source_px=still.box_source_px,
             crop_source_px=still.crop_source_px,
-            class_name=still.class_name[:64],
+            class_name=fitted_text(still.class_name, 64),
             confidence=still.confidence,
-            reason=still.reason,
+            reason=fitted_text(still.reason, 48),
             codec=still.codec,
             quality_pct=still.quality_pct,
             parameters={},
         )
+
+    def _payload_bytes(self, room_bytes: int, media_type: str) -> int:
+        """What of so many line bytes is left for a still's payload."""
+        around = STILL_ATTACHMENT_BYTES + overhead_bytes(
+            room_bytes, STILL_ATTACHMENT_BYTES, key=self._keys.key(Row.ROI), encoding=media_type
+        )
+        return max(0, room_bytes - around)
 
     def _count(
         self, row: Row, channel: Channel, payload: bytes, attachment: bytes, *, at_ns: int, encoding: str = ""

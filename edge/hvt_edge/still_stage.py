@@ -11,20 +11,20 @@ from functools import partial
 from types import TracebackType
 from typing import Self
 
+from hvt_common.distinct import DistinctIds
 from hvt_common.link.wire import StillResult
+from hvt_common.priority import give_way
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.choose import Chooser
 from hvt_edge.keyframes import KeyframePlan
 from hvt_edge.send import Sender
-from hvt_edge.sight import Sight
+from hvt_edge.sight import Seen, Sight
 
 __all__ = ["StillStage", "StillWorker"]
 
 _BEHIND_FRAMES = 3
 """With more frames waiting than this, detection is put off; decoding never is."""
-
-
-_REMEMBERED_TRACKS = 10_000
+_FINISH_S = 1.0
 
 
 class StillStage:
@@ -38,11 +38,14 @@ class StillStage:
         self._sender = sender
         self._keyframes = keyframes
         self._media_type = media_type
-        self._track_ids: set[int] = set()
+        self._track_ids = DistinctIds()
         self._sight_ns = 0
         self._steps = 0
-        self.tracks = 0
+
+    @property
+    def tracks(self) -> int:
         """Distinct tracks so far."""
+        return self._track_ids.count
 
     @property
     def waiting(self) -> int:
@@ -54,23 +57,25 @@ class StillStage:
         """Mean time to decode, detect and track, over all frames."""
         return self._sight_ns / max(1, self._steps) / 1e6
 
-    def step(
-        self, frame: Frame, unit: AccessUnit, *, clock: Callable[[], int], hurry: bool = False
-    ) -> set[int]:
-        """See the frame, choose, send the stills that fit; return their sequence numbers.
-
-        ``clock`` tells the time that windows go by.
-        """
+    def see(self, frame: Frame, unit: AccessUnit, *, hurry: bool = False) -> Seen:
+        """Decode, detect and track one frame."""
         began_ns = time.perf_counter_ns()
         seen = self._sight.see(frame, unit, hurry=hurry)
         self._sight_ns += time.perf_counter_ns() - began_ns
         self._steps += 1
-        self._count_tracks(seen.tracks.ids.tolist())
-        now_ns = clock()
-        room = partial(self._sender.still_room_bytes, now_ns)
+        self._track_ids.add(seen.tracks.ids.tolist())
+        return seen
+
+    def send(self, seen: Seen, *, now_ns: int, held: bool | None = None) -> set[int]:
+        """Choose, and send the stills that fit now; return their sequence numbers.
+
+        ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
+        asks the plan.
+        """
+        room = partial(self._sender.still_room_bytes, now_ns, media_type=self._media_type)
         self._chooser.consider(seen, now_ns=now_ns, room_bytes=room())
         sent: set[int] = set()
-        if self._keyframes.due(now_ns):
+        if self._keyframes.due(now_ns) if held is None else held:
             return sent
         for still in self._chooser.stills(now_ns=now_ns, room_bytes=room):
             self._sender.still(still, media_type=self._media_type, now_ns=now_ns)
@@ -93,20 +98,13 @@ class StillStage:
         """Give up what still waits."""
         self._chooser.close()
 
-    def _count_tracks(self, ids: list[int]) -> None:
-        new = set(ids) - self._track_ids
-        self.tracks += len(new)
-        self._track_ids.update(new)
-        if len(self._track_ids) > 2 * _REMEMBERED_TRACKS:  # ids only grow: the oldest do not come back
-            self._track_ids = set(sorted(self._track_ids)[-_REMEMBERED_TRACKS:])
-
 
 class StillWorker:
     """Runs a `StillStage` in a thread of its own, so that detection never delays the base stream.
 
     The queue is bounded; where it is `full` the frame loop drops the next frame before encoding. Before each frame
-    the thread asks ``hear`` for what grounds have reported. An error in it ends the process: `offer` and `close`
-    raise it.
+    the thread asks ``hear`` for what grounds have reported. An error in it ends the process: `full`, `offer` and
+    `close` raise it.
     """
 
     def __init__(
@@ -122,12 +120,14 @@ class StillWorker:
         self._clock = clock
         self._frames: queue.Queue[tuple[Frame, AccessUnit] | None] = queue.Queue(length)
         self._error: BaseException | None = None
+        self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-stills", daemon=True)
         self._thread.start()
 
     @property
     def full(self) -> bool:
         """Whether the next `offer` would have to wait."""
+        self._raise_error()  # a dead thread leaves a full queue, and `offer` is not called any more
         return self._frames.full()
 
     def offer(self, frame: Frame, unit: AccessUnit) -> None:
@@ -136,10 +136,13 @@ class StillWorker:
         self._frames.put((frame, unit))
 
     def close(self) -> None:
-        """Let the thread finish what it has, at most for a second, and join it."""
+        """Let the thread finish what it has, at most for a second, then leave the rest; join it."""
+        until_s = time.monotonic() + _FINISH_S
         with contextlib.suppress(queue.Full):
-            self._frames.put(None, timeout=1.0)
-        self._thread.join(timeout=2.0)
+            self._frames.put(None, timeout=_FINISH_S)
+        self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
+        self._given_up.set()
+        self._thread.join(timeout=_FINISH_S)
         self._raise_error()
 
     def __enter__(self) -> Self:
@@ -151,11 +154,13 @@ class StillWorker:
         self.close()
 
     def _run(self) -> None:
+        give_way()
         try:
-            while (item := self._frames.get()) is not None:
+            while (item := self._frames.get()) is not None and not self._given_up.is_set():
                 behind = self._frames.qsize() >= _BEHIND_FRAMES
                 self._stage.hear(self._hear())
-                self._stage.step(*item, clock=self._clock, hurry=behind)
+                seen = self._stage.see(*item, hurry=behind)
+                self._stage.send(seen, now_ns=self._clock())
         except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
             self._error = error
 

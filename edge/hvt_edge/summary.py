@@ -23,7 +23,7 @@ class EdgeRun:
     frames_dropped: int
     """Given up before encoding because the link or the machine was behind."""
     duration_s: float
-    """Of the stream: frames of the base rate, dropped ones included."""
+    """From the first frame sent to the last; frames dropped between them count."""
     budget_bps: int
     base_bps: int
     """The part of the budget for the base stream."""

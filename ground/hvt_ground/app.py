@@ -15,8 +15,9 @@ from hvt_common.link.wire import Info
 from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_common.report import StatusLine, check_writable
 from hvt_common.units import bitrate_text
-from hvt_ground.build import Models, make_sight, recording_path
+from hvt_ground.build import Models, make_sight, output_path
 from hvt_ground.config import GroundConfig
+from hvt_ground.export_tracks import TrackTable
 from hvt_ground.live_view import LiveView
 from hvt_ground.receive import EdgeReceiver
 from hvt_ground.record import Recorder, RecorderSettings
@@ -64,6 +65,7 @@ class Ground:
                 insecure=config.insecure,
             )
             session = stack.enter_context(open_session(settings))
+            self._make_record_folder()
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges))
             self._say_where(line)
@@ -83,13 +85,18 @@ class Ground:
             raise UserError(
                 f"--record {record} is neither a folder nor named .rrd: give FILE.rrd or a folder"
             )
-        else:
-            try:
-                record.mkdir(parents=True)
-            except OSError as error:
-                raise UserError(
-                    f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
-                ) from None
+
+    def _make_record_folder(self) -> None:
+        """Comes after all that may be refused: a failed start leaves nothing behind."""
+        record = self._config.record
+        if record is None or record.suffix == ".rrd":
+            return
+        try:
+            record.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
+            ) from None
 
     def _say_where(self, line: StatusLine) -> None:
         config = self._config
@@ -133,6 +140,8 @@ class Ground:
 
     def _close_receivers(self) -> None:
         for receiver in self._receivers.values():
+            receiver.stop()
+        for receiver in self._receivers.values():
             receiver.close()
         for receiver in self._receivers.values():
             if receiver.error is not None:
@@ -142,7 +151,7 @@ class Ground:
         config, models = self._config, self._models
         assert models is not None, "run() opens them"
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        path = recording_path(config.record, edge=info.edge, stamp=stamp, taken=self._paths)
+        path = output_path(config.record, suffix=".rrd", edge=info.edge, stamp=stamp, taken=self._paths)
         recorder = Recorder(
             RecorderSettings(
                 path=path,
@@ -156,8 +165,8 @@ class Ground:
                     "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
                     "source": f"{info.source_size[0]}x{info.source_size[1]}",
                     "base": f"{info.base_size[0]}x{info.base_size[1]} at {info.fps:g} fps, {info.codec}",
-                    "detector": config.detector,
-                    "classifier": config.classifier or "detector",
+                    "detector": Path(config.detector).name,
+                    "classifier": Path(config.classifier or "detector").name,
                 },
                 clocked=info.pace == "realtime",
                 live_url=self._view.url if self._view is not None else None,
@@ -167,11 +176,18 @@ class Ground:
             info,
             recorder=recorder,
             recording=path,
+            tables=self._open_tables(info, stamp),
             sight_of=lambda emit: make_sight(config, models, info=info, emit=emit),
             to_local_ns=receiver.clock_offset.to_local_ns,
             clock=time.time_ns,
             report=receiver.report_now,
         )
+
+    def _open_tables(self, info: Info, stamp: str) -> list[TrackTable]:
+        wish = self._config.tracks
+        if wish is None:
+            return []
+        return [TrackTable(output_path(wish, suffix=".csv", edge=info.edge, stamp=stamp, taken=self._paths))]
 
     # Saying
 
@@ -194,7 +210,7 @@ class Ground:
 
     def _summaries(self) -> list[dict[str, Any]]:
         return [
-            summary(session, receiver.reassembler.counters, unusable=receiver.unusable)
+            summary(session, unusable=receiver.unusable)
             for _, receiver in sorted(self._receivers.items())
             for session in receiver.done
         ]

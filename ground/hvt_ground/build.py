@@ -10,14 +10,14 @@ from hvt_common.errors import UserError
 from hvt_common.link.wire import Info
 from hvt_common.vision.classify import Classifier, open_classifier
 from hvt_common.vision.detect import Detector, open_detector
-from hvt_common.vision.track import ByteTracker, TrackerSettings
+from hvt_common.vision.track import ByteTracker, TrackerSettings, weak_confidence
 from hvt_ground.classify_stills import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event
 from hvt_ground.refine import Refiner
 from hvt_ground.sight import GroundSight
 
-__all__ = ["Models", "make_sight", "recording_path"]
+__all__ = ["Models", "make_sight", "output_path"]
 
 MOTION = "motion"
 
@@ -39,9 +39,10 @@ class Models:
         detector = open_detector(
             config.detector,
             labels=config.detector_labels,
-            confidence=min(config.confidence, TrackerSettings().low_confidence),
+            confidence=weak_confidence(config.confidence),
             nms_iou=config.nms_iou,
             threads=config.threads,
+            provider=config.provider,
         )
         if config.classifier in (None, "detector"):
             if config.classifier == "detector" and config.detector == MOTION:
@@ -49,7 +50,9 @@ class Models:
                     "--classifier detector needs a detector that knows classes: give --detector FILE.onnx too"
                 )
             return detector, None
-        return detector, open_classifier(config.classifier, labels=config.labels, threads=config.threads)
+        return detector, open_classifier(
+            config.classifier, labels=config.labels, threads=config.threads, provider=config.provider
+        )
 
 
 def make_sight(
@@ -65,11 +68,8 @@ def make_sight(
     else:
         reader = Redetection(detector, view=info.view)
     tracker = ByteTracker(
-        TrackerSettings(
-            track_confidence=config.confidence,
-            low_confidence=min(config.confidence, TrackerSettings().low_confidence),
-            new_confidence=config.confidence,
-            camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion),
+        TrackerSettings.starting_at(
+            config.confidence, camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion)
         ),
         fps=info.fps,
     )
@@ -89,22 +89,24 @@ def make_sight(
     )
 
 
-def recording_path(record: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
-    """Where a session is recorded, and note it in ``taken``.
+def output_path(wish: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:
+    """Where a file of one session goes, and note it in ``taken``.
 
-    ``record`` is the file or folder of ``--record``; ``stamp`` the time of the session's beginning. A file that the
-    user named is written anew, but each session of this process gets one of its own: the first takes the name, others
-    have the edge's id in it.
+    ``wish`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file is
+    written anew, but each session of this process gets one of its own: the first takes the name, others have the
+    edge's id in it. A file that nobody named is never overwritten.
     """
-    if record is None or record.is_dir() or record.suffix != ".rrd":
-        first = (record or Path()) / f"hvt-{edge}-{stamp}.rrd"
+    if wish is None or wish.is_dir() or wish.suffix != suffix:
+        first = (wish or Path()) / f"hvt-{edge}-{stamp}{suffix}"
         further = first
     else:
-        first, further = record, record.with_name(f"{record.stem}-{edge}.rrd")
+        first, further = wish, wish.with_name(f"{wish.stem}-{edge}{suffix}")
     count, path = 1, first
-    while path in taken or (path != record and path.exists()):
+    while path in taken or (path != wish and path.exists()):
         path = (
-            further if count == 1 and further != first else further.with_name(f"{further.stem}-{count}.rrd")
+            further
+            if count == 1 and further != first
+            else further.with_name(f"{further.stem}-{count}{suffix}")
         )
         count += 1
     taken.add(path)

@@ -8,9 +8,9 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from hvt_common.values import Boxes, Image, Posterior, View
+from hvt_common.values import Image, Posterior, View
+from hvt_common.vision.boxes import iou
 from hvt_common.vision.classify import Classifier
 from hvt_common.vision.detect import Detector
 
@@ -94,7 +94,7 @@ class Redetection:
         found = self._detector.detect(composite(base_bgr, stills, view=self._view))
         answers: list[Posterior | None] = []
         for still in stills:
-            overlaps = _iou(np.array(still.box_base_px, np.float32), found.boxes_xyxy_px)
+            overlaps = iou(np.array([still.box_base_px], np.float32), found.boxes_xyxy_px)[0]
             best = int(overlaps.argmax()) if len(overlaps) else -1
             if best < 0 or overlaps[best] < _SAME_OBJECT_IOU:
                 answers.append(None)
@@ -131,13 +131,3 @@ def composite(base_bgr: Image, stills: Sequence[Decoded], *, view: View) -> Imag
         if right > left and bottom > top:
             picture[top:bottom, left:right] = patch[top - y1 : bottom - y1, left - x1 : right - x1]
     return picture
-
-
-def _iou(box: npt.NDArray[np.float32], boxes: Boxes) -> npt.NDArray[np.float32]:
-    """Overlap of one box with (N, 4) others, (N,)."""
-    low = np.maximum(box[:2], boxes[:, :2])
-    high = np.minimum(box[2:], boxes[:, 2:])
-    shared = np.clip(high - low, 0, None).prod(axis=1)
-    area = (box[2] - box[0]) * (box[3] - box[1])
-    areas = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
-    return np.asarray(shared / np.maximum(area + areas - shared, 1e-6), np.float32)

@@ -35,6 +35,8 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = check(config)
     logging.basicConfig(level=logging.WARNING, format="hvt-ground: %(message)s")
+    if not config.quiet:
+        logging.getLogger("hvt_common.vision.model").setLevel(logging.INFO)  # says what runs each network
     stop = threading.Event()
     for one in (signal.SIGINT, signal.SIGTERM):
         signal.signal(one, lambda *_: stop.set())

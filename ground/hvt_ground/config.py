@@ -8,6 +8,7 @@ from pathlib import Path
 from hvt_common.config import DURATION, PATH, TEXT, choice, integer, number, option, switch
 from hvt_common.errors import UserError
 from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT
+from hvt_common.vision.providers import PROVIDERS
 
 __all__ = ["GroundConfig", "check"]
 
@@ -30,7 +31,7 @@ class GroundConfig:
     labels: Path | None = option(PATH, None, "class names of the classifier, one a line")
     detector_labels: Path | None = option(PATH, None, "class names of the detector, one a line")
     detect_every: int = option(
-        integer(1, 1000, unit=" frames"), 3, "detect on every n-th frame, less when behind"
+        integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame, less when behind"
     )
     confidence: float = option(number(0.01, 1), 0.25, "confidence from which a detection starts a track")
     nms_iou: float = option(number(0.01, 1), 0.45, "overlap above which two boxes of a class are one")
@@ -49,9 +50,15 @@ class GroundConfig:
         "a still's class replaces the track's, or is weighed with the others",
     )
     threads: int = option(integer(1, 64), 2, "threads of the detector and the classifier")
+    provider: str = option(
+        choice(*PROVIDERS), "auto", "what runs the networks; auto says what it took and why"
+    )
 
     record: Path | None = option(
         PATH, None, "FILE.rrd, or a folder for one file an edge", shown_default="hvt-<edge>-<time>.rrd here"
+    )
+    tracks: Path | None = option(
+        PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
     view: bool = switch("also open the Rerun viewer")
     serve: bool = switch("also serve the Rerun web viewer on this machine")

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Generic, Literal, Protocol, TypeVar
 
 __all__ = ["AccessUnitHeader", "Arrival", "Counters", "Reassembler", "Verdict"]
@@ -130,6 +130,12 @@ class Counters:
     sessions: int = 0
     """Adopted; one that starts afresh after numbers that could not be believed counts again."""
     keyframe_requests: int = 0
+
+    def since(self, before: Counters) -> Counters:
+        """What was counted after ``before`` was copied."""
+        return Counters(
+            **{one.name: getattr(self, one.name) - getattr(before, one.name) for one in fields(Counters)}
+        )
 
 
 class Reassembler(Generic[H]):

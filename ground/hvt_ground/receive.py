@@ -23,7 +23,7 @@ from hvt_common.link.wire import (
     UnknownVersionError,
     WireError,
 )
-from hvt_ground.reassemble import Arrival, Reassembler
+from hvt_ground.reassemble import Arrival, Counters, Reassembler
 from hvt_ground.session import GroundSession
 from hvt_ground.subscribe import EdgePort
 
@@ -38,6 +38,10 @@ _ENDED_PATIENCE_NS = 2 * _SECOND_NS
 _GONE_NS = 5 * _SECOND_NS
 """An edge whose token is gone and that sends nothing for so long has ended without saying so."""
 _INFO_TRIES = 3
+_HEARD_NS = 2 * _SECOND_NS
+"""A keyframe is asked for only while the edge is heard."""
+_DRAIN_NS = _SECOND_NS
+"""How long what has already arrived is still taken in when the ground stops."""
 
 
 class EdgeReceiver:
@@ -61,6 +65,10 @@ class EdgeReceiver:
         self._report_lock = threading.Lock()
         self._next_report_ns = 0
         self._ended_ns: int | None = None
+        self._ended_id: int | None = None
+        self._stop_ns = 0
+        self._counted = Counters()
+        """The counters when the session before ended."""
         self._heard_ns = time.monotonic_ns()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"hvt-receive-{port.edge}", daemon=True)
@@ -73,15 +81,21 @@ class EdgeReceiver:
 
     def close(self) -> None:
         """Finish what has arrived, close the session, join the thread."""
-        self._stop.set()
-        self.port.inbox.close()
+        self.stop()
         self._thread.join(4.0)
+
+    def stop(self) -> None:
+        """Begin to finish; `close` waits for it. Several receivers finish in the time of one."""
+        if not self._stop.is_set():
+            self._stop_ns = time.monotonic_ns()
+            self._stop.set()
+            self.port.inbox.close()
 
     # The thread
 
     def _run(self) -> None:
         try:
-            while not (self._stop.is_set() and len(self.port.inbox) == 0):
+            while not self._finished():
                 item = self.port.inbox.get(timeout_s=0.05)
                 if item is not None:
                     self._handle(item)
@@ -89,6 +103,11 @@ class EdgeReceiver:
             self._end_session()
         except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
             self.error = error
+
+    def _finished(self) -> bool:
+        if not self._stop.is_set():
+            return False
+        return len(self.port.inbox) == 0 or time.monotonic_ns() - self._stop_ns > _DRAIN_NS
 
     def _handle(self, item: Received) -> None:
         self._heard_ns = time.monotonic_ns()
@@ -108,8 +127,10 @@ class EdgeReceiver:
 
     def _base(self, header: BaseHeader, item: Received) -> None:
         for arrival in self.reassembler.accept(header, item.payload, now_ns=time.monotonic_ns()):
-            if arrival.starts_session:
+            if arrival.starts_session or (arrival.starts_run and self._may_resume(arrival.header.session_id)):
                 self._begin_session(arrival.header.session_id)
+                if self.session is None:
+                    self.reassembler.decoder_failed()  # the next keyframe is the next try
             session = self.session
             if session is None or arrival.verdict not in ("decode", "skip"):
                 continue
@@ -146,6 +167,10 @@ class EdgeReceiver:
 
     # Sessions
 
+    def _may_resume(self, session_id: int) -> bool:
+        """Whether a session that is not open here goes on at the edge: after an outage, or a lost answer to info."""
+        return self.session is None and session_id != self._ended_id
+
     def _begin_session(self, session_id: int) -> None:
         self._end_session()
         info = self._ask_info(session_id)
@@ -177,11 +202,18 @@ class EdgeReceiver:
 
     def _end_session(self) -> None:
         session, self.session = self.session, None
+        if session is None:
+            return
+        if self._ended_ns is not None:
+            self._ended_id = session.info.session_id
         self._ended_ns = None
-        if session is not None:
-            self.done.append(session)
+        session.counters = self.reassembler.counters.since(self._counted)
+        self.done.append(session)
+        try:
             session.close()
             self._report(session)
+        finally:
+            self._counted = replace(self.reassembler.counters)
 
     # What goes back
 
@@ -192,7 +224,7 @@ class EdgeReceiver:
 
     def _keep_house(self) -> None:
         now_ns = time.monotonic_ns()
-        if self.reassembler.wants_keyframe(now_ns):
+        if now_ns - self._heard_ns < _HEARD_NS and self.reassembler.wants_keyframe(now_ns):
             self.reassembler.keyframe_requested(now_ns)
             self.port.request_keyframe()
             if self.session is not None:
@@ -205,7 +237,10 @@ class EdgeReceiver:
             self._next_report_ns = now_ns + _REPORT_NS
             self._report(session)
         if self._is_over(session, now_ns):
+            gone = self._ended_ns is None
             self._end_session()
+            if gone:
+                self.reassembler.decoder_failed()  # should it come back, it starts with a keyframe
 
     def _is_over(self, session: GroundSession, now_ns: int) -> bool:
         if self._ended_ns is not None and session.last_status is not None:
@@ -216,7 +251,7 @@ class EdgeReceiver:
         return not self.port.present.is_set() and now_ns - self._heard_ns > _GONE_NS
 
     def _report(self, session: GroundSession) -> None:
-        counters = self.reassembler.counters
+        counters = self.reassembler.counters.since(self._counted)
         with self._report_lock:
             delay_ms = session.receive_latency.percentile(50)
             error_ns = self.clock_offset.error_ns

@@ -25,6 +25,7 @@ from hvt_ground.live_view import LiveSink
 from hvt_ground.overlay_encoding import LAYERS, Identity, Layer, OverlayEncoder
 from hvt_ground.palette import AMBER, GREY, VERMILLION, Rgb, class_colour
 from hvt_ground.rrd_file import RrdEncoder, RrdFile
+from hvt_ground.rrd_footer import add_footer
 from hvt_ground.rrd_tables import (
     Captions,
     CodedIdentity,
@@ -129,7 +130,9 @@ class Recorder:
     @property
     def size_bytes(self) -> int:
         """The size of the file so far; 0 without one."""
-        return self._file.size_bytes if self._file is not None else 0
+        if self._file is None:
+            return 0
+        return self._file.path.stat().st_size if self._closed else self._file.size_bytes
 
     def log(self, event: Event) -> None:
         """Record an event. An access unit that no decoder could use at its place is left out."""
@@ -160,6 +163,7 @@ class Recorder:
             finally:
                 if self._file is not None:
                     self._file.close()
+                    add_footer(self._file.path)
                 self._encoder.close()
                 if self._live is not None:
                     self._live.close()

@@ -7,7 +7,7 @@ appended at once as a chunk of its own (the *journal*, at the end of the file), 
 become `FOLD_BYTES`, the same rows are written again as one chunk a table, over the journal (*folding*).
 
 What is on disk is a plain RRD stream without a footer: the SDK keeps a footer's manifest in memory for as long as
-it records (a footer costs 1.6 kB a chunk, too). ``rerun rrd optimize`` adds one.
+it records (a footer costs 1.6 kB a chunk, too). `rrd_footer` adds one at the end.
 """
 
 from __future__ import annotations

@@ -5,16 +5,20 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from hvt_common.distinct import DistinctIds
 from hvt_common.latency import LatencyStats
 from hvt_common.link.inbox import Received
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
 from hvt_common.link.wire import BaseHeader, Info, RoiHeader, Status, StillResult
+from hvt_common.priority import give_way
 from hvt_common.vision.hevc import BaseDecoder
 from hvt_ground.events import Event, Notice, Traffic, VideoSample
+from hvt_ground.export_tracks import TrackTable
+from hvt_ground.reassemble import Counters
 from hvt_ground.record import Recorder
 from hvt_ground.sight import GroundSight, Picture, ReceivedStill
 
@@ -29,6 +33,8 @@ _WAITING_PICTURES = 24
 _BEHIND_PICTURES = 1
 _STILLS_AT_ONCE = 16
 _WAITING_STILLS = 256
+_FINISH_S = 1.5
+_LEAVE_S = 1.0
 
 
 class GroundSession:
@@ -45,6 +51,7 @@ class GroundSession:
         *,
         recorder: Recorder | None,
         recording: Path | None,
+        tables: Sequence[TrackTable] = (),
         sight_of: Callable[[Callable[[Event], None]], GroundSight],
         to_local_ns: Callable[[int], int],
         clock: Callable[[], int],
@@ -53,6 +60,7 @@ class GroundSession:
         self.info = info
         self.recorder = recorder
         self.recording = recording
+        self._tables = tables
         self.lockstep = info.pace == "lockstep"
         self.ledger = Ledger(window_ns=info.window_ns)
         self.sight = sight_of(self._emit)
@@ -65,6 +73,8 @@ class GroundSession:
         self.last_frame_index = -1
         """The last frame that was decoded, tracked and drawn."""
         self.last_status: Status | None = None
+        self.counters = Counters()
+        """What the reassembly counted in this session; filled in when it ends."""
         self._keys = EdgeKeys(info.edge)
         self._decoder = BaseDecoder()
         self._to_local_ns = to_local_ns
@@ -76,11 +86,12 @@ class GroundSession:
         self._next_traffic_ns = 0
         self._results: list[StillResult] = []
         self._results_lock = threading.Lock()
-        self._still_sequences: set[int] = set()
+        self._still_sequences = DistinctIds(remember=4096)
         self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
         self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
         self._wake = threading.Event()
         self._ending = threading.Event()
+        self._given_up = threading.Event()
         self._error: BaseException | None = None
         self._thread: threading.Thread | None = None
         if not self.lockstep:
@@ -96,17 +107,13 @@ class GroundSession:
         self.frames_received += 1
         if self._first_index is None:
             self._first_index = header.frame_index
-        self._last_index, self._last_capture_ns, self._last_at_ns = (
-            header.frame_index,
-            header.capture_ns,
-            at_ns,
-        )
+        self._last_index, self._last_capture_ns = header.frame_index, header.capture_ns
         if not decode:
             return True
         if starts_run:
             self._decoder.reset()
         image = self._decoder.decode(item.payload)
-        if image is None:
+        if image is None or image.shape[1::-1] != self.info.base_size:
             return False
         self.frames_decoded += 1
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
@@ -119,11 +126,8 @@ class GroundSession:
 
     def still(self, header: RoiHeader, item: Received, *, media_type: str) -> None:
         """Take one still; a second one of the same number is ignored."""
-        if header.sequence in self._still_sequences:
+        if not self._still_sequences.add([header.sequence]):
             return
-        self._still_sequences.add(header.sequence)
-        if len(self._still_sequences) > 8192:
-            self._still_sequences = set(sorted(self._still_sequences)[-4096:])
         self._count(Row.ROI, Channel.ROI, item, at_ns=header.send_ns)
         self.stills_received += 1
         self.ledger.record_fate("received", header.reason)
@@ -138,7 +142,9 @@ class GroundSession:
         self._wake.set()
 
     def status(self, status: Status, item: Received) -> None:
-        """Take the edge's report."""
+        """Take the edge's report; one that is not newer than the last is ignored."""
+        if self.last_status is not None and status.sequence <= self.last_status.sequence:
+            return
         self._count(Row.STATUS, Channel.META, item, at_ns=status.send_ns)
         self.last_status = status
 
@@ -166,15 +172,24 @@ class GroundSession:
         return (self._last_index - self._first_index + 1) / self.info.fps
 
     def close(self) -> None:
-        """Finish what waits (two seconds at most), close the recording, raise what went wrong in the thread."""
+        """Finish what waits (for a second or two), close the recording, raise what went wrong in the thread."""
         self._ending.set()
         self._wake.set()
         if self._thread is not None:
-            self._thread.join(2.0)
-        self.sight.end()
-        self.note("info", f"session {self.info.session_id:016x} ended")
-        if self.recorder is not None:
-            self.recorder.close()
+            self._thread.join(_FINISH_S)
+            self._given_up.set()
+            self._thread.join(_LEAVE_S)
+        try:
+            if self._thread is None or not self._thread.is_alive():
+                self.sight.stills_dropped.update(["ended"] * self._stills.qsize())
+                self.frames_untracked += self._pictures.qsize()
+                self.sight.end()
+            self.note("info", f"session {self.info.session_id:016x} ended")
+        finally:
+            for table in self._tables:
+                table.close()
+            if self.recorder is not None:
+                self.recorder.close()
         self.raise_error()
 
     def raise_error(self) -> None:
@@ -202,8 +217,9 @@ class GroundSession:
         self._wake.set()
 
     def _run(self) -> None:
+        give_way()
         try:
-            while True:
+            while not self._given_up.is_set():
                 self._wake.wait(0.2)
                 self._wake.clear()
                 self._work_off()
@@ -214,7 +230,7 @@ class GroundSession:
 
     def _work_off(self) -> None:
         """Pictures first: a still's frame has to be known before the still."""
-        while True:
+        while not self._given_up.is_set():
             try:
                 picture = self._pictures.get_nowait()
             except queue.Empty:
@@ -282,3 +298,5 @@ class GroundSession:
     def _emit(self, event: Event) -> None:
         if self.recorder is not None:
             self.recorder.log(event)
+        for table in self._tables:
+            table.log(event)

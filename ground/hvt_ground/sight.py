@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvt_common.link.wire import RoiHeader, StillResult
+from hvt_common.distinct import DistinctIds
+from hvt_common.link.wire import RoiHeader, StillResult, fitted_text
 from hvt_common.values import Image, Posterior, Tracks, View
 from hvt_common.vision.detect import Detector
 from hvt_common.vision.still_codec import StillError, still_codec
@@ -19,8 +20,6 @@ from hvt_ground.history import History
 from hvt_ground.refine import Refiner, Settled, StillSeen
 
 __all__ = ["GroundSight", "Picture", "ReceivedStill"]
-
-_REMEMBERED_TRACKS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,14 +77,17 @@ class GroundSight:
         self._detected_frame: int | None = None
         self._newest = (0, 0)
         self._results: list[StillResult] = []
-        self._track_ids: set[int] = set()
-        self.tracks = 0
-        """Distinct tracks so far."""
+        self._track_ids = DistinctIds()
         self.detections_run = 0
         self.stills_dropped: Counter[str] = Counter()
         """Stills of which nothing could be made, by reason."""
         self.outcomes: Counter[str] = Counter()
         """What became of the others."""
+
+    @property
+    def tracks(self) -> int:
+        """Distinct tracks so far."""
+        return self._track_ids.count
 
     @property
     def refined(self) -> int:
@@ -110,7 +112,7 @@ class GroundSight:
         else:
             tracks = self._tracker.predict(frame_index=index, image_bgr=image)
         self._history.add_tracks(tracks)
-        self._count(tracks)
+        self._track_ids.add(tracks.ids.tolist())
         self._settle()
         self._emit(self._overlay(tracks, picture.capture_ns))
 
@@ -220,7 +222,7 @@ class GroundSight:
             StillResult(
                 still_sequence=header.sequence,
                 track_id=header.track_id,
-                class_name=posterior.class_name[:64] if posterior else "",
+                class_name=fitted_text(posterior.class_name, 64) if posterior else "",
                 confidence=posterior.confidence if posterior else 0.0,
                 entropy_nats=min(20.0, posterior.entropy_nats) if posterior else 0.0,
                 ground_track_id=ground_track_id,
@@ -241,13 +243,6 @@ class GroundSight:
             confidences=shown.confidences,
             refined=shown.refined,
         )
-
-    def _count(self, tracks: Tracks) -> None:
-        new = set(tracks.ids.tolist()) - self._track_ids
-        self.tracks += len(new)
-        self._track_ids |= new
-        if len(self._track_ids) > 2 * _REMEMBERED_TRACKS:
-            self._track_ids = set(sorted(self._track_ids)[-_REMEMBERED_TRACKS:])
 
     def _box_base_px(self, header: RoiHeader) -> tuple[float, float, float, float]:
         x1, y1, x2, y2 = self._view.to_base(np.array([header.box_source_px], np.float32))[0].tolist()

@@ -5,18 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 from hvt_common.units import bitrate_text
-from hvt_ground.reassemble import Counters
 from hvt_ground.session import GroundSession
 
 __all__ = ["summary", "table"]
 
 
-def summary(session: GroundSession, counters: Counters, *, unusable: int) -> dict[str, Any]:
-    """The JSON summary; rates count every byte on the line, by the same account as the edge's.
+def summary(session: GroundSession, *, unusable: int) -> dict[str, Any]:
+    """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do.
 
-    ``counters`` are those of the reassembly over all sessions of the edge.
+    ``unusable`` counts messages of the edge that were skipped, over all its sessions.
     """
-    info, sight = session.info, session.sight
+    info, sight, counters = session.info, session.sight, session.counters
     account = session.ledger.summary(session.duration_s)
     worst = account.worst_window_bps
     unread = sight.outcomes.get("unread", 0)

@@ -214,18 +214,20 @@ def test_folding_changes_nothing_but_the_size(
 ) -> None:
     """The journal is rewritten while recording; a row lost or doubled there would be lost for good."""
     plain, folded = tmp_path / "plain.rrd", tmp_path / "folded.rrd"
+    sizes: list[int] = []
     for path, limit in ((plain, 1 << 40), (folded, 20_000)):
         monkeypatch.setattr("hvt_ground.record.FOLD_BYTES", limit)
         with Recorder(settings(path)) as recorder:
             for event in events:
                 recorder.log(event)
             assert recorder.size_bytes == path.stat().st_size
+            sizes.append(recorder.size_bytes)
     one, other = Recording(plain), Recording(folded)
     assert one.video() == other.video()
     assert one.events() == other.events()
     assert one.stills() == other.stills()
     assert one.boxes(FRAMES - 1) == other.boxes(FRAMES - 1)
-    assert len(other.chunks) > len(one.chunks)
+    assert sizes[1] < 0.8 * sizes[0]
 
 
 def test_two_recorders_do_not_mix(events: list[Event], tmp_path: Path) -> None:
@@ -316,15 +318,12 @@ def test_a_killed_process_leaves_all_that_was_logged(events: list[Event], tmp_pa
     assert len(read.boxes(last)) == TRACKS
 
 
-def test_it_can_be_optimised_into_a_file_with_a_footer(recording: Recording, tmp_path: Path) -> None:
-    """The documented way to a file with a footer must work."""
+def test_a_closed_recording_verifies(recording: Recording) -> None:
+    """Tools that index recordings refuse a file without a footer."""
     from hvt_ground.live_view import viewer_program
 
-    out = tmp_path / "o.rrd"
-    source = str(recording.reader.path)
-    subprocess.run([viewer_program(), "rrd", "optimize", source, "-o", out], check=True, capture_output=True)
-    subprocess.run([viewer_program(), "rrd", "verify", out], check=True, capture_output=True)
-    assert Recording(out).video() == recording.video()
+    path = str(recording.reader.path)
+    subprocess.run([viewer_program(), "rrd", "verify", path], check=True, capture_output=True)
 
 
 @pytest.mark.realdata

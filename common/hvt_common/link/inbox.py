@@ -7,7 +7,10 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-__all__ = ["Inbox", "Received", "Sink"]
+__all__ = ["CAPACITY_BYTES", "Inbox", "Received", "Sink"]
+
+CAPACITY_BYTES = 64 * 2**20
+"""What one inbox holds at most: minutes of a base stream, and sixteen of the largest messages there are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +24,11 @@ class Received:
     received_ns: int
     """Our Unix clock in Zenoh's callback."""
 
+    @property
+    def size_bytes(self) -> int:
+        """Payload and attachment."""
+        return len(self.payload) + len(self.attachment)
+
 
 class Sink(Protocol):
     """Where Zenoh's callbacks put what came; must never block."""
@@ -33,13 +41,18 @@ class Sink(Protocol):
 class Inbox:
     """A bounded queue between Zenoh's callbacks and one of our threads; putting never blocks.
 
-    ``overflow`` says what gives way when it is full: ``newest`` for the base stream (what is queued stays whole up
-    to a gap), ``oldest`` where the latest value wins.
+    It is bounded in messages and in bytes: a payload may have megabytes. ``overflow`` says what gives way when it is
+    full: ``newest`` for the base stream (what is queued stays whole up to a gap), ``oldest`` where the latest value
+    wins. A message that is larger than the whole inbox never enters.
     """
 
-    def __init__(self, *, capacity: int, overflow: Literal["newest", "oldest"]) -> None:
+    def __init__(
+        self, *, capacity: int, overflow: Literal["newest", "oldest"], capacity_bytes: int = CAPACITY_BYTES
+    ) -> None:
         self._items: deque[Received] = deque()
+        self._bytes = 0
         self._capacity = capacity
+        self._capacity_bytes = capacity_bytes
         self._overflow = overflow
         self._changed = threading.Condition()
         self._closed = False
@@ -48,20 +61,26 @@ class Inbox:
 
     def put(self, item: Received) -> None:
         """Add a message, or drop one."""
+        size_bytes = item.size_bytes
         with self._changed:
-            if len(self._items) >= self._capacity:
+            while not self._has_room(size_bytes):
                 self.dropped += 1
-                if self._overflow == "newest":
+                if self._overflow == "newest" or not self._items:
                     return
-                self._items.popleft()
+                self._bytes -= self._items.popleft().size_bytes
             self._items.append(item)
+            self._bytes += size_bytes
             self._changed.notify()
 
     def get(self, *, timeout_s: float) -> Received | None:
         """The oldest message; None after ``timeout_s``, or at once when closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._closed, timeout_s)
-            return self._items.popleft() if self._items else None
+            if not self._items:
+                return None
+            item = self._items.popleft()
+            self._bytes -= item.size_bytes
+            return item
 
     def close(self) -> None:
         """Wake whoever waits; what is queued can still be taken."""
@@ -71,3 +90,6 @@ class Inbox:
 
     def __len__(self) -> int:
         return len(self._items)
+
+    def _has_room(self, size_bytes: int) -> bool:
+        return len(self._items) < self._capacity and self._bytes + size_bytes <= self._capacity_bytes

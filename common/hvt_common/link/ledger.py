@@ -6,7 +6,6 @@ of the headers) and get the same totals and windows.
 
 from __future__ import annotations
 
-import copy
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -198,9 +197,9 @@ class Ledger:
 
     @property
     def worst_window_bps(self) -> WindowRates:
-        """The fullest windows so far."""
-        windows = copy.deepcopy(self._windows)
-        for entry in self._pending:
+        """The fullest windows so far. May be asked for while another thread counts."""
+        windows = self._windows.copy()
+        for entry in tuple(self._pending):
             windows.add(*entry)
         bits = {name: round(line * 8 * 1e9 / self.window_ns) for name, line in windows.worst.items()}
         return WindowRates(base=bits["base"], roi=bits["roi"], total=bits["total"])
@@ -262,6 +261,10 @@ class _Windows:
         for name in (channel, "total"):
             self.sums[name] += line
             self.worst[name] = max(self.worst[name], self.sums[name])
+
+    def copy(self) -> _Windows:
+        """One that goes on by itself. Each part is copied in one step, which no other thread can interrupt."""
+        return _Windows(self.window_ns, self.entries.copy(), self.sums.copy(), self.worst.copy())
 
     def restart(self) -> None:
         """Forget the messages of the window but not the worst."""

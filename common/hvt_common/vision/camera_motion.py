@@ -21,10 +21,10 @@ Method = Literal["flow", "ecc"]
 _Gray = npt.NDArray[np.uint8]
 _Points = npt.NDArray[np.float32]
 
-_MAX_CORNERS: Final = 600
+_MAX_CORNERS: Final = 250
 _CORNER_QUALITY: Final = 0.01
 _CORNER_DISTANCE_PX: Final = 7
-_FLOW_WINDOW_PX: Final = 21
+_FLOW_WINDOW_PX: Final = 15
 _FLOW_LEVELS: Final = 3
 _RANSAC_PX: Final = 1.0
 # Fewer corners that agree than this, or a smaller share of them, is chance: objects, noise, an empty sky.
@@ -59,8 +59,8 @@ class CameraMotion:
         """
         full_size = (image_bgr.shape[1], image_bgr.shape[0])
         small_size = (max(1, round(full_size[0] * self._scale)), max(1, round(full_size[1] * self._scale)))
-        gray = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
-        current = np.asarray(cv2.resize(gray, small_size, interpolation=cv2.INTER_AREA), np.uint8)
+        small = cv2.resize(image_bgr, small_size, interpolation=cv2.INTER_AREA)
+        current = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
         previous, self._previous = self._previous, current
         if previous is None or previous.shape != current.shape:
             return _identity()

@@ -25,7 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
+from hvt_common.model_store import resolve_model
 from hvt_common.values import Image, Posterior
+from hvt_common.vision.imagenet_names import IMAGENET_NAMES
 from hvt_common.vision.labels import first_synonym, metadata_labels, read_labels
 from hvt_common.vision.letterbox import as_bgr
 from hvt_common.vision.model import ModelSettings, OnnxModel, open_model
@@ -63,20 +65,26 @@ _TENSORFLOW = Preparation(mean=(128.0,) * 3, scale=(1 / 128,) * 3)
 _TORCHVISION = Preparation(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 / 57.12, 1 / 57.375))
 
 
-def open_classifier(spec: str, *, labels: Path | None = None, threads: int = 2) -> Classifier:
+def open_classifier(
+    spec: str, *, labels: Path | None = None, threads: int = 2, provider: str = "cpu"
+) -> Classifier:
     """Open an ONNX classifier.
 
     Args:
-        spec: Path of the ONNX file.
-        labels: Class names, one a line; else those in the model's metadata, else "class 0" and so on. Names of
-            1000 classes fit a model of 1001 (a background is put in front), and 1001 names that begin with
-            "background" fit a model of 1000. Of synonyms separated by commas the first is shown.
-        threads: CPU threads of onnxruntime.
+        spec: The name of a model (`hvt_common.model_store.resolve_model`), or the path of an ONNX file.
+        labels: Class names, one a line; else those in the model's metadata, else ImageNet's for 1000 or 1001
+            classes, else "class 0" and so on. Names of 1000 classes fit a model of 1001 (a background is put in
+            front), and 1001 names that begin with "background" fit a model of 1000. Of synonyms separated by commas
+            the first is shown.
+        threads: CPU threads of the network.
+        provider: What runs the network, one of `hvt_common.vision.providers.PROVIDERS`.
 
     Raises:
-        UserError: No such file, not a classifier, metadata or labels that do not fit.
+        UserError: No such model, not a classifier, metadata or labels that do not fit.
     """
-    return OnnxClassifier(open_model(Path(spec), settings=ModelSettings(threads=threads)), labels=labels)
+    path = resolve_model(spec, role="classifier")
+    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
+    return OnnxClassifier(model, labels=labels)
 
 
 class OnnxClassifier:
@@ -226,6 +234,8 @@ def _three_numbers(
 
 def _class_names(model: OnnxModel, classes: int, labels: Path | None) -> tuple[str, ...]:
     names = read_labels(labels) if labels is not None else metadata_labels(model.metadata)
+    if names is None and classes in (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):
+        names = None
     if names is None:
         return tuple(f"class {index}" for index in range(classes))
     if (len(names), classes) == (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from hvt_common.errors import UserError
+from hvt_common.model_store import resolve_model
 from hvt_common.values import Detections, Image
 from hvt_common.vision.class_names import COCO_NAMES, VISDRONE_NAMES
 from hvt_common.vision.detect_heads import ACCEPTED_HEADS, Head, choose_head
@@ -47,31 +48,32 @@ def open_detector(
     nms_iou: float = 0.45,
     size: tuple[int, int] | None = None,
     threads: int = 2,
+    provider: str = "cpu",
 ) -> Detector:
     """Open the detector that ``spec`` names.
 
     Args:
-        spec: ``motion`` or the path of an ONNX file with one of the heads of `detect_heads`.
+        spec: ``motion``, the name of a model (`hvt_common.model_store.resolve_model`), or the path of an ONNX file
+            with one of the heads of `detect_heads`.
         labels: Class names, one a line; else those in the model's metadata, else COCO for 80 classes and VisDrone
             for 10, else "class 0" and so on.
         confidence: Least confidence of a detection, 0…1.
         nms_iou: Largest overlap of two detections of one class, 0…1.
         size: (width, height) of the network's input where the model leaves it free; else each image gets the
             multiples of 32 that hold it (at most 1920 on the longer side).
-        threads: CPU threads of onnxruntime.
+        threads: CPU threads of the network.
+        provider: What runs the network, one of `hvt_common.vision.providers.PROVIDERS`.
 
     Raises:
-        UserError: No such file, not a detector, labels that do not fit, a setting out of its range.
+        UserError: No such model, not a detector, labels that do not fit, a setting out of its range.
     """
     for name, value in (("confidence", confidence), ("NMS IoU", nms_iou)):
         if not 0 <= value <= 1:
             raise UserError(f"{name} {value} is not accepted; a number from 0 to 1 is")
     if spec == MOTION:
         return MotionDetector(confidence=confidence)
-    path = Path(spec)
-    if not path.exists():
-        raise UserError(f"detector {spec} is neither the word '{MOTION}' nor an ONNX file that exists")
-    model = open_model(path, settings=ModelSettings(threads=threads))
+    path = resolve_model(spec, role="detector", words=(MOTION,))
+    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size)
 
 
@@ -94,15 +96,16 @@ class OnnxDetector:
         size: tuple[int, int] | None = None,
     ) -> None:
         self.model = model
+        self.head: Head
         self._confidence = confidence
         self._nms_iou = nms_iou
         self._fixed_size = _fixed_size(model, size)
-        self._output_index, self._head = _find_head(model, self._fixed_size or (_TRIAL_SIDE, _TRIAL_SIDE))
-        self.class_names = _class_names(model, self._head, labels)
+        self._output_index, self.head = _find_head(model, self._fixed_size or (_TRIAL_SIDE, _TRIAL_SIDE))
+        self.class_names = _class_names(model, self.head, labels)
         dtype = model.inputs[0].dtype
         assert dtype is not None
         self._letterboxer = Letterboxer(
-            anchor=self._head.anchor, rgb=self._head.rgb, gain=self._head.gain, dtype=dtype
+            anchor=self.head.anchor, rgb=self.head.rgb, gain=self.head.gain, dtype=dtype
         )
 
     def detect(self, image_bgr: Image) -> Detections:
@@ -115,8 +118,8 @@ class OnnxDetector:
         input_size = self.input_size((image.shape[1], image.shape[0]))
         tensor, letterbox = self._letterboxer.fill(image, input_size)
         output = self.model.run(tensor)[self._output_index].astype(np.float32, copy=False)
-        found = self._head.decode(output, confidence=self._confidence, input_size=input_size)
-        if self._head.suppresses:
+        found = self.head.decode(output, confidence=self._confidence, input_size=input_size)
+        if self.head.suppresses:
             kept = suppress(found.boxes_input_px, found.scores, found.class_ids, iou=self._nms_iou)
         else:
             kept = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]

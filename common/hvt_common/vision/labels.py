@@ -75,7 +75,9 @@ def _read_text(path: Path) -> str:
     except OSError as error:
         raise UserError(f"labels file {path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"labels file {path} is not UTF-8 text (byte {error.start})") from error
+        raise UserError(
+            f"labels file {path} is not UTF-8 text (byte {error.start}); one class name a line is expected"
+        ) from error
 
 
 def _literal_names(text: str) -> tuple[str, ...] | None:

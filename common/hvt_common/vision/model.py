@@ -1,17 +1,20 @@
-"""ONNX models: the only file that imports onnxruntime.
+"""ONNX models, on onnxruntime or another runtime: the only file that imports onnxruntime.
 
 A model file comes from outside, so it is looked at before onnxruntime sees it: it must be a file, not too large,
 and its bytes must walk as an ONNX protobuf with a graph in it. No custom operator library is ever registered, and
-onnxruntime itself refuses external weights that lie outside the folder of the model (a test holds it to that).
+onnxruntime itself refuses external weights that lie outside the folder of the model (a test holds it to that). A
+model that another runtime will run is opened by onnxruntime first all the same: it says the ports and the metadata,
+and no runtime gets a file that onnxruntime refuses.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +22,12 @@ import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from hvt_common.errors import UserError
+from hvt_common.vision.openvino_model import OpenVinoRunner, find_openvino
+from hvt_common.vision.providers import ONNXRUNTIME_PROVIDERS, Choice, choose_provider
 
-__all__ = ["MAX_MODEL_BYTES", "ModelSettings", "OnnxModel", "Port", "open_model"]
+__all__ = ["MAX_MODEL_BYTES", "ModelSettings", "OnnxModel", "Port", "open_model", "opset_versions"]
+
+_log = logging.getLogger(__name__)
 
 MAX_MODEL_BYTES = 1 << 30
 """1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
@@ -52,6 +59,7 @@ _ORT_ERRORS: tuple[type[Exception], ...] = tuple(
 # Field numbers of ModelProto in onnx.proto, and the one that holds the graph.
 _MODEL_FIELDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 14, 20, 25, 26})
 _GRAPH_FIELD = 7
+_OPSET_FIELD = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +68,8 @@ class ModelSettings:
 
     threads: int = 2
     """CPU threads inside one operator, 1 or more."""
-    providers: tuple[str, ...] = ("CPUExecutionProvider",)
-    """onnxruntime execution providers, the first that is able takes each operator."""
+    provider: str = "cpu"
+    """One of `hvt_common.vision.providers.PROVIDERS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,57 +87,115 @@ class Port:
         return f"{self.name} ({sizes}) {self.dtype if self.dtype is not None else 'not a tensor'}"
 
 
-class OnnxModel:
-    """An opened ONNX model.
+class _Runner(Protocol):
+    def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]: ...
 
-    Args:
+
+class OnnxModel:
+    """An opened ONNX model; made by `open_model`.
+
+    Attributes:
         path: The file, for messages.
-        session: The onnxruntime session, made by `open_model`.
+        inputs, outputs: The ports as the file declares them.
+        metadata: What the exporter wrote into the file.
+        provider: What runs it, and why.
     """
 
-    def __init__(self, path: Path, session: ort.InferenceSession) -> None:
+    def __init__(
+        self, path: Path, session: ort.InferenceSession, *, runner: _Runner, provider: Choice
+    ) -> None:
         self.path = path
         self.inputs = tuple(_port(value) for value in session.get_inputs())
         self.outputs = tuple(_port(value) for value in session.get_outputs())
         self.metadata: dict[str, str] = dict(session.get_modelmeta().custom_metadata_map)
-        self._session = session
-        self._output_names = [port.name for port in self.outputs]
+        self.provider = provider
+        self._runner = runner
 
     def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
         """Run the model on its only input; return its outputs in their declared order.
 
         Raises:
-            UserError: onnxruntime cannot run this model on an input of this shape.
+            UserError: This model cannot run on an input of this shape.
         """
+        port = self.inputs[0]
+        if len(feed.shape) != len(port.shape) or any(
+            size not in (None, given) for size, given in zip(port.shape, feed.shape, strict=True)
+        ):
+            shape = "x".join(map(str, feed.shape))
+            raise UserError(f"model {self.path} does not run on a {shape} input: it takes {port}")
+        return self._runner.run(feed)
+
+
+class _OnnxRuntimeRunner:
+    def __init__(self, path: Path, session: ort.InferenceSession) -> None:
+        self._path = path
+        self._session = session
+        self._input_name = session.get_inputs()[0].name if session.get_inputs() else ""
+        self._output_names = [port.name for port in session.get_outputs()]
+
+    def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
         try:
-            outputs: list[npt.NDArray[Any]] = self._session.run(
-                self._output_names, {self.inputs[0].name: feed}
-            )
+            outputs: list[npt.NDArray[Any]] = self._session.run(self._output_names, {self._input_name: feed})
         except _ORT_ERRORS as error:
             shape = "x".join(map(str, feed.shape))
-            raise UserError(f"model {self.path} does not run on a {shape} input: {_reason(error)}") from error
+            raise UserError(
+                f"model {self._path} does not run on a {shape} input: {_reason(error)}"
+            ) from error
         return outputs
 
 
 def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxModel:
-    """Open an ONNX file.
+    """Open an ONNX file; what runs it is logged, with the reason.
 
     Raises:
-        UserError: No such file, too large, not an ONNX model, or one that onnxruntime cannot load.
+        UserError: No such file, too large, not an ONNX model, one that the runtime cannot load, or a provider that is
+            unknown, not installed or cannot start.
     """
     settings = settings or ModelSettings()
+    choice = choose_provider(
+        settings.provider, onnxruntime=ort.get_available_providers(), openvino=find_openvino
+    )
     _check_file(path)
+    try:
+        model = _open(path, settings, choice)
+    except UserError as error:
+        if choice.asked or choice.provider == "cpu":
+            raise
+        model = _open(path, settings, Choice("cpu", str(error), asked=False))
+    _log.info("%s runs on %s: %s", path.name, model.provider.provider, model.provider.why)
+    return model
+
+
+def _open(path: Path, settings: ModelSettings, choice: Choice) -> OnnxModel:
+    if choice.provider == "openvino":
+        described = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
+        found = find_openvino()
+        runner = OpenVinoRunner(path, threads=settings.threads, bf16=found is not None and found.bf16)
+        return OnnxModel(path, described, runner=runner, provider=choice)
+    names = ONNXRUNTIME_PROVIDERS[choice.provider]
+    session = _session(path, settings, names)
+    if session.get_providers()[0] != names[0]:
+        raise UserError(
+            f"--provider {choice.provider} did not start (its driver or libraries are missing): choose cpu"
+        )
+    return OnnxModel(path, session, runner=_OnnxRuntimeRunner(path, session), provider=choice)
+
+
+def _session(
+    path: Path, settings: ModelSettings, providers: tuple[str, ...], *, optimised: bool = True
+) -> ort.InferenceSession:
     options = ort.SessionOptions()
     options.intra_op_num_threads = settings.threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 4
+    if not optimised:
+        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
     # Threads that spin between runs burn the cores that the encoder needs: half the CPU time for no gain.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        session = ort.InferenceSession(str(path), options, providers=list(settings.providers))
+        return ort.InferenceSession(str(path), options, providers=list(providers))
     except _ORT_ERRORS as error:
         raise UserError(f"model {path} cannot be opened: {_reason(error)}") from error
-    return OnnxModel(path, session)
 
 
 def _port(value: Any) -> Port:
@@ -158,7 +224,7 @@ def _check_file(path: Path) -> None:
                     f"model {path} has {size_bytes} bytes; at most {MAX_MODEL_BYTES} are accepted"
                 )
             try:
-                fields = set(_top_level_fields(file, size_bytes))
+                fields = {field for field, _, _ in _top_level_fields(file, size_bytes)}
             except ValueError as error:
                 raise UserError(f"model {path} is not an ONNX file, or is cut short ({error})") from error
     except OSError as error:
@@ -167,8 +233,44 @@ def _check_file(path: Path) -> None:
         raise UserError(f"model {path} is not an ONNX file (no graph in it)")
 
 
-def _top_level_fields(file: BinaryIO, size_bytes: int) -> Iterator[int]:
-    """Field numbers of a serialised ModelProto without its contents; ValueError where the bytes are no such thing."""
+def opset_versions(path: Path) -> dict[str, int]:
+    """The version of each operator set that a model imports, by domain; "" is ONNX itself.
+
+    Raises:
+        UserError: Not an ONNX model.
+    """
+    _check_file(path)
+    versions = {}
+    with path.open("rb") as file:
+        for field, start, end in list(_top_level_fields(file, path.stat().st_size)):
+            if field == _OPSET_FIELD:
+                file.seek(start)
+                domain, version = _opset(file.read(end - start))
+                versions[domain] = version
+    return versions
+
+
+def _opset(data: bytes) -> tuple[str, int]:
+    """Decode an OperatorSetIdProto: domain is field 1, version field 2."""
+    domain, version, position = "", 0, 0
+    while position < len(data):
+        tag, position = _varint(data, position)
+        value, position = _varint(data, position)
+        if tag == 0x0A:
+            domain = data[position : position + value].decode(errors="replace")
+            position += value
+        elif tag == 0x10:
+            version = value
+        else:
+            break
+    return domain, version
+
+
+def _top_level_fields(file: BinaryIO, size_bytes: int) -> Iterator[tuple[int, int, int]]:
+    """Field number, start and end of each field of a serialised ModelProto; ValueError where it is no such thing.
+
+    The contents are passed over, so a large file costs a few seeks.
+    """
     position = 0
     while position < size_bytes:
         file.seek(position)
@@ -177,17 +279,20 @@ def _top_level_fields(file: BinaryIO, size_bytes: int) -> Iterator[int]:
         field, wire_type = tag >> 3, tag & 7
         if field not in _MODEL_FIELDS:
             raise ValueError(f"unknown field {field} at byte {position}")
+        start = position
         if wire_type == 0:
+            start += used
             _, used = _varint(head, used)
         elif wire_type == 2:
             length, used = _varint(head, used)
+            start += used
             used += length
         else:
             raise ValueError(f"unknown wire type {wire_type} at byte {position}")
         position += used
         if position > size_bytes:
             raise ValueError(f"field {field} ends {position - size_bytes} bytes past the end")
-        yield field
+        yield field, start, position
 
 
 def _varint(data: bytes, start: int) -> tuple[int, int]:

@@ -23,12 +23,13 @@ from hvt_common.vision.associate import grown, overlaps, pair
 from hvt_common.vision.camera_motion import CameraMotion
 from hvt_common.vision.track_table import LOST, TRACKED, UNCONFIRMED, Seen, TrackTable
 
-__all__ = ["ByteTracker", "TrackerSettings"]
+__all__ = ["ByteTracker", "TrackerSettings", "weak_confidence"]
 
 _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
+_LOW_CONFIDENCE: Final = 0.1
 # Fixed in the authors' program, as costs 1 - IoU of at most 0.5, 0.7 and 0.15.
 _WEAK_COST_LIMIT: Final = 0.5
 _UNCONFIRMED_COST_LIMIT: Final = 0.7
@@ -44,7 +45,7 @@ class TrackerSettings:
 
     track_confidence: float = 0.5
     """Detections above it are matched first and may start tracks (``track_thresh``)."""
-    low_confidence: float = 0.1
+    low_confidence: float = _LOW_CONFIDENCE
     """Detections above it and below ``track_confidence`` may only carry a track on."""
     new_confidence: float | None = None
     """Least confidence that starts a track; None is ``track_confidence`` + 0.1."""
@@ -64,6 +65,18 @@ class TrackerSettings:
     """What a class vote is still worth one matched detection later: 1 never forgets."""
     camera_motion: Literal["off", "flow", "ecc"] = "off"
     """How to estimate the camera's motion, which then moves all tracks before they are matched."""
+
+    @classmethod
+    def starting_at(
+        cls, confidence: float, *, camera_motion: Literal["off", "flow", "ecc"]
+    ) -> TrackerSettings:
+        """What both sides run with: detections from ``confidence`` start tracks, weaker ones carry them on."""
+        return cls(
+            track_confidence=confidence,
+            low_confidence=weak_confidence(confidence),
+            new_confidence=confidence,
+            camera_motion=camera_motion,
+        )
 
     def __post_init__(self) -> None:
         """Check every bound; a `ValueError` names the setting."""
@@ -90,6 +103,11 @@ class TrackerSettings:
 def _check_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:  # also refuses NaN
         raise ValueError(f"{name} is {value}, must be from {low} to {high}")
+
+
+def weak_confidence(confidence: float) -> float:
+    """From where a detector is to report, so that weak detections may carry on tracks begun at ``confidence``."""
+    return min(confidence, _LOW_CONFIDENCE)
 
 
 class ByteTracker:

@@ -147,7 +147,10 @@ def _open(spec: str) -> tuple[Any, Any]:
     try:
         container = av.open(spec, timeout=(_OPEN_S, _READ_S))
     except (av.error.FFmpegError, OSError, ValueError) as error:
-        raise UserError(f"source {name!r} is not a video that can be read ({_cause(error)})") from error
+        raise UserError(
+            f"source {name!r} is not a video that can be read ({_cause(error)}); accepted is any video file that "
+            "FFmpeg decodes"
+        ) from error
     stream = next(iter(container.streams.video), None)
     codec: Any = None if stream is None else stream.codec_context  # None where FFmpeg has no decoder
     if stream is None or codec is None or codec.name in _TEXT_CODECS:

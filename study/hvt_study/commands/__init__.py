@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from typing import Final, Protocol
 
-from hvt_study.commands import track
+from hvt_study.commands import score, track
 
 __all__ = ["COMMANDS", "Command"]
 
@@ -27,5 +27,6 @@ class Command(Protocol):
 
 
 COMMANDS: Final[dict[str, Command]] = {
+    "score": score,
     "track": track,
 }

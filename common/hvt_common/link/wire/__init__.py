@@ -10,8 +10,8 @@ from hvt_common.link.wire.dialogue import (
     Feedback,
     StillResult,
 )
-from hvt_common.link.wire.fields import WireError
-from hvt_common.link.wire.reports import Health, Info, Status
+from hvt_common.link.wire.fields import WireError, fitted_text
+from hvt_common.link.wire.reports import Health, Info, Status, fitted_class_names
 from hvt_common.link.wire.sealed import (
     MAX_PAYLOAD_BYTES,
     WIRE_VERSION,
@@ -41,5 +41,7 @@ __all__ = [
     "StillResult",
     "UnknownVersionError",
     "WireError",
+    "fitted_class_names",
+    "fitted_text",
     "kinds",
 ]

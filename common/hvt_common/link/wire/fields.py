@@ -27,6 +27,7 @@ __all__ = [
     "TupleOf",
     "WireError",
     "carried",
+    "fitted_text",
 ]
 
 U32 = 2**32 - 1
@@ -172,6 +173,12 @@ class Text(Kind):
 
     def _describe(self) -> str:
         return f"str ≤ {self.max_bytes} B"
+
+
+def fitted_text(text: str, max_bytes: int) -> str:
+    """Text of any origin, such as a model's class name, as `Text` takes it: cut between characters, printable."""
+    plain = "".join(one if one.isprintable() else "?" for one in text)
+    return plain.encode("utf-8", "replace")[:max_bytes].decode("utf-8", "ignore")
 
 
 @dataclass(frozen=True, slots=True)

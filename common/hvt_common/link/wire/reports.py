@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -19,18 +19,34 @@ from hvt_common.link.wire.fields import (
     Text,
     TupleOf,
     carried,
+    fitted_text,
 )
 from hvt_common.link.wire.sealed import Message, Nested
 from hvt_common.values import View
 
-__all__ = ["Health", "Info", "Status"]
+__all__ = ["Health", "Info", "Status", "fitted_class_names"]
 
 _TIME = Int(0, I63)
 _COUNT = Int(0, 2**53 - 1)
 _BPS = Int(0, 2**53 - 1)
 _SIDE = Int(1, 32767)
+_CLASS_NAME_BYTES = 64
+_CLASS_NAMES = 2048
+_CLASS_NAMES_BYTES = 60_000
 _LAST = Int(-1, U32)
 _REASONS = MapOf(Int(0, U32), 24)
+
+
+def fitted_class_names(names: Sequence[str]) -> tuple[str, ...]:
+    """As many of a detector's class names as an `Info` holds, each as it takes them."""
+    fitted: list[str] = []
+    size_bytes = 0
+    for name in names[:_CLASS_NAMES]:
+        fitted.append(fitted_text(name, _CLASS_NAME_BYTES))
+        size_bytes += 2 + len(fitted[-1].encode())
+        if size_bytes > _CLASS_NAMES_BYTES:
+            break
+    return tuple(fitted)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +75,7 @@ class Info(Message):
     """The part of the budget that the base stream may use."""
     window_ns: int = carried(Int(1, 3_600_000_000_000))
     """Length of the rolling window that the budget holds over."""
-    class_names: tuple[str, ...] = carried(ListOf(Text(64), 2048))
+    class_names: tuple[str, ...] = carried(ListOf(Text(_CLASS_NAME_BYTES), _CLASS_NAMES))
     """Of the edge's detector."""
     received_ns: int = carried(_TIME)
     """When the edge received the question, its clock (t1)."""

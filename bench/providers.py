@@ -1,0 +1,148 @@
+"""What each execution provider costs and what it changes: `python bench/providers.py`.
+
+Speed: median ms of the bare network, providers in turn on the same input, so that a busy machine slows all alike.
+Change: on frames of the drone clip at base size, F1 at IoU 0.5 with the same class, against the same network on cpu
+(onnxruntime, float32). A provider that is faster may cost one point: F1 at least 0.99.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.values import Detections, Image
+from hvt_common.vision.detect import open_detector
+from hvt_common.vision.model import ModelSettings, OnnxModel, open_model
+from hvt_common.vision.providers import PROVIDERS
+
+DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
+LEAST_F1 = 0.99
+SHARE_BAR = 1.0
+MODELS = (
+    ("yolox_nano", (1, 3, 384, 640), 25),
+    ("yolov5su_visdrone_640", (1, 3, 640, 640), 9),
+    ("yolov5su_visdrone_736x1280", (1, 3, 736, 1280), 7),
+)
+CLASSIFIER = ("mobilenet_v2_imagenet", (1, 3, 224, 224), 25)
+COMPARED = ("yolov5su_visdrone_736x1280", "yolov5su_visdrone_640")
+FRAMES = range(0, 351, 27)
+
+
+def rows() -> list[dict]:
+    """One row a measure: measure, value, bar, holds (bar and holds are None where there is none)."""
+    providers = available()
+    result = []
+    for name, shape, rounds in (*MODELS, CLASSIFIER):
+        times = _times(DATA / f"models/{name}.onnx", shape, rounds, providers)
+        size = f"{shape[3]}x{shape[2]}"
+        result.append(_row(f"{name} {size}: cpu, ms", times["cpu"][0]))
+        for provider in providers[1:]:
+            ms, ratio = times[provider]
+            result.append(_row(f"{name} {size}: {provider}, ms", ms))
+            result.append(_row(f"{name} {size}: {provider} / cpu", ratio, SHARE_BAR, at_least=False))
+    images = _frames()
+    for name in COMPARED:
+        for provider in providers[1:]:
+            f1 = _f1(str(DATA / f"models/{name}.onnx"), images, provider)
+            result.append(_row(f"{name}: F1 of {provider} against cpu on drone_carpark", f1, LEAST_F1))
+    return result
+
+
+def available() -> tuple[str, ...]:
+    """cpu, then every other provider that runs the smallest model here."""
+    found = ["cpu"]
+    for provider in PROVIDERS:
+        if provider not in ("cpu", "auto"):
+            try:
+                open_model(DATA / "models/yolox_nano.onnx", settings=ModelSettings(provider=provider))
+            except UserError:
+                continue
+            found.append(provider)
+    return tuple(found)
+
+
+def _times(
+    path: Path, shape: tuple[int, ...], rounds: int, providers: tuple[str, ...]
+) -> dict[str, tuple[float, float]]:
+    """(median ms, median ratio to cpu) by provider."""
+    models = {name: open_model(path, settings=ModelSettings(provider=name)) for name in providers}
+    feed = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)
+    for model in models.values():
+        for _ in range(3):
+            model.run(feed)
+    times = {name: [] for name in providers}
+    for _ in range(rounds):
+        for name, model in models.items():
+            times[name].append(_ms(model, feed))
+    return {
+        name: (
+            statistics.median(times[name]),
+            statistics.median(own / cpu for own, cpu in zip(times[name], times["cpu"], strict=True)),
+        )
+        for name in providers
+    }
+
+
+def _ms(model: OnnxModel, feed: np.ndarray) -> float:
+    start = time.perf_counter()
+    model.run(feed)
+    return (time.perf_counter() - start) * 1e3
+
+
+def _frames() -> list[Image]:
+    clip = cv2.VideoCapture(str(DATA / "clips/drone_carpark.mp4"))
+    images = []
+    for index in FRAMES:
+        clip.set(cv2.CAP_PROP_POS_FRAMES, index)
+        done, image = clip.read()
+        if done:
+            images.append(cv2.resize(image, (1100, 720)))
+    return images
+
+
+def _f1(path: str, images: list[Image], provider: str) -> float:
+    reference, other = (open_detector(path, provider=name) for name in ("cpu", provider))
+    matched = total = 0
+    for image in images:
+        expected, found = reference.detect(image), other.detect(image)
+        matched += _matches(expected, found)
+        total += len(expected) + len(found)
+    return 2 * matched / max(total, 1)
+
+
+def _matches(expected: Detections, found: Detections) -> int:
+    """Pairs of IoU 0.5 and one class, each box in one pair at most, the more confident first."""
+    free = np.ones(len(expected), bool)
+    count = 0
+    for box, class_id in zip(found.boxes_xyxy_px, found.class_ids, strict=True):
+        overlap = np.where(free & (expected.class_ids == class_id), _iou(box, expected.boxes_xyxy_px), 0)
+        if overlap.size and overlap.max() >= 0.5:
+            free[overlap.argmax()] = False
+            count += 1
+    return count
+
+
+def _iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
+    shared = np.prod(np.maximum(high - low, 0), axis=1)
+    return shared / (np.prod(box[2:] - box[:2]) + np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) - shared)
+
+
+def _row(measure: str, value: float, bar: float | None = None, *, at_least: bool = True) -> dict:
+    return {
+        "measure": measure,
+        "value": round(value, 3),
+        "bar": bar,
+        "holds": None if bar is None else (value >= bar if at_least else value <= bar),
+    }
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(row)

@@ -1,0 +1,107 @@
+"""What runs the networks: which execution provider is taken, and why.
+
+=========  =====================================  ============================================================
+provider   package                                what it is
+=========  =====================================  ============================================================
+cpu        onnxruntime                            float32, the reference that every other provider is held to
+openvino   openvino (``hvt[openvino]``)           bf16 where the processor has it, else float32
+cuda       onnxruntime-gpu instead of onnxruntime  NVIDIA
+tensorrt   the same, and TensorRT                 NVIDIA; builds its engine at the first start of a model
+coreml     onnxruntime for macOS                  Apple
+=========  =====================================  ============================================================
+
+``auto`` takes cuda where it is installed, then openvino where the processor computes in bf16 (without that it is no
+faster than onnxruntime, measured), else cpu.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+from hvt_common.errors import UserError
+
+__all__ = ["ONNXRUNTIME_PROVIDERS", "PROVIDERS", "Choice", "OpenVinoCpu", "choose_provider"]
+
+PROVIDERS = ("auto", "cpu", "cuda", "tensorrt", "openvino", "coreml")
+
+ONNXRUNTIME_PROVIDERS: Mapping[str, tuple[str, ...]] = {
+    "cpu": ("CPUExecutionProvider",),
+    "cuda": ("CUDAExecutionProvider", "CPUExecutionProvider"),
+    "tensorrt": ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"),
+    "coreml": ("CoreMLExecutionProvider", "CPUExecutionProvider"),
+}
+"""onnxruntime's own names; the first that is able takes each operator, so the CPU stands last."""
+
+_HOW_TO_GET: Mapping[str, str] = {
+    "openvino": "pip install 'hvt[openvino]'",
+    "cuda": "pip uninstall -y onnxruntime && pip install onnxruntime-gpu",
+    "tensorrt": "pip uninstall -y onnxruntime && pip install onnxruntime-gpu tensorrt",
+    "coreml": "it comes with onnxruntime on macOS only",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class OpenVinoCpu:
+    """The OpenVINO that is installed, and what it can do on this processor."""
+
+    version: str
+    bf16: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The provider that is taken."""
+
+    provider: str
+    """One of `PROVIDERS`, never ``auto``."""
+    why: str
+    """Half a sentence."""
+    asked: bool
+    """The user named it; else ``auto`` did, and may fall back to cpu."""
+
+
+def choose_provider(
+    wanted: str, *, onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]
+) -> Choice:
+    """Settle ``wanted`` to a provider that is installed here.
+
+    Args:
+        wanted: One of `PROVIDERS`.
+        onnxruntime: The providers that the installed onnxruntime has, by its own names.
+        openvino: Looks for OpenVINO; called only where the answer matters.
+
+    Raises:
+        UserError: An unknown word, or a provider that is not installed, with what installs it.
+    """
+    if wanted not in PROVIDERS:
+        raise UserError(f"--provider '{wanted}' is not known: choose one of {', '.join(PROVIDERS)}")
+    if wanted == "auto":
+        return _best(onnxruntime, openvino)
+    if wanted == "openvino":
+        found = openvino()
+        if found is not None:
+            return Choice(wanted, _openvino_text(found), asked=True)
+    elif ONNXRUNTIME_PROVIDERS[wanted][0] in onnxruntime:
+        return Choice(wanted, "as asked", asked=True)
+    raise UserError(
+        f"--provider {wanted} is not installed here ({_HOW_TO_GET[wanted]}): choose auto or cpu, or install it"
+    )
+
+
+def _best(onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]) -> Choice:
+    if ONNXRUNTIME_PROVIDERS["cuda"][0] in onnxruntime:
+        return Choice("cuda", "onnxruntime-gpu is installed", asked=False)
+    found = openvino()
+    if found is None:
+        return Choice("cpu", f"OpenVINO is not installed ({_HOW_TO_GET['openvino']})", asked=False)
+    if not found.bf16:
+        why = f"this processor has no bf16, without which OpenVINO {found.version} is no faster"
+        return Choice("cpu", why, asked=False)
+    return Choice("openvino", _openvino_text(found), asked=False)
+
+
+def _openvino_text(found: OpenVinoCpu) -> str:
+    if found.bf16:
+        return f"OpenVINO {found.version} is installed and this processor computes in bf16"
+    return f"OpenVINO {found.version} in float32, for this processor has no bf16"

@@ -1,0 +1,101 @@
+"""The frame loop in lockstep: as fast as the parts allow, nothing dropped, every window in media time.
+
+The same input gives the same bytes and stills, however fast the machine: what is done side by side (a frame is
+encoded while the one before it is seen) does not change the order in which the budget is spent, and what a ground
+reports counts a fixed number of frames later.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+from typing import Self
+
+from hvt_common.values import Frame
+from hvt_edge.base_stage import BaseStage
+from hvt_edge.counts import FrameCounts
+from hvt_edge.feedback import FeedbackInbox
+from hvt_edge.keyframes import KeyframePlan
+from hvt_edge.sight import Seen
+from hvt_edge.still_stage import StillStage
+
+__all__ = ["LockstepPace"]
+
+_AHEAD_S = 1.0
+"""How far the edge runs ahead of the ground, in media time: what a ground reports counts so much later."""
+_GROUND_GONE_S = 20.0
+
+
+class LockstepPace:
+    """``follow``: a ground listens, so that the loop waits for it."""
+
+    def __init__(
+        self,
+        base: BaseStage,
+        stills: StillStage,
+        *,
+        inbox: FeedbackInbox,
+        keyframes: KeyframePlan,
+        fps: float,
+        counts: FrameCounts,
+        follow: bool,
+    ) -> None:
+        self._base = base
+        self._stills = stills
+        self._inbox = inbox
+        self._keyframes = keyframes
+        self._ahead_frames = max(1, round(_AHEAD_S * fps))
+        self._counts = counts
+        self._follows = follow
+        self._eyes = ThreadPoolExecutor(1, thread_name_prefix="hvt-sight")
+        self._seeing: tuple[Frame, bool, Future[Seen]] | None = None
+        self._in_flight: deque[tuple[int, set[int]]] = deque()
+        self._newest_answered = -1
+        self.now_ns = 0
+        """The capture time of the newest frame."""
+
+    def step(self, frame: Frame) -> None:
+        """Encode this frame while the one before is seen; send that one's stills, then this one's unit."""
+        began_ns = time.perf_counter_ns()
+        unit = self._base.encode(frame, now_ns=frame.capture_ns)
+        self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
+        self._finish_seeing()
+        self.now_ns = frame.capture_ns
+        self._base.send(unit, now_ns=frame.capture_ns)
+        held = self._keyframes.due(frame.capture_ns)
+        self._seeing = (frame, held, self._eyes.submit(self._stills.see, frame, unit))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                self._finish_seeing()
+                self._follow_ground(before=self._counts.last_index + 1)
+        finally:
+            self._eyes.shutdown()
+
+    def _finish_seeing(self) -> None:
+        if self._seeing is None:
+            return
+        frame, held, future = self._seeing
+        self._seeing = None
+        self._follow_ground(before=frame.index - self._ahead_frames + 1)
+        sent = self._stills.send(future.result(), now_ns=frame.capture_ns, held=held)
+        self._in_flight.append((frame.index, sent))
+
+    def _follow_ground(self, *, before: int) -> None:
+        """Wait until the ground has done with the frames before this one, and take in what it made of them."""
+        while self._in_flight and self._in_flight[0][0] < before:
+            index, sent = self._in_flight.popleft()
+            if self._follows and not self._inbox.wait_for(
+                frame_index=index, stills=sent, timeout_s=_GROUND_GONE_S
+            ):
+                self._follows = False  # it is gone, or it never answers: do not wait again
+            self._newest_answered = max([self._newest_answered, *sent])
+        self._stills.hear(self._inbox.take_up_to(self._newest_answered))

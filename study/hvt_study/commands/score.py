@@ -1,0 +1,70 @@
+"""``hvt-study score``: tables of tracks against ground truth, side by side."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from hvt_common.units import parse_size
+from hvt_edge.scene import Scene
+from hvt_study.score import Score, read_tracks, read_truth, score
+
+__all__ = ["SUMMARY", "add_arguments", "run"]
+
+SUMMARY = "Score the tracks of hvt-ground --tracks against ground truth."
+
+
+_ROWS = (
+    ("found (recall at IoU 0.5)", "recall"),
+    ("class right, of those found (top-1)", "top1"),
+    ("the same of small objects", "small_top1"),
+    ("macro-F1", "macro_f1"),
+    ("found with the right class", "seen_right"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Tables, truth, and what its numbers mean."""
+    parser.add_argument(
+        "tracks", nargs="+", metavar="[NAME=]TRACKS.csv", help="tables of tracks; NAME heads the column"
+    )
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        required=True,
+        default=argparse.SUPPRESS,
+        metavar="GT.txt",
+        help="MOTChallenge ground truth: frame,id,x,y,w,h,1,class,visibility",
+    )
+    parser.add_argument("--classes", default=",".join(Scene.class_names), help="names of the truth's classes")
+    parser.add_argument("--size", default="1280x720", metavar="WxH", help="size of the base stream")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print one column a table of tracks."""
+    width, height = parse_size(arguments.size, name="--size")
+    truth = read_truth(arguments.truth, class_names=arguments.classes.split(","))
+    columns: list[tuple[str, Score]] = []
+    for spec in arguments.tracks:
+        name, separator, path = spec.rpartition("=")
+        file = Path(path)
+        label = name if separator else file.stem
+        tracks = read_tracks(file)
+        columns.append((label, score(tracks, truth, frame_area_px=width * height)))
+    _print(columns)
+    return 0
+
+
+def _print(columns: Sequence[tuple[str, Score]]) -> None:
+    table = Table(title="What the ground knows, on every frame", title_justify="left", title_style="bold")
+    table.add_column("", style="cyan", no_wrap=True)
+    for name, _ in columns:
+        table.add_column(name, justify="right")
+    table.add_row("objects on all frames", *(f"{one.objects}" for _, one in columns))
+    for label, field in _ROWS:
+        table.add_row(label, *(f"{getattr(one, field):.3f}" for _, one in columns))
+    Console(highlight=False).print(table)

@@ -1,0 +1,148 @@
+"""deploy/compose.yaml: read, checked against the real parsers, and its commands run as processes without Docker."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from hvt_common.config import load
+from hvt_edge.config import EdgeConfig
+from hvt_edge.config import check as check_edge
+from hvt_ground.config import GroundConfig
+from hvt_ground.config import check as check_ground
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+IMAGE_PATHS = {"/opt/hvt/router.py": DEPLOY / "router.py", "/opt/hvt/zenoh": DEPLOY / "zenoh"}
+MODULES = {"hvt-edge": "hvt_edge.cli", "hvt-ground": "hvt_ground.cli"}
+
+
+@pytest.fixture(scope="module")
+def compose() -> dict[str, Any]:
+    """The file with ``${NAME:-default}`` settled as in an empty environment."""
+    text = (DEPLOY / "compose.yaml").read_text(encoding="utf-8")
+    return yaml.safe_load(re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text))
+
+
+def test_every_service_is_built_from_this_checkout(compose: dict[str, Any]) -> None:
+    """Without a build section Docker would look for an image of our name on the internet."""
+    assert set(compose["services"]) == {"router", "ground", "edge"}
+    for service in compose["services"].values():
+        context = (DEPLOY / service["build"]["context"]).resolve()
+        assert (context / service["build"]["dockerfile"]).samefile(DEPLOY / "Dockerfile")
+        assert (context / "pyproject.toml").is_file()
+
+
+def test_only_this_machine_can_reach_the_router(compose: dict[str, Any]) -> None:
+    """The router listens without keys: published on every address it would show the cameras to the network."""
+    for name, service in compose["services"].items():
+        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", [])), name
+
+
+def test_the_parts_that_name_each_other_exist(compose: dict[str, Any]) -> None:
+    """Compose refuses a file with an unknown volume or service."""
+    for service in compose["services"].values():
+        assert set(service.get("depends_on", {})) <= set(compose["services"])
+        named = {volume.split(":")[0] for volume in service.get("volumes", [])}
+        assert named <= set(compose["volumes"])
+        assert service["stop_signal"] == "SIGINT"
+    waited_for = compose["services"]["edge"]["depends_on"]["router"]["condition"]
+    assert waited_for == "service_healthy"
+    assert "healthcheck" in compose["services"]["router"]
+
+
+def test_the_commands_are_accepted_by_the_real_parsers(compose: dict[str, Any]) -> None:
+    """A renamed flag would end the container with code 2."""
+    program, *arguments = compose["services"]["edge"]["command"]
+    assert program == "hvt-edge"
+    edge, _ = load(EdgeConfig, arguments, program=program, description="")
+    assert check_edge(edge).source == "demo"
+    program, *arguments = compose["services"]["ground"]["command"]
+    assert program == "hvt-ground"
+    ground, _ = load(GroundConfig, arguments, program=program, description="")
+    assert check_ground(ground).connect == edge.connect == ("tcp/router:7447",)
+    router = _module(DEPLOY / "router.py")
+    python, script, *arguments = compose["services"]["router"]["command"]
+    assert (python, script) == ("python", "/opt/hvt/router.py")
+    config, _ = load(router.RouterConfig, arguments, program="router", description="")
+    assert config.listen == ("tcp/0.0.0.0:7447",)
+    assert config.insecure
+
+
+def test_the_image_holds_what_the_commands_name(compose: dict[str, Any]) -> None:
+    """Paths inside the image are made by the Dockerfile, a file away."""
+    dockerfile = (DEPLOY / "Dockerfile").read_text(encoding="utf-8")
+    for inside, outside in IMAGE_PATHS.items():
+        assert f"COPY {outside.relative_to(DEPLOY.parent)} {inside}\n" in dockerfile
+    for service in compose["services"].values():
+        for word in service["command"]:
+            if found := re.search(r"/opt/hvt/\S+", word):
+                assert Path(_here(found[0], port=7447, recordings=Path())).exists(), word
+
+
+@pytest.mark.integration
+def test_the_commands_do_what_the_file_promises(
+    compose: dict[str, Any], tmp_path: Path, free_port: int
+) -> None:
+    """Router, ground and edge with the very commands of the file: at the end there must be a recording."""
+
+    def start(name: str, *more: str) -> subprocess.Popen[str]:
+        words = [
+            _here(word, port=free_port, recordings=tmp_path) for word in compose["services"][name]["command"]
+        ]
+        program = [sys.executable, "-m", MODULES[words[0]]] if words[0] in MODULES else [sys.executable]
+        return subprocess.Popen([*program, *words[1:], *more], text=True, stdout=subprocess.DEVNULL)
+
+    check = [_here(word, port=free_port, recordings=tmp_path) for word in _health(compose)]
+    with start("router") as router:
+        deadline_s = time.monotonic() + 30
+        while subprocess.run([sys.executable, *check[1:]], check=False, capture_output=True).returncode:
+            assert time.monotonic() < deadline_s, "the health check never passed"
+        with start("ground", "--quiet", "--once") as ground:
+            with start("edge", "--quiet", "--wait=60s", "--max-frames=30") as edge:
+                assert edge.wait(timeout=120) == 0
+            assert ground.wait(timeout=60) == 0
+        router.send_signal(signal.SIGINT)
+        assert router.wait(timeout=3) == 0
+    sent = json.loads((tmp_path / "edge.json").read_text())
+    received = json.loads((tmp_path / "ground.json").read_text())
+    assert 0 < sent["frames"] == received["frames_decoded"]
+    assert sent["base_bytes"] == received["base_bytes"]
+    assert [file.stat().st_size > 0 for file in tmp_path.glob("hvt-demo-*.rrd")] == [True]
+
+
+def _health(compose: dict[str, Any]) -> list[str]:
+    kind, *command = compose["services"]["router"]["healthcheck"]["test"]
+    assert kind == "CMD"
+    assert command[0] == "python"
+    return command
+
+
+def _here(word: str, *, port: int, recordings: Path) -> str:
+    """A word of a command as it has to be outside of a container."""
+    word = re.sub(r"tcp/(router|0\.0\.0\.0):7447", f"tcp/127.0.0.1:{port}", word).replace("7447", str(port))
+    for inside, outside in IMAGE_PATHS.items():
+        word = word.replace(inside, str(outside))
+    return word.replace("/recordings", str(recordings))
+
+
+def _module(file: Path) -> Any:
+    spec = importlib.util.spec_from_file_location("hvt_router_script", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.modules[spec.name]
+    return module

@@ -1,0 +1,150 @@
+"""deploy/router.py as a real process, with messages of two other sessions through it."""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from hvt_common.link.keys import EdgeKeys, Row, selector
+from hvt_common.link.session import ask, declare_publisher, open_session, serve
+from hvt_common.link.zenoh_config import LinkSettings
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+KEYS = EdgeKeys("uav-1")
+
+pytestmark = pytest.mark.integration
+
+
+def _lines(process: subprocess.Popen[str]) -> queue.Queue[str]:
+    lines: queue.Queue[str] = queue.Queue()
+    assert process.stdout is not None
+    stream = process.stdout
+    threading.Thread(target=lambda: [lines.put(line) for line in stream], daemon=True).start()
+    return lines
+
+
+@contextmanager
+def _router(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, str(DEPLOY / "router.py"), *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert "listens on" in _lines(process).get(timeout=30)
+            yield process
+        finally:
+            process.kill()
+
+
+def _wait_for(condition: Callable[[], object], *, timeout_s: float = 20.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "it did not come"
+        time.sleep(0.01)
+
+
+def _client(endpoint: str) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return config
+
+
+@pytest.mark.parametrize("receiver", ["ground behind the router", "client"])
+def test_messages_questions_and_presence_pass(free_port: int, receiver: str) -> None:
+    """Where both sides can only call out, the router is the link: all of the key table must get through it."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    ground = LinkSettings(
+        role="ground", connect=(endpoint,), zenoh_config=DEPLOY / "zenoh" / "ground-behind-router.json5"
+    )
+    with ExitStack() as stack:
+        stack.enter_context(_router("--listen", endpoint))
+        edge = stack.enter_context(open_session(LinkSettings(role="edge", connect=(endpoint,))))
+        other = stack.enter_context(
+            open_session(ground) if receiver != "client" else zenoh.open(_client(endpoint))
+        )
+        samples = other.declare_subscriber(selector(Row.BASE))
+        publisher = declare_publisher(edge, Row.BASE, keys=KEYS)
+        serve(edge, Row.INFO, keys=KEYS, answer=lambda question: b"answer to " + question)
+        token = edge.liveliness().declare_token(KEYS.key(Row.ALIVE))
+        _wait_for(lambda: publisher.matching_status.matching)
+        unit = bytes(range(256)) * 120
+        publisher.put(unit, attachment=b"header")
+        sample = samples.recv()
+        assert sample.payload.to_bytes() == unit
+        assert sample.attachment is not None
+        assert sample.attachment.to_bytes() == b"header"
+        assert sample.timestamp is None, "a router that stamps adds 26 bytes to each message"
+        assert ask(other, Row.INFO, keys=KEYS, question=b"this", timeout_s=5) == b"answer to this"
+        alive = [reply.ok.key_expr for reply in other.liveliness().get("hvt/*/alive") if reply.ok is not None]
+        assert [str(key) for key in alive] == ["hvt/uav-1/alive"]
+        token.undeclare()
+
+
+def test_a_ground_that_comes_before_its_router_finds_it(free_port: int) -> None:
+    """After a power cut the ground may be up first; it has to start, and connect by itself."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    ground_settings = LinkSettings(
+        role="ground", connect=(endpoint,), zenoh_config=DEPLOY / "zenoh" / "ground-behind-router.json5"
+    )
+    with ExitStack() as stack:
+        ground = stack.enter_context(open_session(ground_settings))
+        edge = stack.enter_context(open_session(LinkSettings(role="edge", connect=(endpoint,))))
+        samples = ground.declare_subscriber(selector(Row.BASE))
+        publisher = declare_publisher(edge, Row.BASE, keys=KEYS)
+        stack.enter_context(_router("--listen", endpoint))
+        _wait_for(lambda: publisher.matching_status.matching)
+        publisher.put(b"first")
+        assert samples.recv().payload.to_bytes() == b"first"
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+def test_a_signal_ends_it_cleanly(free_port: int, how: signal.Signals) -> None:
+    """Otherwise systemd and Docker would wait for their time-out and kill it, and note a failure."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    calling = LinkSettings(role="edge", connect=(endpoint,))
+    with _router("--listen", endpoint) as process, open_session(calling) as edge:
+        _wait_for(lambda: list(edge.info.routers_zid()))
+        process.send_signal(how)
+        assert process.wait(timeout=3) == 0
+
+
+def _refused(*arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, str(DEPLOY / "router.py"), *arguments],
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("\n") == 1
+    return done.stderr
+
+
+def test_it_does_not_open_the_network_without_keys(free_port: int) -> None:
+    """Anybody on the network could watch the cameras and ask for keyframes."""
+    assert "--insecure" in _refused("--listen", f"tcp/0.0.0.0:{free_port}")
+
+
+def test_a_port_in_use_is_a_sentence() -> None:
+    """The most likely mistake: a ground already listens there."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        assert "in use" in _refused("--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}")
+
+
+def test_a_configuration_that_is_no_router_is_a_sentence(tmp_path: Path, free_port: int) -> None:
+    """As a peer it would run, and pass nothing on: the hardest fault to find."""
+    file = tmp_path / "peer.json5"
+    file.write_text('{ mode: "peer" }', encoding="utf-8")
+    said = _refused("--zenoh-config", str(file), "--listen", f"tcp/127.0.0.1:{free_port}")
+    assert 'mode: "router"' in said

@@ -1,0 +1,135 @@
+"""The systemd units, as systemd and our own parsers read them."""
+
+from __future__ import annotations
+
+import configparser
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hvt_common.config import load
+from hvt_common.link.keys import EdgeKeys
+from hvt_edge.config import EdgeConfig
+from hvt_edge.config import check as check_edge
+from hvt_ground.config import GroundConfig
+from hvt_ground.config import check as check_ground
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
+INSTANCE = "uav-1"
+BIN = "/opt/hvt/venv/bin/"
+
+
+class _Unit(configparser.RawConfigParser):
+    def optionxform(self, optionstr: str) -> str:
+        return optionstr
+
+
+def _read(unit: Path) -> _Unit:
+    parsed = _Unit(delimiters=("=",), comment_prefixes=("#",), interpolation=None)
+    parsed.read_string(unit.read_text(encoding="utf-8").replace("%i", INSTANCE))
+    return parsed
+
+
+def _command(unit: Path) -> list[str]:
+    return shlex.split(_read(unit)["Service"]["ExecStart"])
+
+
+def test_units_are_there() -> None:
+    """Without this, an empty folder would pass every other test of this file."""
+    assert {unit.name for unit in UNITS} == {"hvt-edge@.service", "hvt-ground.service", "hvt-router.service"}
+
+
+def test_edge_unit_starts_with_the_sample_configuration() -> None:
+    """A unit with a flag that hvt-edge does not know would end with code 2 and never be tried again."""
+    program, *arguments = _command(DEPLOY / "systemd" / "hvt-edge@.service")
+    assert program == BIN + "hvt-edge"
+    at = arguments.index("--config") + 1
+    assert arguments[at] == f"/etc/hvt/edge-{INSTANCE}.toml"
+    arguments[at] = str(DEPLOY / "config" / "edge.toml")
+    config, _ = load(EdgeConfig, arguments, program="hvt-edge", description="")
+    assert check_edge(config).edge_id == INSTANCE
+    assert EdgeKeys(config.edge_id).edge == INSTANCE
+
+
+def test_ground_unit_starts_with_the_sample_configuration() -> None:
+    """The same for the ground."""
+    program, *arguments = _command(DEPLOY / "systemd" / "hvt-ground.service")
+    assert program == BIN + "hvt-ground"
+    at = arguments.index("--config") + 1
+    assert arguments[at] == "/etc/hvt/ground.toml"
+    arguments[at] = str(DEPLOY / "config" / "ground.toml")
+    config, _ = load(GroundConfig, arguments, program="hvt-ground", description="")
+    assert check_ground(config).record == Path()
+
+
+def test_router_unit_runs_the_script_that_is_in_the_checkout() -> None:
+    """The router is a script, not an installed command: a moved file would leave the unit pointing at nothing."""
+    python, script, flag, file = _command(DEPLOY / "systemd" / "hvt-router.service")
+    assert python == BIN + "python"
+    assert (DEPLOY.parent / Path(script).relative_to("/opt/hvt/src")).is_file()
+    assert (flag, file) == ("--zenoh-config", "/etc/hvt/router.json5")
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
+def test_unit_stops_like_ctrl_c_and_does_not_retry_a_wrong_configuration(unit: Path) -> None:
+    """Another signal would cost the summary; retrying code 2 would fill the journal with one sentence for ever."""
+    service = _read(unit)["Service"]
+    assert service["KillSignal"] == "SIGINT"
+    assert service["Restart"] == "on-failure"
+    assert service["RestartPreventExitStatus"] == "2"
+    assert float(service["TimeoutStopSec"]) > 3, "a clean end may take 3 s"
+    assert (
+        service["User"] == (DEPLOY / "systemd" / "hvt-sysusers.conf").read_text().splitlines()[-1].split()[1]
+    )
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
+def test_unit_writes_where_it_may(unit: Path) -> None:
+    """ProtectSystem=strict makes all else read-only: a working directory outside loses the recording."""
+    service = _read(unit)["Service"]
+    assert service["ProtectSystem"] == "strict"
+    if "StateDirectory" in service:
+        assert service["WorkingDirectory"] == "%S/" + service["StateDirectory"]
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> list[str]:
+    """The units with the paths of an installation replaced by those of this one, so that systemd finds programs."""
+    bin_here = Path(sys.executable).parent
+    if not (bin_here / "hvt-edge").exists():
+        pytest.skip("hvt is not installed beside this interpreter: no console scripts to point the units at")
+    copies = []
+    for unit in UNITS:
+        text = unit.read_text(encoding="utf-8").replace(BIN, f"{bin_here}/")
+        copy = tmp_path / unit.name
+        copy.write_text(text.replace("/opt/hvt/src", str(DEPLOY.parent)), encoding="utf-8")
+        copies.append(str(copy))
+    return copies
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_accepts_the_units(installed: list[str]) -> None:
+    """A misspelt hardening option is ignored by systemd with a line in the journal: the service runs without it."""
+    found = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", *installed], capture_output=True, text=True, check=False
+    )
+    names = [Path(copy).name for copy in installed]
+    complaints = [line for line in found.stderr.splitlines() if any(name in line for name in names)]
+    assert complaints == []
+    assert found.returncode == 0, found.stderr
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_finds_a_misspelt_option(installed: list[str]) -> None:
+    """Shows that the test above can fail."""
+    broken = Path(installed[-1])
+    broken.write_text(broken.read_text().replace("NoNewPrivileges", "NoNewPrivilege"))
+    found = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(broken)], capture_output=True, text=True, check=False
+    )
+    assert "NoNewPrivilege" in found.stderr

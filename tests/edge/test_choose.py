@@ -1,0 +1,217 @@
+"""From tracks to stills, with the real codec; every wish has one fate."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from clips import START_NS, hard_pictures
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_common.values import Frame, Tracks, View
+from hvt_edge.candidates import Candidate, TrackMemory
+from hvt_edge.choose import Chooser, ChooserSettings
+from hvt_edge.methods.base import Request, Step
+from hvt_edge.sight import Seen
+from hvt_edge.still import StillMaker
+from hvt_edge.still_queue import QueueSettings
+from hvt_edge.suppress import Suppression
+
+SIZE = (640, 360)
+PICTURE = hard_pictures(1, size=SIZE)[0]
+FLAT = np.full_like(PICTURE, 128)
+STEP_NS = 333_333_333
+
+
+@dataclass(frozen=True)
+class ByScore:
+    """Wants every candidate; the score is its id, or what is given for it."""
+
+    scores: tuple[tuple[int, float], ...] = ()
+    name: str = "by-score"
+    video_only: bool = False
+
+    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
+        given_scores = dict(self.scores)
+        wanted = [
+            Request(one, "test", given_scores.get(one.track_id, float(one.track_id))) for one in candidates
+        ]
+        return sorted(wanted, key=lambda request: -request.score)
+
+
+class Rig:
+    """A chooser, its fates, and steps of a third of a second."""
+
+    def __init__(
+        self,
+        method: ByScore | None = None,
+        *,
+        cooldown: float = 0.0,
+        most_bytes: int = 20_000,
+        picture: np.ndarray = PICTURE,
+    ) -> None:
+        self.picture = picture
+        self.fates: Counter[tuple[str, str]] = Counter()
+        view = View.fitted(SIZE, SIZE, fit="letterbox")
+        self.chooser = Chooser(
+            method or ByScore(),
+            suppression=Suppression.for_cooldown(cooldown),
+            maker=StillMaker(),
+            memory=TrackMemory(),
+            view=view,
+            class_names=("car",),
+            settings=ChooserSettings(fps=3, most_bytes=most_bytes, queue=QueueSettings(max_length=3)),
+            on_fate=lambda fate, reason: self.fates.update([(fate, reason)]),
+        )
+        self.number = -1
+
+    @property
+    def now_ns(self) -> int:
+        return START_NS + self.number * STEP_NS
+
+    def consider(self, boxes: dict[int, tuple[float, ...]], *, base=FLAT, detected: bool = True) -> None:
+        """The next decision step."""
+        self.number += 1
+        count = len(boxes)
+        tracks = Tracks(
+            self.number,
+            np.array(list(boxes), np.int64),
+            np.array(list(boxes.values()), np.float32).reshape(count, 4),
+            np.full(count, 0.5, np.float32),
+            np.zeros(count, np.int32),
+            np.zeros(count, np.int64),
+            np.full(count, self.number),
+            np.zeros(count, np.bool_),
+        )
+        seen = Seen(
+            Frame(self.number, self.now_ns, self.picture, self.picture), base, tracks, detected=detected
+        )
+        self.chooser.consider(seen, now_ns=self.now_ns, room_bytes=1000)
+
+    def stills(self, room: int) -> list[int]:
+        """Send what fits ``room`` in all; the tracks of the stills."""
+        sent, left = [], room
+        for still in self.chooser.stills(now_ns=self.now_ns, room_bytes=lambda: left):
+            assert len(still.data) <= left
+            left -= len(still.data)
+            sent.append(still.track_id)
+        return sent
+
+
+SMALL, LARGE = (20.0, 20.0, 60.0, 50.0), (150.0, 50.0, 500.0, 330.0)
+
+
+def box_at(number: int, side: float = 36.0) -> tuple[float, ...]:
+    """One of many small boxes."""
+    x, y = 10.0 + 45 * (number % 12), 10.0 + 45 * (number // 12)
+    return x, y, x + side, y + side
+
+
+def test_the_most_useful_is_sent_first_as_long_as_there_is_room():
+    """The bits would go to whatever was seen first."""
+    rig = Rig()
+    rig.consider({1: box_at(1), 3: box_at(3), 2: box_at(2)})
+    assert rig.stills(100_000) == [3, 2, 1]
+    assert rig.fates == {("sent", "test"): 3}
+    assert rig.chooser.waiting == 0
+
+
+def test_a_lesser_one_does_not_slip_in_before_the_most_useful():
+    """What matters would starve behind what happens to be small."""
+    rig = Rig(ByScore(((1, 1.0), (2, 2.0))))
+    rig.consider({1: SMALL, 2: LARGE})
+    assert rig.stills(2_500) == []
+    assert rig.chooser.waiting == 2
+    assert rig.stills(60_000) == [2, 1]
+
+
+def test_one_that_never_fits_does_not_block_the_others_for_ever():
+    """One lorry close to the camera would keep every other still from being sent for the rest of the flight."""
+    rig = Rig(ByScore(((1, 1.0), (2, 2.0))))
+    sent: list[int] = []
+    for _ in range(12):
+        rig.consider({1: SMALL, 2: LARGE})  # wished for again at each step, so that no wish grows old
+        sent += rig.stills(2_500)
+    assert set(sent) == {1}
+    assert len(sent) >= 3
+    assert rig.fates["dropped", "too_large"] >= 2
+
+
+def test_one_that_waited_long_is_coded_to_the_room_there_is():
+    """An object that is believed to need a little more than its share would never be seen sharp at all."""
+    rig = Rig(picture=cv2.GaussianBlur(PICTURE, (0, 0), 3))  # codes to far less than is expected
+    expected = 640 + 0.12 * 208 * 208
+    sent = []
+    for _ in range(4):
+        rig.consider({2: (20.0, 20.0, 180.0, 180.0)})
+        sent.append(rig.stills(round(expected * 0.8)))
+    assert sent == [[], [], [], [2]], "a second of waiting"
+
+
+def test_what_the_base_shows_as_well_is_not_sent():
+    """Bits would be spent on stills that show nothing new."""
+    rig = Rig()
+    rig.consider({1: SMALL}, base=PICTURE)
+    assert rig.stills(100_000) == []
+    assert rig.fates == {("dropped", "base_good"): 1}
+    rig.consider({1: SMALL}, base=PICTURE)
+    assert rig.stills(100_000) == []
+    assert rig.fates["deferred", "refused"] == 1, "it rests before it is tried again"
+
+
+def test_between_detections_nothing_is_wished_for_but_what_waits_may_go():
+    """Stills would wait for the next detection although there is room now."""
+    rig = Rig()
+    rig.consider({1: SMALL})
+    assert rig.stills(10) == []
+    rig.consider({1: SMALL, 2: box_at(5)}, detected=False)
+    assert rig.stills(100_000) == [1]
+
+
+def test_sequence_numbers_count_stills_and_nothing_else():
+    """The ground would believe that stills were lost."""
+    rig = Rig()
+    numbers = []
+    for step in range(4):
+        rig.consider({1: SMALL, 2: box_at(7)}, base=PICTURE if step % 2 else FLAT)
+        numbers += [
+            still.sequence for still in rig.chooser.stills(now_ns=rig.now_ns, room_bytes=lambda: 10**6)
+        ]
+        rig.number += 3  # past the rest of what was refused
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) >= 4
+
+
+def test_closing_says_what_becomes_of_those_that_wait():
+    """The sums of the ledger would not agree."""
+    rig = Rig()
+    rig.consider({1: SMALL, 2: box_at(5)})
+    rig.chooser.close()
+    assert rig.fates == {("dropped", "ended"): 2}
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sets(st.integers(0, 30), max_size=6), st.integers(0, 6_000), st.booleans()),
+        min_size=1,
+        max_size=15,
+    ),
+    st.sampled_from([0.0, 1.0]),
+)
+def test_every_candidate_of_a_step_has_exactly_one_fate(steps, cooldown):
+    """The table of fates would not add up to the candidates there were."""
+    rig, candidates = Rig(cooldown=cooldown), 0
+    for tracks, room, good in steps:
+        rig.consider({one: box_at(one) for one in sorted(tracks)}, base=PICTURE if good else FLAT)
+        candidates += len(tracks)
+        rig.stills(room)
+        assert rig.chooser.waiting <= 3
+        assert set(rig.chooser._held_up) <= {one.request.candidate.track_id for one in rig.chooser._queue}
+        assert len(rig.chooser._base_frames) <= 3
+    rig.chooser.close()
+    assert sum(rig.fates.values()) == candidates

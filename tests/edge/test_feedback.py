@@ -1,0 +1,106 @@
+"""What grounds report, and when the edge takes it in."""
+
+from __future__ import annotations
+
+import threading
+
+from hvt_common.link.wire import Feedback, StillResult
+from hvt_edge.feedback import FeedbackInbox
+
+U32 = 2**32 - 1
+
+
+def result(sequence: int, *, track: int = 1, name: str = "car") -> StillResult:
+    """One still's class."""
+    return StillResult(
+        still_sequence=sequence,
+        track_id=track,
+        class_name=name,
+        confidence=0.9,
+        entropy_nats=0.1,
+        ground_track_id=-1,
+    )
+
+
+def report(*stills: StillResult, frame: int = -1, base: int = 0, roi: int = 0, receiver: int = 1) -> Feedback:
+    """A receiver report."""
+    return Feedback(
+        session_id=7,
+        receiver_id=receiver,
+        sequence=0,
+        send_ns=1,
+        last_frame_index=frame,
+        base_messages=base,
+        base_bytes=0,
+        roi_messages=roi,
+        roi_bytes=0,
+        lost=0,
+        corrupt=0,
+        delay_p50_ms=-1.0,
+        clock_offset_ns=0,
+        clock_error_ns=-1,
+        stills=stills,
+    )
+
+
+def test_results_are_taken_once_as_they_come():
+    """A class would count twice for M3 and M5, or never."""
+    inbox = FeedbackInbox()
+    assert inbox.received_ns is None
+    inbox.receive(report(result(1), result(0)), now_ns=5)
+    inbox.receive(report(result(1, name="bus"), receiver=2), now_ns=6)  # another ground says it too
+    assert [one.still_sequence for one in inbox.take()] == [1, 0]
+    assert inbox.take() == []
+    assert inbox.received_ns == 6
+    inbox.receive(report(result(1)), now_ns=7)
+    assert inbox.take() == []
+
+
+def test_lockstep_takes_exactly_the_stills_it_waited_for_in_their_order():
+    """What a ground says early would count early in one run and late in the next: other stills each time."""
+    inbox = FeedbackInbox()
+    inbox.receive(report(result(3), result(1), result(2), frame=4), now_ns=1)
+    assert inbox.wait_for(frame_index=4, stills={1, 2}, timeout_s=0)
+    assert [one.still_sequence for one in inbox.take_up_to(2)] == [1, 2]
+    assert inbox.wait_for(frame_index=4, stills={3}, timeout_s=0)
+    assert [one.still_sequence for one in inbox.take_up_to(3)] == [3]
+    inbox.receive(report(result(2, name="bus"), result(3), result(4)), now_ns=2)  # a second ground, later
+    assert [one.still_sequence for one in inbox.take_up_to(10)] == [4]
+
+
+def test_waiting_ends_when_frame_and_stills_are_there_or_the_time_is_up():
+    """A lockstep edge would run ahead of its ground, or wait for ever for one that is gone."""
+    inbox = FeedbackInbox()
+    assert not inbox.wait_for(frame_index=0, stills=set(), timeout_s=0.01)
+    inbox.receive(report(frame=3), now_ns=1)
+    assert inbox.wait_for(frame_index=3, stills=set(), timeout_s=0)
+    assert not inbox.wait_for(frame_index=3, stills={0}, timeout_s=0.01)
+    later = threading.Timer(0.05, lambda: inbox.receive(report(result(0), frame=4), now_ns=2))
+    later.start()
+    assert inbox.wait_for(frame_index=4, stills={0}, timeout_s=10)
+    later.join()
+
+
+def test_the_goodbye_waits_for_all_messages():
+    """The last pictures and stills would be lost with the session."""
+    inbox = FeedbackInbox()
+    inbox.receive(report(base=10, roi=2), now_ns=1)
+    assert inbox.wait_for_messages(base=10, roi=2, timeout_s=0)
+    assert not inbox.wait_for_messages(base=11, roi=2, timeout_s=0.01)
+    assert not inbox.wait_for_messages(base=10, roi=3, timeout_s=0.01)
+    inbox.receive(report(base=3, roi=3), now_ns=2)  # an older report, or another ground's
+    assert inbox.wait_for_messages(base=10, roi=3, timeout_s=0)
+
+
+def test_hostile_reports_take_no_memory_and_do_not_hide_true_ones():
+    """Anybody on the link could fill a drone's memory, or make its methods deaf."""
+    inbox = FeedbackInbox()
+    for number in range(0, 100_000, 32):
+        never_asked = tuple(result(U32 - number - one) for one in range(32))
+        inbox.receive(report(*never_asked, frame=U32, base=2**53 - 1), now_ns=1)
+    assert len(inbox._answered) <= 2048
+    inbox.receive(report(result(5)), now_ns=2)
+    assert inbox.wait_for(frame_index=9, stills={5}, timeout_s=0)
+    assert [one.still_sequence for one in inbox.take_up_to(5)] == [5]
+    taken = inbox.take()
+    assert len(taken) <= 1024

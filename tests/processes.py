@@ -1,0 +1,168 @@
+"""Starts hvt-edge and hvt-ground as real processes, for tests, and gathers what they say and leave behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Link", "Running", "eventually", "free_ports"]
+
+START_S = 30.0
+"""How long a process may take to get going on a busy machine."""
+_POLL_S = 0.01
+
+
+def free_ports(number: int) -> list[int]:
+    """TCP ports of loopback that nobody listens on at this moment, all different."""
+    probes = [socket.socket() for _ in range(number)]
+    try:
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [int(probe.getsockname()[1]) for probe in probes]
+    finally:
+        for probe in probes:
+            probe.close()
+
+
+def eventually(true: Callable[[], object], *, within_s: float, what: str) -> None:
+    """Wait until ``true()``; fail where it does not become so in time."""
+    deadline_s = time.monotonic() + within_s
+    while not true():
+        if time.monotonic() > deadline_s:
+            raise AssertionError(f"not within {within_s:g} s: {what}")
+        time.sleep(_POLL_S)
+
+
+class Running:
+    """One process; its output goes to files, so that it never waits for a reader."""
+
+    def __init__(self, module: str, arguments: list[str], *, folder: Path, name: str) -> None:
+        self.name = name
+        self._summary = folder / f"{name}.json"
+        self._out, self._err = folder / f"{name}.out", folder / f"{name}.err"
+        command = [sys.executable, "-m", module, "--summary", str(self._summary), *arguments]
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                cwd=folder,
+                env={**os.environ, "COLUMNS": "200"},
+            )
+
+    @property
+    def said(self) -> str:
+        """Standard error so far: status lines and warnings."""
+        return self._err.read_text(errors="replace")
+
+    @property
+    def told(self) -> str:
+        """Standard output so far: the table at the end."""
+        return self._out.read_text(errors="replace")
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still runs."""
+        return self.process.poll() is None
+
+    def until(self, text: str, *, within_s: float = START_S) -> float:
+        """Wait until standard error holds ``text``; return the Unix time of noticing."""
+
+        def found() -> bool:
+            assert text in self.said or self.alive, f"{self.name} ended early:\n{self.said}"
+            return text in self.said
+
+        eventually(found, within_s=within_s, what=f"{self.name} says {text!r}; it said:\n{self.said}")
+        return time.time()
+
+    def wait(self, *, within_s: float) -> int:
+        """The exit code; fails with what the process said where it does not end in time."""
+        try:
+            return self.process.wait(within_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"{self.name} still runs after {within_s:g} s:\n{self.said}") from None
+
+    def finish(self, *, within_s: float = 90.0) -> dict[str, Any]:
+        """Wait for a good end; return the summary."""
+        code = self.wait(within_s=within_s)
+        assert code == 0, f"{self.name} ended with {code}:\n{self.said}"
+        assert "Traceback" not in self.said, self.said
+        return self.summary()
+
+    def interrupt(self) -> float:
+        """Ctrl-C; return the seconds until the process had ended."""
+        began_s = time.monotonic()
+        self.process.send_signal(signal.SIGINT)
+        self.wait(within_s=20)
+        return time.monotonic() - began_s
+
+    def kill(self) -> None:
+        """kill -9."""
+        self.process.kill()
+        self.process.wait(10)
+
+    def summary(self) -> Any:
+        """The JSON that it left."""
+        return json.loads(self._summary.read_text())
+
+
+class Link:
+    """A ground and its edges on ports of their own. A context manager that leaves no process behind."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.port, self.edge_port = free_ports(2)
+        self._started: list[Running] = []
+
+    @property
+    def ground_endpoint(self) -> str:
+        """Where a ground of this link listens."""
+        return f"tcp/127.0.0.1:{self.port}"
+
+    @property
+    def edge_endpoint(self) -> str:
+        """Where an edge started with ``listens=True`` listens, too."""
+        return f"tcp/127.0.0.1:{self.edge_port}"
+
+    def ground(
+        self, *arguments: str, name: str = "ground", connects: bool = False, up: bool = True
+    ) -> Running:
+        """Start a ground; with ``up`` return when it says where it listens."""
+        where = ["--connect", self.edge_endpoint] if connects else ["--listen", self.ground_endpoint]
+        running = self._start("hvt_ground.cli", [*where, *arguments], name=name)
+        if up:
+            running.until("connecting to" if connects else "listening on")
+        return running
+
+    def edge(self, *arguments: str, name: str = "edge", listens: bool = False) -> Running:
+        """Start an edge that connects to the ground's port; with ``listens`` others can connect to it."""
+        where = ["--connect", self.ground_endpoint]
+        where += ["--listen", self.edge_endpoint] if listens else []
+        return self._start("hvt_edge.cli", [*where, *arguments], name=name)
+
+    def _start(self, module: str, arguments: list[str], *, name: str) -> Running:
+        running = Running(module, arguments, folder=self.folder, name=name)
+        self._started.append(running)
+        return running
+
+    def __enter__(self) -> Link:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        for running in self._started:
+            if running.alive:
+                running.kill()
+
+
+def flags(settings: Mapping[str, object]) -> list[str]:
+    """``{"max_frames": 90}`` as ``["--max-frames", "90"]``."""
+    return [word for name, value in settings.items() for word in (f"--{name.replace('_', '-')}", str(value))]
