@@ -235,7 +235,7 @@ def _three_numbers(
 def _class_names(model: OnnxModel, classes: int, labels: Path | None) -> tuple[str, ...]:
     names = read_labels(labels) if labels is not None else metadata_labels(model.metadata)
     if names is None and classes in (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):
-        names = None
+        names = IMAGENET_NAMES
     if names is None:
         return tuple(f"class {index}" for index in range(classes))
     if (len(names), classes) == (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):

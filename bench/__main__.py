@@ -1,0 +1,45 @@
+"""``make bench``: speed and memory as ratios against a peer or a floor, each pair measured in one run.
+
+``python -m bench [NAME …]`` runs some; the table is also written to build/bench.json.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+PARTS = ("tracker", "detector", "pipeline", "latency", "providers")
+
+
+def main(argv: list[str]) -> int:
+    console = Console(highlight=False)
+    table = Table(title="make bench", title_justify="left")
+    for name in ("part", "measure", "value", "bar", "holds"):
+        table.add_column(name, justify="left" if name in ("part", "measure") else "right")
+    found = []
+    for part in argv or PARTS:
+        with console.status(f"{part} …"):
+            try:
+                rows = importlib.import_module(f"bench.{part}").rows()
+            except ImportError as error:
+                rows = [{"measure": f"left out: {error}", "value": None, "bar": None, "holds": None}]
+        for row in rows:
+            found.append({"part": part, **row})
+            holds = {True: "yes", False: "NO", None: ""}[row["holds"]]
+            value, bar = row["value"], row["bar"]
+            shown = f"{value:.3f}" if isinstance(value, float) else str("" if value is None else value)
+            table.add_row(part, row["measure"], shown, str("" if bar is None else bar), holds)
+    console.print(table)
+    out = Path("build/bench.json")
+    out.parent.mkdir(exist_ok=True)
+    out.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

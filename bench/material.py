@@ -1,0 +1,32 @@
+"""Where benchmarks find clips and models: the folder that HVT_DATA names."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from hvt_common.values import Frame
+from hvt_edge.source import open_source
+
+ROOT = Path(__file__).resolve().parent.parent
+SIZE, FPS = (1280, 720), 15.0
+
+
+def data() -> Path:
+    folder = Path(os.environ.get("HVT_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        raise ImportError(f"no clips and models at {folder}; HVT_DATA names the folder")
+    return folder
+
+
+def clip() -> Path:
+    return data() / "clips" / "drone_carpark.mp4"
+
+
+def nano() -> Path:
+    return data() / "models" / "yolox_nano.onnx"
+
+
+def frames(count: int) -> list[Frame]:
+    with open_source(str(clip()), size=SIZE, fps=FPS, max_frames=count) as source:
+        return list(source.frames(start_ns=0))

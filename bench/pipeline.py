@@ -1,0 +1,153 @@
+"""Whole pipelines in lockstep against the bare sum of their parts, on the same frames in the same run.
+
+The floor of the edge is x265 encode, HEVC decode and a detector call on every fifth frame; that of the ground is decode
+and the same detector calls. A pipeline adds the source, tracking, camera motion, methods, stills, headers, ledger and
+the recording, and may win time back by doing things side by side.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from bench.material import FPS, SIZE, clip, frames, nano
+from hvt_common import __version__
+from hvt_common.link.inbox import Received
+from hvt_common.link.wire import BaseHeader, Flags, Info
+from hvt_common.values import AccessUnit, View
+from hvt_common.vision.detect import open_detector
+from hvt_common.vision.hevc import BaseDecoder
+from hvt_edge.encode import BaseEncoder
+from hvt_edge.rate import encoder_settings
+from hvt_ground.build import Models, make_sight
+from hvt_ground.config import GroundConfig
+from hvt_ground.record import Recorder, RecorderSettings
+from hvt_ground.session import GroundSession
+
+_FRAMES = 200
+_EVERY = 5
+_ROUNDS = 3
+
+
+def rows() -> list[dict[str, object]]:
+    taken = frames(_FRAMES)
+    edge, ground, floor_edge, floor_ground = [], [], [], []
+    for _ in range(_ROUNDS):
+        encode_s, units = _bare_encode(taken)
+        see_s = _bare_see(units)
+        floor_edge.append(encode_s + see_s)
+        floor_ground.append(see_s)
+        edge.append(_edge())
+        ground.append(_ground(units))
+    return [
+        _row("edge, frames a second over its floor's", min(floor_edge) / min(edge)),
+        _row("ground, frames a second over its floor's", min(floor_ground) / min(ground)),
+        {"measure": "edge floor, ms a frame", "value": min(floor_edge) * 1e3, "bar": None, "holds": None},
+        {"measure": "ground floor, ms a frame", "value": min(floor_ground) * 1e3, "bar": None, "holds": None},
+    ]
+
+
+def _row(measure: str, value: float) -> dict[str, object]:
+    return {"measure": measure, "value": value, "bar": ">= 0.90", "holds": value >= 0.90}
+
+
+def _bare_encode(taken) -> tuple[float, list[AccessUnit]]:
+    settings = encoder_settings(
+        size=SIZE, fps=FPS, preset="veryfast", total_bps=800_000, base_bps=650_000, edge_id="edge-1"
+    )
+    encoder = BaseEncoder(settings)
+    began = time.perf_counter()
+    units = [encoder.encode(frame) for frame in taken]
+    return (time.perf_counter() - began) / len(taken), units
+
+
+def _bare_see(units: list[AccessUnit]) -> float:
+    decoder, detector = BaseDecoder(), open_detector(str(nano()))
+    began = time.perf_counter()
+    for index, unit in enumerate(units):
+        image = decoder.decode(unit.data)
+        if index % _EVERY == 0:
+            detector.detect(image)
+    return (time.perf_counter() - began) / len(units)
+
+
+def _edge() -> float:
+    """Seconds a frame of hvt-edge in lockstep; start-up is taken off by running two lengths."""
+    took = {}
+    for count in (20, 20 + _FRAMES):
+        command = [sys.executable, "-m", "hvt_edge.cli", "--source", clip(), "--detector", nano(), "--quiet"]
+        command += ["--pace", "lockstep", "--wait", "0s", "--max-frames", str(count)]
+        began = time.perf_counter()
+        subprocess.run([*command, "--connect", "tcp/127.0.0.1:9"], check=True, stdout=subprocess.DEVNULL)
+        took[count] = time.perf_counter() - began
+    return (took[20 + _FRAMES] - took[20]) / _FRAMES
+
+
+def _ground(units: list[AccessUnit]) -> float:
+    """Seconds a frame of a lockstep session with its recording, fed with what the link would bring."""
+    info = _info()
+    config = GroundConfig(detector=str(nano()), detect_every=_EVERY)
+    models = Models(config)
+    items = [_received(sequence, unit) for sequence, unit in enumerate(units)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bench.rrd"
+        session = GroundSession(
+            info,
+            recorder=Recorder(_recorder_settings(path, info)),
+            recording=path,
+            sight_of=lambda emit: make_sight(config, models, info=info, emit=emit),
+            to_local_ns=lambda at_ns: at_ns,
+            clock=time.time_ns,
+            report=lambda: None,
+        )
+        began = time.perf_counter()
+        for number, (header, item) in enumerate(items):
+            session.base(header, item, decode=True, starts_run=number == 0)
+        took = time.perf_counter() - began
+        session.close()
+    return took / len(items)
+
+
+def _received(sequence: int, unit: AccessUnit) -> tuple[BaseHeader, Received]:
+    header = BaseHeader(
+        session_id=1,
+        sequence=sequence,
+        frame_index=unit.frame_index,
+        capture_ns=unit.capture_ns,
+        send_delay_ns=0,
+        flags=Flags.LOCKSTEP | (Flags.KEYFRAME if unit.keyframe else 0),
+    )
+    return header, Received(
+        "hvt/edge-1/base", unit.data, header.pack(unit.data), "video/h265", time.time_ns()
+    )
+
+
+def _info() -> Info:
+    view = View.fitted(SIZE, SIZE, fit="letterbox")
+    return Info(
+        session_id=1, edge="edge-1", software=__version__, started_ns=0, source_size=SIZE, base_size=SIZE,
+        view_scale=view.scale, view_offset_px=view.offset_px, fps=FPS, codec="hevc", pace="lockstep", method="M0",
+        budget_bps=800_000, base_bps=650_000, window_ns=10**9, class_names=("car",), received_ns=0, answered_ns=0,
+    )  # fmt: skip
+
+
+def _recorder_settings(path: Path, info: Info) -> RecorderSettings:
+    return RecorderSettings(
+        path=path,
+        edge_id=info.edge,
+        session="1",
+        base_size=info.base_size,
+        fps=info.fps,
+        budget_bps=info.budget_bps,
+        clocked=False,
+    )
+
+
+if __name__ == "__main__":
+    for one in rows():
+        print(one)
+    os._exit(0)
