@@ -4,7 +4,7 @@
 
 It forwards, and looks into nothing. SIGINT and SIGTERM end it with exit code 0, wrong settings with 2.
 """
-# ruff: noqa: INP001, RUF009  (a script beside its configuration; settings are declared by calls that return fields)
+# ruff: noqa: RUF009  (a script beside its configuration; settings are declared by calls that return fields)
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ Settings and why (measured on drone_carpark, intel_car-detection and a panning a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -34,21 +35,23 @@ PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
 VBV_S = 0.15
 """Depth of the VBV buffer in seconds of the base rate."""
 
-# At QP 51 a keyframe of a textured 1280x720 aerial picture still takes about 6 kB (0.052 bit a pixel), and the frames
-# after it about 4 kbit: x265 can go no lower, whatever the target says. With a keyframe each 10 s a run of 10 s takes
-# 1.21 x a target of 58 kbps, 1.11 x 100, 1.06 x 150, 1.03 x 200.
-_KEYFRAME_FLOOR_BITS_PER_PX = 0.052
-_STREAM_FLOOR_BITS_PER_PX = 0.0075
+# At QP 51 a keyframe of textured pictures of 320x180, 640x360, 960x540 and 1280x720 takes 3.0, 3.9, 4.9 and 5.9 kB:
+# about 2060 bytes and 4 for each pixel of the square root of the area. x265 can go no lower, whatever the target says.
+# The frames after it follow a target down to some 300 bits and 0.0045 bit a pixel each (67 kbps at 1280x720 and 15 fps).
+_KEYFRAME_FLOOR_BYTES = 2060
+_KEYFRAME_FLOOR_BYTES_PER_SIDE_PX = 4.0
+_FRAME_FLOOR_BITS = 300
+_FRAME_FLOOR_BITS_PER_PX = 0.0045
 
 
 def keyframe_floor_bytes(size: tuple[int, int]) -> int:
     """The least that a keyframe of a textured picture of ``size`` (width, height) takes."""
-    return round(size[0] * size[1] * _KEYFRAME_FLOOR_BITS_PER_PX / 8)
+    return round(_KEYFRAME_FLOOR_BYTES + _KEYFRAME_FLOOR_BYTES_PER_SIDE_PX * math.sqrt(size[0] * size[1]))
 
 
 def minimum_bps(size: tuple[int, int], fps: float) -> int:
-    """The lowest payload rate that x265 can follow at this size and frame rate, within 1.1 x over ten seconds."""
-    return round(size[0] * size[1] * fps * _STREAM_FLOOR_BITS_PER_PX)
+    """The lowest payload rate that x265 can follow at this size and frame rate, keyframes apart."""
+    return round(fps * (_FRAME_FLOOR_BITS + size[0] * size[1] * _FRAME_FLOOR_BITS_PER_PX))
 
 
 @dataclass(frozen=True, slots=True)

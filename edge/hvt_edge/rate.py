@@ -11,9 +11,9 @@ __all__ = ["encoder_settings", "least_base_bps"]
 _PEAK = 1.14
 _TIGHT_VBV_S = 0.1
 _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
-_KEYFRAME_EVERY_S = 10.0
-"""x265 never takes back about 50 kbit of its first keyframe and 20 kbit of each later one (1280x720, at any rate):
-1.6 % of 300 kbps in ten seconds. So much is asked for less."""
+_KEYFRAME_EVERY_S = 5.0
+"""x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
+So much is asked for less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
 
 
 def encoder_settings(

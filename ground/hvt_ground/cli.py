@@ -9,11 +9,9 @@ import threading
 from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
-from hvt_common.errors import exit_with_sentence
+from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.report import print_table, write_json
-from hvt_ground.app import Ground
 from hvt_ground.config import GroundConfig, check
-from hvt_ground.summary import table
 
 __all__ = ["main"]
 
@@ -29,6 +27,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    try:  # only now: without Rerun this is a sentence, not a traceback
+        from hvt_ground.app import Ground  # noqa: PLC0415
+        from hvt_ground.summary import table  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"the package {error.name!r} is missing: install HVT with its extra, 'hvt[ground]'"
+        ) from None
     config, asked = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
     if asked.print_config:
         print(to_toml(config), end="")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvt_common.distinct import DistinctIds
+from hvt_common.errors import UserError
 from hvt_common.link.wire import RoiHeader, StillResult, fitted_text
 from hvt_common.values import Image, Posterior, Tracks, View
 from hvt_common.vision.detect import Detector
@@ -149,7 +150,7 @@ class GroundSight:
             codec = still_codec(header.codec)
             # A still may be shrunk, never be larger than what it shows.
             image = codec.decode(still.data, max_pixels=(x2 - x1) * (y2 - y1))
-        except (StillError, KeyError, ValueError) as error:
+        except (StillError, UserError) as error:
             self.stills_dropped["undecodable"] += 1
             self._notice("warning", f"still {header.sequence} cannot be decoded: {error}")
             self._answer(header, None, ground_track_id=-1)

@@ -56,7 +56,7 @@ def test_sample_of_the_ground_listens_on_this_machine_only(tmp_path: Path) -> No
         GroundConfig, ["--config", str(_uncommented(sample, tmp_path))], program="hvt-ground", description=""
     )
     check_ground(everything)
-    assert {"connect", "classifier", "labels", "zenoh_config"} <= set(asked.values)
+    assert {"connect", "classifier", "labels"} <= set(asked.values)
 
 
 @pytest.mark.parametrize(

@@ -65,9 +65,7 @@ def _client(endpoint: str) -> zenoh.Config:
 def test_messages_questions_and_presence_pass(free_port: int, receiver: str) -> None:
     """Where both sides can only call out, the router is the link: all of the key table must get through it."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    ground = LinkSettings(
-        role="ground", connect=(endpoint,), zenoh_config=DEPLOY / "zenoh" / "ground-behind-router.json5"
-    )
+    ground = LinkSettings(role="ground", connect=(endpoint,))
     with ExitStack() as stack:
         stack.enter_context(_router("--listen", endpoint))
         edge = stack.enter_context(open_session(LinkSettings(role="edge", connect=(endpoint,))))
@@ -95,9 +93,7 @@ def test_messages_questions_and_presence_pass(free_port: int, receiver: str) -> 
 def test_a_ground_that_comes_before_its_router_finds_it(free_port: int) -> None:
     """After a power cut the ground may be up first; it has to start, and connect by itself."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    ground_settings = LinkSettings(
-        role="ground", connect=(endpoint,), zenoh_config=DEPLOY / "zenoh" / "ground-behind-router.json5"
-    )
+    ground_settings = LinkSettings(role="ground", connect=(endpoint,))
     with ExitStack() as stack:
         ground = stack.enter_context(open_session(ground_settings))
         edge = stack.enter_context(open_session(LinkSettings(role="edge", connect=(endpoint,))))

@@ -17,21 +17,24 @@ from hvt_edge.methods.registry import METHODS
 
 pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(120)]
 
+FRAMES = 90
+"""Six seconds."""
+
 Run = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture
 def run(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Play eight seconds of drone_carpark with more settings, without a ground; return the summary."""
+    """Play six seconds of drone_carpark with more settings, keyframes among them, without a ground."""
     handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
 
     def run(*settings: str) -> dict[str, Any]:
         (port,) = free_ports(1)
         summary = tmp_path / "edge.json"
-        arguments = ["--source", str(data / "clips/drone_carpark.mp4"), "--max-frames", "120", "--quiet"]
+        arguments = ["--source", str(data / "clips/drone_carpark.mp4"), "--max-frames", str(FRAMES), "--quiet"]
         arguments += ["--connect", f"tcp/127.0.0.1:{port}", "--wait", "0s", "--pace", "lockstep"]
         arguments += ["--detector", str(data / "models/yolov5su_visdrone_640.onnx"), "--detect-every", "10"]
-        arguments += ["--preset", "ultrafast", "--summary", str(summary)]
+        arguments += ["--preset", "ultrafast", "--keyframe-interval", "3s", "--summary", str(summary)]
         assert main([*arguments, *settings]) == 0, capsys.readouterr().err
         return json.loads(summary.read_text())
 
@@ -43,7 +46,8 @@ def run(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
 
 def held(summary: dict[str, Any], *, budget_bps: int, base_bps: int) -> None:
     """Every promise on bits, and that the run was whole."""
-    assert summary["frames"] == 120
+    assert summary["frames"] == FRAMES
+    assert summary["keyframes"] == 2
     assert (summary["budget_bps"], summary["budget_base_bps"]) == (budget_bps, base_bps)
     assert summary["worst_window_bps"]["total"] <= budget_bps
     assert summary["worst_window_bps"]["base"] <= 1.15 * base_bps
@@ -60,21 +64,33 @@ def test_every_method_holds_the_budget(run, method):
     assert (summary["stills"]["sent"] > 0) == (method != "M0")
 
 
-@pytest.mark.parametrize("method", ["M0", "M5"])
 @pytest.mark.parametrize(
-    ("regime", "budget_bps", "base_bps"), [("low", 800_000, 650_000), ("moderate", 1_400_000, 1_200_000)]
+    ("method", "regime", "budget_bps", "base_bps"),
+    [
+        ("M0", "low", 800_000, 800_000),
+        ("M0", "moderate", 1_400_000, 1_400_000),
+        ("M5", "low", 800_000, 650_000),
+        ("M5", "moderate", 1_400_000, 1_200_000),
+    ],
 )
 def test_the_regimes_of_the_paper_are_held_at_full_size(run, method, regime, budget_bps, base_bps):
     """Figures at "0.80 Mbps" would be figures at some other rate."""
     summary = run("--method", method, "--regime", regime)
-    held(summary, budget_bps=budget_bps, base_bps=budget_bps if method == "M0" else base_bps)
+    held(summary, budget_bps=budget_bps, base_bps=base_bps)
 
 
-@pytest.mark.parametrize("method", ["M1", "M5", "permissive"])
+@pytest.mark.parametrize("method", ["M1", "permissive"])
 def test_a_thin_budget_is_held(run, method):
     """On the thinnest links, where one still is a large part of a second, the video would stall most."""
-    summary = run("--method", method, "--size", "640x360", "--budget", "150kbps", "--video-share", "0.8")
-    held(summary, budget_bps=150_000, base_bps=120_000)
+    summary = run("--method", method, "--size", "640x360", "--budget", "300kbps", "--video-share", "0.8")
+    held(summary, budget_bps=300_000, base_bps=240_000)
+
+
+def test_the_total_is_held_even_where_keyframes_are_most_of_a_second(run):
+    """Below what x265 can bound by itself, the budget would be a hope."""
+    summary = run("--method", "M1", "--size", "640x360", "--budget", "100kbps")
+    assert summary["frames"] == FRAMES
+    assert summary["worst_window_bps"]["total"] <= 100_000
 
 
 def test_stills_without_cooldown_hold_the_budget(run):

@@ -81,6 +81,10 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     if connect:
         config.insert_json5("connect/endpoints", json.dumps(connect))
     effective = listen or file_listen
+    if settings.role == "ground" and not effective and not _mentions(said, "mode"):
+        # Since Zenoh 1.9 a router does not pass messages between two peers, but it does between a peer and a router.
+        # An edge that listens is served just as well. ("client" would wait at its start, deaf to Ctrl-C.)
+        config.insert_json5("mode", '"router"')
     for endpoint in effective:
         _check_reach(endpoint, allowed=settings.insecure or _has_keys(said, endpoint))
     return config, effective

@@ -42,7 +42,9 @@ class BaseDecoder:
     def decode(self, data: bytes) -> Image | None:
         """Return the picture, uint8 (H, W, 3) BGR in base pixels, or None where the unit cannot be decoded."""
         if not data:
-            return None  # to libavcodec an empty packet means the end of the stream: it would take nothing more
+            return (
+                None  # to libavcodec an empty packet means the end of the stream: it would take nothing more
+            )
         try:
             pictures = self._context.decode(av.Packet(data))
         except av.error.FFmpegError:

@@ -1,0 +1,229 @@
+"""Real time: grounds and edges that come late, leave, die and come back, while the others go on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+from outsider import Tap, answer, joined
+from processes import Link, Running, eventually
+from rrd import Recording
+
+from hvt_common.link.wire import BaseHeader, Command, ControlAnswer, ControlRequest
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+PICTURE_WITHIN_S = 1.0
+STOPPED_WITHIN_S = 3.0
+
+CHEAP = ("--size", "640x360", "--fps", "10", "--preset", "ultrafast", "--budget", "300kbps")
+
+
+def arguments(scene: Path, edge_id: str, *more: str) -> list[str]:
+    """Settings of an edge that plays the scene in real time at little cost."""
+    return ["--source", str(scene), "--source-fps", "10", "--edge-id", edge_id, *CHEAP, *more]
+
+
+def count_frames(file: Path) -> int:
+    """How many frames of a video file a player shows."""
+    with av.open(str(file)) as container:
+        return sum(1 for _ in container.decode(container.streams.video[0]))
+
+
+def whole(recording: Recording, summary: dict[str, Any]) -> None:
+    """The recording holds what was decoded and ends with the end of the session."""
+    assert len(recording.video()) == summary["frames_decoded"] > 0
+    assert recording.events()[-1][2] == f"session {summary['session']} ended"
+
+
+@dataclass
+class Late:
+    """What was seen of an edge that played on while grounds came and went."""
+
+    keyframe_answer: ControlAnswer
+    keyframe_s: float
+    """From the third party's request to the keyframe's arrival."""
+    first_connecting_s: float
+    """Unix time at which the first ground said that it connects."""
+    first_stop_s: float
+    edge_stop_s: float
+    first: dict[str, Any]
+    second: dict[str, Any]
+    edge: dict[str, Any]
+    folder: Path
+
+
+@pytest.fixture(scope="module")
+def late(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Late]:
+    """The edge plays from the start; a bare subscriber, a ground and then another ground join it."""
+    folder = tmp_path_factory.mktemp("late")
+    with Link(folder) as link:
+        edge = link.edge(
+            *arguments(scene, "uav-1", "--wait", "0s", "--record-base", "base.mkv"), listens=True
+        )
+        edge.until("no ground yet")
+        with joined(link.edge_endpoint) as third:
+            eventually(lambda: answer(third, "hvt/uav-1/info"), within_s=20, what="the edge answers info")
+            time.sleep(2.0)  # the stream's own first keyframe is long gone
+            tap = Tap(third, "hvt/uav-1/base")
+            request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
+            asked_s = time.time()
+            reply = ControlAnswer.parse(answer(third, "hvt/uav-1/control", request.pack()) or b"")
+            eventually(lambda: keyframes_s(tap), within_s=5, what="a keyframe comes")
+            keyframe_s = keyframes_s(tap)[0] - asked_s
+        first = link.ground("--record", "first.rrd", name="first", connects=True)
+        connecting_s = time.time()
+        eventually(lambda: "uav-1: " in first.said, within_s=20, what="the first ground sees the edge")
+        time.sleep(3.0)
+        first_stop_s = first.interrupt()
+        second = link.ground("--record", "second.rrd", "--once", name="second")
+        eventually(lambda: "uav-1: " in second.said, within_s=20, what="the second ground sees the edge")
+        time.sleep(3.0)
+        edge_stop_s = edge.interrupt()
+        yield Late(
+            keyframe_answer=reply,
+            keyframe_s=keyframe_s,
+            first_connecting_s=connecting_s,
+            first_stop_s=first_stop_s,
+            edge_stop_s=edge_stop_s,
+            first=first.finish(within_s=0),
+            second=second.finish(within_s=20),
+            edge=edge.finish(within_s=0),
+            folder=folder,
+        )
+
+
+def keyframes_s(tap: Tap) -> list[float]:
+    """When keyframes came."""
+    headers = [(BaseHeader.parse(m.attachment, m.payload), m.received_s) for m in tap.messages]
+    return [received_s for header, received_s in headers if header.keyframe]
+
+
+def test_a_keyframe_comes_within_a_second_of_asking(late):
+    """Whoever joins by himself, with docs/wire.md in hand, would wait for the next scheduled keyframe, 10 s."""
+    assert late.keyframe_answer.accepted
+    assert late.keyframe_s <= PICTURE_WITHIN_S
+
+
+def test_a_late_ground_shows_a_picture_within_a_second(late):
+    """An operator who opens the ground in mid-flight would look at nothing."""
+    recording = Recording(late.folder / "first.rrd")
+    captured_s = recording.video()[0][1] / 1e9
+    shown_s = captured_s + late.first["receive_latency_ms"]["max"] / 1000
+    assert shown_s - late.first_connecting_s <= PICTURE_WITHIN_S
+    assert recording.video()[0][0] > 20, "it did join late"
+    assert late.edge["keyframe_requests"] >= 2
+
+
+def test_a_restarted_ground_goes_on(late):
+    """After a crash of the ground's machine the drone would have to be started again, in the air."""
+    assert late.first["session"] == late.second["session"] == late.edge["session"]
+    assert late.second["frames_decoded"] >= 15
+    whole(Recording(late.folder / "second.rrd"), late.second)
+
+
+def test_ctrl_c_ends_a_ground_with_a_whole_recording(late):
+    """The flight so far would be lost, or the terminal hang."""
+    assert late.first_stop_s <= STOPPED_WITHIN_S
+    assert late.first["frames_decoded"] >= 15
+    whole(Recording(late.folder / "first.rrd"), late.first)
+
+
+def test_ctrl_c_ends_an_edge_with_a_summary_and_its_ground_with_it(late):
+    """Landing would need a kill -9, and the account of the flight be lost."""
+    assert late.edge_stop_s <= STOPPED_WITHIN_S
+    assert 0 < late.edge["frames"] < 300
+    assert late.edge["worst_window_bps"]["total"] <= 300_000
+    assert count_frames(late.folder / "base.mkv") == late.edge["frames"]
+
+
+@dataclass
+class Fleet:
+    """One ground, three edges, of which one was killed and started again."""
+
+    ground: list[dict[str, Any]]
+    killed_file: Path
+    edges: dict[str, dict[str, Any]]
+    folder: Path
+
+
+@pytest.fixture(scope="module")
+def fleet(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    """uav-1 is killed and comes back, uav-2 plays through it, rover-1 is none of this ground's."""
+    folder = tmp_path_factory.mktemp("fleet")
+    with Link(folder) as link:
+        ground = link.ground("--record", "recordings", "--once", "--edges", "uav-*")
+        steady = link.edge(*arguments(scene, "uav-2", "--max-frames", "150"), name="uav-2")
+        other = link.edge(
+            *arguments(scene, "rover-1", "--max-frames", "20", "--wait", "1s"), name="rover-1"
+        )
+        killed = link.edge(
+            *arguments(scene, "uav-1", "--record-base", "killed.mkv"), name="uav-1-killed"
+        )
+        eventually(lambda: "uav-1: " in served(ground), within_s=30, what="the ground serves uav-1")
+        time.sleep(2.5)
+        killed.kill()
+        again = link.edge(*arguments(scene, "uav-1", "--max-frames", "40"), name="uav-1-again")
+        edges = {"uav-1": again.finish(), "uav-2": steady.finish(), "rover-1": other.finish()}
+        summaries = ground.finish(within_s=20)
+    yield Fleet(ground=summaries, killed_file=folder / "killed.mkv", edges=edges, folder=folder)
+
+
+def served(ground: Running) -> str:
+    """The ground's status lines that speak of frames."""
+    return "\n".join(line for line in ground.said.splitlines() if " s  " in line)
+
+
+def test_each_session_of_each_edge_has_a_recording(fleet):
+    """Two drones would overwrite each other's flight, or a restart the flight before it."""
+    assert [one["edge"] for one in fleet.ground] == ["uav-1", "uav-1", "uav-2"]
+    assert len({one["session"] for one in fleet.ground}) == 3
+    files = {Path(fleet.folder / one["recording"]).resolve() for one in fleet.ground}
+    assert files == {file.resolve() for file in (fleet.folder / "recordings").iterdir()}
+    assert len(files) == 3
+    for one in fleet.ground:
+        whole(Recording(fleet.folder / one["recording"]), one)
+
+
+def test_two_edges_at_once_are_both_whole(fleet):
+    """One drone's picture would suffer from the other's."""
+    by_session = {one["session"]: one for one in fleet.ground}
+    for name in ("uav-1", "uav-2"):
+        edge = fleet.edges[name]
+        seen = by_session[edge["session"]]
+        assert seen["frames_decoded"] == seen["frames"] == edge["frames"] > 0
+        assert seen["gaps"] == seen["unusable_messages"] == 0
+        for count in ("base_bytes", "roi_bytes", "meta_bytes", "overhead_bytes", "worst_window_bps"):
+            assert seen[count] == edge[count], count
+        assert edge["worst_window_bps"]["total"] <= 300_000
+
+
+def test_an_edge_that_was_not_asked_for_is_not_served(fleet):
+    """A shared link would carry the streams of everybody to everybody."""
+    assert fleet.edges["rover-1"]["frames"] > 0
+    assert all(one["edge"] != "rover-1" for one in fleet.ground)
+
+
+def test_the_killed_edge_left_a_base_file_that_plays(fleet):
+    """A crash in the air would take its own evidence with it."""
+    (killed,) = (one for one in fleet.ground if one["session"] != fleet.edges["uav-1"]["session"] and one["edge"] == "uav-1")
+    shown = count_frames(fleet.killed_file)
+    assert 20 <= killed["frames_decoded"]
+    assert shown >= killed["frames_decoded"] - 3, "a fifth of a second may be missing at the end"
+
+
+def test_ctrl_c_before_anybody_came(link, scene):
+    """Who started the wrong side first could not stop it without a kill -9."""
+    edge = link.edge(*arguments(scene, "uav-1", "--wait", "60s"))
+    edge.until("waiting up to")
+    assert edge.interrupt() <= STOPPED_WITHIN_S
+    assert edge.finish()["frames"] == 0
+    ground = link.ground("--record", "recordings")
+    assert ground.interrupt() <= STOPPED_WITHIN_S
+    assert ground.finish() == []
+    assert "no edge was heard" in ground.told
