@@ -69,7 +69,7 @@ class RollingBudget:
         self._asked_ns: int | None = None
         self._last_ns = 0
         self._base_steps: deque[int] = deque(maxlen=steps * _MEMORY_WINDOWS)
-        self._burst = np.zeros(len(self._forecasts))
+        self._burst = self._recent_bursts()
         self._tokens = self._cap = (settings.total_bps - settings.base_bps) * settings.carry_s / 8
         self._tokens_ns: int | None = None
 

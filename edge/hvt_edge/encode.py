@@ -36,8 +36,9 @@ VBV_S = 0.15
 """Depth of the VBV buffer in seconds of the base rate."""
 
 # At QP 51 a keyframe of textured pictures of 320x180, 640x360, 960x540 and 1280x720 takes 3.0, 3.9, 4.9 and 5.9 kB:
-# about 2060 bytes and 4 for each pixel of the square root of the area. x265 can go no lower, whatever the target says.
-# The frames after it follow a target down to some 300 bits and 0.0045 bit a pixel each (67 kbps at 1280x720 and 15 fps).
+# about 2060 bytes and 4 for each pixel of the square root of the area. x265 can go no lower, whatever the target is.
+# The frames after it follow a target down to some 300 bits and 0.0045 bit a pixel each: 67 kbps at 1280x720 and
+# 15 fps.
 _KEYFRAME_FLOOR_BYTES = 2060
 _KEYFRAME_FLOOR_BYTES_PER_SIDE_PX = 4.0
 _FRAME_FLOOR_BITS = 300
