@@ -66,7 +66,9 @@ class Tap:
             self._messages.append(message)
 
 
-def answer(session: zenoh.Session, key: str, question: bytes = b"", *, timeout_s: float = 1.0) -> bytes | None:
+def answer(
+    session: zenoh.Session, key: str, question: bytes = b"", *, timeout_s: float = 1.0
+) -> bytes | None:
     """The first answer of a queryable; None where nobody answers in time."""
     for reply in session.get(key, payload=question, timeout=timeout_s):
         if reply.ok is not None:

@@ -9,9 +9,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 __all__ = ["Link", "Running", "eventually", "free_ports"]
 
@@ -106,7 +106,7 @@ class Running:
         return time.monotonic() - began_s
 
     def kill(self) -> None:
-        """kill -9."""
+        """End it as ``kill -9`` does."""
         self.process.kill()
         self.process.wait(10)
 
@@ -154,15 +154,10 @@ class Link:
         self._started.append(running)
         return running
 
-    def __enter__(self) -> Link:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_error: object) -> None:
         for running in self._started:
             if running.alive:
                 running.kill()
-
-
-def flags(settings: Mapping[str, object]) -> list[str]:
-    """``{"max_frames": 90}`` as ``["--max-frames", "90"]``."""
-    return [word for name, value in settings.items() for word in (f"--{name.replace('_', '-')}", str(value))]

@@ -330,7 +330,9 @@ class Edge:
             self._counts,
             self._ledger,
         )
-        age_ns = None if self._inbox.received_ns is None else self._clock() - self._inbox.received_ns
+        # In lockstep the same input gives the same bytes: no field whose length hangs on this machine's speed.
+        measured = not self._lockstep
+        heard_ns = self._inbox.received_ns if measured else None
         return Status(
             session_id=self._session_id,
             sequence=self._status_sequence,
@@ -362,9 +364,9 @@ class Edge:
                 tracks=stills.tracks,
                 base_queue=0,
                 still_queue=stills.waiting,
-                encode_ms=counts.encode_ms,
-                detect_ms=stills.sight_ms,
-                feedback_age_ms=-1 if age_ns is None else max(0, age_ns // _MILLION),
+                encode_ms=counts.encode_ms if measured else 0.0,
+                detect_ms=stills.sight_ms if measured else 0.0,
+                feedback_age_ms=-1 if heard_ns is None else max(0, (self._clock() - heard_ns) // _MILLION),
             ),
         )
 

@@ -66,6 +66,8 @@ class EdgeReceiver:
         self._next_report_ns = 0
         self._ended_ns: int | None = None
         self._ended_id: int | None = None
+        self._first_status: tuple[Status, Received] | None = None
+        """The first report of a session may overtake the keyframe that begins it; it counts all the same."""
         self._stop_ns = 0
         self._counted = Counters()
         """The counters when the session before ended."""
@@ -160,6 +162,8 @@ class EdgeReceiver:
     def _status(self, status: Status, item: Received) -> None:
         session = self.session
         if session is None or status.session_id != session.info.session_id:
+            if status.sequence == 0:
+                self._first_status = (status, item)
             return
         session.status(status, item)
         if status.state == "ended":
@@ -179,6 +183,9 @@ class EdgeReceiver:
             return
         self._ended_ns = None
         self.session = self._open_session(info, self)
+        first, self._first_status = self._first_status, None
+        if first is not None:
+            self._status(*first)
 
     def _ask_info(self, session_id: int) -> Info | None:
         for _ in range(_INFO_TRIES):

@@ -89,6 +89,7 @@ class GroundSession:
         self._still_sequences = DistinctIds(remember=4096)
         self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
         self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
+        self._early: list[ReceivedStill] = []
         self._wake = threading.Event()
         self._ending = threading.Event()
         self._given_up = threading.Event()
@@ -133,7 +134,11 @@ class GroundSession:
         self.ledger.record_fate("received", header.reason)
         still = ReceivedStill(header, item.payload, media_type)
         if self.lockstep:
-            self._read([still])
+            self._early.append(still)
+            if len(self._early) > _WAITING_STILLS:
+                self._early.pop(0)
+                self.sight.stills_dropped["overflow"] += 1
+            self._read_known()
             return
         try:
             self._stills.put_nowait(still)
@@ -181,7 +186,7 @@ class GroundSession:
             self._thread.join(_LEAVE_S)
         try:
             if self._thread is None or not self._thread.is_alive():
-                self.sight.stills_dropped.update(["ended"] * self._stills.qsize())
+                self.sight.stills_dropped.update(["ended"] * (self._stills.qsize() + len(self._early)))
                 self.frames_untracked += self._pictures.qsize()
                 self.sight.end()
             self.note("info", f"session {self.info.session_id:016x} ended")
@@ -229,16 +234,16 @@ class GroundSession:
             self._error = error
 
     def _work_off(self) -> None:
-        """Pictures first: a still's frame has to be known before the still."""
+        """See all pictures that came before the stills taken here, then read these: their frames have to be known."""
+        stills: list[ReceivedStill] = []
+        while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
+            stills.append(self._stills.get_nowait())
         while not self._given_up.is_set():
             try:
                 picture = self._pictures.get_nowait()
             except queue.Empty:
                 break
             self._see(picture, hurry=self._pictures.qsize() > _BEHIND_PICTURES)
-        stills: list[ReceivedStill] = []
-        while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
-            stills.append(self._stills.get_nowait())
         if stills:
             self._read(stills)
             self._wake.set()
@@ -250,6 +255,14 @@ class GroundSession:
         self._hear_results()
         if self.lockstep:
             self._report()
+            self._read_known()
+
+    def _read_known(self) -> None:
+        """In lockstep: a still may overtake its frame on the link; it is read once that frame has been seen."""
+        known = [one for one in self._early if one.header.frame_index <= self.last_frame_index]
+        if known:
+            self._early = [one for one in self._early if one.header.frame_index > self.last_frame_index]
+            self._read(known)
 
     def _read(self, stills: list[ReceivedStill]) -> None:
         self.sight.read(stills)

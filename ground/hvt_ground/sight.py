@@ -146,10 +146,11 @@ class GroundSight:
     def _decode(self, still: ReceivedStill) -> Decoded | None:
         header = still.header
         x1, y1, x2, y2 = header.crop_source_px
+        inside = x2 <= self._view.source_size[0] and y2 <= self._view.source_size[1]
         try:
             codec = still_codec(header.codec)
             # A still may be shrunk, never be larger than what it shows.
-            image = codec.decode(still.data, max_pixels=(x2 - x1) * (y2 - y1))
+            image = codec.decode(still.data, max_pixels=(x2 - x1) * (y2 - y1) if inside else 0)
         except (StillError, UserError) as error:
             self.stills_dropped["undecodable"] += 1
             self._notice("warning", f"still {header.sequence} cannot be decoded: {error}")

@@ -337,7 +337,9 @@ def test_what_is_no_detector_is_refused_in_one_sentence(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     with pytest.raises(UserError, match=r"outputs: scores \(1, 1000\) float32"):
         open_detector(str(models["classifier"]))
-    with pytest.raises(UserError, match=r"detector 'yolo' is not known .*give one of motion, .*or an ONNX file"):
+    with pytest.raises(
+        UserError, match=r"detector 'yolo' is not known .*give one of motion, .*or an ONNX file"
+    ):
         open_detector("yolo")
 
 

@@ -61,7 +61,7 @@ def test_sizes():
     """The base stream would have another size than asked for."""
     assert parse_size("1280x720", name="--size") == (1280, 720)
     assert parse_size(" 640 X 360 ", name="--size") == (640, 360)
-    for wrong in ("", "1280", "x720", "1280x", "-1x2", "100000x1", "1280*720", "1280x720x3"):
+    for wrong in ("", "1280", "x720", "1280x", "-1x2", "9999999999x1", "1280*720", "1280x720x3"):
         with pytest.raises(UserError, match=r"^--size .* is not a size: write WIDTHxHEIGHT"):
             parse_size(wrong, name="--size")
 
@@ -83,7 +83,7 @@ def test_any_text_gives_a_finite_value_or_a_sentence(parse, text):
     try:
         value = parse(text, name="--it")
     except UserError as error:
-        assert str(error).startswith("--it ")
+        assert str(error).startswith("--it ")  # noqa: PT017 - most texts are no error
     else:
         assert all(
             math.isfinite(one) and one >= 0 for one in (value if isinstance(value, tuple) else (value,))

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from clips import START_NS, hard_pictures
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from clips import START_NS, hard_pictures
 from hvt_common.values import Frame, Tracks, View
 from hvt_edge.candidates import Candidate, TrackMemory
 from hvt_edge.choose import Chooser, ChooserSettings
@@ -35,7 +35,8 @@ class ByScore:
     name: str = "by-score"
     video_only: bool = False
 
-    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:  # noqa: ARG002
+    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
+        """All of them."""
         given_scores = dict(self.scores)
         wanted = [
             Request(one, "test", given_scores.get(one.track_id, float(one.track_id))) for one in candidates
@@ -71,6 +72,7 @@ class Rig:
 
     @property
     def now_ns(self) -> int:
+        """Time of the step."""
         return START_NS + self.number * STEP_NS
 
     def consider(self, boxes: dict[int, tuple[float, ...]], *, base=FLAT, detected: bool = True) -> None:
@@ -94,10 +96,10 @@ class Rig:
 
     def stills(self, room: int) -> list[int]:
         """Send what fits ``room`` in all; the tracks of the stills."""
-        sent, left = [], room
-        for still in self.chooser.stills(now_ns=self.now_ns, room_bytes=lambda: left):
-            assert len(still.data) <= left
-            left -= len(still.data)
+        sent, left = [], [room]
+        for still in self.chooser.stills(now_ns=self.now_ns, room_bytes=lambda: left[-1]):
+            assert len(still.data) <= left[-1]
+            left.append(left[-1] - len(still.data))
             sent.append(still.track_id)
         return sent
 

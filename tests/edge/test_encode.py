@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from clips import framed, hard_pictures, smooth_pictures
 
+from clips import framed, hard_pictures, smooth_pictures
 from hvt_common.errors import UserError
 from hvt_common.vision.hevc import BaseDecoder
 from hvt_edge.encode import PRESETS, BaseEncoder, EncoderSettings, keyframe_floor_bytes, minimum_bps

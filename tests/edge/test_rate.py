@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from clips import framed, hard_pictures, real_pictures
 
+from clips import framed, hard_pictures, real_pictures
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.ledger import overhead_bytes
 from hvt_edge.encode import BaseEncoder, EncoderSettings, minimum_bps

@@ -35,6 +35,7 @@ class Out:
         self.puts: list[tuple[Row, bytes, bytes, str]] = []
 
     def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+        """Keep it."""
         self.puts.append((row, payload, attachment or b"", encoding))
 
     def line_bytes(self, keys: EdgeKeys) -> int:
@@ -183,7 +184,7 @@ def test_the_ledger_counts_the_very_bytes_that_were_put():
     for index in range(30):
         now_ns = NOW_NS + index * SECOND_NS // 15
         line = rig.sender.base(unit(index, 900 + 61 * index, keyframe=index == 0), now_ns=now_ns)
-        row, payload, attachment, encoding = rig.out.puts[-1]
+        _, payload, attachment, encoding = rig.out.puts[-1]
         around = overhead_bytes(len(payload), len(attachment), key="hvt/uav-1/base", encoding=encoding)
         assert line == len(payload) + len(attachment) + around
         if index % 3 == 0:
@@ -227,7 +228,7 @@ _NAMES = st.text(st.characters(codec="utf-8"), max_size=90) | st.sampled_from(["
     media_type=st.sampled_from([JPEG, "image/webp", "image/avif", "image/x-hvt-residual"]),
     spend=st.integers(0, 15_000),
 )
-def test_a_still_of_just_the_room_fits(
+def test_a_still_of_just_the_room_fits(  # noqa: PLR0917 - hypothesis
     class_name, reason, codec, sequence, frame, track, far, late_ns, media_type, spend
 ):
     """A still with a long name would take more than its admission, and the window would be overrun."""

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
-from hvt_ground.build import recording_path
+from hvt_ground.build import output_path
 from hvt_ground.config import GroundConfig, check
 
 
@@ -83,13 +83,15 @@ def test_what_is_printed_reads_back_the_same(tmp_path_factory, config):
 def test_no_recording_is_written_over_another(tmp_path):
     """A restart of the edge would destroy the recording of the flight before."""
     taken: set[Path] = set()
-    folder = [recording_path(tmp_path, edge="uav-1", stamp="t", taken=taken) for _ in range(3)]
-    assert [one.name for one in folder] == ["hvt-uav-1-t.rrd", "hvt-uav-1-t-2.rrd", "hvt-uav-1-t-3.rrd"]
+    folder = [output_path(tmp_path, suffix=".rrd", edge="uav-1", stamp="t", taken=taken) for _ in range(3)]
+    assert [one.name for one in folder] == ["hvt-uav-1-t.rrd", "hvt-uav-1-t-1.rrd", "hvt-uav-1-t-2.rrd"]
     (tmp_path / "hvt-uav-2-t.rrd").touch()  # of an earlier process
-    assert recording_path(tmp_path, edge="uav-2", stamp="t", taken=taken).name == "hvt-uav-2-t-2.rrd"
+    assert (
+        output_path(tmp_path, suffix=".rrd", edge="uav-2", stamp="t", taken=taken).name == "hvt-uav-2-t-1.rrd"
+    )
     named = tmp_path / "flight.rrd"
     named.touch()  # the user named it: it is written anew, once
     edges = ["uav-1", "uav-2", "uav-2", "uav-1"]
-    names = [recording_path(named, edge=edge, stamp="t", taken=taken).name for edge in edges]
+    names = [output_path(named, suffix=".rrd", edge=edge, stamp="t", taken=taken).name for edge in edges]
     assert names == ["flight.rrd", "flight-uav-2.rrd", "flight-uav-2-2.rrd", "flight-uav-1.rrd"]
     assert len(set(names)) == 4

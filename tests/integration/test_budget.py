@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import free_ports
 
 from hvt_edge.cli import main
 from hvt_edge.methods.registry import METHODS
+from processes import free_ports
 
 pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(120)]
 
@@ -31,7 +31,13 @@ def run(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     def run(*settings: str) -> dict[str, Any]:
         (port,) = free_ports(1)
         summary = tmp_path / "edge.json"
-        arguments = ["--source", str(data / "clips/drone_carpark.mp4"), "--max-frames", str(FRAMES), "--quiet"]
+        arguments = [
+            "--source",
+            str(data / "clips/drone_carpark.mp4"),
+            "--max-frames",
+            str(FRAMES),
+            "--quiet",
+        ]
         arguments += ["--connect", f"tcp/127.0.0.1:{port}", "--wait", "0s", "--pace", "lockstep"]
         arguments += ["--detector", str(data / "models/yolov5su_visdrone_640.onnx"), "--detect-every", "10"]
         arguments += ["--preset", "ultrafast", "--keyframe-interval", "3s", "--summary", str(summary)]
@@ -95,6 +101,8 @@ def test_the_total_is_held_even_where_keyframes_are_most_of_a_second(run):
 
 def test_stills_without_cooldown_hold_the_budget(run):
     """The paper's plain method asks for far more than fits: nothing but the budget is in the way."""
-    summary = run("--method", "M2", "--cooldown", "0s", "--min-gain", "1", "--size", "640x360", "--budget", "300kbps")
+    summary = run(
+        "--method", "M2", "--cooldown", "0s", "--min-gain", "1", "--size", "640x360", "--budget", "300kbps"
+    )
     held(summary, budget_bps=300_000, base_bps=243_750)
     assert summary["stills"]["deferred"] > 0

@@ -14,12 +14,13 @@ import av
 import cv2
 import numpy as np
 import pytest
-from outsider import Message, Tap, answer, joined
-from processes import Link, eventually
-from rrd import Recording
+import zenoh
 
 from hvt_common.link.wire import Info, RoiHeader
 from hvt_common.vision.hevc import BaseDecoder
+from outsider import Message, Tap, answer, joined
+from processes import Link, eventually
+from rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(180)]
 
@@ -41,7 +42,7 @@ class Flight:
 
 
 @pytest.fixture(scope="module")
-def flight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
+def flight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """drone_carpark at the default budget, M5, the VisDrone detector on both sides, ImageNet at the ground.
 
     The edge starts first and waits; the third party joins, then the ground.
@@ -57,12 +58,7 @@ def flight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fli
         with joined(link.edge_endpoint) as third:
             # Only `roi`: what waits for a ground waits for one that wants everything.
             tap = Tap(third, "hvt/uav-1/roi")
-            answers: list[bytes] = []
-            eventually(
-                lambda: answers or (found := answer(third, "hvt/uav-1/info")) and answers.append(found),
-                within_s=30,
-                what="the edge answers info",
-            )
+            info = wait_for_info(third)
             ground = link.ground(
                 *("--once", "--record", "flight.rrd", "--detector", detector),
                 *("--classifier", str(data / "models/mobilenet_v2_imagenet.onnx")),
@@ -71,14 +67,26 @@ def flight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fli
             summaries = edge.finish(within_s=120), ground.finish(within_s=30)
             stills = tap.messages
     file = folder / "flight.rrd"
-    yield Flight(
+    return Flight(
         *summaries,
         recording=Recording(file),
         recording_bytes=file.stat().st_size,
         base_file=folder / "base.mkv",
-        info=Info.parse(answers[0]),
+        info=info,
         stills=stills,
     )
+
+
+def wait_for_info(session: zenoh.Session) -> Info:
+    """The edge's answer, as soon as it is there; then all that was declared before the question is known to it."""
+    answers = []
+
+    def answered() -> bool:
+        answers.append(answer(session, "hvt/uav-1/info"))
+        return answers[-1] is not None
+
+    eventually(answered, within_s=30, what="the edge answers info")
+    return Info.parse(answers[-1])
 
 
 def test_every_frame_is_decoded(flight):

@@ -66,6 +66,11 @@ class VideoSource(Source):
         self.frame_count = min(counts, default=None) if duration_s is not None else None
         self._running: Generator[Frame, None, None] | None = None
 
+    @property
+    def source_fps(self) -> float:
+        """The clip's own frame rate, as it says or as it was overridden."""
+        return float(self._rate)
+
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """The clip from its beginning."""
         self.close()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from typing import Final, Protocol
 
-from hvt_study.commands import score, track
+from hvt_study.commands import score, sweep, track
 
 __all__ = ["COMMANDS", "Command"]
 
@@ -28,5 +28,6 @@ class Command(Protocol):
 
 COMMANDS: Final[dict[str, Command]] = {
     "score": score,
+    "sweep": sweep,
     "track": track,
 }

@@ -1,0 +1,120 @@
+"""``hvt-study sweep``: the pilot's selector table, for a clip or for detections from anywhere."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Sequence
+from dataclasses import astuple
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from hvt_common.errors import UserError
+from hvt_common.units import parse_size
+from hvt_common.vision.detect import open_detector
+from hvt_edge.source import open_source
+from hvt_edge.sources.video import VideoSource
+from hvt_study.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
+
+__all__ = ["SUMMARY", "add_arguments", "run"]
+
+_ANY_SIZE = (64, 64)  # of base frames, which the sweep does not look at
+
+SUMMARY = "Apply the pilot's four selectors to raw detections and print what each keeps."
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """A clip and its detector, or a file of detections and its frame size."""
+    parser.add_argument(
+        "source",
+        type=Path,
+        metavar="CLIP|DETECTIONS.csv",
+        help="a video, or columns frame,x1,y1,x2,y2,conf,class",
+    )
+    parser.add_argument(
+        "--detector", default=argparse.SUPPRESS, help="for a clip: FILE.onnx or a model's name"
+    )
+    parser.add_argument(
+        "--size", metavar="WxH", default=argparse.SUPPRESS, help="for a CSV file: size of the frames"
+    )
+    parser.add_argument("--detect-every", type=int, default=5, metavar="N", help="frames of the clip")
+    parser.add_argument("--confidence", type=float, default=0.25, help="least confidence of a raw detection")
+    parser.add_argument("--nms-iou", type=float, default=0.45, help="overlap above which two boxes are one")
+    parser.add_argument(
+        "--out", type=Path, default=argparse.SUPPRESS, metavar="DIR", help="also write sweep.csv"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the table; write it where ``--out`` says."""
+    if arguments.source.suffix.lower() == ".csv":
+        frames, area = _from_csv(arguments)
+    else:
+        frames, area = _from_clip(arguments)
+    raw = sum(len(found.confidences) for found in frames.values())
+    rows = sweep(frames, frame_area_px=area)
+    _print(rows, raw=raw, frames=len(frames))
+    if hasattr(arguments, "out"):
+        _write(rows, arguments.out)
+    return 0
+
+
+def _from_csv(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections], float]:
+    if not hasattr(arguments, "size"):
+        raise UserError(
+            f"--size is missing: {arguments.source} does not say how large its frames are, for example 1280x720"
+        )
+    width, height = parse_size(arguments.size, name="--size")
+    return read_csv(arguments.source), float(width * height)
+
+
+def _from_clip(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections], float]:
+    if not hasattr(arguments, "detector"):
+        raise UserError(f"--detector is missing: {arguments.source} is a clip, give FILE.onnx")
+    if arguments.detect_every < 1:
+        raise UserError(
+            f"--detect-every {arguments.detect_every} is not accepted: give a whole number from 1"
+        )
+    detector = open_detector(arguments.detector, confidence=arguments.confidence, nms_iou=arguments.nms_iou)
+    with open_source(str(arguments.source), size=_ANY_SIZE, fps=_own_rate(arguments.source)) as source:
+        found = track(
+            detect_clip(source, detector, every=arguments.detect_every),
+            description="detecting",
+            total=None if source.frame_count is None else -(-source.frame_count // arguments.detect_every),
+            transient=True,
+        )
+        return dict(found), float(source.view.source_size[0] * source.view.source_size[1])
+
+
+def _own_rate(path: Path) -> float:
+    """Frames a second of a clip: the pilot counts its frames, not time. A folder plays image by image at any rate."""
+    with open_source(str(path), size=_ANY_SIZE, fps=30) as source:
+        if source.live:
+            raise UserError(f"{path} is live: give a clip or a folder of images")
+        return min(240.0, source.source_fps) if isinstance(source, VideoSource) else source.fps
+
+
+def _print(rows: Sequence[SweepRow], *, raw: int, frames: int) -> None:
+    table = Table(title=f"{raw} raw detections on {frames} frames", title_justify="left", title_style="bold")
+    table.add_column("policy", style="cyan")
+    for name in COLUMNS[1:]:
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(row.policy, str(row.selected), f"{row.ratio:.4f}", f"{row.frame_coverage:.4f}")
+    Console(highlight=False).print(table)
+
+
+def _write(rows: Sequence[SweepRow], folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "sweep.csv").open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(COLUMNS)
+            writer.writerows(astuple(row) for row in rows)
+    except OSError as error:
+        raise UserError(
+            f"--out {folder} cannot be written ({error.strerror}): name a folder that can"
+        ) from None

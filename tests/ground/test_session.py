@@ -1,0 +1,411 @@
+"""Messages of an edge in, sessions out: real access units through the real threads."""
+
+from __future__ import annotations
+
+import time
+from typing import Self
+
+import pytest
+
+from flight import Flight, Port, RedSquares, SameAnswer, sight_of
+from hvt_common.link.inbox import Inbox, Received
+from hvt_common.link.ledger import Channel, overhead_bytes
+from hvt_common.link.wire import Info
+from hvt_ground.receive import EdgeReceiver
+from hvt_ground.session import GroundSession
+from hvt_ground.summary import summary, table
+
+
+def wait_for(condition, *, timeout_s: float = 10) -> None:
+    """Poll until true; a test that waits in vain fails here."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
+
+
+class Rig:
+    """A receiver with a port; sessions without a recording."""
+
+    def __init__(self, *, detector=None, reader=None) -> None:
+        self.port = Port()
+        self.reader = reader or SameAnswer()
+        self.detector = detector
+        self.opened: list[GroundSession] = []
+        self.receiver = EdgeReceiver(self.port, open_session=self._open)
+
+    def _open(self, info: Info, receiver: EdgeReceiver) -> GroundSession:
+        session = GroundSession(
+            info,
+            recorder=None,
+            recording=None,
+            sight_of=lambda emit: sight_of(emit, detector=self.detector, reader=self.reader),
+            to_local_ns=receiver.clock_offset.to_local_ns,
+            clock=time.time_ns,
+            report=receiver.report_now,
+        )
+        self.opened.append(session)
+        return session
+
+    def put(self, *items: Received) -> None:
+        """What Zenoh's callback does."""
+        for item in items:
+            self.port.inbox.put(item)
+
+    def settle(self) -> None:
+        """All that was put has been handled and seen."""
+        wait_for(lambda: len(self.port.inbox) == 0)
+        time.sleep(0.06)  # the last one is being handled
+        for session in self.opened:
+            wait_for(lambda one=session: one._pictures.empty() and one._stills.empty())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind, *_) -> None:
+        self.receiver.close()
+        assert not self.receiver._thread.is_alive(), "the receiver did not end"
+        if kind is None and self.receiver.error is not None:
+            raise self.receiver.error
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """Two seconds, a second keyframe at frame 20."""
+    return Flight(30, keyframes=(20,))
+
+
+def bases(flight: Flight, *indices: int) -> list[Received]:
+    """Access units of frames."""
+    return [flight.base(index) for index in indices]
+
+
+def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
+    """The operator would not see all there is; or the two sides' accounts would differ."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        items = [
+            *bases(flight, *range(30)),
+            flight.still(4, 0),
+            flight.still(9, 1),
+            flight.status(base=30, roi=2),
+        ]
+        rig.put(*items)
+        rig.settle()
+        session = rig.receiver.session
+        assert (session.frames_received, session.frames_decoded) == (30, 30)
+        assert session.stills_received == 2
+        assert session.duration_s == pytest.approx(2.0)
+        expected = sum(
+            len(one.payload)
+            + len(one.attachment)
+            + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
+            for one in items
+        )
+        assert session.ledger.line_bytes == expected
+        assert session.sight.tracks >= 1
+        wait_for(lambda: rig.port.reports and rig.port.reports[-1].last_frame_index == 29)
+        last = rig.port.reports[-1]
+        assert (last.base_messages, last.roi_messages, last.lost, last.corrupt) == (30, 2, 0, 0)
+        assert last.session_id == flight.session_id
+        results = [one for report in rig.port.reports for one in report.stills]
+        assert [(one.still_sequence, one.class_name, one.track_id) for one in results] == [
+            (0, "bus", 1),
+            (1, "bus", 1),
+        ]
+        assert rig.port.keyframe_requests == 0
+
+
+def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
+    """One lost message would freeze the picture, or fill it with garbage that looks like a picture."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2, *range(5, 14)))
+        rig.settle()
+        session = rig.receiver.session
+        assert session.frames_decoded == 3
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(*bases(flight, *range(14, 30)))
+        rig.settle()
+        assert session.frames_decoded == 3 + 10
+        assert session.frames_received == 28
+        assert session.last_frame_index == 29
+        asked = rig.port.keyframe_requests
+        time.sleep(0.4)
+        assert rig.port.keyframe_requests == asked, "what is shown again is not asked for"
+    content = summary(rig.receiver.done[0], unusable=rig.receiver.unusable)
+    assert (content["gaps"], content["lost"], content["keyframe_requests"]) == (1, 2, asked)
+    assert (content["frames"], content["frames_decoded"]) == (28, 13)
+
+
+def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
+    """One bad message would end the ground, spoil the picture, or count twice."""
+    broken = flight.base(3)
+    broken = Received(broken.key, broken.payload[:-1] + b"?", broken.attachment, broken.encoding, 1)
+    nonsense = Received("hvt/uav-1/roi", b"x", b"\x93\x01", "", 1)
+    other = Received("hvt/uav-1/tracks", b"x", b"", "", 1)
+    stranger = Flight(2)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2, 1, 0), nonsense, other)
+        rig.put(flight.still(1, 0), flight.still(1, 0), stranger.still(0, 5), *bases(stranger, 1))
+        rig.put(status := flight.status(base=3, roi=1), status)
+        rig.settle()
+        session = rig.receiver.session
+        assert (session.frames_received, session.frames_decoded, session.stills_received) == (3, 3, 1)
+        assert session.ledger.messages(Channel.META) == 1
+        assert rig.receiver.unusable == 2
+        rig.put(broken)
+        rig.settle()
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(flight.base(3))  # the very unit, whole this time
+        rig.settle()
+        assert session.frames_decoded == 4
+    counters = rig.receiver.done[0].counters
+    assert (counters.corrupt, counters.duplicates + counters.replayed, counters.foreign) == (1, 2, 1)
+
+
+def test_an_edge_that_restarts_gets_a_session_of_its_own(flight):
+    """The second flight's picture and numbers would end up in the first one's recording, or nowhere."""
+    second = Flight(8)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2), *bases(flight, 5, 6, 7, 8))  # with a loss
+        rig.settle()
+        rig.port.flight = second
+        time.sleep(1.1)  # the first one is silent: it is over
+        rig.put(*bases(second, *range(8)), second.still(2, 0))
+        rig.settle()
+        assert [one.info.session_id for one in rig.opened] == [flight.session_id, second.session_id]
+        assert rig.receiver.session is rig.opened[1]
+        assert rig.opened[1].frames_decoded == 8
+    first, last = (summary(one, unusable=0) for one in rig.receiver.done)
+    assert (first["frames"], first["gaps"], first["lost"]) == (7, 1, 2)
+    assert (last["frames"], last["gaps"], last["lost"], last["stills"]["received"]) == (8, 0, 0, 1)
+
+
+def test_a_session_ends_when_all_of_it_has_arrived(flight):
+    """``--once`` would cut the last pictures off, or never end."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, *range(5)))
+        rig.put(flight.status(base=6, roi=1, state="ended"))
+        rig.settle()
+        assert not rig.receiver.idle, "a picture and a still are on their way"
+        rig.put(flight.base(5))
+        rig.settle()
+        assert not rig.receiver.idle
+        rig.put(flight.still(3, 0))
+        wait_for(lambda: rig.receiver.idle, timeout_s=1.5)
+        (session,) = rig.receiver.done
+        assert (session.frames_received, session.stills_received) == (6, 1)
+        asked = rig.port.asked
+        rig.put(flight.base(20), flight.still(3, 1))  # a keyframe after the end does not begin it again
+        rig.settle()
+        assert rig.receiver.idle
+        assert rig.port.asked == asked
+
+
+def test_a_session_whose_rest_is_lost_ends_after_two_seconds(flight):
+    """``--once`` would wait for ever for a message that is gone."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1), flight.status(base=9, state="ended"))
+        rig.settle()
+        began = time.monotonic()
+        assert not rig.receiver.idle
+        wait_for(lambda: rig.receiver.idle, timeout_s=5)
+        assert time.monotonic() - began > 1.5
+
+
+def test_a_lost_answer_does_not_lose_the_flight(flight):
+    """Where the link loses the one answer to ``info``, nothing of the whole flight would be shown."""
+    with Rig() as rig:
+        rig.put(*bases(flight, 0, 1, 2))  # nobody answers yet
+        wait_for(lambda: rig.port.asked >= 3)
+        rig.settle()
+        assert rig.receiver.session is None
+        rig.port.flight = flight
+        rig.put(*bases(flight, 3, 4))
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(*bases(flight, *range(5, 30)))
+        rig.settle()
+        assert rig.receiver.session.info.session_id == flight.session_id
+        assert rig.receiver.session.frames_decoded == 10
+
+
+def test_a_flight_goes_on_after_an_outage(flight, monkeypatch):
+    """After ten seconds without a link the picture would never come back although the edge flies on."""
+    monkeypatch.setattr("hvt_ground.receive._GONE_NS", 200_000_000)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, *range(6)))
+        rig.settle()
+        rig.port.present.clear()
+        wait_for(lambda: rig.receiver.idle)
+        assert len(rig.receiver.done) == 1
+        rig.port.present.set()
+        requests = rig.port.keyframe_requests
+        rig.put(*bases(flight, *range(6, 10)))  # not one is missing, but the decoder has been closed
+        wait_for(lambda: rig.port.keyframe_requests > requests)
+        rig.put(*bases(flight, *range(10, 30)))
+        rig.settle()
+        assert rig.receiver.session is not None
+        assert rig.receiver.session.frames_decoded == 10
+
+
+def test_slow_detection_never_holds_up_decoding(flight):
+    """With a large model the ground would fall behind the flight, more with every second."""
+    with Rig(detector=RedSquares(takes_s=0.3)) as rig:
+        rig.port.flight = flight
+        began = time.monotonic()
+        rig.put(*bases(flight, *range(30)))
+        wait_for(lambda: rig.opened and rig.opened[0].frames_decoded == 30)
+        assert rig.opened[0].sight.detections_run <= 2 + (time.monotonic() - began) / 0.3
+        rig.settle()
+    (session,) = rig.receiver.done
+    assert session.last_frame_index == 29, "the newest is tracked, whatever is left out"
+    assert session.frames_untracked + session.sight.detections_run < 30
+
+
+def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
+    """A still would be read without the picture around it, or held against the wrong one."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        for index in range(20):
+            rig.put(flight.base(index), flight.still(index, index))
+        rig.settle()
+        wait_for(lambda: len(rig.reader.had_base) == 20)
+        assert all(rig.reader.had_base)
+        assert rig.receiver.session.sight.refined == 1
+
+
+def test_a_still_before_its_frame_waits_for_its_track(flight):
+    """On two links stills overtake pictures: they would refine nothing."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2), flight.still(6, 0))
+        rig.settle()
+        assert rig.receiver.session.sight.refined == 0
+        rig.put(*bases(flight, *range(3, 12)))
+        rig.settle()
+        wait_for(lambda: rig.receiver.session.sight.refined == 1)
+
+
+def test_lockstep_sees_every_frame_and_answers_every_still():
+    """The same clip would give other tracks in each run, or the edge would wait for an answer that never comes."""
+    outcomes = []
+    for _ in range(2):
+        flight = Flight(20, pace="lockstep")
+        with Rig(detector=RedSquares(takes_s=0.01)) as rig:
+            rig.port.flight = flight
+            for index in range(20):
+                rig.put(
+                    flight.base(index), flight.still(index, index, data=b"no jpeg" if index == 7 else None)
+                )
+            rig.settle()
+            session = rig.receiver.session
+            assert session.sight.detections_run == 20
+            answered = [one.still_sequence for report in rig.port.reports for one in report.stills]
+            assert answered == list(range(20))
+            frames = [report.last_frame_index for report in rig.port.reports]
+            assert frames == sorted(frames)
+            assert set(range(20)) <= set(frames)
+        content = summary(rig.receiver.done[0], unusable=0)
+        outcomes.append((content["tracks"], content["tracks_refined"], content["stills"]))
+    assert outcomes[0] == outcomes[1]
+    assert outcomes[0][2]["dropped"] == 1
+
+
+def test_another_picture_size_under_the_same_session_is_not_shown(flight):
+    """A forged or broken unit would end the ground in the middle of tracking."""
+    large = Flight(3, size=(384, 256))
+    large.session_id = flight.session_id
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2))
+        rig.settle()
+        forged = Flight(5, keyframes=(3,), size=(384, 256))
+        forged.session_id = flight.session_id
+        rig.put(forged.base(3))
+        rig.settle()
+        assert rig.receiver.session.frames_decoded == 3
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(*bases(flight, *range(4, 30)))
+        rig.settle()
+        assert rig.receiver.session.last_frame_index == 29
+
+
+def test_a_crash_of_the_eyes_ends_the_process_and_not_in_silence(flight):
+    """The ground would go on looking alive and track nothing."""
+
+    class Broken(RedSquares):
+        def detect(self, image_bgr):
+            raise RuntimeError("model is gone")
+
+    rig = Rig(detector=Broken())
+    rig.port.flight = flight
+    rig.put(*bases(flight, *range(10)))
+    wait_for(lambda: rig.receiver.error is not None)
+    assert str(rig.receiver.error) == "model is gone"
+    rig.receiver.close()
+
+
+def test_closing_keeps_what_has_arrived_and_is_quick(flight):
+    """Ctrl-C would throw away the last second, or hang."""
+    rig = Rig(detector=RedSquares(takes_s=0.05))
+    rig.port.flight = flight
+    rig.put(*bases(flight, *range(30)))
+    wait_for(lambda: bool(rig.opened))
+    rig.receiver.close()
+    assert not rig.receiver._thread.is_alive()
+    (session,) = rig.receiver.done
+    assert session.frames_decoded == 30
+    assert session.last_frame_index == 29
+
+
+def test_the_summary_can_be_written_and_read(flight):
+    """Programs that compare runs would miss a field."""
+    with Rig(reader=SameAnswer(knows=False)) as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, *range(10)), flight.still(2, 0), flight.still(3, 1, data=b"junk"))
+        rig.settle()
+    content = summary(rig.receiver.done[0], unusable=3)
+    assert content["stills"]["received"] == 2
+    assert content["stills"]["unread"] == 1
+    assert content["stills"]["dropped"] == 1
+    assert content["stills"]["deferred"] == 0
+    assert content["unusable_messages"] == 3
+    assert content["latency_ms"]["p50"] is not None
+    assert (content["edge"], content["method"], content["recording"]) == ("uav-1", "M5", None)
+    rows = dict(table(content))
+    assert rows["frames"].startswith("10 decoded in 0.7 s, no gaps")
+
+
+def test_an_inbox_is_bounded_in_bytes():
+    """A flood of large messages would fill the ground's memory: a thousand of them have four gigabytes."""
+
+    def item(size: int, number: int = 0) -> Received:
+        return Received("k", bytes(size), b"ab", "", number)
+
+    inbox = Inbox(capacity=1000, overflow="newest", capacity_bytes=1_000)
+    for number in range(5):
+        inbox.put(item(298, number))
+    assert (len(inbox), inbox.dropped) == (3, 2)
+    assert inbox.get(timeout_s=0).received_ns == 0
+    inbox.put(item(298, 9))
+    assert [inbox.get(timeout_s=0).received_ns for _ in range(3)] == [1, 2, 9]
+    inbox.put(item(2_000))
+    assert (len(inbox), inbox.dropped) == (0, 3)
+    latest = Inbox(capacity=1000, overflow="oldest", capacity_bytes=1_000)
+    for number in range(5):
+        latest.put(item(298, number))
+    latest.put(item(600, 7))
+    assert [latest.get(timeout_s=0).received_ns for _ in range(len(latest))] == [4, 7]
+    latest.put(item(2_000))
+    assert len(latest) == 0
+    for _ in range(100):
+        latest.put(item(300))
+        latest.get(timeout_s=0)
+    latest.put(item(900))
+    assert len(latest) == 1, "what was taken out counts no more"

@@ -1,0 +1,102 @@
+"""Lockstep: the same input gives the same bytes, also where the ground's opinion decides what is sent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+
+from processes import Link
+from rrd import Recording
+
+pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(180)]
+
+MEASURED = ("session", "encode_ms", "sight_ms")
+"""What a run measures of the machine; all else follows from the input."""
+
+
+@dataclass(frozen=True)
+class Play:
+    """One run: both summaries, the recording, and the base stream as it was kept."""
+
+    edge: dict[str, Any]
+    ground: dict[str, Any]
+    recording: Recording
+    base: list[tuple[int | None, bytes]]
+
+    @property
+    def stills(self) -> list[bytes]:
+        """Every still; when each is shown hangs on when it comes, since stills yield to the base stream."""
+        return sorted(still for _, still in self.recording.stills())
+
+
+def play(data: Path, folder: Path, *ground_settings: str) -> Play:
+    """Six seconds of drone_carpark with M3, whose decisions hang on the classifier's confidence."""
+    folder.mkdir()
+    with Link(folder) as link:
+        ground = link.ground("--once", "--record", "flight.rrd", *ground_settings)
+        edge = link.edge(
+            *("--source", str(data / "clips/drone_carpark.mp4"), "--max-frames", "90", "--pace", "lockstep"),
+            *("--size", "640x360", "--budget", "400kbps", "--preset", "ultrafast", "--method", "M3"),
+            *("--detector", str(data / "models/yolov5su_visdrone_640.onnx"), "--cooldown", "1s"),
+            *("--min-gain", "1", "--record-base", "base.mkv", "--wait", "60s"),
+        )
+        summaries = edge.finish(), ground.finish(within_s=30)
+    with av.open(str(folder / "base.mkv")) as container:
+        base = [(packet.pts, bytes(packet)) for packet in container.demux(video=0) if packet.size]
+    return Play(*summaries, recording=Recording(folder / "flight.rrd"), base=base)
+
+
+@pytest.fixture(scope="module")
+def plays(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Play, Play, Play]:
+    """Twice the same, and once with a ground that has no opinion."""
+    folder = tmp_path_factory.mktemp("lockstep")
+    opinions = (
+        *("--detector", str(data / "models/yolov5su_visdrone_640.onnx"), "--detect-every", "5"),
+        *("--classifier", str(data / "models/mobilenet_v2_imagenet.onnx")),
+        *("--labels", str(data / "models/imagenet_labels_1001.txt")),
+    )
+    return (
+        play(data, folder / "one", *opinions),
+        play(data, folder / "two", *opinions),
+        play(data, folder / "mute"),
+    )
+
+
+def test_the_same_input_gives_the_same_base_stream(plays):
+    """No figure of a study could be made again."""
+    one, two, _ = plays
+    assert len(one.base) == 90
+    assert one.base == two.base
+    samples = [[unit for _, _, unit in run.recording.video()] for run in (one, two)]
+    assert len(samples[0]) == 90
+    assert samples[0] == samples[1]
+
+
+def test_the_same_input_gives_the_same_stills(plays):
+    """A method that is a little better would look a little worse on the next run."""
+    one, two, _ = plays
+    assert one.edge["stills"]["sent"] == len(one.stills) > 10
+    assert one.stills == two.stills
+
+
+def test_the_same_input_gives_the_same_account(plays):
+    """Two runs could not be compared number by number."""
+    one, two, _ = plays
+    accounts = [
+        {name: value for name, value in run.edge.items() if name not in MEASURED} for run in (one, two)
+    ]
+    assert accounts[0] == accounts[1]
+    for name in ("tracks", "detections_run", "frames_decoded", "meta_bytes", "worst_window_bps"):
+        assert one.ground[name] == two.ground[name], name
+
+
+def test_the_grounds_opinion_counts(plays):
+    """Feedback would be sent and paid for, and change nothing."""
+    one, _, mute = plays
+    assert mute.base == one.base, "the base stream does not hang on it"
+    assert mute.ground["stills"]["unread"] == mute.ground["stills"]["received"] > 0
+    assert mute.stills != one.stills
