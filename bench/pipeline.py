@@ -66,7 +66,7 @@ def _bare_encode(taken) -> tuple[float, list[AccessUnit]]:
 
 
 def _bare_see(units: list[AccessUnit]) -> float:
-    decoder, detector = BaseDecoder(), open_detector(str(nano()))
+    decoder, detector = BaseDecoder(), open_detector(str(nano()), provider="auto")
     began = time.perf_counter()
     for index, unit in enumerate(units):
         image = decoder.decode(unit.data)

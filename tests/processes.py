@@ -98,10 +98,10 @@ class Running:
         assert "Traceback" not in self.said, self.said
         return self.summary()
 
-    def interrupt(self) -> float:
-        """Ctrl-C; return the seconds until the process had ended."""
+    def stop(self, sign: signal.Signals = signal.SIGINT) -> float:
+        """Ctrl-C, or another signal; return the seconds until the process had ended."""
         began_s = time.monotonic()
-        self.process.send_signal(signal.SIGINT)
+        self.process.send_signal(sign)
         self.wait(within_s=20)
         return time.monotonic() - began_s
 

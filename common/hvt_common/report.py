@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -16,16 +18,19 @@ from rich.text import Text
 
 from hvt_common.errors import UserError
 
-__all__ = ["StatusLine", "check_writable", "print_table", "write_json"]
+__all__ = ["StatusLine", "check_writable", "print_table", "say", "write_json"]
 
 _PLAIN_EVERY = 5
 
 
 class StatusLine:
-    """One line on a terminal, rewritten in place; elsewhere a line now and then, so that logs stay short."""
+    """One line on a terminal, rewritten in place; elsewhere a line now and then, so that logs stay short.
+
+    Where nobody reads any more (a closed pipe, a lost terminal, a full disk) the run goes on without a word.
+    """
 
     def __init__(self, *, quiet: bool) -> None:
-        self._console = Console(stderr=True, highlight=False, emoji=False)
+        self._console = _Console(stderr=True, highlight=False, emoji=False)
         self._quiet = quiet
         self._updates = 0
         self._live: Live | None = None
@@ -34,28 +39,56 @@ class StatusLine:
 
     def show(self, text: str) -> None:
         """Replace the line (call about once a second)."""
-        if self._live is not None:
-            self._live.update(Text(text, overflow="ellipsis", no_wrap=True), refresh=True)
-        elif not self._quiet:
-            if self._updates % _PLAIN_EVERY == 0:
-                print(text, file=sys.stderr, flush=True)
-            self._updates += 1
+        with _going_on(sys.stderr):
+            if self._live is not None:
+                self._live.update(Text(text, overflow="ellipsis", no_wrap=True), refresh=True)
+            elif not self._quiet:
+                if self._updates % _PLAIN_EVERY == 0:
+                    print(text, file=sys.stderr, flush=True)
+                self._updates += 1
 
     def note(self, text: str) -> None:
         """Say something that stays, above the line."""
         if not self._quiet:
-            self._console.print(text, markup=False, soft_wrap=True)
+            with _going_on(sys.stderr):
+                self._console.print(text, markup=False, soft_wrap=True)
 
     def __enter__(self) -> Self:
         if self._live is not None:
-            self._live.start()
+            with _going_on(sys.stderr):
+                self._live.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._live is not None:
-            self._live.stop()
+            with _going_on(sys.stderr):
+                self._live.stop()
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Rich would end the process here."""
+        raise BrokenPipeError
+
+
+@contextlib.contextmanager
+def _going_on(stream: TextIO) -> Iterator[None]:
+    """What cannot be said is not: from then on, nor is anything else."""
+    try:
+        yield
+        if stream is not None:  # None where the process was started with the stream closed
+            stream.flush()
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def say(text: str) -> None:
+    """Print a line on standard output."""
+    with _going_on(sys.stdout):
+        print(text)
 
 
 def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
@@ -65,7 +98,8 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     table.add_column()
     for name, value in rows:
         table.add_row(Text(name), Text(value))  # not markup: a path may have brackets in it
-    Console(highlight=False).print(table)
+    with _going_on(sys.stdout):
+        _Console(highlight=False).print(table)
 
 
 def check_writable(path: Path | None, *, name: str) -> None:
@@ -78,9 +112,9 @@ def check_writable(path: Path | None, *, name: str) -> None:
         raise UserError(
             f"{name} {path} is in a folder that does not exist: make {path.absolute().parent} first"
         )
-    real = path.resolve()
-    if real.exists() and not real.is_file():  # /dev/stdout or a pipe: opening it to see may block
+    if path.exists() and not path.is_file():  # /dev/stdout or a pipe: opening it to see may block
         return
+    real = path.resolve()
     fresh = not real.exists()
     try:
         with real.open("ab"):

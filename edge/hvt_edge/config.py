@@ -31,6 +31,9 @@ from hvt_edge.source import check_shape
 __all__ = ["REGIMES", "EdgeConfig", "Regime", "check"]
 
 
+_LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, 60.0
+
+
 @dataclass(frozen=True, slots=True)
 class Regime:
     """A budget of the paper: so much in all, so much of it for video."""
@@ -148,9 +151,10 @@ def check(config: EdgeConfig) -> EdgeConfig:
     share = 1.0 if video_only else regime.video_share if config.video_share is None else config.video_share
     if not 0 < share <= 1:
         raise UserError(f"--video-share {share:g} leaves no base stream: give more than 0, at most 1")
-    if config.window < 1 / config.fps or config.window > 60:
+    if not _LEAST_WINDOW_S <= config.window <= _MOST_WINDOW_S or config.window < 2 / config.fps:
         raise UserError(
-            f"--window {config.window:g}s is not accepted: give one frame ({1 / config.fps:g}s) to 60s"
+            f"--window {config.window:g}s is not accepted: give {_LEAST_WINDOW_S:g}s to {_MOST_WINDOW_S:g}s, and two "
+            f"frames at least (shorter, and a keyframe fills more than a window)"
         )
     config = replace(config, budget=config.budget or regime.budget_bps, video_share=share)
     least_bps = least_base_bps(config.size, config.fps, edge_id=config.edge_id)

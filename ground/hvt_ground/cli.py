@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
-from hvt_common.report import print_table, write_json
+from hvt_common.report import print_table, say, write_json
 from hvt_ground.config import GroundConfig, check
 
 __all__ = ["main"]
@@ -52,7 +52,7 @@ def _run(argv: Sequence[str] | None) -> int:
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
     if not sessions:
-        print("hvt-ground: no edge was heard")
+        say("hvt-ground: no edge was heard")
     return 0
 
 

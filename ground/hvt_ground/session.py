@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-import queue
 import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -14,10 +14,10 @@ from hvt_common.link.inbox import Received
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
 from hvt_common.link.wire import BaseHeader, Info, RoiHeader, Status, StillResult
-from hvt_common.priority import give_way
 from hvt_common.vision.hevc import BaseDecoder
 from hvt_ground.events import Event, Notice, Traffic, VideoSample
 from hvt_ground.export_tracks import TrackTable
+from hvt_ground.eyes import Eyes, LockstepEyes, RealtimeEyes
 from hvt_ground.reassemble import Counters
 from hvt_ground.record import Recorder
 from hvt_ground.sight import GroundSight, Picture, ReceivedStill
@@ -28,13 +28,6 @@ _log = logging.getLogger(__name__)
 
 _SECOND_NS = 1_000_000_000
 _MILLION = 1_000_000
-_WAITING_PICTURES = 24
-"""How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
-_BEHIND_PICTURES = 1
-_STILLS_AT_ONCE = 16
-_WAITING_STILLS = 256
-_FINISH_S = 1.5
-_LEAVE_S = 1.0
 
 
 class GroundSession:
@@ -68,7 +61,6 @@ class GroundSession:
         self.overlay_latency = LatencyStats()
         self.frames_decoded = 0
         self.frames_received = 0
-        self.frames_untracked = 0
         self.stills_received = 0
         self.last_frame_index = -1
         """The last frame that was decoded, tracked and drawn."""
@@ -87,17 +79,8 @@ class GroundSession:
         self._results: list[StillResult] = []
         self._results_lock = threading.Lock()
         self._still_sequences = DistinctIds(remember=4096)
-        self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
-        self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
-        self._early: list[ReceivedStill] = []
-        self._wake = threading.Event()
-        self._ending = threading.Event()
-        self._given_up = threading.Event()
-        self._error: BaseException | None = None
-        self._thread: threading.Thread | None = None
-        if not self.lockstep:
-            self._thread = threading.Thread(target=self._run, name=f"hvt-sight-{info.edge}", daemon=True)
-            self._thread.start()
+        eyes = LockstepEyes if self.lockstep else RealtimeEyes
+        self._eyes: Eyes = eyes(self._see, self._read, name=info.edge)
 
     # What the receiving thread brings
 
@@ -121,7 +104,7 @@ class GroundSession:
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
         reference_ns = item.received_ns if self.lockstep else self._to_local_ns(header.capture_ns)
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
-        self._offer(Picture(header.frame_index, header.capture_ns, reference_ns, image))
+        self._eyes.picture(Picture(header.frame_index, header.capture_ns, reference_ns, image))
         self._traffic(at_ns)
         return True
 
@@ -133,18 +116,7 @@ class GroundSession:
         self.stills_received += 1
         self.ledger.record_fate("received", header.reason)
         still = ReceivedStill(header, item.payload, media_type)
-        if self.lockstep:
-            self._early.append(still)
-            if len(self._early) > _WAITING_STILLS:
-                self._early.pop(0)
-                self.sight.stills_dropped["overflow"] += 1
-            self._read_known()
-            return
-        try:
-            self._stills.put_nowait(still)
-        except queue.Full:
-            self.sight.stills_dropped["overflow"] += 1
-        self._wake.set()
+        self._eyes.still(still)
 
     def status(self, status: Status, item: Received) -> None:
         """Take the edge's report; one that is not newer than the last is ignored."""
@@ -178,16 +150,8 @@ class GroundSession:
 
     def close(self) -> None:
         """Finish what waits (for a second or two), close the recording, raise what went wrong in the thread."""
-        self._ending.set()
-        self._wake.set()
-        if self._thread is not None:
-            self._thread.join(_FINISH_S)
-            self._given_up.set()
-            self._thread.join(_LEAVE_S)
         try:
-            if self._thread is None or not self._thread.is_alive():
-                self.sight.stills_dropped.update(["ended"] * (self._stills.qsize() + len(self._early)))
-                self.frames_untracked += self._pictures.qsize()
+            if self._eyes.close():
                 self.sight.end()
             self.note("info", f"session {self.info.session_id:016x} ended")
         finally:
@@ -197,74 +161,36 @@ class GroundSession:
                 self.recorder.close()
         self.raise_error()
 
+    @property
+    def frames_untracked(self) -> int:
+        """Frames that were decoded, and passed over by detection and tracking."""
+        return self._eyes.untracked
+
+    @property
+    def stills_dropped(self) -> Counter[str]:
+        """Stills of which nothing was made, by reason."""
+        return +(self.sight.stills_dropped + self._eyes.dropped)
+
+    @property
+    def idle(self) -> bool:
+        """Nothing waits to be seen."""
+        return self._eyes.idle
+
     def raise_error(self) -> None:
-        """Raise what went wrong in the seeing thread."""
-        if self._error is not None:
-            error, self._error = self._error, None
-            raise error
+        """Raise what went wrong while seeing."""
+        self._eyes.raise_error()
 
-    # Seeing
+    # Seeing, in the thread of the eyes
 
-    def _offer(self, picture: Picture) -> None:
-        if self.lockstep:
-            self._see(picture, hurry=False)
-            return
-        while True:
-            try:
-                self._pictures.put_nowait(picture)
-                break
-            except queue.Full:
-                try:
-                    self._pictures.get_nowait()
-                    self.frames_untracked += 1
-                except queue.Empty:
-                    continue
-        self._wake.set()
-
-    def _run(self) -> None:
-        give_way()
-        try:
-            while not self._given_up.is_set():
-                self._wake.wait(0.2)
-                self._wake.clear()
-                self._work_off()
-                if self._ending.is_set() and self._pictures.empty() and self._stills.empty():
-                    return
-        except BaseException as error:  # noqa: BLE001 - handed to the receiving thread, which ends the process
-            self._error = error
-
-    def _work_off(self) -> None:
-        """See all pictures that came before the stills taken here, then read these: their frames have to be known."""
-        stills: list[ReceivedStill] = []
-        while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
-            stills.append(self._stills.get_nowait())
-        while not self._given_up.is_set():
-            try:
-                picture = self._pictures.get_nowait()
-            except queue.Empty:
-                break
-            self._see(picture, hurry=self._pictures.qsize() > _BEHIND_PICTURES)
-        if stills:
-            self._read(stills)
-            self._wake.set()
-
-    def _see(self, picture: Picture, *, hurry: bool) -> None:
+    def _see(self, picture: Picture, hurry: bool) -> None:  # noqa: FBT001 - called by the eyes only
         self.sight.see(picture, hurry=hurry)
         self.last_frame_index = picture.frame_index
         self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
         self._hear_results()
         if self.lockstep:
             self._report()
-            self._read_known()
 
-    def _read_known(self) -> None:
-        """In lockstep: a still may overtake its frame on the link; it is read once that frame has been seen."""
-        known = [one for one in self._early if one.header.frame_index <= self.last_frame_index]
-        if known:
-            self._early = [one for one in self._early if one.header.frame_index > self.last_frame_index]
-            self._read(known)
-
-    def _read(self, stills: list[ReceivedStill]) -> None:
+    def _read(self, stills: Sequence[ReceivedStill]) -> None:
         self.sight.read(stills)
         self._hear_results()
         self._report()

@@ -19,7 +19,7 @@ def summary(session: GroundSession, *, unusable: int) -> dict[str, Any]:
     account = session.ledger.summary(session.duration_s)
     worst = account.worst_window_bps
     unread = sight.outcomes.get("unread", 0)
-    waiting = session.stills_received - sum(sight.outcomes.values()) - sum(sight.stills_dropped.values())
+    waiting = session.stills_received - sum(sight.outcomes.values()) - sum(session.stills_dropped.values())
     return {
         "edge": info.edge,
         "session": f"{info.session_id:016x}",
@@ -42,11 +42,11 @@ def summary(session: GroundSession, *, unusable: int) -> dict[str, Any]:
         "stills": {
             "received": session.stills_received,
             "deferred": waiting,
-            "dropped": sum(sight.stills_dropped.values()),
+            "dropped": sum(session.stills_dropped.values()),
             "unread": unread,
             "reasons": {
                 "received": account.fates["received"],
-                "dropped": dict(sight.stills_dropped),
+                "dropped": dict(session.stills_dropped),
                 "outcomes": dict(sight.outcomes),
             },
             "mean_bytes": round(account.roi_bytes / session.stills_received)

@@ -57,7 +57,7 @@ class Rig:
         wait_for(lambda: len(self.port.inbox) == 0)
         time.sleep(0.06)  # the last one is being handled
         for session in self.opened:
-            wait_for(lambda one=session: one._pictures.empty() and one._stills.empty())
+            wait_for(lambda one=session: one.idle)
 
     def __enter__(self) -> Self:
         return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,11 +80,11 @@ def late(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
         connecting_s = time.time()
         eventually(lambda: "uav-1: " in first.said, within_s=20, what="the first ground sees the edge")
         time.sleep(3.0)
-        first_stop_s = first.interrupt()
+        first_stop_s = first.stop()
         second = link.ground("--record", "second.rrd", "--once", name="second")
         eventually(lambda: "uav-1: " in second.said, within_s=20, what="the second ground sees the edge")
         time.sleep(3.0)
-        edge_stop_s = edge.interrupt()
+        edge_stop_s = edge.stop()
         return Late(
             keyframe_answer=reply,
             keyframe_s=keyframe_s,
@@ -216,13 +217,14 @@ def test_the_killed_edge_left_a_base_file_that_plays(fleet):
     assert shown >= killed["frames_decoded"] - 3, "a fifth of a second may be missing at the end"
 
 
-def test_ctrl_c_before_anybody_came(link, scene):
-    """Who started the wrong side first could not stop it without a kill -9."""
-    edge = link.edge(*arguments(scene, "uav-1", "--wait", "60s"))
-    edge.until("waiting up to")
-    assert edge.interrupt() <= STOPPED_WITHIN_S
-    assert edge.finish()["frames"] == 0
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+def test_either_side_stops_before_anybody_came(link, scene, sign):
+    """Who started the wrong side first, or a service manager, would need a kill -9."""
     ground = link.ground("--record", "recordings")
-    assert ground.interrupt() <= STOPPED_WITHIN_S
+    assert ground.stop(sign) <= STOPPED_WITHIN_S
     assert ground.finish() == []
     assert "no edge was heard" in ground.told
+    edge = link.edge(*arguments(scene, "uav-1", "--wait", "60s"))
+    edge.until("waiting up to")
+    assert edge.stop(sign) <= STOPPED_WITHIN_S
+    assert edge.finish()["frames"] == 0

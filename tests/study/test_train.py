@@ -194,7 +194,7 @@ def test_training_lowers_the_loss(torch, batch):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        losses.append(loss.item())
+        losses.append(loss.detach().item())
     assert losses[-1] < 0.8 * losses[0]
 
 
@@ -204,12 +204,14 @@ def test_perfect_answers_cost_next_to_nothing(torch):
 
     maps = [torch.full((1, 12, side, side), -12.0) for side in (16, 8, 4)]
     for level in maps:
-        level[:, :4] = 0.0
+        level[:, :2], level[:, 2:4] = 0.0, -5.0
     target = torch.tensor([[32.0, 32.0, 56.0, 56.0]])  # centre 44, 44: cell 5, 5 of stride 8
-    maps[0][0, :, 5, 5] = torch.tensor([0.5, 0.5, np.log(3), np.log(3), 12, 12, -12, -12, -12, -12, -12, -12])
+    for column, shift in ((5, 0.5), (4, 1.5)):  # two cells are asked at least
+        answer = [shift, 0.5, np.log(3), np.log(3), 12, 12, -12, -12, -12, -12, -12, -12]
+        maps[0][0, :, 5, column] = torch.tensor(answer)
     right = Targets(torch.tensor([0]), target, torch.tensor([0]))
     loss, parts = detector_loss(maps, right)
-    assert parts["cells"] == 1
+    assert parts["cells"] == 2
     assert loss.item() < 0.02
     ignored, _ = detector_loss(maps, Targets(torch.tensor([0]), target, torch.tensor([-1])))
     assert ignored.item() < 0.02

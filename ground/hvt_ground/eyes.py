@@ -1,0 +1,207 @@
+"""When things are seen: beside the receiving thread, so that decoding never waits for detection.
+
+In real time what comes too fast is passed over, newest first; in lockstep nothing is, and the order is always the
+same: the same input gives the same tracks.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
+
+from hvt_common.priority import give_way
+from hvt_ground.sight import Picture, ReceivedStill
+
+__all__ = ["Eyes", "LockstepEyes", "RealtimeEyes"]
+
+_WAITING_PICTURES = 24
+"""How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
+_BEHIND_PICTURES = 1
+_STILLS_AT_ONCE = 16
+_WAITING_STILLS = 256
+_FINISH_S = 1.5
+_LEAVE_S = 1.0
+_AHEAD = 2
+
+See = Callable[[Picture, bool], None]
+"""Called with a picture, and whether to hurry."""
+Read = Callable[[Sequence[ReceivedStill]], None]
+
+
+class Eyes(Protocol):
+    """Where the receiving thread hands over what is to be seen."""
+
+    untracked: int
+    """Pictures that were passed over."""
+    dropped: Counter[str]
+    """Stills that were passed over, by reason."""
+
+    @property
+    def idle(self) -> bool:
+        """Nothing waits."""
+        ...
+
+    def picture(self, picture: Picture) -> None:
+        """Hand over a decoded frame."""
+        ...
+
+    def still(self, still: ReceivedStill) -> None:
+        """Hand over a still."""
+        ...
+
+    def close(self) -> bool:
+        """Finish what waits, for a second or two; False where the thread did not come back."""
+        ...
+
+    def raise_error(self) -> None:
+        """Raise what went wrong while seeing."""
+        ...
+
+
+class RealtimeEyes:
+    """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still."""
+
+    def __init__(self, see: See, read: Read, *, name: str) -> None:
+        self._see = see
+        self._read = read
+        self.untracked = 0
+        self.dropped: Counter[str] = Counter()
+        self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
+        self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
+        self._wake = threading.Event()
+        self._ending = threading.Event()
+        self._given_up = threading.Event()
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name=f"hvt-sight-{name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def idle(self) -> bool:
+        """Nothing waits."""
+        return self._pictures.empty() and self._stills.empty()
+
+    def picture(self, picture: Picture) -> None:
+        """Queue a frame; where the queue is full the oldest goes untracked."""
+        while True:
+            try:
+                self._pictures.put_nowait(picture)
+                break
+            except queue.Full:
+                try:
+                    self._pictures.get_nowait()
+                    self.untracked += 1
+                except queue.Empty:
+                    continue
+        self._wake.set()
+
+    def still(self, still: ReceivedStill) -> None:
+        """Queue a still; where the queue is full it is dropped."""
+        try:
+            self._stills.put_nowait(still)
+        except queue.Full:
+            self.dropped["overflow"] += 1
+        self._wake.set()
+
+    def close(self) -> bool:
+        """Finish what waits, for a second or two."""
+        self._ending.set()
+        self._wake.set()
+        self._thread.join(_FINISH_S)
+        self._given_up.set()
+        self._thread.join(_LEAVE_S)
+        self.dropped["ended"] += self._stills.qsize()
+        self.untracked += self._pictures.qsize()
+        return not self._thread.is_alive()
+
+    def raise_error(self) -> None:
+        """Raise what ended the thread."""
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _run(self) -> None:
+        give_way()
+        try:
+            while not self._given_up.is_set():
+                self._wake.wait(0.2)
+                self._wake.clear()
+                self._work_off()
+                if self._ending.is_set() and self.idle:
+                    return
+        except BaseException as error:  # noqa: BLE001 - handed to the receiving thread, which ends the process
+            self._error = error
+
+    def _work_off(self) -> None:
+        """See all pictures that came before the stills taken here, then read these."""
+        stills: list[ReceivedStill] = []
+        while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
+            stills.append(self._stills.get_nowait())
+        while not self._given_up.is_set():
+            try:
+                picture = self._pictures.get_nowait()
+            except queue.Empty:
+                break
+            self._see(picture, self._pictures.qsize() > _BEHIND_PICTURES)
+        if stills:
+            self._read(stills)
+            self._wake.set()
+
+
+class LockstepEyes:
+    """Sees one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
+
+    def __init__(self, see: See, read: Read, *, name: str) -> None:
+        self._see = see
+        self._read = read
+        self.untracked = 0
+        self.dropped: Counter[str] = Counter()
+        self._pending: deque[Future[None]] = deque()
+        self._early: list[ReceivedStill] = []
+        self._newest_frame = -1
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-sight-{name}")
+
+    @property
+    def idle(self) -> bool:
+        """Nothing waits."""
+        return all(future.done() for future in self._pending)
+
+    def picture(self, picture: Picture) -> None:
+        """See a frame, and read the stills of it that overtook it on the link."""
+        self._newest_frame = picture.frame_index
+        self._submit(self._worker.submit(self._see, picture, False))
+        known = [one for one in self._early if one.header.frame_index <= self._newest_frame]
+        if known:
+            self._early = [one for one in self._early if one.header.frame_index > self._newest_frame]
+            self._submit(self._worker.submit(self._read, known))
+
+    def still(self, still: ReceivedStill) -> None:
+        """Read a still once its frame has been seen."""
+        if still.header.frame_index <= self._newest_frame:
+            self._submit(self._worker.submit(self._read, [still]))
+            return
+        self._early.append(still)
+        if len(self._early) > _WAITING_STILLS:
+            self._early.pop(0)
+            self.dropped["overflow"] += 1
+
+    def close(self) -> bool:
+        """Finish what waits."""
+        try:
+            while self._pending:
+                self._pending.popleft().result()
+        finally:
+            self._worker.shutdown()
+            self.dropped["ended"] += len(self._early)
+        return True
+
+    def raise_error(self) -> None:
+        """Errors come out of `picture`, `still` and `close`."""
+
+    def _submit(self, future: Future[None]) -> None:
+        self._pending.append(future)
+        while len(self._pending) > _AHEAD:
+            self._pending.popleft().result()

@@ -1,0 +1,25 @@
+"""What a wrong input must come to: one sentence, and nothing left behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["checked", "snapshot"]
+
+
+def snapshot(folder: Path) -> set[tuple[Path, int, int]]:
+    """Every file and folder below, with size and time of change."""
+    found = ((path, path.lstat()) for path in folder.rglob("*"))
+    return {(path, status.st_size if path.is_file() else 0, status.st_mtime_ns) for path, status in found}
+
+
+def checked(err: str, *, program: str, left: object) -> str:
+    """The sentence: the only line, of the program's own, with the sign of no traceback."""
+    lines = err.splitlines()
+    assert len(lines) == 1, err
+    assert lines[0].startswith(f"{program}: ")
+    assert not left, "a failed start left something behind"
+    sentence = lines[0].removeprefix(f"{program}: ")
+    assert "Traceback" not in sentence
+    assert "Errno" not in sentence
+    return sentence

@@ -1,0 +1,66 @@
+"""What every wrong input must come to: one sentence, exit code 2, and nothing left behind."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import hvt_edge.cli
+import hvt_ground.cli
+from refusal import checked, snapshot
+
+Refused = Callable[..., str]
+
+_PROGRAMS = {"hvt-edge": hvt_edge.cli.main, "hvt-ground": hvt_ground.cli.main}
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def refused(here: Path, capfd: pytest.CaptureFixture[str]) -> Iterator[Refused]:
+    """Run a program in this process with wrong settings; return the sentence it refuses them with."""
+    handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    kept = logging.getLogger().handlers[:]
+
+    def refused(program: str, *settings: str) -> str:
+        before = snapshot(here)
+        assert _PROGRAMS[program]([*settings, "--quiet"]) == 2
+        out, err = capfd.readouterr()
+        assert out == ""
+        return checked(err, program=program, left=snapshot(here) - before)
+
+    yield refused
+    for one, handler in handlers.items():
+        signal.signal(one, handler)
+    logging.getLogger().handlers[:] = kept
+
+
+@pytest.fixture
+def pictures(here: Path) -> str:
+    """A folder that is a good source: two small pictures."""
+    folder = here / "pictures"
+    folder.mkdir()
+    for index in range(2):
+        cv2.imwrite(str(folder / f"{index}.png"), np.full((64, 96, 3), 40 * index, np.uint8))
+    return "pictures"
+
+
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    """A TCP port of loopback on which somebody else listens."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        yield int(other.getsockname()[1])

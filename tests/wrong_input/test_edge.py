@@ -1,0 +1,301 @@
+"""hvt-edge with input that it cannot use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.timeout(60)
+
+
+@pytest.fixture
+def edge(refused, pictures, free_port):
+    """Refuse settings on top of a run that would otherwise work."""
+
+    def edge(*settings: str, source: str = pictures) -> str:
+        link = (
+            "--connect",
+            f"tcp/127.0.0.1:{free_port}",
+            "--wait",
+            "0s",
+            "--size",
+            "96x64",
+            "--max-frames",
+            "2",
+        )
+        return refused("hvt-edge", "--source", source, *link, *settings)
+
+    return edge
+
+
+# Where frames come from
+
+
+def test_no_source(refused):
+    """A first try without arguments would show a traceback."""
+    sentence = refused("hvt-edge")
+    assert "--source" in sentence
+    assert "demo" in sentence
+
+
+@pytest.mark.parametrize("source", ["nope.mp4", "folder/nope", "ftp://host/clip.mp4"])
+def test_a_source_that_is_not_there(edge, source):
+    """A typing mistake would be answered with FFmpeg's internals."""
+    sentence = edge(source=source)
+    assert repr(source) in sentence
+    assert "accepted is" in sentence
+
+
+@pytest.mark.parametrize("content", [b"", b"no video, only words\n" * 50, b"\x00\x01\x02garbage" * 99])
+def test_a_file_that_is_no_video(edge, here, content):
+    """The wrong file of a folder would crash the decoder."""
+    Path("notes.mp4").write_bytes(content)
+    sentence = edge(source="notes.mp4")
+    assert "'notes.mp4'" in sentence
+    assert "accepted is" in sentence
+
+
+def test_a_folder_without_pictures(edge, here):
+    """An empty card would look like a broken program."""
+    Path("empty").mkdir()
+    sentence = edge(source="empty")
+    assert "'empty'" in sentence
+    assert "jpg" in sentence
+
+
+def test_a_folder_of_pictures_that_cannot_be_read(edge, here):
+    """A card that was pulled out too early would look like a broken program."""
+    Path("broken").mkdir()
+    Path("broken/1.jpg").write_bytes(b"\xff\xd8\xff nothing")
+    assert "'broken'" in edge(source="broken")
+
+
+def test_a_camera_that_is_not_there(edge):
+    """A loose plug would be answered with OpenCV's internals."""
+    sentence = edge(source="/dev/video99")
+    assert "/dev/video99 does not exist" in sentence
+    assert "devices here" in sentence
+
+
+def test_a_device_that_is_no_camera(edge):
+    """The same for the wrong device."""
+    sentence = edge(source="/dev/null")
+    assert "/dev/null" in sentence
+    assert "/dev/videoN" in sentence
+
+
+def test_a_stream_that_does_not_answer(edge, free_port):
+    """The wrong address of a camera would be answered with FFmpeg's internals."""
+    url = f"rtsp://127.0.0.1:{free_port}/cam"
+    assert url in edge(source=url)
+
+
+def test_a_password_is_not_printed(edge, free_port):
+    """A camera's password would end in a log that others read."""
+    sentence = edge(source=f"rtsp://me:secret@127.0.0.1:{free_port}/cam")
+    assert "secret" not in sentence
+    assert f"127.0.0.1:{free_port}" in sentence
+
+
+# Numbers and words
+
+
+@pytest.mark.parametrize(
+    ("flag", "value", "accepted"),
+    [
+        *(("size", value, "WIDTHxHEIGHT") for value in ("abc", "640", "-4x4", "640x360x3", "")),
+        *(
+            ("size", value, "between 64 and 8192")
+            for value in ("0x0", "641x360", "640x361", "100000x100", "32x32")
+        ),
+        *(("fps", value, "0.1 to 240") for value in ("0", "-1", "nan", "inf", "1e9", "many")),
+        *(
+            ("budget", value, "800kbps")
+            for value in ("0", "abc", "-5kbps", "nan", "1e12", "99999Mbps", "800 kB")
+        ),
+        *(("video-share", value, "0 to 1") for value in ("1.5", "-1", "most", "120%")),
+        *(("padding", value, "0 to 1") for value in ("9", "-0.1", "wide")),
+        *(("jpeg-quality", value, "5 to 95") for value in ("0", "400", "65.5")),
+        *(("detect-every", value, "1 to 1000") for value in ("0", "-5", "often")),
+        *(("max-frames", value, "from 1") for value in ("0", "-1")),
+        *(("cooldown", value, "2s") for value in ("-1s", "soon", "1e3")),
+        *(("wait", value, "2s") for value in ("-1", "99999999999s")),
+        *(("source-fps", value, "0.1 to 1000") for value in ("0", "1e6")),
+        *(("threads", value, "1 to 64") for value in ("0", "1000")),
+        *(("confidence", value, "0.01 to 1") for value in ("0", "2")),
+        ("method", "M9", "M0, M1, M2, M3, M4, M5, permissive"),
+        ("method", "m5", "M5"),
+        ("regime", "high", "low, moderate"),
+        ("preset", "placebo", "ultrafast"),
+        ("pace", "fast", "realtime, lockstep"),
+        ("fit", "stretch", "letterbox, crop"),
+    ],
+)
+def test_a_value_that_is_not_accepted(edge, flag, value, accepted):
+    """The user would have to read the source to learn what the setting takes."""
+    sentence = edge(f"--{flag}", value)
+    assert flag in sentence
+    assert value in sentence
+    assert accepted in sentence
+
+
+def test_a_video_share_of_nothing(edge):
+    """A run without video would begin and show nothing."""
+    assert "--video-share 0" in edge("--video-share", "0")
+
+
+def test_a_budget_below_what_the_video_needs(edge):
+    """x265 would send what it likes and call it 10 kbps."""
+    sentence = edge("--size", "1280x720", "--budget", "10kbps")
+    assert "--budget 10 kbps" in sentence
+    assert "at least" in sentence
+    assert "--size" in sentence
+
+
+def test_a_regime_and_a_budget(edge):
+    """One of the two would silently not count."""
+    sentence = edge("--regime", "low", "--budget", "1Mbps")
+    assert "--regime low" in sentence
+    assert "--budget" in sentence
+
+
+@pytest.mark.parametrize("window", ["0s", "10ms", "2min"])
+def test_a_window_that_no_budget_can_hold_over(edge, window):
+    """A window shorter than a frame would be held by nothing, or by everything."""
+    assert "--window" in edge("--window", window)
+
+
+@pytest.mark.parametrize("edge_id", ["UAV_1", "", "a" * 33, "a/b", "*", "dröne", "a b"])
+def test_an_edge_id_out_of_the_alphabet(edge, edge_id):
+    """Its keys would be other edges' keys, or nobody's."""
+    sentence = edge("--edge-id", edge_id)
+    assert "edge" in sentence
+    assert edge_id in sentence
+
+
+@pytest.mark.parametrize("words", [("--bogus",), ("stray",), ("--budgit", "1M"), ("--bud", "1M")])
+def test_a_flag_that_does_not_exist(edge, words):
+    """A misspelt setting would silently not count."""
+    sentence = edge(*words)
+    assert words[0] in sentence
+    assert "--help" in sentence
+
+
+def test_a_flag_without_its_value(edge):
+    """The next flag would be taken for the value."""
+    sentence = edge("--budget")
+    assert "--budget" in sentence
+
+
+# Files
+
+
+def test_truth_of_a_clip(edge):
+    """An evaluation would run on a file that was never written."""
+    sentence = edge("--truth", "truth.txt", "--summary", "s.json", "--record-base", "b.mkv")
+    assert "--truth truth.txt" in sentence
+    assert "demo" in sentence
+
+
+@pytest.mark.parametrize("flag", ["--summary", "--record-base", "--truth"])
+@pytest.mark.parametrize("path", ["missing/file", "pictures", "/proc/file"])
+def test_a_file_that_cannot_be_written(edge, flag, path):
+    """The run would end before its result could be kept."""
+    assert f"{flag} {path}" in edge(flag, path)
+
+
+def test_a_failed_start_leaves_an_old_summary_as_it_was(edge, here, taken_port):
+    """The result of yesterday would be gone."""
+    Path("s.json").write_text("yesterday")
+    edge("--summary", "s.json", "--record-base", "b.mkv", "--listen", f"tcp/127.0.0.1:{taken_port}")
+    assert Path("s.json").read_text() == "yesterday"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("size = \n", "not valid TOML"),
+        ("fps = 15\nfps = 20\n", "not valid TOML"),
+        ('sizee = "640x360"\n', "did you mean size"),
+        ("[edge]\nfps = 15\n", "unknown key 'edge'"),
+        ("fps = [1, 2]\n", "fps"),
+        ("fps = true\n", "fps"),
+        ('fps = "fast"\n', "0.1 to 240"),
+        ('quiet = "yes"\n', "true or false"),
+        ('budget = "10 potatoes"\n', "800kbps"),
+        ('connect = [["tcp/127.0.0.1:1"]]\n', "connect"),
+        ('edge-id = "UAV_1"\n', "UAV_1"),
+    ],
+)
+def test_a_configuration_file_that_is_wrong(edge, here, text, told):
+    """A drone would start with another setting than the one in its file."""
+    Path("edge.toml").write_text(text)
+    assert told in edge("--config", "edge.toml")
+
+
+@pytest.mark.parametrize("file", ["missing.toml", "pictures", "binary.toml"])
+def test_a_configuration_file_that_cannot_be_read(edge, here, file):
+    """The same, and the user would look for the mistake in the drone."""
+    Path("binary.toml").write_bytes(bytes(range(128, 256)))
+    sentence = edge("--config", file)
+    assert f"--config {file}" in sentence
+    assert "TOML" in sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{ mode: ", "zenoh.json5:1: not JSON5"),
+        ("{\n mode: 'peer',\n oops\n}", "zenoh.json5:"),
+        ("[1, 2]", "object"),
+        ("{ transprot: {} }", "transprot"),
+        ("{ mode: 'boss' }", "boss"),
+    ],
+)
+def test_a_zenoh_configuration_that_is_wrong(edge, here, text, told):
+    """A link without the keys that the file should have given it."""
+    Path("zenoh.json5").write_text(text)
+    assert told in edge("--zenoh-config", "zenoh.json5")
+
+
+@pytest.mark.parametrize("file", ["missing.json5", "pictures"])
+def test_a_zenoh_configuration_that_cannot_be_read(edge, file):
+    """The same."""
+    assert file in edge("--zenoh-config", file)
+
+
+# The link
+
+
+@pytest.mark.parametrize("flag", ["--connect", "--listen"])
+@pytest.mark.parametrize(
+    "endpoint", ["here", "tcp/127.0.0.1", "tcp/127.0.0.1:0", "tcp/127.0.0.1:99999", "smoke/x:1"]
+)
+def test_an_endpoint_that_is_none(edge, flag, endpoint):
+    """The drone would wait for ever for a ground at no address."""
+    sentence = edge(flag, endpoint)
+    assert repr(endpoint) in sentence
+    assert "PROTOCOL/HOST:PORT" in sentence
+
+
+def test_a_port_in_use(edge, taken_port):
+    """Two edges on one machine would be one that works and one that is silent."""
+    sentence = edge("--listen", f"tcp/127.0.0.1:{taken_port}")
+    assert str(taken_port) in sentence
+    assert "in use" in sentence
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7999", "tcp/[::]:7999"])
+def test_an_open_door(edge, endpoint):
+    """Anybody on the network could watch, by mistake."""
+    sentence = edge("--listen", endpoint)
+    assert endpoint in sentence
+    assert "--insecure" in sentence
+
+
+def test_an_address_that_is_not_this_machines(edge):
+    """Zenoh's own error names a source file of whoever built it."""
+    sentence = edge("--listen", "tcp/192.0.2.1:7999", "--insecure")
+    assert "tcp/192.0.2.1:7999" in sentence
+    assert ".rs" not in sentence

@@ -1,0 +1,113 @@
+"""hvt-ground with input that it cannot use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.timeout(60)
+
+
+@pytest.fixture
+def ground(refused, free_port):
+    """Refuse settings on top of a run that would otherwise work, and end by itself."""
+
+    def ground(*settings: str) -> str:
+        listen = () if "--listen" in settings else ("--listen", f"tcp/127.0.0.1:{free_port}")
+        return refused("hvt-ground", *listen, "--once", "--wait", "1s", *settings)
+
+    return ground
+
+
+def test_a_port_in_use_leaves_nothing_behind(ground, taken_port):
+    """A second ground would look as if it worked, and the files of the first would be touched."""
+    for record in ("flight.rrd", "recordings"):
+        sentence = ground(
+            "--listen", f"tcp/127.0.0.1:{taken_port}", "--record", record, "--summary", "s.json"
+        )
+        assert str(taken_port) in sentence
+        assert "in use" in sentence
+
+
+def test_a_failed_start_leaves_an_old_recording_as_it_was(ground, here, taken_port):
+    """The flight of yesterday would be gone."""
+    Path("flight.rrd").write_bytes(b"yesterday")
+    ground("--listen", f"tcp/127.0.0.1:{taken_port}", "--record", "flight.rrd")
+    assert Path("flight.rrd").read_bytes() == b"yesterday"
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7999", "tcp/[::]:7999"])
+def test_an_open_door(ground, endpoint):
+    """Anybody on the network could command the drones, by mistake."""
+    sentence = ground("--listen", endpoint)
+    assert endpoint in sentence
+    assert "--insecure" in sentence
+
+
+@pytest.mark.parametrize(
+    ("flag", "path"),
+    [
+        ("--record", "missing/flight.rrd"),
+        ("--record", "notes.txt"),
+        ("--record", "/proc/flight.rrd"),
+        ("--record", "/proc/flights"),
+        ("--record", "notes.txt/flights"),
+        ("--summary", "missing/s.json"),
+        ("--summary", "folder"),
+        ("--summary", "/proc/s.json"),
+    ],
+)
+def test_a_file_that_cannot_be_written(ground, here, flag, path):
+    """The flight would be over before anybody sees that it was not kept."""
+    Path("notes.txt").write_text("not a recording")
+    Path("folder").mkdir()
+    assert f"{flag} {path}" in ground(flag, path)
+
+
+@pytest.mark.parametrize("pattern", ["UAV_*", "", "a/b", "**/x"])
+def test_a_pattern_of_edges_that_matches_nothing(ground, pattern):
+    """The ground would listen to nobody and say nothing."""
+    sentence = ground("--edges", pattern)
+    assert "edge" in sentence
+    assert pattern in sentence
+
+
+def test_two_viewers(ground):
+    """One of the two would silently not count."""
+    sentence = ground("--view", "--serve")
+    assert "--view" in sentence
+    assert "--serve" in sentence
+
+
+@pytest.mark.parametrize(
+    ("flag", "value", "accepted"),
+    [
+        ("refine", "guess", "replace, fuse"),
+        ("detect-every", "0", "1 to 1000"),
+        ("confidence", "2", "0.01 to 1"),
+        ("camera-motion", "yes", "off, flow, ecc"),
+        ("wait", "-1s", "2s"),
+    ],
+)
+def test_a_value_that_is_not_accepted(ground, flag, value, accepted):
+    """The user would have to read the source to learn what the setting takes."""
+    sentence = ground(f"--{flag}", value)
+    assert f"--{flag} '{value}'" in sentence
+    assert accepted in sentence
+
+
+@pytest.mark.parametrize("words", [("--bogus",), ("stray",)])
+def test_a_flag_that_does_not_exist(ground, words):
+    """A misspelt setting would silently not count."""
+    assert words[0] in ground(*words)
+
+
+def test_files_of_settings_that_are_wrong(ground, here):
+    """The ground would start with other settings than those in its file."""
+    Path("ground.toml").write_text("refine = \n")
+    assert "not valid TOML" in ground("--config", "ground.toml")
+    Path("ground.toml").write_text("sauce = 'tomato'\n")
+    assert "unknown key 'sauce'" in ground("--config", "ground.toml")
+    Path("zenoh.json5").write_text("{ mode: ")
+    assert "zenoh.json5:1: not JSON5" in ground("--zenoh-config", "zenoh.json5")

@@ -1,0 +1,54 @@
+"""The same as processes of their own: what a shell and a service manager see."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from refusal import checked, snapshot
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+
+def started(module: str, *words: str, folder) -> subprocess.CompletedProcess[str]:
+    """Run a program to its end."""
+    command = [sys.executable, "-m", module, *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "told"),
+    [
+        ("hvt_edge.cli", ("--source", "nope.mp4", "--summary", "s.json"), "'nope.mp4' does not exist"),
+        ("hvt_edge.cli", ("--source", "demo", "--budget", "10kbps"), "--budget 10 kbps"),
+        ("hvt_ground.cli", ("--record", "new", "--classifier", "nope.onnx"), "classifier nope.onnx"),
+    ],
+)
+def test_one_sentence_and_exit_code_2(here, module, words, told):
+    """A script could not tell a mistake in its settings from a crash."""
+    before = snapshot(here)
+    done = started(module, *words, folder=here)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    program = "hvt-" + module.removeprefix("hvt_").removesuffix(".cli")
+    assert told in checked(done.stderr, program=program, left=snapshot(here) - before)
+
+
+def test_a_second_ground_on_the_port_of_the_first(here, taken_port):
+    """Zenoh's own error would name a source file of whoever built it."""
+    done = started("hvt_ground.cli", "--listen", f"tcp/127.0.0.1:{taken_port}", folder=here)
+    assert done.returncode == 2
+    assert f"tcp/127.0.0.1:{taken_port}: the port is in use" in checked(
+        done.stderr, program="hvt-ground", left=snapshot(here)
+    )
+
+
+@pytest.mark.parametrize("module", ["hvt_edge.cli", "hvt_ground.cli"])
+def test_help_is_not_an_error(here, module):
+    """Who asks for help would be told off."""
+    done = started(module, "--help", folder=here)
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert "--summary" in done.stdout
