@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test check lint type format bench clean help
+.PHONY: setup demo test check lint type format bench bench-peers clean help
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -44,6 +44,11 @@ format: setup    ## write what `make check` wants to see
 
 bench: setup     ## speed and memory as ratios against a peer or a floor, measured in one run
 	@$(BIN)/python -m bench
+
+bench-peers: setup ## the tracker beside roboflow trackers, which get an environment of their own (they are large)
+	@test -x build/peers/bin/python || $(PYTHON) -m venv build/peers
+	@build/peers/bin/python -m pip install --quiet numpy scipy trackers
+	@PYTHONPATH=common build/peers/bin/python bench/tracker.py
 
 clean:
 	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,6 +1,6 @@
 """Whole pipelines in lockstep against the bare sum of their parts, on the same frames in the same run.
 
-The floor of the edge is x265 encode, HEVC decode and a detector call on every fifth frame; that of the ground is decode
+The floor of the edge is x265 encode, HEVC decode and a detector call on every fifth frame; of the ground, decode
 and the same detector calls. A pipeline adds the source, tracking, camera motion, methods, stills, headers, ledger and
 the recording, and may win time back by doing things side by side.
 """

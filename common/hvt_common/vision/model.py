@@ -162,6 +162,8 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
         if choice.asked or choice.provider == "cpu":
             raise
         model = _open(path, settings, Choice("cpu", str(error), asked=False))
+    except UnicodeDecodeError as error:  # a name in the file, or the runtime's message that quotes it
+        raise UserError(f"model {path} cannot be opened: a name in it is not text") from error
     _log.info("%s runs on %s: %s", path.name, model.provider.provider, model.provider.why)
     return model
 
@@ -193,7 +195,8 @@ def _session(
     # Threads that spin between runs burn the cores that the encoder needs: half the CPU time for no gain.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        return ort.InferenceSession(str(path), options, providers=list(providers))
+        # Without its own fallback, which tries the same again and prints banners.
+        return ort.InferenceSession(str(path), options, providers=list(providers), enable_fallback=0)
     except _ORT_ERRORS as error:
         raise UserError(f"model {path} cannot be opened: {_reason(error)}") from error
 
