@@ -249,7 +249,8 @@ class Edge:
                 keyframes=self._keyframes,
                 fps=fps,
                 counts=self._counts,
-                follow=link.heard(),
+                heard=link.heard,
+                stop=self._stop,
             )
         return RealtimePace(
             base,

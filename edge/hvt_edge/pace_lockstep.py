@@ -7,8 +7,10 @@ reports counts a fixed number of frames later.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Self
@@ -26,10 +28,16 @@ __all__ = ["LockstepPace"]
 _AHEAD_S = 1.0
 """How far the edge runs ahead of the ground, in media time: what a ground reports counts so much later."""
 _GROUND_GONE_S = 20.0
+"""A ground that has not answered for so long is not waited for again."""
+_UNHEARD_S = 2.0
+"""Nor one that has not listened for so long; a link may break and come back."""
+_STOP_S = 0.3
+"""How long the ground is waited for when the run is to stop."""
+_LOOK_S = 0.1
 
 
 class LockstepPace:
-    """``follow``: a ground listens, so that the loop waits for it."""
+    """``heard()``: whether a ground listens. Where one does at the start, the loop waits for it, until ``stop``."""
 
     def __init__(
         self,
@@ -40,7 +48,8 @@ class LockstepPace:
         keyframes: KeyframePlan,
         fps: float,
         counts: FrameCounts,
-        follow: bool,
+        heard: Callable[[], bool],
+        stop: threading.Event,
     ) -> None:
         self._base = base
         self._stills = stills
@@ -48,7 +57,9 @@ class LockstepPace:
         self._keyframes = keyframes
         self._ahead_frames = max(1, round(_AHEAD_S * fps))
         self._counts = counts
-        self._follows = follow
+        self._heard = heard
+        self._stop = stop
+        self._follows = heard()
         self._eyes = ThreadPoolExecutor(1, thread_name_prefix="hvt-sight")
         self._seeing: tuple[Frame, bool, Future[Seen]] | None = None
         self._in_flight: deque[tuple[int, set[int]]] = deque()
@@ -93,9 +104,18 @@ class LockstepPace:
         """Wait until the ground has done with the frames before this one, and take in what it made of them."""
         while self._in_flight and self._in_flight[0][0] < before:
             index, sent = self._in_flight.popleft()
-            if self._follows and not self._inbox.wait_for(
-                frame_index=index, stills=sent, timeout_s=_GROUND_GONE_S
-            ):
-                self._follows = False  # it is gone, or it never answers: do not wait again
+            if self._follows:
+                self._follows = self._answered(index, sent)
             self._newest_answered = max([self._newest_answered, *sent])
         self._stills.hear(self._inbox.take_up_to(self._newest_answered))
+
+    def _answered(self, index: int, sent: set[int]) -> bool:
+        """Wait for the ground's answer to a frame and its stills; False where it is gone or never answers."""
+        waited_s = unheard_s = 0.0
+        while not self._inbox.wait_for(frame_index=index, stills=sent, timeout_s=_LOOK_S):
+            waited_s += _LOOK_S
+            unheard_s = 0.0 if self._heard() else unheard_s + _LOOK_S
+            patience_s = _STOP_S if self._stop.is_set() else _GROUND_GONE_S
+            if waited_s >= patience_s or unheard_s >= _UNHEARD_S:
+                return False
+        return True

@@ -228,3 +228,18 @@ def test_either_side_stops_before_anybody_came(link, scene, sign):
     edge.until("waiting up to")
     assert edge.stop(sign) <= STOPPED_WITHIN_S
     assert edge.finish()["frames"] == 0
+
+
+def test_a_lockstep_edge_does_not_wait_for_a_dead_ground(link, scene):
+    """A long run of a study, or Ctrl-C, would hang on a ground that crashed."""
+    ground = link.ground("--record", "recordings")
+    stops, plays_on = (
+        link.edge(*arguments(scene, name, "--wait", "60s", "--pace", "lockstep"), name=name)
+        for name in ("uav-1", "uav-2")
+    )
+    for name in ("uav-1", "uav-2"):
+        eventually(lambda name=name: f"{name}: " in served(ground), within_s=30, what=f"{name} is served")
+    ground.kill()
+    assert stops.stop() <= STOPPED_WITHIN_S
+    assert 0 < stops.finish()["frames"] < 300
+    assert plays_on.finish(within_s=15)["frames"] == 300

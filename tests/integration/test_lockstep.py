@@ -14,6 +14,8 @@ from rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(180)]
 
+FRAMES = 60
+
 MEASURED = ("session", "encode_ms", "sight_ms")
 """What a run measures of the machine; all else follows from the input."""
 
@@ -34,12 +36,19 @@ class Play:
 
 
 def play(data: Path, folder: Path, *ground_settings: str) -> Play:
-    """Six seconds of drone_carpark with M3, whose decisions hang on the classifier's confidence."""
+    """Four seconds of drone_carpark with M3, whose decisions hang on the classifier's confidence."""
     folder.mkdir()
     with Link(folder) as link:
         ground = link.ground("--once", "--record", "flight.rrd", *ground_settings)
         edge = link.edge(
-            *("--source", str(data / "clips/drone_carpark.mp4"), "--max-frames", "90", "--pace", "lockstep"),
+            *(
+                "--source",
+                str(data / "clips/drone_carpark.mp4"),
+                "--max-frames",
+                str(FRAMES),
+                "--pace",
+                "lockstep",
+            ),
             *("--size", "640x360", "--budget", "400kbps", "--preset", "ultrafast", "--method", "M3"),
             *("--detector", str(data / "models/yolov5su_visdrone_640.onnx"), "--cooldown", "1s"),
             *("--min-gain", "1", "--record-base", "base.mkv", "--wait", "60s"),
@@ -69,10 +78,10 @@ def plays(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Play, P
 def test_the_same_input_gives_the_same_base_stream(plays):
     """No figure of a study could be made again."""
     one, two, _ = plays
-    assert len(one.base) == 90
+    assert len(one.base) == FRAMES
     assert one.base == two.base
     samples = [[unit for _, _, unit in run.recording.video()] for run in (one, two)]
-    assert len(samples[0]) == 90
+    assert len(samples[0]) == FRAMES
     assert samples[0] == samples[1]
 
 
