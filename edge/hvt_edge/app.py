@@ -375,8 +375,13 @@ class Edge:
         """Let the ground finish, then tell it that this was all."""
         self._send_status("ended", sender, stills)
         if link.heard():  # what is still in a queue would be lost with the session
-            base, roi = sender.base_sequence + 1, sender.still_sequence + 1
-            self._inbox.wait_for_messages(base=base, roi=roi, timeout_s=_GOODBYE_S)
+            self._inbox.wait_for_end(
+                base=sender.base_sequence + 1,
+                roi=sender.still_sequence + 1,
+                frame_index=self._counts.last_index,
+                still_sequence=sender.still_sequence,
+                timeout_s=_GOODBYE_S,
+            )
 
     def _facts(self, stills: StillStage, link: EdgeLink) -> EdgeRun:
         counts, config = self._counts, self._config

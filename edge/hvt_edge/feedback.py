@@ -75,9 +75,19 @@ class FeedbackInbox:
                 lambda: self._last_frame_index >= frame_index and stills <= self._answered.keys(), timeout_s
             )
 
-    def wait_for_messages(self, *, base: int, roi: int, timeout_s: float) -> bool:
-        """Wait until a ground has received so many messages of each; False after the time-out."""
+    def wait_for_end(
+        self, *, base: int, roi: int, frame_index: int, still_sequence: int, timeout_s: float
+    ) -> bool:
+        """Wait until a ground has all there is; False after the time-out.
+
+        Either it has received so many messages of each, or, where it joined late, it is done with this frame and has
+        answered this still (-1 for none).
+        """
+
+        def complete() -> bool:
+            counted = self._base_messages >= base and self._roi_messages >= roi
+            answered = still_sequence < 0 or still_sequence in self._answered
+            return counted or (self._last_frame_index >= frame_index >= 0 and answered)
+
         with self._changed:
-            return self._changed.wait_for(
-                lambda: self._base_messages >= base and self._roi_messages >= roi, timeout_s
-            )
+            return self._changed.wait_for(complete, timeout_s)

@@ -16,6 +16,8 @@ _LARGEST_BYTES = 64 * 2**20
 """About ten minutes at 800 kbps. The tool holds the file in memory, and Ctrl-C is answered within three seconds; a
 larger recording opens without a footer just as well."""
 _PATIENCE_S = 2.0
+_MOST_GROWTH = 1.12
+"""A footer takes some 70 kB, whatever the length of the flight: too much for one of a few seconds."""
 
 
 def add_footer(path: Path) -> bool:
@@ -31,6 +33,9 @@ def add_footer(path: Path) -> bool:
         subprocess.run(  # noqa: S603 - the SDK's own program, no shell
             command, env=viewer_environment(), capture_output=True, check=True, timeout=_PATIENCE_S
         )
+        if scratch.stat().st_size > _MOST_GROWTH * path.stat().st_size:
+            scratch.unlink()
+            return False
         scratch.replace(path)
     except (OSError, subprocess.SubprocessError) as error:
         _log.info("%s stays without a footer: %s", path, error)

@@ -85,11 +85,20 @@ def test_the_goodbye_waits_for_all_messages():
     """The last pictures and stills would be lost with the session."""
     inbox = FeedbackInbox()
     inbox.receive(report(base=10, roi=2), now_ns=1)
-    assert inbox.wait_for_messages(base=10, roi=2, timeout_s=0)
-    assert not inbox.wait_for_messages(base=11, roi=2, timeout_s=0.01)
-    assert not inbox.wait_for_messages(base=10, roi=3, timeout_s=0.01)
+    assert inbox.wait_for_end(base=10, roi=2, frame_index=10**6, still_sequence=-1, timeout_s=0)
+    assert not inbox.wait_for_end(base=11, roi=2, frame_index=10**6, still_sequence=-1, timeout_s=0.01)
+    assert not inbox.wait_for_end(base=10, roi=3, frame_index=10**6, still_sequence=-1, timeout_s=0.01)
     inbox.receive(report(base=3, roi=3), now_ns=2)  # an older report, or another ground's
-    assert inbox.wait_for_messages(base=10, roi=3, timeout_s=0)
+    assert inbox.wait_for_end(base=10, roi=3, frame_index=10**6, still_sequence=-1, timeout_s=0)
+
+
+def test_the_goodbye_to_a_ground_that_joined_late_is_short():
+    """It never gets the first messages; Ctrl-C must not wait for them."""
+    inbox = FeedbackInbox()
+    inbox.receive(report(result(7), base=10, roi=1, frame=90), now_ns=1)
+    assert inbox.wait_for_end(base=90, roi=8, frame_index=90, still_sequence=7, timeout_s=0)
+    assert not inbox.wait_for_end(base=90, roi=9, frame_index=90, still_sequence=8, timeout_s=0.01)
+    assert not inbox.wait_for_end(base=90, roi=8, frame_index=91, still_sequence=7, timeout_s=0.01)
 
 
 def test_hostile_reports_take_no_memory_and_do_not_hide_true_ones():

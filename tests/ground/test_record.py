@@ -318,12 +318,23 @@ def test_a_killed_process_leaves_all_that_was_logged(events: list[Event], tmp_pa
     assert len(read.boxes(last)) == TRACKS
 
 
-def test_a_closed_recording_verifies(recording: Recording) -> None:
-    """Tools that index recordings refuse a file without a footer."""
+def test_a_footer_makes_a_recording_that_verifies(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tools that index recordings refuse a file without a footer; a short flight must not grow by one."""
     from hvt_ground.live_view import viewer_program
+    from hvt_ground.rrd_footer import add_footer
 
-    path = str(recording.reader.path)
+    path = tmp_path / "copy.rrd"
+    path.write_bytes(Path(recording.reader.path).read_bytes())
+    plain_bytes = path.stat().st_size
+    assert not add_footer(path)
+    assert path.stat().st_size == plain_bytes
+    monkeypatch.setattr("hvt_ground.rrd_footer._MOST_GROWTH", 10)
+    assert add_footer(path)
     subprocess.run([viewer_program(), "rrd", "verify", path], check=True, capture_output=True)
+    assert Recording(path).video() == recording.video()
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.realdata
