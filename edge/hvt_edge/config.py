@@ -84,7 +84,9 @@ class EdgeConfig:
     jpeg_quality: int = option(integer(5, 95), 65, "quality of the stills, in percent")
     padding: float = option(number(0, 1), 0.15, "margin around a box, as a share of its sides")
 
-    detector: str = option(TEXT, "motion", "FILE.onnx, or motion, which needs no model")
+    detector: str = option(
+        TEXT, "aerial-nano", "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
+    )
     labels: Path | None = option(PATH, None, "class names of the detector, one a line")
     candidates: str = option(
         choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"

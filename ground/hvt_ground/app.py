@@ -166,7 +166,7 @@ class Ground:
                     "source": f"{info.source_size[0]}x{info.source_size[1]}",
                     "base": f"{info.base_size[0]}x{info.base_size[1]} at {info.fps:g} fps, {info.codec}",
                     "detector": Path(config.detector).name,
-                    "classifier": Path(config.classifier or "detector").name,
+                    "classifier": Path(config.classifier or "none").name,
                 },
                 clocked=info.pace == "realtime",
                 live_url=self._view.url if self._view is not None else None,

@@ -6,20 +6,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, cast
 
-from hvt_common.errors import UserError
 from hvt_common.link.wire import Info
 from hvt_common.vision.classify import Classifier, open_classifier
 from hvt_common.vision.detect import Detector, open_detector
 from hvt_common.vision.track import ByteTracker, TrackerSettings, weak_confidence
 from hvt_ground.classify_stills import CropReader, NoReader, Redetection, StillReader
-from hvt_ground.config import GroundConfig
+from hvt_ground.config import DETECTOR, NONE, GroundConfig
 from hvt_ground.events import Event
 from hvt_ground.refine import Refiner
 from hvt_ground.sight import GroundSight
 
 __all__ = ["Models", "make_sight", "output_path"]
-
-MOTION = "motion"
 
 
 class Models:
@@ -44,11 +41,7 @@ class Models:
             threads=config.threads,
             provider=config.provider,
         )
-        if config.classifier in (None, "detector"):
-            if config.classifier == "detector" and config.detector == MOTION:
-                raise UserError(
-                    "--classifier detector needs a detector that knows classes: give --detector FILE.onnx too"
-                )
+        if config.classifier in (None, DETECTOR, NONE):
             return detector, None
         return detector, open_classifier(
             config.classifier, labels=config.labels, threads=config.threads, provider=config.provider
@@ -63,10 +56,10 @@ def make_sight(
     reader: StillReader
     if classifier is not None:
         reader = CropReader(classifier)
-    elif config.detector == MOTION:
-        reader = NoReader()
-    else:
+    elif config.classifier == DETECTOR:
         reader = Redetection(detector, view=info.view)
+    else:
+        reader = NoReader()
     tracker = ByteTracker(
         TrackerSettings.starting_at(
             config.confidence, camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hvt_common.config import DURATION, PATH, TEXT, choice, integer, number, option, switch
@@ -10,7 +10,10 @@ from hvt_common.errors import UserError
 from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.vision.providers import PROVIDERS
 
-__all__ = ["GroundConfig", "check"]
+__all__ = ["DETECTOR", "NONE", "GroundConfig", "check"]
+
+DETECTOR, NONE, MOTION = "detector", "none", "motion"
+EMBEDDED_DETECTOR, EMBEDDED_CLASSIFIER = "aerial-nano", "aerial-cls"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +30,9 @@ class GroundConfig:
     insecure: bool = switch("allow listening beyond this machine without keys")
     edges: str = option(TEXT, "*", "which edges to serve, for example 'uav-*'")
 
-    detector: str = option(TEXT, "motion", "FILE.onnx, or motion, which needs no model")
+    detector: str = option(
+        TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
+    )
     labels: Path | None = option(PATH, None, "class names of the classifier, one a line")
     detector_labels: Path | None = option(PATH, None, "class names of the detector, one a line")
     detect_every: int = option(
@@ -41,8 +46,8 @@ class GroundConfig:
     classifier: str | None = option(
         TEXT,
         None,
-        "FILE.onnx, or detector, which runs again with the stills pasted into the picture",
-        shown_default="detector, where --detector is a file",
+        "FILE.onnx, a name of hvt-models list, none, or detector: it runs again with the stills pasted in",
+        shown_default="aerial-cls; detector where --detector is another",
     )
     refine: str = option(
         choice("replace", "fuse"),
@@ -74,8 +79,15 @@ def check(config: GroundConfig) -> GroundConfig:
     """Return the configuration; `UserError` where settings contradict."""
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
-    if config.labels is not None and config.classifier in (None, "detector"):
+    if config.labels is not None and config.classifier in (None, DETECTOR, NONE):
         raise UserError(
             f"--labels {config.labels} names a classifier's classes, but --classifier is no file: give one"
         )
+    if config.classifier == DETECTOR and config.detector == MOTION:
+        raise UserError(
+            f"--classifier {DETECTOR} needs a detector that knows classes, and --detector is {MOTION}: give a model"
+        )
+    if config.classifier is None:
+        classifier = EMBEDDED_CLASSIFIER if config.detector in (MOTION, EMBEDDED_DETECTOR) else DETECTOR
+        return replace(config, classifier=classifier)
     return config
