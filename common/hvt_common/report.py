@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
+import logging.handlers
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,9 +20,27 @@ from rich.text import Text
 
 from hvt_common.errors import UserError
 
-__all__ = ["StatusLine", "check_writable", "print_table", "say", "write_json"]
+__all__ = ["StatusLine", "check_writable", "print_table", "say", "start_log", "write_json"]
 
 _PLAIN_EVERY = 5
+
+
+def start_log(program: str, *, quiet: bool) -> Callable[[], None]:
+    """Send the log to stderr, from when the returned function is called: until then it is held.
+
+    A start that fails says one sentence and nothing else. What runs each network is said unless ``quiet``.
+    """
+    stream = logging.StreamHandler()
+    stream.setFormatter(logging.Formatter(f"{program}: %(message)s"))
+    held = logging.handlers.MemoryHandler(10_000, logging.CRITICAL + 1, stream, flushOnClose=False)
+    logging.basicConfig(level=logging.WARNING, handlers=[held], force=True)
+    logging.getLogger("hvt_common.vision.model").setLevel(logging.WARNING if quiet else logging.INFO)
+
+    def release() -> None:
+        held.flush()
+        held.flushLevel = logging.NOTSET
+
+    return release
 
 
 class StatusLine:

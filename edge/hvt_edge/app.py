@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, cast
 
@@ -76,11 +76,14 @@ def _closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
 
 
 class Edge:
-    """One run of one edge: build it, `run` it once."""
+    """One run of one edge: build it, `run` it once. ``on_started()`` is called once nothing is refused any more."""
 
-    def __init__(self, config: EdgeConfig, *, stop: threading.Event) -> None:
+    def __init__(
+        self, config: EdgeConfig, *, stop: threading.Event, on_started: Callable[[], None] = lambda: None
+    ) -> None:
         self._config = config
         self._stop = stop
+        self._on_started = on_started
         self._lockstep = config.pace == "lockstep"
         self._clock = SteadyClock()
         self._session_id = secrets.randbits(64)
@@ -146,6 +149,7 @@ class Edge:
                 keyframes=self._keyframes,
                 media_type=_STILL_MEDIA_TYPE,
             )
+            self._on_started()
             self._wait_for_ground(link, source, line)
             self._started_ns = self._clock()
             try:

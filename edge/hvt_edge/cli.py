@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import signal
 import sys
 import threading
@@ -10,7 +9,7 @@ from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
-from hvt_common.report import print_table, write_json
+from hvt_common.report import print_table, start_log, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.summary import table
@@ -34,13 +33,11 @@ def _run(argv: Sequence[str] | None) -> int:
         print(to_toml(config), end="")
         return 0
     config = check(config)
-    logging.basicConfig(level=logging.WARNING, format="hvt-edge: %(message)s")
-    if not config.quiet:
-        logging.getLogger("hvt_common.vision.model").setLevel(logging.INFO)  # says what runs each network
+    release_log = start_log("hvt-edge", quiet=config.quiet)
     stop = threading.Event()
     for one in (signal.SIGINT, signal.SIGTERM):
         signal.signal(one, lambda *_: stop.set())
-    content = Edge(config, stop=stop).run()
+    content = Edge(config, stop=stop, on_started=release_log).run()
     if config.summary is not None:
         write_json(config.summary, content)
     print_table(f"{config.edge_id}: sent", table(content))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -32,11 +33,14 @@ _CLOCK_EVERY_TICKS = 200
 
 
 class Ground:
-    """One run of a ground: build it, `run` it once."""
+    """One run of a ground: build it, `run` it once. ``on_started()`` is called once nothing is refused any more."""
 
-    def __init__(self, config: GroundConfig, *, stop: threading.Event) -> None:
+    def __init__(
+        self, config: GroundConfig, *, stop: threading.Event, on_started: Callable[[], None] = lambda: None
+    ) -> None:
         self._config = config
         self._stop = stop
+        self._on_started = on_started
         self._receivers: dict[str, EdgeReceiver] = {}
         self._view: LiveView | None = None
         self._paths: set[Path] = set()
@@ -68,6 +72,7 @@ class Ground:
             self._make_record_folder()
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges))
+            self._on_started()
             self._say_where(line)
             try:
                 self._serve(link, line)

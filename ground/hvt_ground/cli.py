@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import signal
 import sys
 import threading
@@ -10,7 +9,7 @@ from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
-from hvt_common.report import print_table, say, write_json
+from hvt_common.report import print_table, say, start_log, write_json
 from hvt_ground.config import GroundConfig, check
 
 __all__ = ["main"]
@@ -39,13 +38,11 @@ def _run(argv: Sequence[str] | None) -> int:
         print(to_toml(config), end="")
         return 0
     config = check(config)
-    logging.basicConfig(level=logging.WARNING, format="hvt-ground: %(message)s")
-    if not config.quiet:
-        logging.getLogger("hvt_common.vision.model").setLevel(logging.INFO)  # says what runs each network
+    release_log = start_log("hvt-ground", quiet=config.quiet)
     stop = threading.Event()
     for one in (signal.SIGINT, signal.SIGTERM):
         signal.signal(one, lambda *_: stop.set())
-    sessions = Ground(config, stop=stop).run()
+    sessions = Ground(config, stop=stop, on_started=release_log).run()
     if config.summary is not None:
         edges = {content["edge"] for content in sessions}
         write_json(config.summary, sessions[0] if len(sessions) == 1 and len(edges) == 1 else sessions)

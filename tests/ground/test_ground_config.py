@@ -23,7 +23,7 @@ def read(*argv: str) -> GroundConfig:
 def test_without_flags_it_listens_and_needs_no_model():
     """``hvt-ground`` alone would not start."""
     config = read()
-    assert (config.detector, config.edges, config.refine, config.once) == ("motion", "*", "replace", False)
+    assert (config.detector, config.edges, config.refine, config.once) == ("aerial-nano", "*", "replace", False)
     assert (config.listen, config.connect, config.record) == ((), (), None)
 
 
@@ -52,7 +52,7 @@ def test_every_flag_explains_itself(capsys):
     for one in dataclasses.fields(GroundConfig):
         assert "--" + one.name.replace("_", "-") in out
         assert len(one.metadata["help"]) > 8
-    assert "[motion]" in out
+    assert "[aerial-nano]" in out
     assert "[hvt-<edge>-<time>.rrd here]" in out
 
 

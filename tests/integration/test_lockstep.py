@@ -71,7 +71,7 @@ def plays(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Play, P
     return (
         play(data, folder / "one", *opinions),
         play(data, folder / "two", *opinions),
-        play(data, folder / "mute"),
+        play(data, folder / "mute", "--classifier", "none"),
     )
 
 
