@@ -8,7 +8,7 @@ import logging
 import logging.handlers
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -32,15 +32,32 @@ def start_log(program: str, *, quiet: bool) -> Callable[[], None]:
     """
     stream = logging.StreamHandler()
     stream.setFormatter(logging.Formatter(f"{program}: %(message)s"))
-    held = logging.handlers.MemoryHandler(10_000, logging.CRITICAL + 1, stream, flushOnClose=False)
+    held = _HeldLog(stream)
     logging.basicConfig(level=logging.WARNING, handlers=[held], force=True)
     logging.getLogger("hvt_common.vision.model").setLevel(logging.WARNING if quiet else logging.INFO)
+    return held.release
 
-    def release() -> None:
-        held.flush()
-        held.flushLevel = logging.NOTSET
 
-    return release
+class _HeldLog(logging.handlers.MemoryHandler):
+    """Keeps what is logged until it is released; what is never released is never said."""
+
+    def __init__(self, target: logging.Handler) -> None:
+        super().__init__(10_000, target=target, flushOnClose=False)
+        self._released = False
+
+    def release(self) -> None:
+        """Say what was held, and from now on everything at once."""
+        self._released = True
+        self.flush()
+
+    def shouldFlush(self, record: logging.LogRecord) -> bool:  # noqa: ARG002, N802 - the library's name
+        """At once, after the release."""
+        return self._released
+
+    def flush(self) -> None:
+        """Logging itself flushes at exit: not what is still held."""
+        if self._released:
+            super().flush()
 
 
 class StatusLine:
