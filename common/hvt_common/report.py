@@ -35,7 +35,7 @@ def start_log(program: str, *, quiet: bool) -> Callable[[], None]:
     held = _HeldLog(stream)
     logging.basicConfig(level=logging.WARNING, handlers=[held], force=True)
     logging.getLogger("hvt_common.vision.model").setLevel(logging.WARNING if quiet else logging.INFO)
-    return held.release
+    return held.say_on
 
 
 class _HeldLog(logging.handlers.MemoryHandler):
@@ -43,20 +43,20 @@ class _HeldLog(logging.handlers.MemoryHandler):
 
     def __init__(self, target: logging.Handler) -> None:
         super().__init__(10_000, target=target, flushOnClose=False)
-        self._released = False
+        self._free = False
 
-    def release(self) -> None:
+    def say_on(self) -> None:
         """Say what was held, and from now on everything at once."""
-        self._released = True
+        self._free = True
         self.flush()
 
     def shouldFlush(self, record: logging.LogRecord) -> bool:  # noqa: ARG002, N802 - the library's name
-        """At once, after the release."""
-        return self._released
+        """At once, when free."""
+        return self._free
 
     def flush(self) -> None:
         """Logging itself flushes at exit: not what is still held."""
-        if self._released:
+        if self._free:
             super().flush()
 
 

@@ -22,6 +22,7 @@ from hvt_common.errors import UserError
 from hvt_common.link.keys import EdgeKeys
 from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
+from hvt_common.vision.embedded import DETECTOR as EMBEDDED_DETECTOR
 from hvt_common.vision.providers import PROVIDERS
 from hvt_edge.encode import PRESETS
 from hvt_edge.methods.registry import METHODS, method
@@ -85,7 +86,7 @@ class EdgeConfig:
     padding: float = option(number(0, 1), 0.15, "margin around a box, as a share of its sides")
 
     detector: str = option(
-        TEXT, "aerial-nano", "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
+        TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
     )
     labels: Path | None = option(PATH, None, "class names of the detector, one a line")
     candidates: str = option(

@@ -8,12 +8,13 @@ from pathlib import Path
 from hvt_common.config import DURATION, PATH, TEXT, choice, integer, number, option, switch
 from hvt_common.errors import UserError
 from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT
+from hvt_common.vision.embedded import CLASSIFIER as EMBEDDED_CLASSIFIER
+from hvt_common.vision.embedded import DETECTOR as EMBEDDED_DETECTOR
 from hvt_common.vision.providers import PROVIDERS
 
 __all__ = ["DETECTOR", "NONE", "GroundConfig", "check"]
 
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
-EMBEDDED_DETECTOR, EMBEDDED_CLASSIFIER = "aerial-nano", "aerial-cls"
 
 
 @dataclass(frozen=True, slots=True)

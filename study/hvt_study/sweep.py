@@ -80,9 +80,7 @@ def read_csv(path: Path) -> dict[int, RawDetections]:
     }
 
 
-def detect_clip(
-    source: Source, detector: Detector, *, every: int
-) -> Iterator[tuple[int, RawDetections]]:
+def detect_clip(source: Source, detector: Detector, *, every: int) -> Iterator[tuple[int, RawDetections]]:
     """Detect on every n-th frame of a clip, on the untouched pixels; yields (frame, detections)."""
     for frame in source.frames(start_ns=0):
         if frame.index % every:

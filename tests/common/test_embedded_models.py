@@ -60,12 +60,13 @@ def test_any_picture_size_goes_in():
         assert len(found) <= 2  # an empty grey picture shows nothing to speak of
 
 
-@pytest.mark.parametrize(("bitrate_bps", "floor"), [(CLEAN, 0.80), (800_000, 0.60)])
-def test_detector_on_held_out_scenes(bitrate_bps, floor):
+def test_detector_on_held_out_scenes():
     """The demo would show a detector that finds nothing, and a retrained file could be worse unseen."""
-    pictures = list(drawn_pictures(range(200, 202), moments=1, bitrate_bps=bitrate_bps, coded_frames=5))
+    floors = {CLEAN: 0.85, 800_000: 0.80}
+    pictures = drawn_pictures(range(200, 203), moments=1, bitrates_bps=tuple(floors), coded_frames=5)
     detector = open_detector(str(embedded_model(DETECTOR)), confidence=0.01)
-    assert evaluate_drawn(detector, pictures).mean >= floor
+    for bitrate_bps, floor in floors.items():
+        assert evaluate_drawn(detector, pictures[bitrate_bps]).mean >= floor
 
 
 def test_classifier_on_held_out_stills():
@@ -74,7 +75,7 @@ def test_classifier_on_held_out_stills():
     assert len(stills) > 50
     posteriors = open_classifier(str(embedded_model(CLASSIFIER))).classify([image for image, _ in stills])
     hits = [p.class_name == name for p, (_, name) in zip(posteriors, stills, strict=True)]
-    assert np.mean(hits) >= 0.85
+    assert np.mean(hits) >= 0.90
 
 
 @pytest.mark.realdata
@@ -84,5 +85,5 @@ def test_vehicles_on_real_pixels(data):
     truth = reference_vehicles(data / "models" / "yolov5su_visdrone_736x1280.onnx", frames)
     assert sum(map(len, truth)) > 100
     result = evaluate_real(open_detector(str(embedded_model(DETECTOR)), confidence=0.25), frames, truth)
-    assert result.recall >= 0.60
-    assert result.precision >= 0.60
+    assert result.recall >= 0.80
+    assert result.precision >= 0.75

@@ -7,8 +7,8 @@ import pytest
 
 from hvt_common.values import Detections
 from hvt_study.train.evaluate import average_precision, evaluate_drawn, evaluate_real, overlaps
+from hvt_study.train.fleet import make_solid
 from hvt_study.train.places import Picture, draw_place
-from hvt_study.train.solids import make_solid
 from hvt_study.train.views import ViewSettings, ViewSource, degrade
 
 CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
@@ -78,7 +78,7 @@ def test_a_view_keeps_boxes_on_their_objects(tmp_path):
         view = source.next()
         assert view.image_bgr.shape == (128, 128, 3)
         for (x0, y0, x1, y1), kind in zip(view.boxes_px.round().astype(int), view.class_ids, strict=True):
-            if kind != 3 or min(x1 - x0, y1 - y0) < 12 or (x0, y0) < (6, 6) or max(x1, y1) > 122:
+            if kind != 3 or min(x1 - x0, y1 - y0) < 12 or min(x0, y0) < 6 or max(x1, y1) > 122:
                 continue
             inner = view.image_bgr[y0 + 3 : y1 - 3, x0 + 3 : x1 - 3].mean()
             frame = view.image_bgr[max(y0 - 8, 0) : y1 + 8, max(x0 - 8, 0) : x1 + 8].astype(float)

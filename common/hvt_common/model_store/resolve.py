@@ -5,19 +5,18 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.model_store.store import Store
+from hvt_common.vision.embedded import EMBEDDED_MODELS, embedded_model
 
 __all__ = ["embedded_models", "resolve_model"]
 
 
 def embedded_models() -> dict[str, Path]:
     """The models that come with the package, by name."""
-    folder = Path(str(files("hvt_common"))) / "models"
-    return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
+    return {name: embedded_model(name) for name in EMBEDDED_MODELS}
 
 
 def resolve_model(
