@@ -22,18 +22,23 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["BudgetSettings", "RollingBudget"]
+__all__ = ["BASE_PEAK", "BudgetSettings", "RollingBudget"]
 
 _SECOND_NS = 1_000_000_000
 _MEMORY_WINDOWS = 5
 """How many windows of the base's recent behaviour the forecast looks back on."""
 _FORECASTS = 30
 """At how many moments of the coming window the forecast is made, at most: what it costs stays bounded."""
+
+
+BASE_PEAK = 1.15
+"""The fullest window of the base stream over B_v: what the VBV allows, kept also where frames bunch up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +70,8 @@ class RollingBudget:
         )
         self._spans_ns = settings.window_ns - self._forecasts * self._step_ns
         self._events: list[tuple[int, int]] = []
+        self._base_events: deque[tuple[int, int]] = deque()
+        self._base_peak = BASE_PEAK * settings.base_bps * settings.window_ns / 8 / _SECOND_NS
         """(time, line bytes), in order of time."""
         self._asked_ns: int | None = None
         self._last_ns = 0
@@ -86,6 +93,9 @@ class RollingBudget:
 
     def record_base(self, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
         """Count one base message; ``now_ns`` is when `earliest_ns` lets it go."""
+        self._base_events.append((now_ns, line_bytes))
+        while self._base_events[0][0] <= now_ns - 2 * self._settings.window_ns:
+            self._base_events.popleft()
         self._record(line_bytes, now_ns)
         self._last_ns = max(self._last_ns, now_ns)
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
@@ -102,19 +112,29 @@ class RollingBudget:
         self._tokens -= line_bytes
         self._record(line_bytes, now_ns)
 
-    def earliest_ns(self, line_bytes: int, *, now_ns: int) -> int:
+    def earliest_ns(self, line_bytes: int, *, now_ns: int, base: bool = False) -> int:
         """Return when a message of so many line bytes may go: now, or as soon as its window has room.
 
-        Messages keep their order: never before the base message or metadata recorded last. The wait beyond that is
-        one window at the most, also for a message that no window can hold.
+        A ``base`` message also keeps every window of the base stream within `BASE_PEAK` times B_v. Messages keep
+        their order: never before the base message or metadata recorded last. The wait beyond that is one window at
+        the most, also for a message that no window can hold.
         """
         self._note_asked(now_ns)
-        window_ns = self._settings.window_ns
         at_ns = max(now_ns, self._last_ns)
-        inside = [event for event in self._events if event[0] > at_ns - window_ns]
+        latest_ns = at_ns + self._settings.window_ns
+        if base:
+            at_ns = self._first_room(self._base_events, self._base_peak, line_bytes, at_ns)
+        return min(latest_ns, self._first_room(self._events, self._total, line_bytes, at_ns))
+
+    def _first_room(
+        self, events: Sequence[tuple[int, int]], limit: float, line_bytes: int, at_ns: int
+    ) -> int:
+        """The first moment from ``at_ns`` at which the window of these events has room."""
+        window_ns = self._settings.window_ns
+        inside = [event for event in events if event[0] > at_ns - window_ns]
         held = sum(size for _, size in inside)
         for event_ns, size in inside:
-            if held + line_bytes <= self._total:
+            if held + line_bytes <= limit:
                 break
             held -= size
             at_ns = max(at_ns, event_ns + window_ns)

@@ -89,7 +89,7 @@ class Sender:
         """Send one access unit as soon as the budget's window has room for it; return its line bytes."""
         line_bytes = self._line_bytes(Row.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
-            at_ns = self._budget.earliest_ns(line_bytes, now_ns=now_ns)
+            at_ns = self._budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
             self.base_sequence += 1
             header = BaseHeader(
                 session_id=self._session_id,

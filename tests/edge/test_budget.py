@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_edge.budget import BudgetSettings, RollingBudget
+from hvt_edge.budget import BASE_PEAK, BudgetSettings, RollingBudget
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_790_000_000 * SECOND_NS
@@ -20,6 +20,8 @@ class Run:
     """A budget, and everything that was recorded with it."""
 
     settings: BudgetSettings
+    own_peak: bool = True
+    """Whether base messages keep the base stream's own peak, as in flight."""
     events: list[tuple[int, int, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -27,7 +29,7 @@ class Run:
 
     def base(self, size: int, now_ns: int, *, keyframe: bool = False) -> int:
         """One base message."""
-        at_ns = self.budget.earliest_ns(size, now_ns=now_ns)
+        at_ns = self.budget.earliest_ns(size, now_ns=now_ns, base=self.own_peak)
         self.budget.record_base(size, now_ns=at_ns, keyframe=keyframe)
         self.events.append((at_ns, size, "base"))
         return at_ns
@@ -114,7 +116,7 @@ def test_stills_keep_to_their_share(one, seed):
 def test_a_base_message_waits_no_longer_than_a_window_and_keeps_its_order(one, seed):
     """A picture would come late for nothing, or before the one that it rests on."""
     rng = np.random.default_rng(seed)
-    run, last_ns = Run(one), 0
+    run, last_ns = Run(one, own_peak=False), 0
     for number in range(100):
         now_ns = START_NS + round(number * SECOND_NS / one.fps)
         size = int(rng.integers(1, round(total_bytes(one) * 1.3)))
@@ -133,7 +135,9 @@ def test_a_base_message_waits_no_longer_than_a_window_and_keeps_its_order(one, s
 
 def test_messages_of_one_moment_leave_the_window_together():
     """In lockstep a frame and its stills have one time: frames a second later would wait longer than they must."""
-    run = Run(BudgetSettings(total_bps=80_000, base_bps=40_000, fps=10))  # 10 000 bytes a window
+    run = Run(
+        BudgetSettings(total_bps=80_000, base_bps=40_000, fps=10), own_peak=False
+    )  # 10 000 bytes a window
     run.still(3_000, START_NS)
     run.still(3_000, START_NS)
     run.base(2_000, START_NS + 500_000_000)
@@ -234,3 +238,18 @@ def test_memory_is_bounded_and_a_long_window_costs_no_more():
         budget.still_room(now_ns)
     assert len(budget._events) <= 2 * 10 * 30 + 1
     assert len(budget._burst) <= 31
+
+
+@given(jitter=st.lists(st.integers(0, 60_000_000), min_size=60, max_size=60), burst=st.floats(1.0, 1.8))
+def test_the_base_keeps_its_own_peak_where_frames_bunch_up(jitter: list[int], burst: float):
+    """In real time frames come late and close together; the radio would see a burst that no VBV allowed."""
+    settings = BudgetSettings(total_bps=800_000, base_bps=650_000, fps=15)
+    run = Run(settings)
+    mean = settings.base_bps / 8 / settings.fps
+    waits = []
+    for number, late_ns in enumerate(jitter):
+        size = round(mean * (burst if number % 5 == 0 else 1.25 - burst / 4))
+        now_ns = START_NS + round(number * SECOND_NS / 15) + late_ns
+        waits.append(run.base(size, now_ns) - now_ns)
+    assert run.fullest(SECOND_NS, ("base",)) <= BASE_PEAK * settings.base_bps / 8
+    assert max(waits) < SECOND_NS / 5
