@@ -130,7 +130,7 @@ class ByteTracker:
         self._fps = fps
         self._buffer_frames = int(fps / 30.0 * self._settings.track_buffer)
         method = self._settings.camera_motion
-        self._camera = None if method == "off" else CameraMotion(method)
+        self._camera = None if method == "off" else CameraMotion(method, scale=None)
         self.reset()
 
     def reset(self) -> None:
