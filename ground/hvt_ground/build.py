@@ -8,7 +8,7 @@ from typing import Literal, cast
 
 from hvt_common.link.wire import Info
 from hvt_common.vision.classify import Classifier, open_classifier
-from hvt_common.vision.detect import Detector, open_detector
+from hvt_common.vision.detect import Detector, open_detector, warm_up
 from hvt_common.vision.track import ByteTracker, TrackerSettings, weak_confidence
 from hvt_ground.classify_stills import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.config import DETECTOR, NONE, GroundConfig
@@ -17,6 +17,10 @@ from hvt_ground.refine import Refiner
 from hvt_ground.sight import GroundSight
 
 __all__ = ["Models", "make_sight", "output_path"]
+
+
+_USUAL_SIZE = (1280, 720)
+"""Of base streams; what an edge really sends is known only when its first picture waits to be seen."""
 
 
 class Models:
@@ -41,6 +45,7 @@ class Models:
             threads=config.threads,
             provider=config.provider,
         )
+        warm_up(detector, _USUAL_SIZE)
         if config.classifier in (None, DETECTOR, NONE):
             return detector, None
         return detector, open_classifier(

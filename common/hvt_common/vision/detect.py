@@ -18,7 +18,7 @@ from hvt_common.vision.model import ModelSettings, OnnxModel, open_model
 from hvt_common.vision.motion import MotionDetector
 from hvt_common.vision.nms import MAX_DETECTIONS, suppress
 
-__all__ = ["MOTION", "Detector", "OnnxDetector", "open_detector"]
+__all__ = ["MOTION", "Detector", "OnnxDetector", "open_detector", "warm_up"]
 
 MOTION = "motion"
 """The word that stands for the detector without weights."""
@@ -75,6 +75,15 @@ def open_detector(
     path = resolve_model(spec, role="detector", words=(MOTION,))
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size)
+
+
+def warm_up(detector: Detector, size: tuple[int, int]) -> None:
+    """Run a network once at the (width, height) it will see: a runtime may compile for it, which takes 0.2 s.
+
+    A detector that remembers pictures, such as `motion`, is left alone.
+    """
+    if isinstance(detector, OnnxDetector):
+        detector.detect(np.zeros((size[1], size[0], 3), np.uint8))
 
 
 class OnnxDetector:
