@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, cast
 
-from hvt_common import __version__
 from hvt_common.errors import UserError
 from hvt_common.link.keys import EdgeKeys
 from hvt_common.link.ledger import Ledger
@@ -19,10 +18,7 @@ from hvt_common.link.wire import (
     ControlAnswer,
     ControlRequest,
     Feedback,
-    Health,
-    Info,
     Status,
-    fitted_class_names,
 )
 from hvt_common.link.zenoh_config import LinkSettings
 from hvt_common.report import StatusLine, check_writable
@@ -46,6 +42,7 @@ from hvt_edge.pace_lockstep import LockstepPace
 from hvt_edge.pace_realtime import RealtimePace
 from hvt_edge.publish import EdgeLink
 from hvt_edge.record_base import BaseRecorder
+from hvt_edge.reports import make_info, make_status
 from hvt_edge.scene.truth import write_truth
 from hvt_edge.send import Sender
 from hvt_edge.source import Source, open_source
@@ -289,26 +286,14 @@ class Edge:
         return ControlAnswer(session_id=self._session_id, accepted=not reason, reason=reason)
 
     def _info(self, source: Source, class_names: tuple[str, ...], received_ns: int) -> bytes:
-        config, view = self._config, source.view
-        info = Info(
+        info = make_info(
+            self._config,
             session_id=self._session_id,
-            edge=config.edge_id,
-            software=__version__,
             started_ns=self._started_ns,
-            source_size=view.source_size,
-            base_size=view.base_size,
-            view_scale=view.scale,
-            view_offset_px=view.offset_px,
-            fps=config.fps,
-            codec="hevc",
-            pace=config.pace,
-            method=config.method,
-            budget_bps=config.budget_bps,
-            base_bps=config.base_bps,
+            view=source.view,
+            class_names=class_names,
             window_ns=self._ledger.window_ns,
-            class_names=fitted_class_names(class_names),
             received_ns=received_ns,
-            answered_ns=time.time_ns(),
         )
         return info.pack()
 
@@ -330,49 +315,21 @@ class Edge:
         self._status_sequence += 1
 
     def _status(self, state: str, sender: Sender, stills: StillStage, at_ns: int) -> Status:
-        account, counts, ledger = (
-            self._ledger.summary(self._counts.duration_s(self._config.fps)),
-            self._counts,
-            self._ledger,
-        )
-        # In lockstep the same input gives the same bytes: no field whose length hangs on this machine's speed.
-        measured = not self._lockstep
-        heard_ns = self._inbox.received_ns if measured else None
-        return Status(
+        heard_ns = self._inbox.received_ns
+        return make_status(
+            state,
             session_id=self._session_id,
             sequence=self._status_sequence,
-            state=state,
-            send_ns=at_ns,
-            media_ns=max(0, at_ns - self._started_ns),
-            last_base_sequence=sender.base_sequence,
-            last_still_sequence=sender.still_sequence,
-            base_bytes=account.base_bytes,
-            roi_bytes=account.roi_bytes,
-            meta_bytes=account.meta_bytes,
-            overhead_bytes=account.overhead_bytes,
-            base_messages=account.messages["base"],
-            roi_messages=account.messages["roi"],
-            meta_messages=account.messages["meta"],
-            worst_window_bps=(
-                account.worst_window_bps.base,
-                account.worst_window_bps.roi,
-                account.worst_window_bps.total,
-            ),
-            sent=ledger.fates("sent"),
-            deferred=ledger.fates("deferred"),
-            dropped=ledger.fates("dropped"),
-            health=Health(
-                frames_captured=counts.captured,
-                frames_encoded=counts.encoded,
-                frames_dropped=counts.dropped,
-                keyframes=self._keyframes.sent,
-                tracks=stills.tracks,
-                base_queue=0,
-                still_queue=stills.waiting,
-                encode_ms=counts.encode_ms if measured else 0.0,
-                detect_ms=stills.sight_ms if measured else 0.0,
-                feedback_age_ms=-1 if heard_ns is None else max(0, (self._clock() - heard_ns) // _MILLION),
-            ),
+            at_ns=at_ns,
+            started_ns=self._started_ns,
+            fps=self._config.fps,
+            ledger=self._ledger,
+            counts=self._counts,
+            keyframes=self._keyframes,
+            sender=sender,
+            stills=stills,
+            feedback_age_ms=-1 if heard_ns is None else max(0, (self._clock() - heard_ns) // _MILLION),
+            measured=not self._lockstep,
         )
 
     def _say_goodbye(self, sender: Sender, stills: StillStage, link: EdgeLink) -> None:

@@ -31,6 +31,7 @@ __all__ = [
     "make_encoder",
     "make_keyframes",
     "make_sight",
+    "make_suppression",
 ]
 
 SECOND_NS = 1_000_000_000
@@ -68,6 +69,11 @@ def make_sight(config: EdgeConfig, *, detector: Detector, view: View) -> Sight:
     )
 
 
+def make_suppression(config: EdgeConfig) -> Suppression:
+    """Which tracks rest, and for how long."""
+    return Suppression.for_cooldown(config.cooldown, min_gain=config.min_gain)
+
+
 def make_chooser(
     config: EdgeConfig,
     *,
@@ -79,7 +85,7 @@ def make_chooser(
     """Method, suppression, queue and still stage; ``most_bytes`` is the largest payload the budget ever admits."""
     return Chooser(
         method(config.method),
-        suppression=Suppression.for_cooldown(config.cooldown),
+        suppression=make_suppression(config),
         maker=StillMaker(codec=JpegCodec(), quality_pct=config.jpeg_quality, padding=config.padding),
         memory=TrackMemory(padding=config.padding),
         view=view,

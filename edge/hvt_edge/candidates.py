@@ -101,7 +101,6 @@ class _History:
     border_since_ns: int | None = None
     border_area_px: float = 0.0
     sent_count: int = 0
-    sent_bytes: int = 0
     sent_frame: int | None = None
     sent_ns: int | None = None
     sent_area_px: float | None = None
@@ -155,7 +154,6 @@ class TrackMemory:
         *,
         frame_index: int,
         now_ns: int,
-        size_bytes: int,
         area_px: float,
         sharpness: float | None = None,
         at_border: bool = False,
@@ -165,7 +163,6 @@ class TrackMemory:
         if history is None:
             return
         history.sent_count += 1
-        history.sent_bytes += size_bytes
         history.sent_frame = frame_index
         history.sent_ns = now_ns
         history.sent_area_px = area_px

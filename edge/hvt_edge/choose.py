@@ -165,7 +165,6 @@ class Chooser:
             candidate.track_id,
             frame_index=frame.index,
             now_ns=now_ns,
-            size_bytes=len(still.data),
             area_px=candidate.area_px,
             sharpness=candidate.sharpness() if candidate.sharpness else None,
             at_border=candidate.touches_border,

@@ -32,11 +32,14 @@ class Suppression:
     """A track that the still stage refused rests this long; on in the plain variants too, for it costs time only."""
 
     @classmethod
-    def for_cooldown(cls, cooldown_s: float) -> Suppression:
-        """What ``--cooldown`` means: 0 is off altogether; else the wait for a gain is five times as long."""
+    def for_cooldown(cls, cooldown_s: float, *, min_gain: float = 1.2) -> Suppression:
+        """What ``--cooldown`` means: 0 is off altogether; else the wait for a gain is five times as long.
+
+        ``min_gain`` is ``--min-gain``.
+        """
         if cooldown_s == 0:
             return cls(cooldown_s=0.0, min_gain=1.0, avoid_border=False)
-        return cls(cooldown_s=cooldown_s, gain_s=5 * cooldown_s)
+        return cls(cooldown_s=cooldown_s, min_gain=min_gain, gain_s=5 * cooldown_s)
 
     def apply(
         self, candidates: Sequence[Candidate], *, now_ns: int

@@ -137,11 +137,6 @@ class GroundSession:
             return tuple(taken)
 
     @property
-    def unheard_results(self) -> int:
-        """How many results wait to be reported."""
-        return len(self._results)
-
-    @property
     def duration_s(self) -> float:
         """From the first frame received to the last."""
         if self._first_index is None:

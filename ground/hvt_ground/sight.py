@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -154,7 +154,7 @@ class GroundSight:
         except (StillError, UserError) as error:
             self.stills_dropped["undecodable"] += 1
             self._notice("warning", f"still {header.sequence} cannot be decoded: {error}")
-            self._answer(header, None, ground_track_id=-1)
+            self._answer(header, None)
             return None
         return Decoded(image, header.crop_source_px, self._box_base_px(header), header.frame_index)
 
@@ -164,7 +164,7 @@ class GroundSight:
         header = still.header
         crop = None if base_bgr is None else _cut(base_bgr, decoded.crop_source_px, view=self._view)
         carried = _Carried(still, crop, known=posterior is not None)
-        self._answer(header, posterior, ground_track_id=-1)
+        self._answer(header, posterior)
         if posterior is None:
             self.outcomes["unread"] += 1
             self._emit(
@@ -190,6 +190,8 @@ class GroundSight:
 
     def _settled(self, settled: Settled[_Carried]) -> None:
         self.outcomes[settled.outcome] += 1
+        if settled.track_id is not None:
+            self._name_track(settled.still.sequence, settled.track_id)
         before, after = settled.class_before, settled.class_after
         self._emit(
             self._refinement(settled.still.carried, settled.track_id, before, after, settled.confidence)
@@ -218,7 +220,7 @@ class GroundSight:
             quality_pct=header.quality_pct,
         )
 
-    def _answer(self, header: RoiHeader, posterior: Posterior | None, *, ground_track_id: int) -> None:
+    def _answer(self, header: RoiHeader, posterior: Posterior | None) -> None:
         """The edge hears of every still, so that a lockstep edge waits for none in vain; no name is no opinion."""
         self._results.append(
             StillResult(
@@ -227,9 +229,15 @@ class GroundSight:
                 class_name=fitted_text(posterior.class_name, 64) if posterior else "",
                 confidence=posterior.confidence if posterior else 0.0,
                 entropy_nats=min(20.0, posterior.entropy_nats) if posterior else 0.0,
-                ground_track_id=ground_track_id,
+                ground_track_id=-1,  # until it has settled
             )
         )
+
+    def _name_track(self, still_sequence: int, ground_track_id: int) -> None:
+        """Add the track that a still refined to its answer, if that has not been reported yet."""
+        for place, result in enumerate(self._results):
+            if result.still_sequence == still_sequence:
+                self._results[place] = replace(result, ground_track_id=ground_track_id)
 
     # Tracks
 

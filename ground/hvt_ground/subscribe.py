@@ -102,6 +102,8 @@ class GroundLink:
     ) -> None:
         for port in self.ports():
             port.inbox.close()
+        if self.foreign:
+            _log.warning("%d messages under keys that are not ours were skipped", self.foreign)
 
     def _port(self, key: str) -> EdgePort | None:
         parsed = parse_key(key)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -132,7 +133,7 @@ def test_every_flag_explains_itself(capsys):
     assert "[15.0]" in out
 
 
-_RATE = st.integers(300_000, 10**9)
+_RATE = st.integers(800_000, 10**9)  # enough for the largest size and rate below, at the least share
 
 
 @given(
@@ -168,3 +169,30 @@ def test_the_checked_settings_can_be_checked_again():
     """The study, which starts from settled settings, would be refused."""
     config = settled("--budget", "1Mbps")
     assert check(config) == config
+
+
+def test_no_setting_is_accepted_and_ignored():
+    """A flag that changes nothing is worse than none: its user believes in it."""
+    import hvt_edge
+
+    folder = Path(hvt_edge.__file__).parent
+    code = {file.name: file.read_text(encoding="utf-8") for file in folder.rglob("*.py")}
+    own = code.pop("config.py")  # its properties derive from settings
+    others = "\n".join(code.values())
+    names = [one.name for one in dataclasses.fields(EdgeConfig)]
+    unread = [
+        name
+        for name in names
+        if not re.search(rf"config\.{name}\b", others) and not re.search(rf"self\.{name}\b", own)
+    ]
+    assert unread == []
+
+
+def test_the_least_gain_reaches_the_suppression():
+    """`--min-gain` decides how much bits go to tracks that look the same as before."""
+    from hvt_edge.build import make_suppression
+
+    config = check(load(EdgeConfig, ["--source", "demo", "--min-gain", "3"], program="p", description="")[0])
+    assert make_suppression(config).min_gain == 3
+    plain = check(load(EdgeConfig, ["--source", "demo", "--cooldown", "0"], program="p", description="")[0])
+    assert make_suppression(plain).min_gain == 1

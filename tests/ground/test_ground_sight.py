@@ -102,6 +102,8 @@ def test_the_edge_hears_of_every_still_once(flight, pictures):
         (1, ""),
         (2, "bus"),
     ]
+    (track_id,) = rig.of(Overlay)[-1].track_ids.tolist()
+    assert {one.still_sequence: one.ground_track_id for one in results} == {0: track_id, 1: -1, 2: track_id}
     assert rig.sight.take_results() == []
     assert dict(rig.sight.stills_dropped) == {"undecodable": 1}
     assert [one.level for one in rig.of(Notice)] == ["warning"]

@@ -57,7 +57,7 @@ class StillResult:
     confidence: float = carried(Scaled(0, 1, 1000))
     entropy_nats: float = carried(Scaled(0, 20, 1000))
     ground_track_id: int = carried(Int(-1, U32))
-    """The ground's track that it refined; -1 where it matched none."""
+    """The ground's track that it refined; -1 where it matched none, or none yet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -39,7 +40,7 @@ class WireError(Exception):
     """A message that cannot be used; the text says what was wrong with it. Count it, skip it, go on."""
 
 
-class Kind:
+class Kind(ABC):
     """A field's type, bounds and coding. Kinds say `_encode`, `_decode` and `_describe`."""
 
     __slots__ = ()
@@ -64,11 +65,11 @@ class Kind:
     def _encode(self, value: Any) -> Any:
         return value
 
-    def _decode(self, raw: Any) -> Any:
-        raise NotImplementedError
+    @abstractmethod
+    def _decode(self, raw: Any) -> Any: ...
 
-    def _describe(self) -> str:
-        raise NotImplementedError
+    @abstractmethod
+    def _describe(self) -> str: ...
 
 
 def carried(kind: Kind) -> Any:
