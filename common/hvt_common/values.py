@@ -9,6 +9,7 @@ Times ending in ``_ns`` are Unix time in nanoseconds unless the name says otherw
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -179,3 +180,8 @@ class Still:
     codec: str
     quality_pct: int
     data: bytes
+    media_type: str = "image/jpeg"
+    parameters: Mapping[str, int | float | str] = field(default_factory=dict)
+    """What the ground needs beside the bytes to undo the coding; see the codec."""
+    also: tuple[tuple[int, tuple[float, float, float, float]], ...] = ()
+    """Further tracks that the same crop shows: each with its edge track id and its box, source pixels."""

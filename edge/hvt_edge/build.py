@@ -9,7 +9,7 @@ from typing import Literal, cast
 
 from hvt_common.values import View
 from hvt_common.vision.detect import Detector, open_detector, warm_up
-from hvt_common.vision.still_codec import JpegCodec
+from hvt_common.vision.still_codecs import JpegCodec
 from hvt_common.vision.track import ByteTracker, TrackerSettings, weak_confidence
 from hvt_edge.budget import BudgetSettings, RollingBudget
 from hvt_edge.candidates import TrackMemory

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from hvt_common.values import Image, Tracks, View
-from hvt_edge.crop import MAX_SIDE_PX, PADDING, coded_size, crop_box
+from hvt_common.vision.base_crop import MAX_SIDE_PX, coded_size
+from hvt_edge.crop import PADDING, crop_box
 
 __all__ = ["Belief", "Candidate", "TrackMemory", "sharpness"]
 

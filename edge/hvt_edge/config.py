@@ -82,7 +82,19 @@ class EdgeConfig:
     min_gain: float = option(
         number(1, 100), 1.2, "a track is sent again only when this much larger or sharper"
     )
-    jpeg_quality: int = option(integer(5, 95), 65, "quality of the stills, in percent")
+    still_codec: str = option(TEXT, "jpeg", "how stills are coded; residual sends what the base lacks")
+    fallback_codec: str = option(
+        TEXT, "h264-intra", "how a still is coded where residual does not serve: no base, or no gain"
+    )
+    jpeg_quality: int = option(integer(5, 95), 65, "quality of the stills, in percent, whatever the codec")
+    fidelity: float = option(
+        number(0, 60, unit=" dB"),
+        0.0,
+        "fewest bytes that bring a still this near to the source; 0: --jpeg-quality",
+    )
+    gate: float = option(
+        number(0, 60, unit=" dB"), 0.0, "no still where the base is already this good (luma PSNR); 0: no gate"
+    )
     padding: float = option(number(0, 1), 0.15, "margin around a box, as a share of its sides")
 
     detector: str = option(
@@ -92,6 +104,10 @@ class EdgeConfig:
     candidates: str = option(
         choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"
     )
+    tiles: str = option(
+        TEXT, "off", "detect in tiles of the source too: CxR, auto, or off; needs --candidates source"
+    )
+    send_tracks: bool = switch("also send the edge's own tracks, a few kbps, as part of --budget")
     detect_every: int = option(integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame")
     confidence: float = option(number(0.01, 1), 0.25, "confidence from which a detection starts a track")
     nms_iou: float = option(number(0.01, 1), 0.45, "overlap above which two boxes of a class are one")
@@ -104,6 +120,15 @@ class EdgeConfig:
     )
 
     preset: str = option(choice(*PRESETS), "veryfast", "x265 preset")
+    pulse: float = option(DURATION, 0.0, "a whole frame at better quality once in so long; 0 for none")
+    pulse_depth: float = option(number(0.05, 1), 0.3, "how much better a pulse is (x265 offset of -51 at 1)")
+    rolling: str = option(
+        TEXT, "off", "pulses of one region a frame in rotation, grid CxR, tracks first; or off"
+    )
+    rolling_depth: float = option(number(0.05, 1), 0.4, "how much better the region is")
+    roi_depth: float = option(
+        number(0, 1), 0.0, "quantise active tracks better by so much; 0 for not, 0.1 for --method R0"
+    )
     keyframe_interval: float = option(DURATION, 10.0, "time between keyframes; 0 for on demand only")
     pace: str = option(
         choice("realtime", "lockstep"), "realtime", "play at the clip's speed, or as fast as all parts allow"

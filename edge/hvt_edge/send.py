@@ -13,7 +13,7 @@ from typing import Protocol
 
 from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row
 from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
-from hvt_common.link.wire import BaseHeader, Flags, RoiHeader, Status, fitted_text
+from hvt_common.link.wire import AlsoShown, BaseHeader, Flags, RoiHeader, Status, fitted_text
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.budget import RollingBudget
 
@@ -168,7 +168,8 @@ class Sender:
             reason=fitted_text(still.reason, 48),
             codec=still.codec,
             quality_pct=still.quality_pct,
-            parameters={},
+            parameters=still.parameters,
+            also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in still.also),
         )
 
     def _payload_bytes(self, room_bytes: int, media_type: str) -> int:

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 
 from hvt_common.values import Frame, Image, Still, View
-from hvt_common.vision.still_codec import JpegCodec, StillCodec
-from hvt_edge.crop import MAX_SIDE_PX, PADDING, base_crop, coded_size, crop_box
+from hvt_common.vision.base_crop import MAX_SIDE_PX, base_crop, coded_size
+from hvt_common.vision.still_codecs import JpegCodec, StillCodec
+from hvt_edge.crop import PADDING, crop_box
 from hvt_edge.methods.base import Request
 
 __all__ = ["NoStill", "StillMaker", "crop_box"]
@@ -98,12 +99,16 @@ class StillMaker:
             codec=self.codec.name,
             quality_pct=quality_pct,
             data=data,
+            media_type=self.codec.media_type,
+            parameters={}
+            if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1])
+            else {"w": size[0], "h": size[1]},
         )
 
     def _coded(self, crop: Image, *, rival: _Rival | None, limit_bytes: int) -> tuple[bytes, int] | NoStill:
         """The asked quality, or the best below it that fits; then upwards until the base crop is beaten."""
         quality_pct = self.quality_pct
-        data = self.codec.encode(crop, quality_pct=quality_pct)
+        data = self.codec.encode(crop, quality_pct=quality_pct).data
         if len(data) > limit_bytes:
             fitting = self._best_fitting(crop, limit_bytes)
             if fitting is None or rival is None:
@@ -115,7 +120,7 @@ class StillMaker:
             quality_pct += _QUALITY_STEP_PCT
             if quality_pct > ceiling_pct:
                 return NoStill("base_good")
-            data = self.codec.encode(crop, quality_pct=quality_pct)
+            data = self.codec.encode(crop, quality_pct=quality_pct).data
             if len(data) > limit_bytes:
                 return NoStill("too_large")
         return data, quality_pct
@@ -126,7 +131,7 @@ class StillMaker:
         best = None
         while low <= high:
             middle = (low + high + 1) // 2
-            data = self.codec.encode(crop, quality_pct=middle)
+            data = self.codec.encode(crop, quality_pct=middle).data
             if len(data) <= limit_bytes:
                 best, low = (data, middle), middle + 1
             else:
@@ -134,7 +139,7 @@ class StillMaker:
         return best
 
     def _decoded(self, data: bytes, crop: Image) -> Image:
-        return self.codec.decode(data, max_pixels=crop.shape[0] * crop.shape[1])
+        return self.codec.decode(data, size=(crop.shape[1], crop.shape[0]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,11 @@ import numpy.typing as npt
 
 from hvt_common.values import Boxes, Image
 
-__all__ = ["Event", "Notice", "Overlay", "Refinement", "Traffic", "VideoSample"]
+__all__ = ["Enhanced", "Event", "Notice", "Origin", "Overlay", "Refinement", "Traffic", "VideoSample"]
+
+Origin = Literal["base", "edge", "edge+base", "still"]
+"""Who knows of a track: the ground's own tracker on the base stream, the edge's report, both, or (``still``) nobody
+but a still in which it was found."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +49,8 @@ class Overlay:
     """(N,) of the class that is shown, 0…1."""
     refined: npt.NDArray[np.bool_]
     """(N,) True once a still has spoken on the track's class."""
+    origins: tuple[Origin, ...] = ()
+    """N words; empty says ``base`` for all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,18 @@ class Refinement:
     reason: str
     """Why the edge's method sent it."""
     quality_pct: int
+
+
+@dataclass(frozen=True, slots=True)
+class Enhanced:
+    """The decoded base frame with the stills of that frame pasted in at their places: what the ground knows best."""
+
+    frame_index: int
+    capture_ns: int
+    image_bgr: Image
+    """At base resolution."""
+    boxes_base_px: Boxes
+    """(N, 4) where the N stills were pasted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,4 +119,4 @@ class Notice:
     text: str
 
 
-Event = VideoSample | Overlay | Refinement | Traffic | Notice
+Event = VideoSample | Overlay | Refinement | Enhanced | Traffic | Notice

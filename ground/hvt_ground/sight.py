@@ -13,7 +13,7 @@ from hvt_common.errors import UserError
 from hvt_common.link.wire import RoiHeader, StillResult, fitted_text
 from hvt_common.values import Image, Posterior, Tracks, View
 from hvt_common.vision.detect import Detector
-from hvt_common.vision.still_codec import StillError, still_codec
+from hvt_common.vision.still_codecs import StillError, still_codec
 from hvt_common.vision.track import ByteTracker
 from hvt_ground.classify_stills import Decoded, StillReader
 from hvt_ground.events import Event, Notice, Overlay, Refinement
@@ -145,18 +145,28 @@ class GroundSight:
 
     def _decode(self, still: ReceivedStill) -> Decoded | None:
         header = still.header
-        x1, y1, x2, y2 = header.crop_source_px
-        inside = x2 <= self._view.source_size[0] and y2 <= self._view.source_size[1]
         try:
-            codec = still_codec(header.codec)
-            # A still may be shrunk, never be larger than what it shows.
-            image = codec.decode(still.data, max_pixels=(x2 - x1) * (y2 - y1) if inside else 0)
+            image = still_codec(header.codec).decode(
+                still.data, size=self._coded_size(header), parameters=header.parameters
+            )
         except (StillError, UserError) as error:
             self.stills_dropped["undecodable"] += 1
             self._notice("warning", f"still {header.sequence} cannot be decoded: {error}")
             self._answer(header, None)
             return None
         return Decoded(image, header.crop_source_px, self._box_base_px(header), header.frame_index)
+
+    def _coded_size(self, header: RoiHeader) -> tuple[int, int]:
+        """(width, height) as announced. A still may be shrunk, never be larger than what it shows."""
+        x1, y1, x2, y2 = header.crop_source_px
+        size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
+        inside = x2 <= self._view.source_size[0] and y2 <= self._view.source_size[1]
+        width, height = size
+        if not (inside and isinstance(width, int) and isinstance(height, int)):
+            raise StillError(f"crop {header.crop_source_px} is not of this source")
+        if not (0 < width <= x2 - x1 and 0 < height <= y2 - y1):
+            raise StillError(f"size {width}x{height} is larger than what it shows")
+        return width, height
 
     def _offer(
         self, still: ReceivedStill, decoded: Decoded, posterior: Posterior | None, base_bgr: Image | None
@@ -230,6 +240,7 @@ class GroundSight:
                 confidence=posterior.confidence if posterior else 0.0,
                 entropy_nats=min(20.0, posterior.entropy_nats) if posterior else 0.0,
                 ground_track_id=-1,  # until it has settled
+                again=False,
             )
         )
 

@@ -48,7 +48,7 @@ from hvt_common.link.wire.fields import (
     Text,
     TupleOf,
 )
-from hvt_common.link.wire.sealed import Nested
+from hvt_common.link.wire.sealed import WIRE_VERSION, Nested
 from hvt_common.values import View
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "wire.md"
@@ -354,7 +354,7 @@ def test_a_frame_rate_that_is_none_is_refused(bad):
     values = [kind.encode(getattr(INFO, name)) for name, kind in kinds(Info)]
     values[[name for name, _ in kinds(Info)].index("fps")] = bad
     with pytest.raises(WireError, match=re.escape("Info.fps")):
-        Info.parse(sealed([1, *values]))
+        Info.parse(sealed([WIRE_VERSION, *values]))
 
 
 @pytest.mark.parametrize("bad", ["\x1b[2J", "a\nb", "x" * 65, "ü" * 33, "\u202e"])
@@ -363,7 +363,7 @@ def test_text_that_is_long_or_does_not_print_is_refused(bad):
     values = [kind.encode(getattr(ROI, name)) for name, kind in kinds(RoiHeader)]
     values[[name for name, _ in kinds(RoiHeader)].index("class_name")] = bad
     with pytest.raises(WireError, match=re.escape("RoiHeader.class_name: text")):
-        RoiHeader.parse(sealed([1, *values]))
+        RoiHeader.parse(sealed([WIRE_VERSION, *values]))
 
 
 @pytest.mark.parametrize(
@@ -375,13 +375,13 @@ def test_an_empty_crop_or_inverted_box_is_refused(name, bad):
     values = [kind.encode(getattr(ROI, field)) for field, kind in kinds(RoiHeader)]
     values[[field for field, _ in kinds(RoiHeader)].index(name)] = bad
     with pytest.raises(WireError, match="RoiHeader: "):
-        RoiHeader.parse(sealed([1, *values]))
+        RoiHeader.parse(sealed([WIRE_VERSION, *values]))
 
 
 def test_another_version_is_told_apart():
     """A newer edge would be reported as corrupt instead of as newer."""
-    with pytest.raises(UnknownVersionError, match="schema version 2, only 1 is known"):
-        BaseHeader.parse(sealed([2, "anything"]))
+    with pytest.raises(UnknownVersionError, match="schema version 3, only 2 is known"):
+        BaseHeader.parse(sealed([3, "anything"]))
     with pytest.raises(WireError, match=r"begins with a version"):
         BaseHeader.parse(sealed([True, 1, 2, 3, 4, 5, 6]))
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.values import Frame, Still, View
-from hvt_common.vision.still_codec import JpegCodec, jpeg_size
+from hvt_common.vision.still_codecs import JpegCodec, jpeg_size
 from hvt_edge.candidates import Candidate
 from hvt_edge.crop import base_crop, coded_size
 from hvt_edge.methods import Request

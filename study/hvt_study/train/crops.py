@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Image
-from hvt_common.vision.still_codec import JpegCodec
+from hvt_common.vision.still_codecs import JpegCodec
 from hvt_edge.crop import PADDING, crop_box
 from hvt_edge.scene.vehicles import CLASS_NAMES
 from hvt_study.train.places import Picture
@@ -113,10 +113,9 @@ def held_out_crops(seeds: range, *, moments: int, quality_pct: int = 65) -> Iter
                     continue
                 corners = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
                 x0, y0, x1, y1 = crop_box(corners, padding=PADDING, source_size=SOURCE_SIZE)
-                data = codec.encode(
-                    np.ascontiguousarray(picture.image_bgr[y0:y1, x0:x1]), quality_pct=quality_pct
-                )
-                yield codec.decode(data, max_pixels=1 << 22), CLASS_NAMES[kind]
+                crop = np.ascontiguousarray(picture.image_bgr[y0:y1, x0:x1])
+                coded = codec.encode(crop, quality_pct=quality_pct)
+                yield codec.decode(coded.data, size=(x1 - x0, y1 - y0)), CLASS_NAMES[kind]
 
 
 class CropSource:

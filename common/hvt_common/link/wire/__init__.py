@@ -20,12 +20,14 @@ from hvt_common.link.wire.sealed import (
     UnknownVersionError,
     kinds,
 )
-from hvt_common.link.wire.stream import BaseHeader, Flags, RoiHeader
+from hvt_common.link.wire.stream import MAX_ALSO, AlsoShown, BaseHeader, Flags, RoiHeader
 
 __all__ = [
+    "MAX_ALSO",
     "MAX_PAYLOAD_BYTES",
     "MAX_STILL_RESULTS",
     "WIRE_VERSION",
+    "AlsoShown",
     "BaseHeader",
     "Command",
     "ControlAnswer",

@@ -58,6 +58,8 @@ class StillResult:
     entropy_nats: float = carried(Scaled(0, 20, 1000))
     ground_track_id: int = carried(Int(-1, U32))
     """The ground's track that it refined; -1 where it matched none, or none yet."""
+    again: bool = carried(Flag())
+    """The still names a base frame that this ground does not have: please send it once more, without the base."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,7 +26,7 @@ __all__ = [
     "kinds",
 ]
 
-WIRE_VERSION = 1
+WIRE_VERSION = 2
 MAX_PAYLOAD_BYTES = 4 * 2**20
 """No access unit and no still is larger; a larger one is not looked at."""
 

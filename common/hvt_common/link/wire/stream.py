@@ -7,10 +7,25 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import ClassVar
 
-from hvt_common.link.wire.fields import I63, U32, U64, Int, MapOf, Scalar, Scaled, Text, TupleOf, carried
-from hvt_common.link.wire.sealed import Message
+from hvt_common.link.wire.fields import (
+    I63,
+    U32,
+    U64,
+    Int,
+    ListOf,
+    MapOf,
+    Scalar,
+    Scaled,
+    Text,
+    TupleOf,
+    carried,
+)
+from hvt_common.link.wire.sealed import Message, Nested
 
-__all__ = ["BaseHeader", "Flags", "RoiHeader"]
+__all__ = ["MAX_ALSO", "AlsoShown", "BaseHeader", "Flags", "RoiHeader"]
+
+MAX_ALSO = 15
+"""How many further tracks one still may name."""
 
 _TIME = Int(0, I63)
 _DELAY = Int(-I63, I63)
@@ -58,10 +73,25 @@ class BaseHeader(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AlsoShown:
+    """A further track that a still shows."""
+
+    track_id: int = carried(Int(0, U32))
+    """The edge's."""
+    box_source_px: tuple[float, float, float, float] = carried(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    """x1, y1, x2, y2 in eighths of a pixel."""
+
+    def __post_init__(self) -> None:
+        x1, y1, x2, y2 = self.box_source_px
+        if x2 < x1 or y2 < y1:
+            raise ValueError(f"box {self.box_source_px} is inside out")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RoiHeader(Message):
     """Attachment of ``roi``. Boxes are x1, y1, x2, y2 in source pixels, x2 and y2 exclusive."""
 
-    MAX_BYTES: ClassVar[int] = 512
+    MAX_BYTES: ClassVar[int] = 1024
 
     session_id: int = carried(Int(0, U64))
     sequence: int = carried(Int(0, U32))
@@ -83,7 +113,10 @@ class RoiHeader(Message):
     codec: str = carried(Text(24))
     quality_pct: int = carried(Int(0, 100))
     parameters: Mapping[str, int | float | str] = carried(MapOf(Scalar(), 8, key_bytes=16))
-    """What else the codec needs to be undone; empty for JPEG."""
+    """What else the codec needs to be undone; empty for JPEG. ``w`` and ``h`` are the coded size where that is not
+    the size of the crop."""
+    also: tuple[AlsoShown, ...] = carried(ListOf(Nested(AlsoShown), MAX_ALSO))
+    """Further tracks that the same crop shows."""
 
     def __post_init__(self) -> None:
         x1, y1, x2, y2 = self.crop_source_px

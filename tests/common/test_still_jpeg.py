@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image as Pillow
 
 from hvt_common.errors import UserError
-from hvt_common.vision.still_codec import STILL_CODECS, JpegCodec, StillError, jpeg_size, still_codec
+from hvt_common.vision.still_codecs import STILL_CODECS, JpegCodec, StillError, jpeg_size, still_codec
 
 CODEC = JpegCodec()
 

@@ -1,23 +1,16 @@
-"""Still codecs behind one small contract: a crop to bytes at the edge, the bytes back to a crop at the ground.
-
-A codec is a frozen value without state. Its ``decode`` is fed by the network, so it looks at the dimensions in the
-header before it decodes a single block, and answers anything it does not like with `StillError`.
-"""
+"""Baseline JPEG: the paper's still."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import Protocol
 
 import cv2
 import numpy as np
 
-from hvt_common.errors import UserError
 from hvt_common.values import Image
+from hvt_common.vision.still_codecs.contract import CodedCrop, Parameters, StillError
 
-__all__ = ["STILL_CODECS", "JpegCodec", "StillCodec", "StillError", "jpeg_size", "still_codec"]
+__all__ = ["JpegCodec", "jpeg_size"]
 
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 # Baseline and extended sequential Huffman. Progressive (C2) is refused: every scan runs over the whole picture, so
@@ -25,32 +18,6 @@ _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 _SEQUENTIAL = (0xC0, 0xC1)
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
-
-
-class StillError(Exception):
-    """A still that cannot be decoded: truncated, of another format than announced, or larger than allowed."""
-
-
-class StillCodec(Protocol):
-    """What the edge and the ground ask of a codec."""
-
-    @property
-    def name(self) -> str:
-        """The word on the wire, ``[a-z0-9-]``."""
-        ...
-
-    @property
-    def media_type(self) -> str:
-        """``image/jpeg`` and the like; also the Zenoh encoding of the payload."""
-        ...
-
-    def encode(self, crop_bgr: Image, *, quality_pct: int) -> bytes:
-        """Code a crop; ``quality_pct`` runs from 1 (smallest) to 100 (best), as the codec understands it."""
-        ...
-
-    def decode(self, data: bytes, *, max_pixels: int) -> Image:
-        """The crop again, BGR. Raises `StillError` for anything hostile, before it costs more than ``max_pixels``."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,20 +30,29 @@ class JpegCodec:
     name: str = field(default="jpeg", init=False)
     media_type: str = field(default="image/jpeg", init=False)
 
-    def encode(self, crop_bgr: Image, *, quality_pct: int) -> bytes:
+    needs_base: bool = field(default=False, init=False)
+
+    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
         """Code a crop of at least one pixel."""
         flags = [cv2.IMWRITE_JPEG_QUALITY, quality_pct, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
         flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
         done, data = cv2.imencode(".jpg", crop_bgr, flags)
         if not done:
             raise RuntimeError(f"JPEG encoder refused a crop of shape {crop_bgr.shape}")
-        return data.tobytes()
+        return CodedCrop(data.tobytes())
 
-    def decode(self, data: bytes, *, max_pixels: int) -> Image:
+    def decode(
+        self,
+        data: bytes,
+        *,
+        size: tuple[int, int],
+        parameters: Parameters = {},  # noqa: ARG002
+        base_bgr: Image | None = None,  # noqa: ARG002
+    ) -> Image:
         """The crop again; an EXIF orientation is ignored, so that the size is the one in the header."""
         width, height = jpeg_size(data)
-        if width * height > max_pixels:
-            raise StillError(f"JPEG of {width}x{height} has more than {max_pixels} pixels")
+        if (width, height) != size:
+            raise StillError(f"JPEG of {width}x{height} in place of {size[0]}x{size[1]}")
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -123,15 +99,3 @@ def _frame_size(marker: int, header: bytes) -> tuple[int, int]:
     if not width or not height:
         raise StillError(f"JPEG of {width}x{height} has no pixels")
     return width, height
-
-
-STILL_CODECS: Mapping[str, StillCodec] = MappingProxyType({codec.name: codec for codec in (JpegCodec(),)})
-"""Every codec by its name on the wire."""
-
-
-def still_codec(name: str) -> StillCodec:
-    """The codec of that name; `UserError` names those there are."""
-    codec = STILL_CODECS.get(name)
-    if codec is None:
-        raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(STILL_CODECS)}")
-    return codec

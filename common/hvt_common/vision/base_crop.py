@@ -1,0 +1,60 @@
+"""What the base frame shows of a crop of the source, at the size at which the crop is coded.
+
+Edge and ground compute it from the same decoded pixels with the same arithmetic: a residual still is the difference to
+it, and a still has to be closer to the source than it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from hvt_common.values import Image, View
+
+__all__ = ["MAX_SIDE_PX", "base_crop", "coded_size"]
+
+MAX_SIDE_PX = 512
+"""A longer crop is coded smaller: an object that fills 512 pixels needs no more to be told apart."""
+
+
+def coded_size(
+    crop_source_px: tuple[int, int, int, int], *, max_side_px: int = MAX_SIDE_PX
+) -> tuple[int, int]:
+    """(width, height) at which the crop is coded: its own, or shrunk so that the longer side is ``max_side_px``."""
+    width, height = crop_source_px[2] - crop_source_px[0], crop_source_px[3] - crop_source_px[1]
+    shrink = max(1.0, max(width, height) / max_side_px)
+    return max(1, round(width / shrink)), max(1, round(height / shrink))
+
+
+def base_crop(
+    base_bgr: Image, *, view: View, crop_source_px: tuple[int, int, int, int], size: tuple[int, int]
+) -> Image:
+    """What the base frame shows of a crop, resampled to ``size``: the picture that a still must beat.
+
+    The base gets its best chance: exact sub-pixel alignment, cubic where it is enlarged, area means where it is
+    shrunk.
+    """
+    x1, y1, x2, y2 = crop_source_px
+    step_x, step_y = (x2 - x1) / size[0] * view.scale, (y2 - y1) / size[1] * view.scale
+    fine = max(1, math.ceil(max(step_x, step_y) - 1e-6))
+    step_x, step_y = step_x / fine, step_y / fine
+    # Pixel i covers i…i+1, hence the half pixels: boxes map by their edges, warpAffine by pixel centres.
+    matrix = np.array(
+        [
+            [step_x, 0, x1 * view.scale + view.offset_px[0] + (step_x - 1) / 2],
+            [0, step_y, y1 * view.scale + view.offset_px[1] + (step_y - 1) / 2],
+        ],
+        np.float64,
+    )
+    crop = cv2.warpAffine(
+        base_bgr,
+        matrix,
+        (size[0] * fine, size[1] * fine),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    if fine > 1:
+        crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(crop, np.uint8)
