@@ -6,22 +6,34 @@ import itertools
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
 from clips import START_NS, framed, smooth_pictures
 from hvt_common.link.inbox import Inbox, Received
-from hvt_common.link.wire import BaseHeader, Feedback, Flags, Health, Info, RoiHeader, Status
-from hvt_common.values import Detections, Image, Posterior, View
+from hvt_common.link.keys import MSGPACK_ENCODING
+from hvt_common.link.wire import (
+    BaseHeader,
+    Feedback,
+    Flags,
+    Health,
+    Info,
+    RoiHeader,
+    Status,
+    TrackStepEncoder,
+)
+from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_common.vision.track import ByteTracker, TrackerSettings
 from hvt_edge.encode import BaseEncoder, EncoderSettings
-from hvt_ground.classify_stills import Decoded
+from hvt_ground.camera_path import CameraPath
+from hvt_ground.classify_stills import Decoded, Reading, Readings
+from hvt_ground.fuse import Fusion, unified_names
 from hvt_ground.refine import Refiner
-from hvt_ground.sight import GroundSight
+from hvt_ground.sight import GroundSight, SightParts
 
-__all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "sight_of", "square_box"]
+__all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "sight_of", "square_box", "tracks_at"]
 
 SIZE = (320, 192)
 CLASSES = ("car", "bus")
@@ -32,6 +44,21 @@ def square_box(index: int) -> tuple[float, float, float, float]:
     """Where `smooth_pictures` draws the red square in this picture."""
     left = (7 * index) % (SIZE[0] - 40)
     return float(left), SIZE[1] / 3, left + 32.0, SIZE[1] / 3 + 32.0
+
+
+def tracks_at(index: int, boxes: dict[int, tuple[float, float, float, float]], *, class_id=0) -> Tracks:
+    """A tracker's list at a frame: all of one class, at 0.8."""
+    ids = np.array(sorted(boxes), np.int64)
+    return Tracks(
+        frame_index=index,
+        ids=ids,
+        boxes_xyxy_px=np.array([boxes[i] for i in ids.tolist()], np.float32).reshape(-1, 4),
+        confidences=np.full(len(ids), 0.8, np.float32),
+        class_ids=np.full(len(ids), class_id, np.int32),
+        born_frames=np.full(len(ids), index, np.int64),
+        seen_frames=np.full(len(ids), index, np.int64),
+        started=np.zeros(len(ids), np.bool_),
+    )
 
 
 class RedSquares:
@@ -55,32 +82,48 @@ class RedSquares:
 
 @dataclass
 class SameAnswer:
-    """Reads every still as a bus, or as nothing; keeps which frames' pictures it was given."""
+    """Reads every object in a still as a bus, or as nothing; keeps which frames' pictures it was given."""
 
     class_names: tuple[str, ...] = CLASSES
     knows: bool = True
     had_base: list[bool] = field(default_factory=list)
+    found: Detections = field(default_factory=Detections.none)
+    """What it sees besides, in each frame with stills."""
+    at: tuple[float, float, float, float] | None = None
+    """Where it sees every object."""
 
-    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> list[Posterior | None]:
+    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:
         """The same for each."""
         self.had_base += [base_bgr is not None] * len(stills)
         answer = Posterior(self.class_names[1], 0.9, 0.3, np.array([0.1, 0.9], np.float32))
-        return [answer if self.knows else None] * len(stills)
+        reading = Reading(answer, self.at) if self.knows else Reading()
+        return Readings(tuple((reading,) * len(one.boxes_base_px) for one in stills), self.found)
 
 
-def sight_of(emit, *, detector=None, reader=None, detect_every: int = 1) -> GroundSight:
+def sight_of(
+    emit,
+    *,
+    detector=None,
+    reader=None,
+    detect_every: int = 1,
+    edge_classes: Sequence[str] = CLASSES,
+    wants_base: bool = False,
+) -> GroundSight:
     """Eyes of a session of this flight."""
     reader = reader or SameAnswer()
-    detector = detector or RedSquares()
-    return GroundSight(
-        detector,
-        ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+    names, places = unified_names(CLASSES, edge_classes)
+    path = CameraPath(ahead_ticks=15)
+    parts = SightParts(
+        detector=detector or RedSquares(),
+        tracker=ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader=reader,
-        refiner=Refiner("replace", fps=15, detector_classes=CLASSES, classifier_classes=reader.class_names),
-        view=View.fitted(SIZE, SIZE, fit="letterbox"),
-        detect_every=detect_every,
-        emit=emit,
+        refiner=Refiner("replace", fps=15, detector_classes=names, classifier_classes=reader.class_names),
+        fusion=Fusion(fps=15, edge_classes=places, path=path),
+        path=path,
+        camera=None,
     )
+    view = View.fitted(SIZE, SIZE, fit="letterbox")
+    return GroundSight(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)
 
 
 class Flight:
@@ -96,6 +139,7 @@ class Flight:
             encoder.encode(frame, keyframe=frame.index in keyframes) for frame in framed(self.pictures)
         ]
         self._statuses = 0
+        self._steps = TrackStepEncoder(session_id=self.session_id)
 
     def info(self) -> Info:
         """What the edge answers."""
@@ -157,10 +201,17 @@ class Flight:
             "codec": "jpeg",
             "quality_pct": 65,
             "parameters": {},
+            "also": (),
         }
         return _received("roi", data, RoiHeader(**(fields | changes)).pack(data), "image/jpeg")
 
-    def status(self, *, base: int, roi: int = 0, state: str = "running") -> Received:
+    def step(self, index: int, listed: dict[int, tuple[float, float, float, float]], **changes) -> Received:
+        """What the edge tracked at a frame, ``{track id: box}``: all cars at 0.8."""
+        tracks = tracks_at(index, listed)
+        step = self._steps.encode(tracks, capture_ns=self.units[index].capture_ns, send_delay_ns=25_000_000)
+        return _received("tracks", replace(step, **changes).pack(), b"", MSGPACK_ENCODING)
+
+    def status(self, *, base: int, roi: int = 0, state: str = "running", meta: int = 0) -> Received:
         """The edge's report after so many messages."""
         self._statuses += 1
         report = Status(
@@ -177,7 +228,7 @@ class Flight:
             overhead_bytes=0,
             base_messages=base,
             roi_messages=roi,
-            meta_messages=0,
+            meta_messages=meta,
             worst_window_bps=(0, 0, 0),
             sent={},
             deferred={},

@@ -25,6 +25,8 @@ class ReadBox:
     class_after: str
     confidence_pct: int
     refined: bool
+    told: bool
+    origin: int | None
     label: str
 
 
@@ -70,8 +72,12 @@ class Recording:
         return [(f, list(v)) for f, _, v in self.rows(entity, "Scalars:scalars")]
 
     def stills(self) -> list[tuple[int, bytes]]:
-        """(frame, picture) of every still, shown or not."""
-        return self._pictures("still")
+        """(frame, picture) of every still, once, wherever it is: gallery, enhanced picture, or neither."""
+        found = set(self._pictures("still"))
+        for (entity, component), rows in self._rows.items():
+            if component == "EncodedImage:blob" and entity.startswith("/base/patches/"):
+                found |= {(frame, bytes(value[0])) for frame, _, value in rows if value}
+        return sorted(found)
 
     def base_crops(self) -> list[tuple[int, bytes]]:
         """(frame, picture) of every base crop."""
@@ -80,20 +86,35 @@ class Recording:
     def boxes(self, frame: int) -> dict[int, ReadBox]:
         """Every track a viewer shows at a frame, by its id."""
         found: dict[int, ReadBox] = {}
-        for entity, refined in (("/base/tracks", False), ("/base/refined", True)):
-            found |= self._layer(entity, frame, refined=refined)
+        for layer in ("tracks", "told", "refined"):
+            found |= self._layer(layer, frame)
         return found
 
-    def _layer(self, entity: str, frame: int, *, refined: bool) -> dict[int, ReadBox]:
+    def patches(self, frame: int) -> dict[int, tuple[float, float, float, bytes]]:
+        """The stills on the enhanced picture at a frame: x, y, scale and JPEG, by slot."""
+        found = {}
+        for slot in range(100):
+            entity = f"/base/patches/{slot}"
+            blob = self.latest(entity, "EncodedImage:blob", frame)
+            if blob:
+                x, y, _ = self.latest(entity, "Transform3D:translation", frame)[0]
+                scale = self.latest(entity, "Transform3D:scale", frame)[0][0]
+                found[slot] = (x, y, scale, bytes(blob[0]))
+        return found
+
+    def _layer(self, layer: str, frame: int) -> dict[int, ReadBox]:
+        entity, refined, told = f"/base/{layer}", layer == "refined", layer == "told"
+        shape = "Ellipses2D" if told else "Boxes2D"
         ids = self.latest(entity, "track_id", frame) or []
-        centres = self.latest(entity, "Boxes2D:centers", frame) or []
-        halves = self.latest(entity, "Boxes2D:half_sizes", frame) or []
+        centres = self.latest(entity, f"{shape}:centers", frame) or []
+        halves = self.latest(entity, f"{shape}:half_sizes", frame) or []
         before = self.latest(entity, "class_before", frame) or []
-        after = self.latest(entity, "Boxes2D:class_ids", frame) or []
+        after = self.latest(entity, f"{shape}:class_ids", frame) or []
         confidences = self.latest(entity, "confidence_pct", frame) or []
+        origins = self.latest(entity, "origin", frame) or [None] * len(ids)
         labels = (self.latest(entity, "Boxes2D:labels", frame) or []) if refined else [""] * len(ids)
         names = self._class_names(entity)
-        rows = zip(ids, centres, halves, before, after, confidences, labels, strict=True)
+        rows = zip(ids, centres, halves, before, after, confidences, origins, labels, strict=True)
         return {
             track: ReadBox(
                 box_px=(c[0] - h[0], c[1] - h[1], c[0] + h[0], c[1] + h[1]),
@@ -101,9 +122,11 @@ class Recording:
                 class_after=names[a],
                 confidence_pct=p,
                 refined=refined,
+                told=told,
+                origin=origin,
                 label=label,
             )
-            for track, c, h, b, a, p, label in rows
+            for track, c, h, b, a, p, origin, label in rows
         }
 
     def _class_names(self, entity: str) -> dict[int, str]:

@@ -25,6 +25,7 @@ from hvt_common.errors import UserError
 from hvt_common.units import parse_bitrate, parse_duration_s, parse_share, parse_size
 
 __all__ = [
+    "AUTO",
     "BITRATE",
     "DURATION",
     "PATH",
@@ -38,6 +39,7 @@ __all__ = [
     "load",
     "number",
     "option",
+    "or_auto",
     "switch",
     "to_toml",
 ]
@@ -127,6 +129,21 @@ def choice(*accepted: str) -> Kind:
         return text
 
     return Kind("|".join(accepted), parse)
+
+
+AUTO = "auto"
+
+
+def or_auto(kind: Kind) -> Kind:
+    """The same kind, or the word ``auto``, which stays as it is: the program finds the value itself."""
+
+    def parse(text: str, *, name: str) -> Any:
+        return AUTO if text.strip() == AUTO else kind.parse(text, name=name)
+
+    def show(value: Any) -> str | int | float:
+        return AUTO if value == AUTO else kind.show(value)
+
+    return Kind(f"{kind.metavar}|{AUTO}", parse, show)
 
 
 def option(kind: Kind, default: Any, help_line: str, *, many: bool = False, shown_default: str = "") -> Any:
@@ -242,7 +259,7 @@ def _flags(config_class: type, *, program: str, description: str) -> argparse.Ar
 def _shown(kind: Kind, default: object) -> str:
     if default is None or default == ():
         return ""
-    if isinstance(default, tuple) and kind is not SIZE:
+    if isinstance(default, tuple) and kind.metavar != SIZE.metavar and not kind.metavar.startswith("WxH"):
         return " ".join(str(kind.show(item)) for item in default)
     return str(kind.show(default)).replace("%", "%%")
 

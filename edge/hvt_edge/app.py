@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any, cast
 
 from hvt_common.errors import UserError
@@ -24,27 +25,36 @@ from hvt_common.link.zenoh_config import LinkSettings
 from hvt_common.report import StatusLine, check_writable
 from hvt_common.units import bitrate_text
 from hvt_common.values import Fit
+from hvt_common.vision.detect import Detector
 from hvt_edge.base_stage import BaseStage
 from hvt_edge.build import (
     SECOND_NS,
+    base_size,
+    first_every_n,
     make_budget,
+    make_cadence,
     make_chooser,
     make_detector,
     make_encoder,
     make_keyframes,
+    make_regions,
     make_sight,
+    make_split,
+    warm_up_for,
 )
 from hvt_edge.clock import SteadyClock
-from hvt_edge.config import EdgeConfig
+from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.counts import FrameCounts
 from hvt_edge.feedback import FeedbackInbox
 from hvt_edge.pace_lockstep import LockstepPace
 from hvt_edge.pace_realtime import RealtimePace
 from hvt_edge.publish import EdgeLink
 from hvt_edge.record_base import BaseRecorder
+from hvt_edge.renew import Renewal
 from hvt_edge.reports import make_info, make_status
 from hvt_edge.scene.truth import write_truth
 from hvt_edge.send import Sender
+from hvt_edge.send_tracks import TrackReporter
 from hvt_edge.source import Source, open_source
 from hvt_edge.sources.demo import DemoSource
 from hvt_edge.still_stage import StillStage
@@ -52,7 +62,6 @@ from hvt_edge.summary import EdgeRun, summary
 
 __all__ = ["Edge"]
 
-_STILL_MEDIA_TYPE = "image/jpeg"
 _GOODBYE_S = 1.5
 _MILLION = 1_000_000
 
@@ -70,6 +79,17 @@ def _closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
         yield
     finally:
         stop.set()
+
+
+@dataclass(frozen=True, slots=True)
+class _Flow:
+    """What a frame goes through."""
+
+    base: BaseStage
+    stills: StillStage
+    sender: Sender
+    link: EdgeLink
+    renewal: Renewal
 
 
 class Edge:
@@ -109,60 +129,81 @@ class Edge:
         with ExitStack() as stack:
             source = stack.enter_context(self._open_source())
             self._check_truth(source)
-            encoder = make_encoder(config)
-            budget = make_budget(config)
+            check_rate(config, source.view.base_size)
+            warm_up_for(config, detector, source.view)
             line = stack.enter_context(StatusLine(quiet=config.quiet))
-            link = self._open_link(stack, source, detector.class_names)
-            # Files come after all that may be refused: a failed start leaves nothing behind.
-            self._write_truth(source)
-            recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
-            sender = Sender(
-                link,
-                ledger=self._ledger,
-                budget=budget,
-                edge_id=config.edge_id,
-                session_id=self._session_id,
-                lockstep=self._lockstep,
-                wait_until=self._wait_until,
-            )
-            base = BaseStage(
-                encoder,
-                keyframes=self._keyframes,
-                sender=sender,
-                recorder=recorder,
-                first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
-            )
-            chooser = make_chooser(
-                config,
-                view=source.view,
-                class_names=detector.class_names,
-                most_bytes=sender.most_still_bytes(media_type=_STILL_MEDIA_TYPE),
-                on_fate=sender.fate,
-            )
-            stills = StillStage(
-                make_sight(config, detector=detector, view=source.view),
-                chooser,
-                sender=sender,
-                keyframes=self._keyframes,
-                media_type=_STILL_MEDIA_TYPE,
-            )
+            flow = self._make_flow(stack, source, detector)
             self._on_started()
-            self._wait_for_ground(link, source, line)
+            self._wait_for_ground(flow.link, source, line)
             self._started_ns = self._clock()
             try:
-                self._play(source, base, stills, sender, line, link)
+                self._play(source, flow, line)
             finally:
-                stills.close()
-                self._say_goodbye(sender, stills, link)
-        return summary(self._facts(stills, link), self._ledger)
+                flow.stills.close()
+                self._say_goodbye(flow)
+        return summary(self._facts(flow), self._ledger)
+
+    def _make_flow(self, stack: ExitStack, source: Source, detector: Detector) -> _Flow:
+        """Everything between the source and the link."""
+        config, view = self._config, source.view
+        every_n = first_every_n(config, view.base_size)
+        encoder = make_encoder(config, size=view.base_size, every_n=every_n, base_bps=config.base_bps)
+        budget = make_budget(config, every_n=every_n)
+        link = self._open_link(stack, source, detector.class_names)
+        # Files come after all that may be refused: a failed start leaves nothing behind.
+        self._write_truth(source)
+        recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
+        sender = Sender(
+            link,
+            ledger=self._ledger,
+            budget=budget,
+            edge_id=config.edge_id,
+            session_id=self._session_id,
+            lockstep=self._lockstep,
+            wait_until=self._wait_until,
+        )
+        renewal = Renewal(
+            config,
+            size=view.base_size,
+            every_n=every_n,
+            sender=sender,
+            split=make_split(config, view.base_size),
+        )
+        base = BaseStage(
+            encoder,
+            keyframes=self._keyframes,
+            sender=sender,
+            recorder=recorder,
+            first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
+            plan=make_regions(config, view.base_size),
+            cadence=make_cadence(config, every_n),
+            renew=renewal,
+        )
+        chooser = make_chooser(
+            config,
+            view=view,
+            class_names=detector.class_names,
+            most_bytes=sender.most_still_bytes(),
+            on_fate=sender.fate,
+            observe=renewal.observe,
+        )
+        renewal.on_change = lambda: chooser.set_most_bytes(sender.most_still_bytes())
+        stills = StillStage(
+            make_sight(config, detector=detector, view=view),
+            chooser,
+            sender=sender,
+            keyframes=self._keyframes,
+            reporter=TrackReporter(sender, session_id=self._session_id) if config.send_tracks else None,
+        )
+        return _Flow(base, stills, sender, link, renewal)
 
     def _open_source(self) -> Source:
         config = self._config
         assert config.source is not None, "check() refuses a missing source"
         return open_source(
             config.source,
-            size=config.size,
-            fps=config.fps,
+            size=base_size(config),
+            fps=config.tick_fps,
             fit=cast("Fit", config.fit),
             seed=config.seed,
             max_frames=config.max_frames,
@@ -177,7 +218,7 @@ class Edge:
 
     def _write_truth(self, source: Source) -> None:
         if self._config.truth is not None and isinstance(source, DemoSource):
-            write_truth(source.scene, self._config.truth, fps=self._config.fps, view=source.view)
+            write_truth(source.scene, self._config.truth, fps=self._config.tick_fps, view=source.view)
 
     def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> EdgeLink:
         config = self._config
@@ -213,20 +254,12 @@ class Edge:
 
     # The frame loop
 
-    def _play(
-        self,
-        source: Source,
-        base: BaseStage,
-        stills: StillStage,
-        sender: Sender,
-        line: StatusLine,
-        link: EdgeLink,
-    ) -> None:
+    def _play(self, source: Source, flow: _Flow, line: StatusLine) -> None:
         next_status_ns = 0
         with ExitStack() as stack:
             if source.live:
                 stack.enter_context(_closing_on(self._stop, source))
-            pace = self._make_pace(base, stills, source, link)
+            pace = self._make_pace(flow, source)
             stack.enter_context(pace)
             for frame in source.frames(start_ns=self._started_ns):
                 if self._stop.is_set():
@@ -236,26 +269,24 @@ class Edge:
                 self._now_ns = pace.now_ns
                 if self._now_ns >= next_status_ns:
                     next_status_ns = self._now_ns + SECOND_NS
-                    self._report(sender, stills, line, link)
+                    self._report(flow, line)
 
-    def _make_pace(
-        self, base: BaseStage, stills: StillStage, source: Source, link: EdgeLink
-    ) -> LockstepPace | RealtimePace:
-        fps = self._config.fps
+    def _make_pace(self, flow: _Flow, source: Source) -> LockstepPace | RealtimePace:
+        fps = self._config.tick_fps
         if self._lockstep:
             return LockstepPace(
-                base,
-                stills,
+                flow.base,
+                flow.stills,
                 inbox=self._inbox,
                 keyframes=self._keyframes,
                 fps=fps,
                 counts=self._counts,
-                heard=link.heard,
+                heard=flow.link.heard,
                 stop=self._stop,
             )
         return RealtimePace(
-            base,
-            stills,
+            flow.base,
+            flow.stills,
             inbox=self._inbox,
             clock=self._clock,
             fps=fps,
@@ -297,24 +328,24 @@ class Edge:
         )
         return info.pack()
 
-    def _report(self, sender: Sender, stills: StillStage, line: StatusLine, link: EdgeLink) -> None:
-        self._send_status("running", sender, stills)
-        media_s = self._counts.duration_s(self._config.fps)
+    def _report(self, flow: _Flow, line: StatusLine) -> None:
+        self._send_status("running", flow)
+        media_s = self._counts.duration_s(self._config.tick_fps)
         rate_bps = self._ledger.window_bytes(None, self._now_ns) * 8 * SECOND_NS / self._ledger.window_ns
         sent = sum(self._ledger.fates("sent").values())
-        heard = "a ground listens" if link.heard() else "no ground listens"
+        heard = "a ground listens" if flow.link.heard() else "no ground listens"
         line.show(
             f"{self._config.edge_id} {media_s:6.1f} s  {bitrate_text(rate_bps)} of "
-            f"{bitrate_text(self._config.budget_bps)}  {self._config.method}  stills {sent}, {stills.waiting} "
-            f"waiting  tracks {stills.tracks}  {heard}"
+            f"{bitrate_text(self._config.budget_bps)}  {self._config.method}  stills {sent}, {flow.stills.waiting} "
+            f"waiting  tracks {flow.stills.tracks}  {heard}"
         )
 
-    def _send_status(self, state: str, sender: Sender, stills: StillStage) -> None:
+    def _send_status(self, state: str, flow: _Flow) -> None:
         now_ns = self._now_ns if self._lockstep else self._clock()
-        sender.status(lambda at_ns: self._status(state, sender, stills, at_ns), now_ns=now_ns)
+        flow.sender.status(lambda at_ns: self._status(state, flow, at_ns), now_ns=now_ns)
         self._status_sequence += 1
 
-    def _status(self, state: str, sender: Sender, stills: StillStage, at_ns: int) -> Status:
+    def _status(self, state: str, flow: _Flow, at_ns: int) -> Status:
         heard_ns = self._inbox.received_ns
         return make_status(
             state,
@@ -322,20 +353,21 @@ class Edge:
             sequence=self._status_sequence,
             at_ns=at_ns,
             started_ns=self._started_ns,
-            fps=self._config.fps,
+            fps=self._config.tick_fps,
             ledger=self._ledger,
             counts=self._counts,
             keyframes=self._keyframes,
-            sender=sender,
-            stills=stills,
+            sender=flow.sender,
+            stills=flow.stills,
             feedback_age_ms=-1 if heard_ns is None else max(0, (self._clock() - heard_ns) // _MILLION),
             measured=not self._lockstep,
         )
 
-    def _say_goodbye(self, sender: Sender, stills: StillStage, link: EdgeLink) -> None:
+    def _say_goodbye(self, flow: _Flow) -> None:
         """Let the ground finish, then tell it that this was all."""
-        self._send_status("ended", sender, stills)
-        if link.heard():  # what is still in a queue would be lost with the session
+        sender = flow.sender
+        self._send_status("ended", flow)
+        if flow.link.heard():  # what is still in a queue would be lost with the session
             self._inbox.wait_for_end(
                 base=sender.base_sequence + 1,
                 roi=sender.still_sequence + 1,
@@ -344,7 +376,7 @@ class Edge:
                 timeout_s=_GOODBYE_S,
             )
 
-    def _facts(self, stills: StillStage, link: EdgeLink) -> EdgeRun:
+    def _facts(self, flow: _Flow) -> EdgeRun:
         counts, config = self._counts, self._config
         return EdgeRun(
             edge=config.edge_id,
@@ -352,13 +384,13 @@ class Edge:
             method=config.method,
             frames=counts.encoded,
             frames_dropped=counts.dropped,
-            duration_s=self._counts.duration_s(self._config.fps),
+            duration_s=self._counts.duration_s(self._config.tick_fps),
             budget_bps=config.budget_bps,
-            base_bps=config.base_bps,
+            base_bps=flow.renewal.base_bps,
             keyframes=self._keyframes.sent,
             keyframe_requests=self._keyframes.requests,
-            tracks=stills.tracks,
+            tracks=flow.stills.tracks,
             encode_ms=counts.encode_ms,
-            sight_ms=stills.sight_ms,
-            unusable_messages=link.unusable,
+            sight_ms=flow.stills.sight_ms,
+            unusable_messages=flow.link.unusable,
         )

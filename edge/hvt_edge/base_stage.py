@@ -1,10 +1,14 @@
-"""One frame of the base stream: decide on a keyframe, encode, keep, send."""
+"""One frame of the base stream: decide whether and how it is coded, encode, keep, send."""
 
 from __future__ import annotations
 
-from hvt_common.values import AccessUnit, Frame
+from collections.abc import Callable
+
+from hvt_common.values import AccessUnit, Frame, Tracks
+from hvt_edge.cadence import Cadence
 from hvt_edge.encode import BaseEncoder
 from hvt_edge.keyframes import KeyframePlan
+from hvt_edge.pulses import RegionPlan
 from hvt_edge.record_base import BaseRecorder
 from hvt_edge.send import Sender
 
@@ -12,7 +16,20 @@ __all__ = ["BaseStage"]
 
 
 class BaseStage:
-    """Runs in the frame loop. ``first_keyframe_bytes`` is the guess until a keyframe has been seen."""
+    """Runs in the frame loop, once for each tick.
+
+    Args:
+        encoder: opened for the cadence's first frame rate; with ``side_data`` where there is a plan.
+        keyframes: when a keyframe comes; it may come at a tick that the cadence would have left out.
+        sender: takes the units.
+        recorder: keeps them in a file too.
+        first_keyframe_bytes: the guess until a keyframe has been seen.
+        plan: which regions get more bits; None for none.
+        cadence: which ticks are coded; all by default.
+        renew: called with (n, ``now_ns``) before each keyframe, each n-th tick being coded from it on. Returns an
+            encoder newly opened for that, where anything has changed, or None to go on with the one there is. x265
+            takes neither another frame rate nor another bit rate once it is open. Needed where the cadence changes.
+    """
 
     def __init__(
         self,
@@ -22,17 +39,38 @@ class BaseStage:
         sender: Sender,
         recorder: BaseRecorder | None,
         first_keyframe_bytes: int,
+        plan: RegionPlan | None = None,
+        cadence: Cadence | None = None,
+        renew: Callable[[int, int], BaseEncoder | None] | None = None,
     ) -> None:
         self._encoder = encoder
         self._keyframes = keyframes
         self._sender = sender
         self._recorder = recorder
         self._keyframe_bytes = first_keyframe_bytes
+        self._plan = plan
+        self._cadence = cadence or Cadence()
+        self._renew = renew
 
-    def encode(self, frame: Frame, *, now_ns: int) -> AccessUnit:
-        """Encode the frame, as a keyframe where one is due and fits."""
+    @property
+    def every_n(self) -> int:
+        """Each n-th tick is coded now."""
+        return self._cadence.every_n
+
+    def encode(self, frame: Frame, *, now_ns: int, tracks: Tracks | None = None) -> AccessUnit | None:
+        """Encode the frame, as a keyframe where one is due and fits; None where this tick is not coded.
+
+        ``tracks`` are the newest that are known, in base pixels.
+        """
         fits = self._sender.keyframe_fits(self._keyframe_bytes, now_ns=now_ns)
-        unit = self._encoder.encode(frame, keyframe=self._keyframes.now(now_ns, fits=fits))
+        keyframe = self._keyframes.now(now_ns, fits=fits)
+        if not keyframe and not self._cadence.codes(frame.index):
+            return None
+        if keyframe:
+            self._begin_run(frame.index, now_ns=now_ns)
+        regions = [] if self._plan is None else self._plan.regions(frame.index, tracks, keyframe=keyframe)
+        unit = self._encoder.encode(frame, keyframe=keyframe, regions=regions)
+        self._cadence.coded(frame.index, keyframe=unit.keyframe, mean_qp=self._encoder.mean_qp)
         if unit.keyframe:
             self._keyframes.done(now_ns)
         if self._recorder is not None:
@@ -44,3 +82,11 @@ class BaseStage:
         line_bytes = self._sender.base(unit, now_ns=now_ns)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes
+
+    def _begin_run(self, tick: int, *, now_ns: int) -> None:
+        """What may change with a keyframe only."""
+        before = self._cadence.every_n
+        every_n = self._cadence.at_keyframe(tick)
+        encoder = None if self._renew is None else self._renew(every_n, now_ns)
+        assert encoder is not None or every_n == before, "a cadence that changes needs another encoder"
+        self._encoder = encoder or self._encoder

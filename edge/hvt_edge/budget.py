@@ -4,12 +4,13 @@ No rolling window ever exceeds the total.
 
 Two limits hold for stills at once, both in line bytes (payload, attachment and transport overhead):
 
-* **the share**: stills earn ``B_r = B_tot - B_v`` all the time and may save up what they do not spend, but no
-  more than ``carry_s`` seconds of it (a token bucket);
+* **the share**: stills earn what is neither the base's nor metadata's, ``B_tot - B_v - metadata``, all the time and
+  may save up what they do not spend, but no more than ``carry_s`` seconds of it (a token bucket). With ``lend`` they
+  may also take what the base left of ``B_v`` in the last window: base and what was lent stay within ``B_v`` there;
 * **the window**: in every rolling window of ``window_ns``, past or still to come, base and stills together stay
   within ``B_tot``. A still sent now sits in every window that ends up to one window from now, so the
-  base frames that will share those windows are counted in advance: at the mean rate of ``B_v``, or
-  what the base did in any stretch of the same length lately, whichever is more. Keyframes are no part of
+  base frames that will share those windows are counted in advance, each at the time it is due: at the mean rate of
+  ``B_v``, or what the base did in any stretch of the same length lately, whichever is more. Keyframes are no part of
   that memory, because they come only when the edge decides: before one, stills are held until it
   fits (`keyframe_fits`).
 
@@ -20,10 +21,11 @@ the total holds all the same.
 
 from __future__ import annotations
 
+import math
 from bisect import insort
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +37,8 @@ _MEMORY_WINDOWS = 5
 """How many windows of the base's recent behaviour the forecast looks back on."""
 _FORECASTS = 30
 """At how many moments of the coming window the forecast is made, at most: what it costs stays bounded."""
-
+_ROUNDING = 0.01
+"""Of a frame: rates and times are rounded to whole nanoseconds."""
 
 BASE_PEAK = 1.15
 """The fullest window of the base stream over B_v: what the VBV allows, kept also where frames bunch up."""
@@ -47,10 +50,20 @@ class BudgetSettings:
 
     total_bps: int
     base_bps: int
-    """B_v, the share of the base stream with its metadata and overhead."""
+    """B_v, the share of the base stream with its headers, overhead and ``status``."""
     fps: float
+    """Coded frames a second."""
     window_ns: int = _SECOND_NS
     carry_s: float = 2.0
+    metadata_bps: int = 0
+    """Kept free of stills for messages beside base and stills, such as ``tracks``."""
+    lend: bool = False
+    """Whether stills may also take what the base leaves of B_v."""
+
+    @property
+    def still_bps(self) -> int:
+        """What stills earn."""
+        return max(0, self.total_bps - self.base_bps - self.metadata_bps)
 
 
 class RollingBudget:
@@ -61,24 +74,41 @@ class RollingBudget:
     """
 
     def __init__(self, settings: BudgetSettings) -> None:
-        self._settings = settings
         self._total = settings.total_bps * settings.window_ns / 8 / _SECOND_NS
+        self._events: list[tuple[int, int]] = []
+        """(time, line bytes), in order of time."""
+        self._base_events: deque[tuple[int, int]] = deque()
+        self._lent: deque[tuple[int, float]] = deque()
+        """(time, bytes that a still took of what the base had left)."""
+        self._asked_ns: int | None = None
+        self._last_ns = 0
+        self._last_base_ns: int | None = None
+        self._old_peak = (0, 0.0)
+        """(until when, bytes in a window): after a change, frames of the former rate are still in the window."""
+        self._adopt(settings)
+        self._tokens = self._cap
+        self._tokens_ns: int | None = None
+
+    def _adopt(self, settings: BudgetSettings) -> None:
+        """Take over settings with the same total and window; what the base did at another rate is forgotten."""
+        self._settings = settings
         self._step_ns = round(_SECOND_NS / settings.fps)
-        steps = max(1, round(settings.window_ns / self._step_ns))
+        steps = max(1, math.ceil(float(settings.window_ns) / self._step_ns - _ROUNDING))
         self._forecasts = np.unique(
             np.linspace(0, steps, min(steps, _FORECASTS) + 1).round().astype(np.int64)
         )
-        self._spans_ns = settings.window_ns - self._forecasts * self._step_ns
-        self._events: list[tuple[int, int]] = []
-        self._base_events: deque[tuple[int, int]] = deque()
         self._base_peak = BASE_PEAK * settings.base_bps * settings.window_ns / 8 / _SECOND_NS
-        """(time, line bytes), in order of time."""
-        self._asked_ns: int | None = None
-        self._last_ns = 0
         self._base_steps: deque[int] = deque(maxlen=steps * _MEMORY_WINDOWS)
         self._burst = self._recent_bursts()
-        self._tokens = self._cap = (settings.total_bps - settings.base_bps) * settings.carry_s / 8
-        self._tokens_ns: int | None = None
+        self._cap = settings.still_bps * settings.carry_s / 8
+
+    def set_base(self, base_bps: int, fps: float, *, now_ns: int) -> None:
+        """The base stream goes on at another rate, from the coded frame that comes next (a keyframe) on."""
+        self._refill(now_ns)
+        until_ns = max(now_ns, self._last_ns) + self._settings.window_ns
+        self._old_peak = (until_ns, max(self._base_peak, self._peak_at(now_ns)))
+        self._adopt(replace(self._settings, base_bps=base_bps, fps=fps))
+        self._tokens = min(self._cap, self._tokens)
 
     @property
     def base_step_bytes(self) -> float:
@@ -88,8 +118,9 @@ class RollingBudget:
     @property
     def most_still_bytes(self) -> int:
         """The most line bytes that `still_room` ever gives, while the base keeps to its share."""
-        spare_bps = self._settings.total_bps - self._settings.base_bps
-        return int(min(self._cap, spare_bps * self._settings.window_ns / 8 / _SECOND_NS))
+        window_s = self._settings.window_ns / _SECOND_NS
+        lent = self._settings.base_bps * window_s / 8 if self._settings.lend else 0.0
+        return int(min(self._cap + lent, self._settings.still_bps * window_s / 8))
 
     def record_base(self, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
         """Count one base message; ``now_ns`` is when `earliest_ns` lets it go."""
@@ -98,6 +129,7 @@ class RollingBudget:
             self._base_events.popleft()
         self._record(line_bytes, now_ns)
         self._last_ns = max(self._last_ns, now_ns)
+        self._last_base_ns = max(self._last_base_ns or now_ns, now_ns)
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
         self._burst = self._recent_bursts()
 
@@ -109,7 +141,11 @@ class RollingBudget:
     def record_still(self, line_bytes: int, *, now_ns: int) -> None:
         """Count one still; it was admitted by `still_room` at this very time."""
         self._refill(now_ns)
-        self._tokens -= line_bytes
+        # What the base left goes first: it is gone a window later, what was saved up is not.
+        lent = min(float(line_bytes), self._lendable(now_ns))
+        if lent > 0:
+            self._lent.append((now_ns, lent))
+        self._tokens -= line_bytes - lent
         self._record(line_bytes, now_ns)
 
     def earliest_ns(self, line_bytes: int, *, now_ns: int, base: bool = False) -> int:
@@ -123,7 +159,7 @@ class RollingBudget:
         at_ns = max(now_ns, self._last_ns)
         latest_ns = at_ns + self._settings.window_ns
         if base:
-            at_ns = self._first_room(self._base_events, self._base_peak, line_bytes, at_ns)
+            at_ns = self._first_room(self._base_events, self._peak_at(at_ns), line_bytes, at_ns)
         return min(latest_ns, self._first_room(self._events, self._total, line_bytes, at_ns))
 
     def _first_room(
@@ -143,7 +179,7 @@ class RollingBudget:
     def still_room(self, now_ns: int) -> int:
         """Return how many line bytes a still may take now; 0 where it has to wait."""
         self._refill(now_ns)
-        return max(0, int(min(self._tokens, self._window_room(now_ns))))
+        return max(0, int(min(self._tokens + self._lendable(now_ns), self._window_room(now_ns))))
 
     def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a keyframe of this many line bytes, sent now, leaves every window within the total."""
@@ -161,23 +197,51 @@ class RollingBudget:
 
     def _refill(self, now_ns: int) -> None:
         if self._tokens_ns is not None:
-            earned = (self._settings.total_bps - self._settings.base_bps) / 8
+            earned = self._settings.still_bps / 8
             self._tokens += earned * (now_ns - self._tokens_ns) / _SECOND_NS
             self._tokens = min(self._cap, self._tokens)
         self._tokens_ns = now_ns
 
+    def _peak_at(self, at_ns: int) -> float:
+        """The most base bytes that a window which ends then may hold."""
+        until_ns, old_peak = self._old_peak
+        return max(old_peak, self._base_peak) if at_ns < until_ns else self._base_peak
+
+    def _lendable(self, now_ns: int) -> float:
+        """What of B_v neither the base nor a still has taken in the window that ends now."""
+        settings = self._settings
+        if not settings.lend or self._last_base_ns is None:
+            return 0.0
+        oldest_ns = now_ns - settings.window_ns
+        while self._lent and self._lent[0][0] <= oldest_ns - settings.window_ns:
+            self._lent.popleft()  # kept for one window more, for a thread whose clock is behind
+        lent = sum(size for at_ns, size in self._lent if at_ns > oldest_ns)
+        # Up to the last frame, unless the next is overdue, and half a frame short of the window: between two frames,
+        # or where they jitter, one that is yet to come would count as left over.
+        last_ns = max(self._last_base_ns, now_ns - self._step_ns)
+        first_ns = last_ns - settings.window_ns + self._step_ns // 2
+        taken = sum(size for at_ns, size in self._base_events if at_ns > first_ns)
+        return max(0.0, settings.base_bps * settings.window_ns / 8 / _SECOND_NS - taken - lent)
+
     def _window_room(self, now_ns: int) -> float:
         """The least room over every window that would contain a message sent now.
 
-        The window that ends ``k`` base frames from now holds the past bytes younger than the window less
-        ``k`` frames, and ``k`` frames of the base to come. The first, of ``k`` = 0, also holds what was recorded for
-        later than now: with it the room is never more than any window has, whatever the base does.
+        The fullest windows end with a base frame. The one that ends with the ``k``-th from now holds the past bytes
+        younger than the window less the time until then, and ``k`` frames of the base to come. The first, of ``k`` =
+        0, ends now and also holds what was recorded for later: with it the room is never more than any window
+        has, whatever the base does.
         """
         self._note_asked(now_ns)
+        due_ns = max(now_ns, (self._last_base_ns or now_ns - self._step_ns) + self._step_ns)
+        # A hair later than due, so that by rounding no frame more falls into the window than its rate has.
+        ahead_ns = due_ns - now_ns + (self._forecasts - 1) * self._step_ns + round(_ROUNDING * self._step_ns)
+        ahead_ns[0] = 0
+        spans_ns = np.maximum(self._settings.window_ns - ahead_ns, 0)
         times_ns = np.array([at_ns for at_ns, _ in self._events], np.int64)
         upto = np.cumsum([0, *(size for _, size in self._events)])
-        past = upto[-1] - upto[np.searchsorted(times_ns, now_ns - self._spans_ns, side="right")]
-        return float((self._total - past - self._burst).min())
+        past = upto[-1] - upto[np.searchsorted(times_ns, now_ns - spans_ns, side="right")]
+        beside = self._settings.metadata_bps / 8 / _SECOND_NS * ahead_ns
+        return float((self._total - past - self._burst - beside).min())
 
     def _recent_bursts(self) -> npt.NDArray[np.float64]:
         """Bytes that ``k`` base frames in a row may take, for each ``k`` of the forecast."""

@@ -3,39 +3,58 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal, cast
 
 from hvt_common.values import View
 from hvt_common.vision.detect import Detector, open_detector, warm_up
-from hvt_common.vision.still_codecs import JpegCodec
+from hvt_common.vision.still_codecs import still_codec
+from hvt_common.vision.tiles import tiled, warm_up_source
 from hvt_common.vision.track import ByteTracker, TrackerSettings, weak_confidence
+from hvt_edge.base_model import choose_base, most_every_n
 from hvt_edge.budget import BudgetSettings, RollingBudget
-from hvt_edge.candidates import TrackMemory
+from hvt_edge.cadence import Cadence, MeasuredCadence
+from hvt_edge.candidates import Candidate, TrackMemory
 from hvt_edge.choose import Chooser, ChooserSettings
-from hvt_edge.config import EdgeConfig
+from hvt_edge.config import LEAST_FPS, EdgeConfig, parse_grid
 from hvt_edge.encode import BaseEncoder
 from hvt_edge.keyframes import KeyframePlan, KeyframeSettings
-from hvt_edge.methods.registry import method
-from hvt_edge.rate import encoder_settings
+from hvt_edge.methods.base import Step
+from hvt_edge.methods.registry import method, tuning
+from hvt_edge.pulses import PulsePlan, RegionPlan, RollingPlan, TrackRegions, combined
+from hvt_edge.rate import encoder_settings, least_base_bps, payload_bps
+from hvt_edge.resample import BaseSize
 from hvt_edge.sight import Sight, SightSettings
+from hvt_edge.split import Split, SplitSettings
 from hvt_edge.still import StillMaker
+from hvt_edge.still_gate import Gate
 from hvt_edge.suppress import Suppression
 
 __all__ = [
     "SECOND_NS",
+    "base_size",
+    "first_every_n",
     "make_budget",
+    "make_cadence",
     "make_chooser",
     "make_detector",
     "make_encoder",
     "make_keyframes",
+    "make_regions",
     "make_sight",
+    "make_split",
     "make_suppression",
+    "warm_up_for",
 ]
 
 SECOND_NS = 1_000_000_000
 _MOST_ENCODER_THREADS = 4  # a 720p picture has twelve rows of blocks, each some steps behind the one above
+_REST_S = 10.0
+"""How often ``--fps auto`` may think again."""
+
+
+# Seeing
 
 
 def make_detector(config: EdgeConfig) -> Detector:
@@ -48,9 +67,15 @@ def make_detector(config: EdgeConfig) -> Detector:
         threads=config.threads,
         provider=config.provider,
     )
-    if config.candidates == "decoded":
-        warm_up(detector, config.size)
-    return detector
+    return tiled(detector, config.tiles) if config.candidates == "source" else detector
+
+
+def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
+    """Run the detector once on what it will be given: a runtime may compile for each shape."""
+    if config.candidates == "source":
+        warm_up_source(detector, view.source_size)
+    else:
+        warm_up(detector, view.base_size)
 
 
 def make_sight(config: EdgeConfig, *, detector: Detector, view: View) -> Sight:
@@ -60,13 +85,16 @@ def make_sight(config: EdgeConfig, *, detector: Detector, view: View) -> Sight:
     )
     return Sight(
         detector,
-        ByteTracker(settings, fps=config.fps),
+        ByteTracker(settings, fps=config.tick_fps),
         view=view,
         settings=SightSettings(
             detect_every=config.detect_every,
             candidates=cast('Literal["decoded", "source"]', config.candidates),
         ),
     )
+
+
+# Choosing
 
 
 def make_suppression(config: EdgeConfig) -> Suppression:
@@ -81,44 +109,130 @@ def make_chooser(
     class_names: tuple[str, ...],
     most_bytes: int,
     on_fate: Callable[[str, str], None],
+    observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
 ) -> Chooser:
     """Method, suppression, queue and still stage; ``most_bytes`` is the largest payload the budget ever admits."""
+    codec = still_codec(config.still_codec)
     return Chooser(
-        method(config.method),
+        method(config.method, **tuning(config.tune)),
         suppression=make_suppression(config),
-        maker=StillMaker(codec=JpegCodec(), quality_pct=config.jpeg_quality, padding=config.padding),
+        maker=StillMaker(
+            codec=codec,
+            fallback=still_codec(config.fallback_codec) if codec.needs_base else None,
+            quality_pct=config.jpeg_quality,
+            fidelity_db=config.fidelity,
+            padding=config.padding,
+        ),
         memory=TrackMemory(padding=config.padding),
         view=view,
         class_names=class_names,
-        settings=ChooserSettings(fps=config.fps, most_bytes=most_bytes),
+        settings=ChooserSettings(
+            fps=config.tick_fps,
+            most_bytes=most_bytes,
+            gate=Gate(psnr_y_db=config.gate),
+            share=config.group_stills,
+            from_source=config.candidates == "source",
+        ),
         on_fate=on_fate,
+        observe=observe,
     )
 
 
-def make_budget(config: EdgeConfig) -> RollingBudget:
+# Bits
+
+
+def base_size(config: EdgeConfig) -> BaseSize:
+    """The base stream's size, or how it follows from the source's."""
+    if config.fixed_size is not None:
+        return config.fixed_size
+    return lambda source_size: _chosen(config, source_size, size=None)[0]
+
+
+def first_every_n(config: EdgeConfig, size: tuple[int, int]) -> int:
+    """Each n-th tick is coded at the start."""
+    return _chosen(config, size, size=size)[1]
+
+
+def _chosen(
+    config: EdgeConfig, source_size: tuple[int, int], *, size: tuple[int, int] | None
+) -> tuple[tuple[int, int], int]:
+    rate_bps = payload_bps(
+        config.base_bps, size=size or source_size, fps=config.tick_fps, edge_id=config.edge_id
+    )
+    return choose_base(
+        rate_bps,
+        source_size,
+        size=size,
+        fps=None if config.auto_fps else config.tick_fps,
+        most_fps=config.tick_fps,
+        least_fps=LEAST_FPS,
+    )
+
+
+def make_cadence(config: EdgeConfig, every_n: int) -> Cadence:
+    """Which ticks are coded."""
+    if not config.auto_fps:
+        return Cadence(every_n)
+    most = most_every_n(config.tick_fps, least_fps=LEAST_FPS)
+    return MeasuredCadence(every_n, most_every_n=most, rest_ticks=round(_REST_S * config.tick_fps))
+
+
+def make_budget(config: EdgeConfig, *, every_n: int) -> RollingBudget:
     """B_tot and B_v over the rolling window."""
     return RollingBudget(
         BudgetSettings(
             total_bps=config.budget_bps,
             base_bps=config.base_bps,
-            fps=config.fps,
+            fps=config.tick_fps / every_n,
             window_ns=round(config.window * SECOND_NS),
+            metadata_bps=config.metadata_bps,
+            lend=config.lend,
         )
     )
 
 
-def make_encoder(config: EdgeConfig) -> BaseEncoder:
+def make_split(config: EdgeConfig, size: tuple[int, int]) -> Split | None:
+    """Who moves the base's share of the budget; None where it is fixed."""
+    if not isinstance(config.video_share, str):
+        return None
+    fps = LEAST_FPS if config.auto_fps else config.tick_fps
+    return Split(
+        SplitSettings(
+            total_bps=config.budget_bps,
+            least_base_bps=least_base_bps(size, fps, edge_id=config.edge_id),
+            metadata_bps=config.metadata_bps,
+        )
+    )
+
+
+def make_encoder(config: EdgeConfig, *, size: tuple[int, int], every_n: int, base_bps: int) -> BaseEncoder:
     """x265 at the rate that the budget leaves it; with several threads only where bytes need not repeat."""
     settings = encoder_settings(
-        size=config.size,
-        fps=config.fps,
+        size=size,
+        fps=config.tick_fps / every_n,
         preset=config.preset,
-        total_bps=config.budget_bps,
-        base_bps=config.base_bps,
+        total_bps=config.budget_bps - config.metadata_bps,
+        base_bps=base_bps,
         edge_id=config.edge_id,
+        side_data=bool(config.roi_depth or parse_grid(config.rolling)),
+        pulses=config.pulse > 0,
     )
     threads = 1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1)
     return BaseEncoder(replace(settings, threads=threads))
+
+
+def make_regions(config: EdgeConfig, size: tuple[int, int]) -> RegionPlan | None:
+    """Which regions of the base get more bits; None for none."""
+    grid = parse_grid(config.rolling)
+    pulse = rolling = tracks = None
+    if config.pulse:
+        period = max(1, round(config.pulse * config.tick_fps))
+        pulse = PulsePlan(size, period_ticks=period, depth=config.pulse_depth)
+    if grid is not None:
+        rolling = RollingPlan(size, columns=grid[0], rows=grid[1], depth=config.rolling_depth)
+    if config.roi_depth:
+        tracks = TrackRegions(size, depth=config.roi_depth)
+    return combined(pulse, rolling, tracks)
 
 
 def make_keyframes(config: EdgeConfig) -> KeyframePlan:

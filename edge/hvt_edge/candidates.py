@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import cv2
 import numpy as np
 
-from hvt_common.values import Image, Tracks, View
-from hvt_common.vision.base_crop import MAX_SIDE_PX, coded_size
+from hvt_common.values import Boxes, Image, Tracks, View
+from hvt_common.vision.base_crop import MAX_SIDE_PX, base_crop, coded_size
+from hvt_edge.base_loss import BaseLoss, measure_loss
 from hvt_edge.crop import PADDING, crop_box
 
 __all__ = ["Belief", "Candidate", "TrackMemory", "sharpness"]
@@ -62,6 +64,8 @@ class Candidate:
     """For how long it has touched the border without a break."""
     leaving: bool = False
     """Touches the border, and less of it shows than before."""
+    covered_share: float = 0.0
+    """The largest share of the box that another track in front of it covers; in front is what reaches lower down."""
     sent_count: int = 0
     last_sent_frame: int | None = None
     last_sent_ns: int | None = None
@@ -74,6 +78,9 @@ class Candidate:
     posterior: Belief | None = None
     sharpness: Callable[[], float] | None = field(default=None, compare=False, repr=False)
     """Measures the source crop when called; None where no picture was at hand."""
+    loss: Callable[[], BaseLoss] | None = field(default=None, compare=False, repr=False)
+    """Measures, once, what the base shows of the crop against the source, at the base's own grid where that is the
+    coarser; None where a picture was not at hand."""
 
     @property
     def area_px(self) -> float:
@@ -192,12 +199,18 @@ class TrackMemory:
         class_names: Sequence[str],
         now_ns: int,
         source_bgr: Image | None = None,
+        base_bgr: Image | None = None,
     ) -> list[Candidate]:
-        """One candidate a track, ordered by id. ``source_bgr`` is only read if someone asks for sharpness."""
+        """One candidate a track, ordered by id.
+
+        ``source_bgr`` and ``base_bgr``, the decoded base frame of the same index, are only read if someone asks for
+        sharpness or loss.
+        """
         self.observe(tracks, now_ns=now_ns)
         picture = _picture(view)
         boxes_base = np.clip(tracks.boxes_xyxy_px, picture[:2] * 2, picture[2:] * 2).astype(np.float32)
         boxes_source = view.to_source(boxes_base)
+        covered = _covered_shares(boxes_base)
         result = []
         for row, track_id in enumerate(tracks.ids.tolist()):
             history = self._histories[track_id]
@@ -208,11 +221,13 @@ class TrackMemory:
                     history,
                     box_base_px=tuple(boxes_base[row].tolist()),
                     box_source_px=tuple(boxes_source[row].tolist()),
+                    covered_share=covered[row],
                     view=view,
                     picture=picture,
                     class_names=class_names,
                     now_ns=now_ns,
                     source_bgr=source_bgr,
+                    base_bgr=base_bgr,
                 )
             )
         self._last_step_frame = tracks.frame_index
@@ -226,11 +241,13 @@ class TrackMemory:
         *,
         box_base_px: Box,
         box_source_px: Box,
+        covered_share: float,
         view: View,
         picture: Box,
         class_names: Sequence[str],
         now_ns: int,
         source_bgr: Image | None,
+        base_bgr: Image | None,
     ) -> Candidate:
         class_id = int(tracks.class_ids[row])
         crop = crop_box(box_source_px, padding=self._padding, source_size=view.source_size)
@@ -254,6 +271,7 @@ class TrackMemory:
             touches_border=touches,
             border_s=0.0 if history.border_since_ns is None else (now_ns - history.border_since_ns) / 1e9,
             leaving=leaving,
+            covered_share=covered_share,
             sent_count=history.sent_count,
             last_sent_frame=history.sent_frame,
             last_sent_ns=history.sent_ns,
@@ -262,7 +280,10 @@ class TrackMemory:
             last_sent_at_border=history.sent_at_border,
             last_refused_ns=history.refused_ns,
             posterior=history.belief,
-            sharpness=None if source_bgr is None else _measurer(source_bgr, crop),
+            sharpness=None if source_bgr is None else _sharpness_of(source_bgr, crop),
+            loss=None
+            if source_bgr is None or base_bgr is None
+            else _loss_of(source_bgr, base_bgr, crop_source_px=crop, view=view),
         )
 
     def _forget(self, now_ns: int) -> None:
@@ -296,6 +317,43 @@ def _note_border(history: _History, box_base_px: Box, *, picture: Box, now_ns: i
     return True, area < _LEAVING_SHARE * history.border_area_px
 
 
-def _measurer(source_bgr: Image, crop_source_px: tuple[int, int, int, int]) -> Callable[[], float]:
+def _covered_shares(boxes_base_px: Boxes) -> list[float]:
+    """Of each box, the largest share that one other box covers which reaches lower down, hence stands in front.
+
+    Seen from straight above nothing is in front; boxes there hardly overlap either.
+    """
+    if not len(boxes_base_px):
+        return []
+    x1, y1, x2, y2 = boxes_base_px.T
+    shares = []
+    for row, area in enumerate(((x2 - x1) * (y2 - y1)).tolist()):
+        width = np.minimum(x2, x2[row]) - np.maximum(x1, x1[row])
+        height = np.minimum(y2, y2[row]) - np.maximum(y1, y1[row])
+        shared = np.maximum(width, 0) * np.maximum(height, 0)
+        shared[y2 <= y2[row]] = 0
+        shares.append(min(1.0, float(shared.max()) / area) if area > 0 else 0.0)
+    return shares
+
+
+def _sharpness_of(source_bgr: Image, crop_source_px: tuple[int, int, int, int]) -> Callable[[], float]:
     x1, y1, x2, y2 = crop_source_px
     return lambda: sharpness(source_bgr[y1:y2, x1:x2])
+
+
+def _loss_of(
+    source_bgr: Image, base_bgr: Image, *, crop_source_px: tuple[int, int, int, int], view: View
+) -> Callable[[], BaseLoss]:
+    """Measures what coding lost, not what the size of the base loses: detectors there see its grid and no finer."""
+    x1, y1, x2, y2 = crop_source_px
+    shrink = max(1.0, 1 / view.scale, max(x2 - x1, y2 - y1) / MAX_SIDE_PX)
+    size = (max(1, round((x2 - x1) / shrink)), max(1, round((y2 - y1) / shrink)))
+
+    @cache
+    def loss() -> BaseLoss:
+        crop = source_bgr[y1:y2, x1:x2]
+        if size != (x2 - x1, y2 - y1):
+            crop = np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
+        shown = base_crop(base_bgr, view=view, crop_source_px=crop_source_px, size=size)
+        return measure_loss(crop, shown)
+
+    return loss

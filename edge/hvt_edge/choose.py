@@ -1,19 +1,23 @@
-"""From tracks to stills: suppression, method, queue, budget, still stage, in that order.
+"""From tracks to stills: suppression, gate, method, sharing, queue, budget, still stage, in that order.
 
-Pure but for the pixels it codes: no threads, no clock, no network. Every candidate's fate is counted.
+Pure but for the pixels it codes: no threads, no clock, no network. The fate of every wish is counted; a candidate
+that rides along in the still of a neighbour shares that one's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
-from hvt_common.values import Frame, Image, Still, View
+from hvt_common.values import Still, View
 from hvt_edge.candidates import Candidate, TrackMemory
-from hvt_edge.methods.base import Method, Step
+from hvt_edge.methods.base import STILL_OVERHEAD_BYTES, Method, Request, Step
 from hvt_edge.methods.cost import CostModel
+from hvt_edge.neighbours import expected_bytes, group
+from hvt_edge.resend import ResendRing, ResendSettings
 from hvt_edge.sight import Seen
-from hvt_edge.still import NoStill, StillMaker
+from hvt_edge.still import NoStill, Room, StillMaker
+from hvt_edge.still_gate import Gate
 from hvt_edge.still_queue import QueueSettings, StillQueue, Waiting
 from hvt_edge.suppress import Suppression
 
@@ -24,6 +28,8 @@ _FULL_SHARE = 0.9
 _PATIENCE_SHARE = 0.75
 """After this share of the longest wait, the most useful wish is coded to whatever room there is: one that never
 gets the room it is expected to need must not hold up all others for ever."""
+_AGAIN = "again"
+"""Why a still is sent that was sent before, and the parameter that names the one before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +39,21 @@ class ChooserSettings:
     fps: float
     most_bytes: int
     queue: QueueSettings = field(default_factory=QueueSettings)
+    gate: Gate = field(default_factory=Gate)
+    resend: ResendSettings = field(default_factory=ResendSettings)
+    share: bool = False
+    """Neighbours share one still where that is cheaper."""
+    overhead_bytes: float = STILL_OVERHEAD_BYTES
+    """What a still takes on the line beside its payload."""
+    from_source: bool = False
+    """Whether candidates were found on the source, and may be unknown to the ground."""
 
 
 class Chooser:
     """Decides at each step who is wanted, and hands out stills as the budget has room for them.
 
     ``on_fate(fate, reason)`` is called with ``sent``, ``deferred`` or ``dropped`` for every candidate that a step
-    did not simply pass over.
+    did not simply pass over; ``observe(candidates, step)`` with all tracks of each step, those that rest included.
     """
 
     def __init__(
@@ -53,6 +67,7 @@ class Chooser:
         class_names: tuple[str, ...],
         settings: ChooserSettings,
         on_fate: Callable[[str, str], None],
+        observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
     ) -> None:
         self._method = method
         self._suppression = suppression
@@ -62,9 +77,12 @@ class Chooser:
         self._class_names = class_names
         self._settings = settings
         self._on_fate = on_fate
-        self._cost = CostModel()
+        self._observe = observe
+        self._most_bytes = settings.most_bytes
+        self._costs: dict[str, CostModel] = {}
         self._queue = StillQueue(settings.queue)
-        self._base_frames: dict[int, Image] = {}
+        self._sent = ResendRing(settings.resend)
+        self._put_off = False
         self._held_up: dict[int, int] = {}
         """Track id → since when it has been the most useful and without room (ns)."""
         self._sequence = 0
@@ -75,44 +93,42 @@ class Chooser:
         return len(self._queue)
 
     def consider(self, seen: Seen, *, now_ns: int, room_bytes: int) -> None:
-        """Take in one frame's tracks; at a decision step let the method say which it wants."""
+        """Take in one frame's tracks; at a decision step let the method say which it wants.
+
+        Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
+        """
         if self._method.video_only:
             return
-        if not seen.detected:
+        due = seen.detected or self._put_off
+        able = seen.base_bgr is not None or not self._maker.codec.needs_base
+        self._put_off = due and not able
+        if not (due and able):
             self._memory.observe(seen.tracks, now_ns=now_ns)
             return
-        candidates = self._memory.candidates(
-            seen.tracks,
-            view=self._view,
-            class_names=self._class_names,
-            now_ns=now_ns,
-            source_bgr=seen.frame.source_bgr,
-        )
-        kept, held = self._suppression.apply(candidates, now_ns=now_ns)
-        for _, reason in held:
-            self._on_fate("deferred", reason)
         step = Step(
             frame_index=seen.frame.index,
             now_ns=now_ns,
             fps=self._settings.fps,
             base_size=self._view.base_size,
-            cost=self._cost.estimate(),
+            cost=self._cost_of(self._maker.codec.name).estimate(),
             room_bytes=room_bytes,
+            still_overhead_bytes=self._settings.overhead_bytes,
+            from_source=self._settings.from_source,
         )
-        for request in self._method.requests(kept, step):
-            self._base_frames[seen.frame.index] = seen.base_bgr
-            for _left, reason in self._queue.offer(Waiting(request, seen.frame, now_ns)):
-                self._on_fate("deferred" if reason == "replaced" else "dropped", reason)
+        candidates = self._candidates(seen, now_ns=now_ns)
+        self._observe(candidates, step)
+        for request in self._requests(self._wanted(candidates, now_ns=now_ns), step):
+            self._wish(request, seen, now_ns=now_ns)
 
-    def stills(self, *, now_ns: int, room_bytes: Callable[[], int]) -> Iterator[Still]:
-        """Yield stills that fit ``room_bytes()`` (payload); the caller sends each before it asks for the next."""
+    def stills(self, *, now_ns: int, room: Room) -> Iterator[Still]:
+        """Yield stills that fit ``room`` of each; the caller sends each before it asks for the next."""
+        self._wish_again(now_ns)
         for _, reason in self._queue.expire(now_ns):
             self._on_fate("dropped", reason)
         while (waiting := self._queue.best()) is not None:
-            limit_bytes = room_bytes()
-            if not self._may_go(waiting, limit_bytes, now_ns=now_ns):
+            if not self._may_go(waiting, room(self._draft(waiting)), now_ns=now_ns):
                 break  # the most useful waits for its room; a lesser one does not slip in before it
-            still = self._make(waiting, limit_bytes, now_ns=now_ns)
+            still = self._make(waiting, room, now_ns=now_ns)
             if still is not None:
                 yield still
         self._forget()
@@ -125,57 +141,163 @@ class Chooser:
             track_id, class_name=class_name, confidence=confidence, entropy_nats=entropy_nats
         )
 
+    def set_most_bytes(self, most_bytes: int) -> None:
+        """The largest admission that the budget can give from now on, payload."""
+        self._most_bytes = most_bytes
+
+    def ask_again(self, sequence: int) -> None:
+        """A ground does not have the base frame of this still; it goes out once more when there is room."""
+        self._sent.ask(sequence)
+
     def close(self) -> None:
         """What still waits will not be sent any more."""
         for _ in self._queue.clear():
             self._on_fate("dropped", "ended")
 
+    # Wishes
+
+    def _candidates(self, seen: Seen, *, now_ns: int) -> list[Candidate]:
+        """All tracks of this step."""
+        return self._memory.candidates(
+            seen.tracks,
+            view=self._view,
+            class_names=self._class_names,
+            now_ns=now_ns,
+            source_bgr=seen.frame.source_bgr,
+            base_bgr=seen.base_bgr,
+        )
+
+    def _wanted(self, candidates: Sequence[Candidate], *, now_ns: int) -> list[Candidate]:
+        """Those that may be asked for."""
+        kept, held = self._suppression.apply(candidates, now_ns=now_ns)
+        for _, reason in held:
+            self._on_fate("deferred", reason)
+        # The gate comes last because it looks at pixels, and before the method, so that the queue's places go to
+        # those that gain from a still.
+        return [one for one in kept if not self._gated(one, now_ns=now_ns)]
+
+    def _gated(self, candidate: Candidate, *, now_ns: int) -> bool:
+        gate = self._settings.gate
+        if not gate.on or candidate.loss is None or not gate.good_enough(candidate.loss()):
+            return False
+        self._refuse(candidate, "base_good", now_ns=now_ns)
+        return True
+
+    def _requests(self, candidates: list[Candidate], step: Step) -> list[Request]:
+        requests = self._method.requests(candidates, step)
+        if not self._settings.share:
+            return requests
+        joined = group(
+            requests,
+            cost=step.cost,
+            overhead_bytes=step.still_overhead_bytes,
+            padding=self._maker.padding,
+            source_size=self._view.source_size,
+        )
+        return [request for request, _ in joined]
+
+    def _wish(self, request: Request, seen: Seen, *, now_ns: int) -> None:
+        if not self._queue.admits(request, now_ns=now_ns):
+            self._on_fate("dropped", "queue_full")
+            return
+        cut = self._maker.cut(seen.frame, request, view=self._view, base_bgr=seen.base_bgr)
+        if isinstance(cut, NoStill):
+            for one in (request.candidate, *request.also):
+                self._memory.record_refused(one.track_id, now_ns=now_ns)
+            self._on_fate("dropped", cut.reason)
+            return
+        self._offer(Waiting(_without_frame(request), cut, now_ns))
+
+    def _wish_again(self, now_ns: int) -> None:
+        """Let those that the ground asked for once more wait for room, unless something newer of the track does."""
+        for sequence, waiting in self._sent.take(now_ns):
+            if waiting.track_id not in self._queue and self._queue.admits(waiting.request, now_ns=now_ns):
+                draft = waiting.cut.draft
+                cut = replace(
+                    waiting.cut, draft=replace(draft, parameters={**draft.parameters, _AGAIN: sequence})
+                )
+                self._offer(replace(waiting, cut=cut, since_ns=now_ns))
+
+    def _offer(self, waiting: Waiting) -> None:
+        for _left, reason in self._queue.offer(waiting):
+            self._on_fate("deferred" if reason == "replaced" else "dropped", reason)
+
+    # Stills
+
+    def _draft(self, waiting: Waiting) -> Still:
+        return replace(waiting.cut.draft, sequence=self._sequence)
+
     def _may_go(self, waiting: Waiting, limit_bytes: int, *, now_ns: int) -> bool:
         """Whether there is as much room as it will need, or it has waited for that long enough."""
-        expected_bytes = self._cost.estimate().of(waiting.request.candidate)
-        if limit_bytes >= min(expected_bytes, self._settings.most_bytes * _FULL_SHARE):
+        expected = expected_bytes(
+            waiting.request,
+            cost=self._cost_of(waiting.cut.draft.codec).estimate(),
+            padding=self._maker.padding,
+            source_size=self._view.source_size,
+        )
+        if limit_bytes >= min(expected, self._most_bytes * _FULL_SHARE):
             return True
         # By track, not by wish: methods wish again at each step, and every new wish takes the place of the last.
-        since_ns = self._held_up.setdefault(waiting.request.candidate.track_id, now_ns)
+        since_ns = self._held_up.setdefault(waiting.track_id, now_ns)
         return now_ns - since_ns >= _PATIENCE_SHARE * self._settings.queue.max_age_ns
 
-    def _make(self, waiting: Waiting, limit_bytes: int, *, now_ns: int) -> Still | None:
+    def _make(self, waiting: Waiting, room: Room, *, now_ns: int) -> Still | None:
         self._queue.remove(waiting)
-        self._held_up.pop(waiting.request.candidate.track_id, None)
-        candidate, frame = waiting.request.candidate, waiting.frame
-        made = self._maker.make(
-            frame,
-            waiting.request,
-            sequence=self._sequence,
-            view=self._view,
-            limit_bytes=limit_bytes,
-            base_bgr=self._base_frames.get(frame.index),
-        )
+        self._held_up.pop(waiting.track_id, None)
+        made = self._maker.code(waiting.cut, sequence=self._sequence, room=room)
         if isinstance(made, NoStill):
-            self._memory.record_refused(candidate.track_id, now_ns=now_ns)
-            self._on_fate("dropped", made.reason)
+            self._refuse(waiting.request.candidate, made.reason, now_ns=now_ns)
             return None
         self._sequence += 1
-        self._record(candidate, frame, made, now_ns=now_ns)
+        self._record(waiting, made, now_ns=now_ns)
         return made
 
-    def _record(self, candidate: Candidate, frame: Frame, still: Still, *, now_ns: int) -> None:
-        self._cost.observe(area_px=candidate.crop_area_px, size_bytes=len(still.data))
-        self._memory.record_sent(
-            candidate.track_id,
-            frame_index=frame.index,
-            now_ns=now_ns,
-            area_px=candidate.area_px,
-            sharpness=candidate.sharpness() if candidate.sharpness else None,
-            at_border=candidate.touches_border,
-        )
+    def _record(self, waiting: Waiting, still: Still, *, now_ns: int) -> None:
+        height, width = waiting.cut.crop_bgr.shape[:2]
+        self._cost_of(still.codec).observe(area_px=width * height, size_bytes=len(still.data))
         self._on_fate("sent", still.reason)
+        if waiting.again:
+            return  # its tracks have rested since it was sent first
+        for one in (waiting.request.candidate, *waiting.request.also):
+            self._memory.record_sent(
+                one.track_id,
+                frame_index=still.frame_index,
+                now_ns=now_ns,
+                area_px=one.area_px,
+                sharpness=one.sharpness() if one.sharpness else None,
+                at_border=one.touches_border,
+            )
+        if still.codec != self._maker.without_base.name:  # it builds on the base, and a ground may lack that
+            cut = waiting.cut.recoded(self._maker.without_base, reason=_AGAIN)
+            self._sent.keep(still.sequence, replace(waiting, cut=cut, again=True), now_ns=now_ns)
+
+    def _refuse(self, candidate: Candidate, reason: str, *, now_ns: int) -> None:
+        self._memory.record_refused(candidate.track_id, now_ns=now_ns)
+        self._on_fate("dropped", reason)
+
+    def _cost_of(self, codec: str) -> CostModel:
+        """Learnt for each codec apart: a residual takes a fraction of what an intra still takes."""
+        return self._costs.setdefault(codec, CostModel.of_codec(codec))
 
     def _forget(self) -> None:
         """Keep nothing of wishes that wait no more."""
-        frames = {waiting.frame.index for waiting in self._queue}
-        tracks = {waiting.request.candidate.track_id for waiting in self._queue}
-        self._base_frames = {index: image for index, image in self._base_frames.items() if index in frames}
+        tracks = {waiting.track_id for waiting in self._queue}
         self._held_up = {
             track_id: since_ns for track_id, since_ns in self._held_up.items() if track_id in tracks
         }
+
+
+def _without_frame(request: Request) -> Request:
+    """The same, with what is measured on the frame measured now: a wish that waits must not keep frames."""
+    return replace(
+        request,
+        candidate=_measured(request.candidate),
+        also=tuple(_measured(one) for one in request.also),
+    )
+
+
+def _measured(candidate: Candidate) -> Candidate:
+    if candidate.sharpness is None:
+        return replace(candidate, loss=None)
+    value = candidate.sharpness()
+    return replace(candidate, sharpness=lambda: value, loss=None)

@@ -12,6 +12,7 @@ from hvt_common.errors import exit_with_sentence
 from hvt_common.report import print_table, start_log, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
+from hvt_edge.profiles import with_profile
 from hvt_edge.summary import table
 
 __all__ = ["main"]
@@ -29,6 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     config, asked = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
+    config = with_profile(config, given=asked.values)
     if asked.print_config:
         print(to_toml(config), end="")
         return 0

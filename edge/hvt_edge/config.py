@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from hvt_common.config import (
     integer,
     number,
     option,
+    or_auto,
     switch,
 )
 from hvt_common.errors import UserError
@@ -24,15 +26,27 @@ from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
 from hvt_common.vision.embedded import DETECTOR as EMBEDDED_DETECTOR
 from hvt_common.vision.providers import PROVIDERS
+from hvt_common.vision.still_codecs import still_codec
+from hvt_common.vision.tiles import parse_tiles
 from hvt_edge.encode import PRESETS
-from hvt_edge.methods.registry import METHODS, method
+from hvt_edge.methods.registry import METHODS, method, tuning
+from hvt_edge.profiles import PROFILES
 from hvt_edge.rate import least_base_bps
 from hvt_edge.source import check_shape
+from hvt_edge.split import FIRST_SHARE
 
-__all__ = ["REGIMES", "EdgeConfig", "Regime", "check"]
+__all__ = ["LEAST_FPS", "REGIMES", "EdgeConfig", "Regime", "check", "check_rate", "parse_grid"]
 
 
+DEFAULT_FPS = 15.0
+DEFAULT_SIZE = (1280, 720)
 _LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, 60.0
+_R0_DEPTH = 0.1
+_MOST_CELLS = 64
+LEAST_FPS = 2.0
+"""To this ``--fps auto`` may fall: two frames in a window of a second."""
+TRACKS_BPS = 8_000
+"""What ``--send-tracks`` takes of the budget: about that for 45 boxes three times a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +69,14 @@ class EdgeConfig:
 
     source: str | None = option(TEXT, None, "clip.mp4, folder/, rtsp://…, /dev/video0 or demo")
     edge_id: str = option(TEXT, "edge-1", "name of this edge: 1 to 32 of a-z, 0-9 and -")
-    size: tuple[int, int] = option(SIZE, (1280, 720), "size of the base stream in pixels")
-    fps: float = option(number(0.1, 240, unit=" frames a second"), 15.0, "frame rate of the base stream")
+    size: tuple[int, int] | str = option(
+        or_auto(SIZE), DEFAULT_SIZE, "size of the base stream in pixels; auto: as large as the rate carries"
+    )
+    fps: float | str = option(
+        or_auto(number(0.1, 240, unit=" frames a second")),
+        DEFAULT_FPS,
+        "frame rate of the base stream; auto: up to 15, fewer and better frames where the rate is thin",
+    )
     fit: str = option(choice("letterbox", "crop"), "letterbox", "how another aspect ratio is fitted")
     source_fps: float | None = option(
         number(0.1, 1000), None, "frame rate of an image folder, or instead of what a file says"
@@ -67,8 +87,11 @@ class EdgeConfig:
     budget: int | None = option(
         BITRATE, None, "bits a second in all, every byte counted", shown_default="800kbps"
     )
-    video_share: float | None = option(
-        SHARE, None, "share of the budget for the base stream", shown_default="0.8125; 1 for M0"
+    video_share: float | str | None = option(
+        or_auto(SHARE),
+        None,
+        "share of the budget for the base stream; auto follows the scene",
+        shown_default="0.8125; 1 for M0",
     )
     regime: str | None = option(
         choice(*REGIMES), None, "a budget of the paper: low 0.80 Mbps, moderate 1.40 Mbps"
@@ -76,6 +99,14 @@ class EdgeConfig:
     window: float = option(DURATION, 1.0, "the budget holds in every rolling window of this length")
 
     method: str = option(choice(*METHODS), "M5", "who gets a still, and when")
+    profile: str | None = option(
+        choice(*PROFILES), None, "settings in one word: thin is everything that helps on a thin link"
+    )
+    tune: tuple[str, ...] = option(
+        TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True
+    )
+    lend: bool = switch("stills may use what the base stream leaves unspent, never beyond --budget")
+    group_stills: bool = switch("neighbours share one still where that is cheaper")
     cooldown: float = option(
         DURATION, 2.0, "least time between two stills of a track; 0 for the paper's plain methods"
     )
@@ -121,11 +152,13 @@ class EdgeConfig:
 
     preset: str = option(choice(*PRESETS), "veryfast", "x265 preset")
     pulse: float = option(DURATION, 0.0, "a whole frame at better quality once in so long; 0 for none")
-    pulse_depth: float = option(number(0.05, 1), 0.3, "how much better a pulse is (x265 offset of -51 at 1)")
+    pulse_depth: float = option(
+        number(0.01, 1), 0.15, "how much better a pulse is; 1 is the whole quantiser range"
+    )
     rolling: str = option(
         TEXT, "off", "pulses of one region a frame in rotation, grid CxR, tracks first; or off"
     )
-    rolling_depth: float = option(number(0.05, 1), 0.4, "how much better the region is")
+    rolling_depth: float = option(number(0.01, 1), 0.1, "how much better that region is")
     roi_depth: float = option(
         number(0, 1), 0.0, "quantise active tracks better by so much; 0 for not, 0.1 for --method R0"
     )
@@ -158,10 +191,35 @@ class EdgeConfig:
         return self.budget
 
     @property
+    def share(self) -> float:
+        """Share of the budget for the base stream; where it is to follow the scene, the one to begin with."""
+        assert self.video_share is not None, "check() fills it"
+        return FIRST_SHARE if isinstance(self.video_share, str) else self.video_share
+
+    @property
+    def metadata_bps(self) -> int:
+        """What is kept for messages beside base and stills, in bits a second."""
+        return TRACKS_BPS if self.send_tracks else 0
+
+    @property
     def base_bps(self) -> int:
         """B_v in bits a second."""
-        assert self.video_share is not None, "check() fills it"
-        return round(self.budget_bps * self.video_share)
+        return round(min(self.budget_bps * self.share, self.budget_bps - self.metadata_bps))
+
+    @property
+    def tick_fps(self) -> float:
+        """Frames a second that the edge looks at; with ``--fps auto`` not all of them are sent."""
+        return DEFAULT_FPS if isinstance(self.fps, str) else self.fps
+
+    @property
+    def auto_fps(self) -> bool:
+        """Whether the rate decides how many ticks are sent."""
+        return isinstance(self.fps, str)
+
+    @property
+    def fixed_size(self) -> tuple[int, int] | None:
+        """(width, height) of the base stream; None where the rate decides."""
+        return None if isinstance(self.size, str) else self.size
 
 
 def check(config: EdgeConfig) -> EdgeConfig:
@@ -169,27 +227,71 @@ def check(config: EdgeConfig) -> EdgeConfig:
     if config.source is None:
         raise UserError("--source is missing: give a clip, an image folder, rtsp://…, /dev/video0 or demo")
     EdgeKeys(config.edge_id)
-    check_shape(size=config.size, fps=config.fps)
+    check_shape(size=config.fixed_size or DEFAULT_SIZE, fps=config.tick_fps)
     if config.regime and (config.budget is not None or config.video_share is not None):
         raise UserError(
             f"--regime {config.regime} already sets --budget and --video-share: leave one or the other out"
         )
-    regime = REGIMES[config.regime or "low"]
-    video_only = method(config.method).video_only
-    share = 1.0 if video_only else regime.video_share if config.video_share is None else config.video_share
-    if not 0 < share <= 1:
-        raise UserError(f"--video-share {share:g} leaves no base stream: give more than 0, at most 1")
-    if not _LEAST_WINDOW_S <= config.window <= _MOST_WINDOW_S or config.window < 2 / config.fps:
+    config = _with_rates(config)
+    if not _LEAST_WINDOW_S <= config.window <= _MOST_WINDOW_S or config.window < 2 / config.tick_fps:
         raise UserError(
             f"--window {config.window:g}s is not accepted: give {_LEAST_WINDOW_S:g}s to {_MOST_WINDOW_S:g}s, and two "
             f"frames at least (shorter, and a keyframe fills more than a window)"
         )
-    config = replace(config, budget=config.budget or regime.budget_bps, video_share=share)
-    least_bps = least_base_bps(config.size, config.fps, edge_id=config.edge_id)
+    _check_stills(config)
+    _check_regions(config)
+    if config.fixed_size is not None:
+        check_rate(config, config.fixed_size)
+    return config
+
+
+def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:
+    """Raise `UserError` where x265 cannot follow what the budget leaves to the base stream at this size."""
+    fps = LEAST_FPS if config.auto_fps else config.tick_fps
+    least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
     if config.base_bps < least_bps:
         raise UserError(
             f"--budget {bitrate_text(config.budget_bps)} leaves {bitrate_text(config.base_bps)} for video, but "
-            f"{config.size[0]}x{config.size[1]} at {config.fps:g} fps takes at least {bitrate_text(least_bps)}: "
+            f"{size[0]}x{size[1]} at {fps:g} fps takes at least {bitrate_text(least_bps)}: "
             "raise --budget, or lower --size or --fps"
         )
-    return config
+
+
+def _with_rates(config: EdgeConfig) -> EdgeConfig:
+    """Budget, share and depth where the method or the regime says them."""
+    regime = REGIMES[config.regime or "low"]
+    policy = method(config.method, **tuning(config.tune))
+    share = regime.video_share if config.video_share is None else config.video_share
+    share = 1.0 if policy.video_only else share
+    if not isinstance(share, str) and not 0 < share <= 1:
+        raise UserError(f"--video-share {share:g} leaves no base stream: give more than 0, at most 1")
+    depth = _R0_DEPTH if policy.name == "R0" and not config.roi_depth else config.roi_depth
+    return replace(config, budget=config.budget or regime.budget_bps, video_share=share, roi_depth=depth)
+
+
+def _check_stills(config: EdgeConfig) -> None:
+    codec = still_codec(config.still_codec)
+    if codec.needs_base and still_codec(config.fallback_codec).needs_base:
+        raise UserError(
+            f"--fallback-codec {config.fallback_codec} needs the base stream itself: give one that does not"
+        )
+    if parse_tiles(config.tiles) not in ("off", "auto") and config.candidates != "source":
+        raise UserError(f"--tiles {config.tiles} cuts up the source: add --candidates source")
+
+
+def _check_regions(config: EdgeConfig) -> None:
+    parse_grid(config.rolling)
+    if config.pulse and config.pulse < 2 / config.tick_fps:
+        raise UserError(f"--pulse {config.pulse:g}s is shorter than two frames: give more, or 0 for none")
+
+
+def parse_grid(text: str) -> tuple[int, int] | None:
+    """The value of ``--rolling``: columns and rows; None for ``off``."""
+    found = re.fullmatch(r"(\d{1,2})x(\d{1,2})", text)
+    if text == "off":
+        return None
+    if found is None or not 2 <= int(found[1]) * int(found[2]) <= _MOST_CELLS:
+        raise UserError(
+            f"--rolling {text!r} is not accepted: give off, or CxR such as 5x3, 2 to {_MOST_CELLS} cells"
+        )
+    return int(found[1]), int(found[2])

@@ -25,6 +25,7 @@ class FeedbackInbox:
         self._results: deque[StillResult] = deque(maxlen=_MAX_RESULTS)
         self._last_frame_index = -1
         self._answered: dict[int, None] = {}  # in the order in which they came
+        self._known: dict[tuple[int, int, bool], None] = {}
         self._done_sequence = -1
         self._base_messages = 0
         self._roi_messages = 0
@@ -39,13 +40,24 @@ class FeedbackInbox:
             self._base_messages = max(self._base_messages, feedback.base_messages)
             self._roi_messages = max(self._roi_messages, feedback.roi_messages)
             for result in feedback.stills:
-                sequence = result.still_sequence
-                if sequence > self._done_sequence and sequence not in self._answered:
-                    self._answered[sequence] = None
-                    self._results.append(result)
-            while len(self._answered) > 2 * _MAX_RESULTS:  # a ground may answer what was never asked
+                self._note(result)
+            # A ground may answer what was never asked.
+            while len(self._answered) > 2 * _MAX_RESULTS:
                 del self._answered[next(iter(self._answered))]
+            while len(self._known) > 2 * _MAX_RESULTS:
+                del self._known[next(iter(self._known))]
             self._changed.notify_all()
+
+    def _note(self, result: StillResult) -> None:
+        """Keep a result that is news: one for each track of a still, and one that asks for the still again.
+
+        What one ground could not show another may have classified, so an opinion does not silence a request.
+        """
+        sequence = result.still_sequence
+        key = (sequence, -1 if result.again else result.track_id, result.again)
+        if sequence > self._done_sequence and key not in self._known:
+            self._known[key] = self._answered[sequence] = None
+            self._results.append(result)
 
     def take(self) -> list[StillResult]:
         """Return and forget all results so far."""
@@ -59,9 +71,10 @@ class FeedbackInbox:
         with self._changed:
             self._done_sequence = max(self._done_sequence, sequence)
             self._answered = dict.fromkeys(one for one in self._answered if one > self._done_sequence)
+            self._known = dict.fromkeys(one for one in self._known if one[0] > self._done_sequence)
             ready = sorted(
                 (one for one in self._results if one.still_sequence <= sequence),
-                key=lambda one: one.still_sequence,
+                key=lambda one: (one.still_sequence, one.again, one.track_id),
             )
             self._results = deque(
                 (one for one in self._results if one.still_sequence > sequence), maxlen=_MAX_RESULTS

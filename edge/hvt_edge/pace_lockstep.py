@@ -61,22 +61,31 @@ class LockstepPace:
         self._stop = stop
         self._follows = heard()
         self._eyes = ThreadPoolExecutor(1, thread_name_prefix="hvt-sight")
-        self._seeing: tuple[Frame, bool, Future[Seen]] | None = None
-        self._in_flight: deque[tuple[int, set[int]]] = deque()
+        self._seeing: tuple[Frame, int, bool, Future[Seen]] | None = None
+        self._in_flight: deque[tuple[int, int, set[int]]] = deque()
+        """(tick, newest coded tick by then, stills sent with it): what the ground is to answer."""
+        self._coded_index = -1
         self._newest_answered = -1
         self.now_ns = 0
         """The capture time of the newest frame."""
 
     def step(self, frame: Frame) -> None:
-        """Encode this frame while the one before is seen; send that one's stills, then this one's unit."""
+        """Encode this frame while the one before is seen; send that one's stills, then this one's unit.
+
+        A tick that is not coded is seen all the same: its source may show what no base frame does.
+        """
         began_ns = time.perf_counter_ns()
-        unit = self._base.encode(frame, now_ns=frame.capture_ns)
-        self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
+        unit = self._base.encode(frame, now_ns=frame.capture_ns, tracks=self._stills.latest_tracks)
+        if unit is not None:
+            self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
         self._finish_seeing()
         self.now_ns = frame.capture_ns
-        self._base.send(unit, now_ns=frame.capture_ns)
+        if unit is not None:
+            self._coded_index = frame.index
+            self._base.send(unit, now_ns=frame.capture_ns)
         held = self._keyframes.due(frame.capture_ns)
-        self._seeing = (frame, held, self._eyes.submit(self._stills.see, frame, unit))
+        seen = self._eyes.submit(self._stills.see, frame, unit)
+        self._seeing = (frame, self._coded_index, held, seen)
 
     def __enter__(self) -> Self:
         return self
@@ -94,18 +103,21 @@ class LockstepPace:
     def _finish_seeing(self) -> None:
         if self._seeing is None:
             return
-        frame, held, future = self._seeing
+        frame, coded_index, held, future = self._seeing
         self._seeing = None
         self._follow_ground(before=frame.index - self._ahead_frames + 1)
         sent = self._stills.send(future.result(), now_ns=frame.capture_ns, held=held)
-        self._in_flight.append((frame.index, sent))
+        if (
+            sent or coded_index == frame.index
+        ):  # of other ticks the ground learns nothing, and answers nothing
+            self._in_flight.append((frame.index, coded_index, sent))
 
     def _follow_ground(self, *, before: int) -> None:
         """Wait until the ground has done with the frames before this one, and take in what it made of them."""
         while self._in_flight and self._in_flight[0][0] < before:
-            index, sent = self._in_flight.popleft()
+            _, coded_index, sent = self._in_flight.popleft()
             if self._follows:
-                self._follows = self._answered(index, sent)
+                self._follows = self._answered(coded_index, sent)
             self._newest_answered = max([self._newest_answered, *sent])
         self._stills.hear(self._inbox.take_up_to(self._newest_answered))
 

@@ -33,6 +33,7 @@ class RealtimePace:
         stop: threading.Event,
     ) -> None:
         self._base = base
+        self._stills = stills
         self._clock = clock
         self._fps = fps
         self._live = live
@@ -43,17 +44,18 @@ class RealtimePace:
         """The time that windows go by, of the newest frame."""
 
     def step(self, frame: Frame) -> None:
-        """Encode and send one frame, and let the worker see it; or drop it."""
+        """Encode and send one frame, and let the worker see it, also where it is not coded; or drop it."""
         on_time = self._live or realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop)
         if not on_time or self._worker.full:
             self._counts.dropped += 1
             return
         self.now_ns = self._clock()
         began_ns = time.perf_counter_ns()
-        unit = self._base.encode(frame, now_ns=self.now_ns)
-        self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
-        self.now_ns = self._clock()
-        self._base.send(unit, now_ns=self.now_ns)
+        unit = self._base.encode(frame, now_ns=self.now_ns, tracks=self._stills.latest_tracks)
+        if unit is not None:
+            self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
+            self.now_ns = self._clock()
+            self._base.send(unit, now_ns=self.now_ns)
         self._worker.offer(frame, unit)
 
     def __enter__(self) -> Self:

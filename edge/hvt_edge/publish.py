@@ -18,11 +18,13 @@ __all__ = ["EdgeLink"]
 
 _log = logging.getLogger(__name__)
 
-_PUBLISHED = (Row.BASE, Row.ROI, Row.STATUS)
+_PUBLISHED = (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS)
+_NEEDED = (Row.BASE, Row.ROI, Row.STATUS)
+"""Rows that a ground subscribes to in any case; one that only shows the video may leave out the tracks."""
 
 
 class EdgeLink:
-    """Publishers of base, roi and status; queryables info and control; a subscriber of feedback; the alive token.
+    """Publishers of base, roi, tracks, status; queryables info, control; a subscriber of feedback; the alive token.
 
     ``answer_info(received_ns)``, ``answer_control(request)`` and ``hear(feedback)`` run in Zenoh's callbacks and
     must be quick.
@@ -51,9 +53,9 @@ class EdgeLink:
         self._token = session.liveliness().declare_token(keys.key(Row.ALIVE))
 
     def heard(self) -> bool:
-        """Whether a ground subscribes to all that is sent."""
+        """Whether a ground subscribes to base, stills and status."""
         # Zenoh's own stub calls the status a bool.
-        return all(one.matching_status.matching for one in self._publishers.values())  # type: ignore[attr-defined]
+        return all(self._publishers[row].matching_status.matching for row in _NEEDED)  # type: ignore[attr-defined]
 
     def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
         """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""

@@ -37,7 +37,7 @@ def make_info(
         base_size=view.base_size,
         view_scale=view.scale,
         view_offset_px=view.offset_px,
-        fps=config.fps,
+        fps=config.tick_fps,
         codec="hevc",
         pace=config.pace,
         method=config.method,

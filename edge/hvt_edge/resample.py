@@ -7,7 +7,7 @@ both axes and centred: whole between black borders (letterbox) or filling the fr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from typing import TypeVar
 
@@ -16,9 +16,21 @@ import numpy as np
 
 from hvt_common.values import Fit, Frame, Image, View
 
-__all__ = ["Gate", "Resizer", "base_frame_count", "capture_time_ns", "exact_rate", "hold", "into_canvas"]
+__all__ = [
+    "BaseSize",
+    "Gate",
+    "Resizer",
+    "base_frame_count",
+    "capture_time_ns",
+    "exact_rate",
+    "hold",
+    "into_canvas",
+]
 
 _T = TypeVar("_T")
+
+BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
+"""(width, height) of the base frames, or how they follow from those of the source."""
 
 
 def exact_rate(fps: float) -> Fraction:
@@ -104,8 +116,9 @@ class Resizer:
             borders and cuts lie on whole pixels.
     """
 
-    def __init__(self, source_size: tuple[int, int], base_size: tuple[int, int], *, fit: Fit) -> None:
-        self.view = View.fitted(source_size, base_size, fit=fit)
+    def __init__(self, source_size: tuple[int, int], base_size: BaseSize, *, fit: Fit) -> None:
+        settled = base_size(source_size) if callable(base_size) else base_size
+        self.view = View.fitted(source_size, settled, fit=fit)
         self._fit = fit
         self._last: tuple[Image, Image] | None = None
 

@@ -19,6 +19,7 @@ from hvt_edge.budget import RollingBudget
 
 __all__ = [
     "BASE_ATTACHMENT_BYTES",
+    "PLAIN_ENCODING",
     "STATUS_BYTES",
     "STILL_ATTACHMENT_BYTES",
     "Outlet",
@@ -28,12 +29,18 @@ __all__ = [
 
 BASE_ATTACHMENT_BYTES = 48
 """What a `BaseHeader` takes at most."""
-STILL_ATTACHMENT_BYTES = 232
-"""What a `RoiHeader` takes at most; with the usual names it is half of that."""
+STILL_ATTACHMENT_BYTES = 100
+"""About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
+`Sender.still_room_bytes` of one that is counts its own header."""
 STATUS_BYTES = 320
 """What a `Status` takes."""
-_STATUS_GROWTH_BYTES = 16
-"""By how much one may grow when it is made for a later moment: its two times."""
+_GROWTH_BYTES = 16
+"""By how much metadata may grow when it is made for a later moment: its two times."""
+
+
+PLAIN_ENCODING = "application/octet-stream"
+"""Of formats that only HVT reads; one byte on the wire."""
+_OWN_TYPES = "application/vnd.hvt."
 
 
 class Outlet(Protocol):
@@ -56,8 +63,16 @@ def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
     return 8 * (per_frame * fps + per_second)
 
 
+def _encoding(still: Still) -> str:
+    """What Zenoh is told of the payload: its media type, if there is any program beside HVT that could read it.
+
+    Spelling a type of our own out would cost up to 34 bytes a still, and the header names the codec anyway.
+    """
+    return PLAIN_ENCODING if still.media_type.startswith(_OWN_TYPES) else still.media_type
+
+
 class Sender:
-    """Sends access units, stills and status, and accounts for each.
+    """Sends access units, stills, tracks and status, and accounts for each.
 
     ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep.
     """
@@ -106,40 +121,52 @@ class Sender:
         self._outlet.put(Row.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Row.BASE].encoding)
         return line_bytes
 
-    def still_room_bytes(self, now_ns: int, *, media_type: str) -> int:
-        """Payload that a still may take now."""
+    def still_room_bytes(self, now_ns: int, *, still: Still | None = None) -> int:
+        """Payload that a still with the header of this one may take now, whatever data it holds itself.
+
+        True to the byte: all that differs between still and still is counted (names, parameters, further tracks,
+        media type). Without a still it is an estimate for one with the usual names.
+        """
         with self._lock:
             room = self._budget.still_room(now_ns)
-        return self._payload_bytes(room, media_type)
+        if still is None:
+            return self._payload_bytes(room, STILL_ATTACHMENT_BYTES, DELIVERIES[Row.ROI].encoding)
+        attachment_bytes = len(self._still_header(still, send_ns=now_ns).pack())
+        return self._payload_bytes(room, attachment_bytes, _encoding(still))
 
-    def most_still_bytes(self, *, media_type: str) -> int:
-        """Payload of the largest still that `still_room_bytes` ever admits."""
-        return self._payload_bytes(self._budget.most_still_bytes, media_type)
+    def most_still_bytes(self) -> int:
+        """About the payload of the largest still that the budget ever admits."""
+        return self._payload_bytes(
+            self._budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Row.ROI].encoding
+        )
 
-    def still(self, still: Still, *, media_type: str, now_ns: int) -> None:
+    def still(self, still: Still, *, now_ns: int) -> None:
         """Send one still that `still_room_bytes` admitted at this very time."""
         with self._lock:
             self.still_sequence = still.sequence
             attachment = self._still_header(still, send_ns=now_ns).pack(still.data)
+            encoding = _encoding(still)
             line_bytes = self._count(
-                Row.ROI, Channel.ROI, still.data, attachment, at_ns=now_ns, encoding=media_type
+                Row.ROI, Channel.ROI, still.data, attachment, at_ns=now_ns, encoding=encoding
             )
             self._budget.record_still(line_bytes, now_ns=now_ns)
-        self._outlet.put(Row.ROI, still.data, attachment=attachment, encoding=media_type)
+        self._outlet.put(Row.ROI, still.data, attachment=attachment, encoding=encoding)
+
+    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
+        """Send the edge's own tracks of one decision step, made for the moment at which they may go."""
+        self._metadata(Row.TRACKS, make, now_ns=now_ns)
 
     def status(self, make: Callable[[int], Status], *, now_ns: int) -> None:
         """Send the once-a-second report, made for the moment at which it may go.
 
         ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment.
         """
+        self._metadata(Row.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns)
+
+    def set_base(self, base_bps: int, fps: float, *, now_ns: int) -> None:
+        """The base stream's share of the budget and its rate of frames, from the keyframe that comes next."""
         with self._lock:
-            size_bytes = _STATUS_GROWTH_BYTES + self._line_bytes(Row.STATUS, make(now_ns).pack(), 0)
-            at_ns = self._budget.earliest_ns(size_bytes, now_ns=now_ns)
-            payload = make(at_ns).pack()
-            line_bytes = self._count(Row.STATUS, Channel.META, payload, b"", at_ns=at_ns)
-            self._budget.record_metadata(line_bytes, now_ns=at_ns)
-        self._wait_until(at_ns)
-        self._outlet.put(Row.STATUS, payload, encoding=DELIVERIES[Row.STATUS].encoding)
+            self._budget.set_base(base_bps, fps, now_ns=now_ns)
 
     def keyframe_fits(self, line_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a keyframe of so many line bytes leaves the budget whole."""
@@ -151,6 +178,17 @@ class Sender:
         assert fate in ("sent", "deferred", "dropped")
         with self._lock:
             self._ledger.record_fate(fate, reason)  # type: ignore[arg-type]
+
+    def _metadata(self, row: Row, make: Callable[[int], bytes], *, now_ns: int) -> None:
+        """Send what belongs to neither stream as soon as the budget's window has room for it."""
+        with self._lock:
+            size_bytes = _GROWTH_BYTES + self._line_bytes(row, make(now_ns), 0)
+            at_ns = self._budget.earliest_ns(size_bytes, now_ns=now_ns)
+            payload = make(at_ns)
+            line_bytes = self._count(row, Channel.META, payload, b"", at_ns=at_ns)
+            self._budget.record_metadata(line_bytes, now_ns=at_ns)
+        self._wait_until(at_ns)
+        self._outlet.put(row, payload, encoding=DELIVERIES[row].encoding)
 
     def _still_header(self, still: Still, *, send_ns: int) -> RoiHeader:
         return RoiHeader(
@@ -172,10 +210,10 @@ class Sender:
             also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in still.also),
         )
 
-    def _payload_bytes(self, room_bytes: int, media_type: str) -> int:
+    def _payload_bytes(self, room_bytes: int, attachment_bytes: int, media_type: str) -> int:
         """What of so many line bytes is left for a still's payload."""
-        around = STILL_ATTACHMENT_BYTES + overhead_bytes(
-            room_bytes, STILL_ATTACHMENT_BYTES, key=self._keys.key(Row.ROI), encoding=media_type
+        around = attachment_bytes + overhead_bytes(
+            room_bytes, attachment_bytes, key=self._keys.key(Row.ROI), encoding=media_type
         )
         return max(0, room_bytes - around)
 

@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
 from hvt_common.values import Fit
+from hvt_edge.resample import BaseSize
 from hvt_edge.sources.camera import CameraGrabber
 from hvt_edge.sources.contract import Source
 from hvt_edge.sources.demo import DemoSource
@@ -24,7 +25,7 @@ _ACCEPTED = "a video file, a folder of images, rtsp://…, http://…, udp://…
 def open_source(
     spec: str,
     *,
-    size: tuple[int, int],
+    size: BaseSize,
     fps: float,
     fit: Fit = "letterbox",
     seed: int = 0,
@@ -35,7 +36,7 @@ def open_source(
 
     Args:
         spec: path of a video file or an image folder, a stream's URL, a V4L2 device, or ``demo``.
-        size: (width, height) of the base frames in pixels, even, 64…8192.
+        size: (width, height) of the base frames in pixels, even, 64…8192, or how they follow from the source's.
         fps: base rate in frames a second, above 0, at most 240.
         fit: what happens to a source of another aspect ratio; see `View.fitted`.
         seed: of the demo scene.
@@ -66,13 +67,13 @@ def open_source(
     return kind(spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps)
 
 
-def check_shape(*, size: tuple[int, int], fps: float, source_fps: float | None = None) -> None:
+def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
     """Refuse sizes and rates that no base stream can have.
 
     Raises:
         UserError: names the value and what is accepted.
     """
-    wide, high = size
+    wide, high = (64, 64) if callable(size) else size
     # HEVC codes 4:2:0 pictures in even sizes only.
     if wide % 2 or high % 2 or not (64 <= wide <= 8192 and 64 <= high <= 8192):
         raise UserError(

@@ -1,38 +1,36 @@
 """The still stage: crop of the untouched source frame, coded to fit its admission, and better than the base.
 
-Two promises hold for every still that leaves here: it is never larger than ``limit_bytes``, and, where the decoded
+Two promises hold for every still that leaves here: it is never larger than its admission, and, where the decoded
 base frame is at hand, it is closer to the source than what the base shows of the same place: in colour and in luma,
-over the padded crop and over the box alone (mean squared error, hence PSNR). Where both promises cannot be kept
+over the padded crop and over each box alone (mean squared error, hence PSNR). Where both promises cannot be kept
 there is no still, and the reason is said.
+
+A codec that builds on the base (``residual``) is used where the base frame of the same tick is at hand. The fallback
+codec takes its place where there is none, and where the base is so far off that it comes out smaller for the
+same picture.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
-
-import cv2
-import numpy as np
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 from hvt_common.values import Frame, Image, Still, View
 from hvt_common.vision.base_crop import MAX_SIDE_PX, base_crop, coded_size
-from hvt_common.vision.still_codecs import JpegCodec, StillCodec
-from hvt_edge.crop import PADDING, crop_box
+from hvt_common.vision.still_codecs import JpegCodec, StillCodec, psnr_y_db
+from hvt_edge.crop import PADDING
+from hvt_edge.cut import Cut, Rival, crop_of, inner_box
 from hvt_edge.methods.base import Request
+from hvt_edge.neighbours import union_crop
+from hvt_edge.still_fit import Fitted, Fitter, NoStill
 
-__all__ = ["NoStill", "StillMaker", "crop_box"]
+__all__ = ["NoStill", "Room", "StillMaker"]
 
-_QUALITY_STEP_PCT = 5
-_BT601 = np.array([[0.114, 0.587, 0.299]], np.float32)
+Room = Callable[[Still], int]
+"""How many payload bytes a still with this header may take now; what it holds as data does not count."""
 
-
-@dataclass(frozen=True, slots=True)
-class NoStill:
-    """Why no still was made."""
-
-    reason: Literal["too_large", "base_good"]
-    """``too_large``: nothing that is better than the base fits the admission (more room may help);
-    ``base_good``: the base shows it as well as the best quality would."""
+_TRIES = 3
+"""Of fitting payload and parameters into one admission: parameters hardly change in size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +38,91 @@ class StillMaker:
     """Makes stills with one set of settings; frozen, without state."""
 
     codec: StillCodec = field(default_factory=JpegCodec)
+    fallback: StillCodec | None = None
+    """Needs no base; must be given where ``codec`` needs one, and is not used where it does not."""
     quality_pct: int = 65
     """Asked for; less where the admission is smaller, more where the base is already better."""
+    fidelity_db: float = 0.0
+    """Luma PSNR to reach with the fewest bytes, in place of ``quality_pct``; 0: the quality is fixed."""
     floor_pct: int = 35
-    """Never below it: what is worse than that tells a classifier little."""
+    """Never below it: what is worse than that tells a classifier little. A codec that builds on the base has no
+    floor, because the base stays."""
     ceiling_pct: int = 90
     """The most that is spent on being better than the base."""
     min_gain_db: float = 0.1
     """By how much the still must be closer than the base; covers how others round when they count."""
     padding: float = PADDING
     max_side_px: int = MAX_SIDE_PX
+
+    def __post_init__(self) -> None:
+        assert self.fallback is not None or not self.codec.needs_base, f"{self.codec.name} needs a fallback"
+        assert not (self.codec.needs_base and self.without_base.needs_base), (
+            "the fallback serves without a base"
+        )
+
+    @property
+    def without_base(self) -> StillCodec:
+        """The codec of stills that show the same whatever base frames the ground has."""
+        if not self.codec.needs_base:
+            return self.codec
+        assert self.fallback is not None, "checked at the start"
+        return self.fallback
+
+    def cut(
+        self, frame: Frame, request: Request, *, view: View, base_bgr: Image | None = None
+    ) -> Cut | NoStill:
+        """Take the request's crop out of ``frame``, which is the frame the request was made at.
+
+        ``base_bgr`` is the decoded base frame of the same index; without it the second promise is not checked.
+        """
+        lead = request.candidate
+        assert frame.index == lead.frame_index, "a still shows the frame that its box belongs to"
+        crop_px = union_crop(request, padding=self.padding, source_size=view.source_size)
+        size = coded_size(crop_px, max_side_px=self.max_side_px)
+        if base_bgr is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
+            return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
+        crop = crop_of(frame.source_bgr, crop_px, size)
+        seen = rival = None
+        if base_bgr is not None:
+            seen = base_crop(base_bgr, view=view, crop_source_px=crop_px, size=size)
+            boxes = (one.box_source_px for one in (lead, *request.also))
+            places = tuple(inner_box(box, crop_px, size) for box in boxes)
+            rival = Rival.of(seen, crop=crop, places=places, min_gain_db=self.min_gain_db)
+            if 0 < self.fidelity_db <= rival.psnr_y_db:
+                return NoStill("base_good")
+        codec = self.without_base if seen is None else self.codec
+        draft = Still(
+            sequence=0,
+            frame_index=frame.index,
+            capture_ns=frame.capture_ns,
+            track_id=lead.track_id,
+            box_source_px=lead.box_source_px,
+            crop_source_px=crop_px,
+            class_name=lead.class_name,
+            confidence=lead.confidence,
+            reason=request.reason,
+            codec=codec.name,
+            quality_pct=self.quality_pct,
+            data=b"",
+            media_type=codec.media_type,
+            parameters={}
+            if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1])
+            else {"w": size[0], "h": size[1]},
+            also=tuple((one.track_id, one.box_source_px) for one in request.also),
+        )
+        return Cut(draft=draft, crop_bgr=crop, base_crop_bgr=seen, rival=rival)
+
+    def code(self, cut: Cut, *, sequence: int, room: Room) -> Still | NoStill:
+        """Code a crop so that ``room``, asked of the very still that comes out, holds its data."""
+        draft = replace(cut.draft, sequence=sequence)
+        if cut.base_crop_bgr is None or not self.codec.needs_base:
+            made = self._fitted(self.without_base, cut, draft, room)
+            return made if isinstance(made, NoStill) else made[0]
+        built = self._fitted(self.codec, cut, draft, room)
+        if isinstance(built, NoStill):
+            made = self._fitted(self.without_base, cut, draft, room) if cut.base_far_off else built
+            return made if isinstance(made, NoStill) else made[0]
+        return (self._cheaper(*built, cut, draft) if cut.base_far_off else None) or built[0]
 
     def make(
         self,
@@ -61,130 +134,55 @@ class StillMaker:
         limit_bytes: int,
         base_bgr: Image | None = None,
     ) -> Still | NoStill:
-        """Code the request's crop of ``frame``, which is the frame the request was made at.
+        """`cut` and `code` in one; ``limit_bytes`` bounds the payload alone."""
+        cut = self.cut(frame, request, view=view, base_bgr=base_bgr)
+        if isinstance(cut, NoStill):
+            return cut
+        return self.code(cut, sequence=sequence, room=lambda _: limit_bytes)
 
-        ``base_bgr`` is the decoded base frame of the same index; without it the second promise is not checked.
-        ``limit_bytes`` bounds the payload.
-        """
-        candidate = request.candidate
-        assert frame.index == candidate.frame_index, "a still shows the frame that its box belongs to"
-        crop_px = crop_box(candidate.box_source_px, padding=self.padding, source_size=view.source_size)
-        size = coded_size(crop_px, max_side_px=self.max_side_px)
-        if base_bgr is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
-            return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
-        crop = _cropped(frame.source_bgr, crop_px, size)
-        rival = None
-        if base_bgr is not None:
-            seen = base_crop(base_bgr, view=view, crop_source_px=crop_px, size=size)
-            rival = _Rival.of(
-                seen,
-                crop=crop,
-                box=_inner_box(candidate.box_source_px, crop_px, size),
-                share=10 ** (-self.min_gain_db / 10),
-            )
-        made = self._coded(crop, rival=rival, limit_bytes=limit_bytes)
-        if isinstance(made, NoStill):
-            return made
-        data, quality_pct = made
-        return Still(
-            sequence=sequence,
-            frame_index=frame.index,
-            capture_ns=frame.capture_ns,
-            track_id=candidate.track_id,
-            box_source_px=candidate.box_source_px,
-            crop_source_px=crop_px,
-            class_name=candidate.class_name,
-            confidence=candidate.confidence,
-            reason=request.reason,
-            codec=self.codec.name,
-            quality_pct=quality_pct,
-            data=data,
-            media_type=self.codec.media_type,
-            parameters={}
-            if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1])
-            else {"w": size[0], "h": size[1]},
-        )
+    def _fitted(
+        self, codec: StillCodec, cut: Cut, draft: Still, room: Room
+    ) -> tuple[Still, Fitted] | NoStill:
+        """As asked, with this codec, or the best below that for which there is room."""
+        fitter = self._fitter(codec)
+        draft = _of_codec(draft, codec)
+        limit_bytes = room(draft)
+        for _ in range(_TRIES):
+            fitted = fitter.best(cut, limit_bytes=limit_bytes)
+            if isinstance(fitted, NoStill):
+                return fitted
+            still = _filled(draft, fitted)
+            excess_bytes = len(still.data) - room(still)  # the codec's parameters have taken their part
+            if excess_bytes <= 0:
+                return still, fitted
+            limit_bytes = min(limit_bytes, len(still.data)) - excess_bytes
+        return NoStill("too_large")
 
-    def _coded(self, crop: Image, *, rival: _Rival | None, limit_bytes: int) -> tuple[bytes, int] | NoStill:
-        """The asked quality, or the best below it that fits; then upwards until the base crop is beaten."""
-        quality_pct = self.quality_pct
-        data = self.codec.encode(crop, quality_pct=quality_pct).data
-        if len(data) > limit_bytes:
-            fitting = self._best_fitting(crop, limit_bytes)
-            if fitting is None or rival is None:
-                return fitting or NoStill("too_large")
-            beaten = rival.loses_to(self._decoded(fitting[0], crop), crop=crop)
-            return fitting if beaten else NoStill("too_large")
-        ceiling_pct = max(self.ceiling_pct, self.quality_pct)
-        while rival is not None and not rival.loses_to(self._decoded(data, crop), crop=crop):
-            quality_pct += _QUALITY_STEP_PCT
-            if quality_pct > ceiling_pct:
-                return NoStill("base_good")
-            data = self.codec.encode(crop, quality_pct=quality_pct).data
-            if len(data) > limit_bytes:
-                return NoStill("too_large")
-        return data, quality_pct
+    def _cheaper(self, built: Still, fitted: Fitted, cut: Cut, draft: Still) -> Still | None:
+        """The fallback's still, where it shows no less than the one built on the base, in fewer bytes."""
+        codec = self.without_base
+        psnr_db = psnr_y_db(fitted.shown_bgr, cut.crop_bgr)
+        smaller = self._fitter(codec).smallest(cut, psnr_db=psnr_db, limit_bytes=len(built.data))
+        return None if smaller is None else _filled(_of_codec(draft, codec), smaller)
 
-    def _best_fitting(self, crop: Image, limit_bytes: int) -> tuple[bytes, int] | None:
-        """Highest quality from ``floor_pct`` below the asked one that fits, by bisection: at most 5 encodings."""
-        low, high = self.floor_pct, self.quality_pct - 1
-        best = None
-        while low <= high:
-            middle = (low + high + 1) // 2
-            data = self.codec.encode(crop, quality_pct=middle).data
-            if len(data) <= limit_bytes:
-                best, low = (data, middle), middle + 1
-            else:
-                high = middle - 1
-        return best
-
-    def _decoded(self, data: bytes, crop: Image) -> Image:
-        return self.codec.decode(data, size=(crop.shape[1], crop.shape[0]))
-
-
-@dataclass(frozen=True, slots=True)
-class _Rival:
-    """How far the base crop is from the source, and so how far a still may be."""
-
-    box: tuple[slice, slice]
-    limits: tuple[float, ...]
-
-    @classmethod
-    def of(cls, base: Image, *, crop: Image, box: tuple[slice, slice], share: float) -> _Rival:
-        return cls(box=box, limits=tuple(share * error for error in _errors(base, crop, box)))
-
-    def loses_to(self, still: Image, *, crop: Image) -> bool:
-        return all(
-            mine < limit for mine, limit in zip(_errors(still, crop, self.box), self.limits, strict=True)
+    def _fitter(self, codec: StillCodec) -> Fitter:
+        return Fitter(
+            codec,
+            quality_pct=self.quality_pct,
+            fidelity_db=self.fidelity_db,
+            floor_pct=1 if codec.needs_base else self.floor_pct,
+            ceiling_pct=self.ceiling_pct,
         )
 
 
-def _errors(image: Image, crop: Image, box: tuple[slice, slice]) -> tuple[float, ...]:
-    """Sums of squared differences: colour and luma, over the crop and over the box in it."""
-    # Luma of the difference, not difference of the lumas: rounded to bytes these would be off by up to 5 %.
-    colour = cv2.subtract(image, crop, dtype=cv2.CV_32F)
-    luma = cv2.transform(colour, _BT601)
-    return tuple(cv2.norm(one, cv2.NORM_L2SQR) for one in (colour, luma, colour[box], luma[box]))
+def _filled(draft: Still, fitted: Fitted) -> Still:
+    return replace(
+        draft,
+        quality_pct=fitted.quality_pct,
+        data=fitted.data,
+        parameters={**draft.parameters, **fitted.parameters},
+    )
 
 
-def _inner_box(
-    box_source_px: tuple[float, float, float, float],
-    crop_px: tuple[int, int, int, int],
-    size: tuple[int, int],
-) -> tuple[slice, slice]:
-    """The box without its padding as (rows, columns) of the coded crop; never empty."""
-    ranges = []
-    for axis in (1, 0):
-        scale = size[axis] / (crop_px[axis + 2] - crop_px[axis])
-        start = min(max(0, round((box_source_px[axis] - crop_px[axis]) * scale)), size[axis] - 1)
-        end = round((box_source_px[axis + 2] - crop_px[axis]) * scale)
-        ranges.append(slice(start, min(max(end, start + 1), size[axis])))
-    return ranges[0], ranges[1]
-
-
-def _cropped(source_bgr: Image, crop_px: tuple[int, int, int, int], size: tuple[int, int]) -> Image:
-    x1, y1, x2, y2 = crop_px
-    crop = source_bgr[y1:y2, x1:x2]
-    if size != (x2 - x1, y2 - y1):
-        return np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return np.ascontiguousarray(crop)
+def _of_codec(draft: Still, codec: StillCodec) -> Still:
+    return replace(draft, codec=codec.name, media_type=codec.media_type)

@@ -7,37 +7,57 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from hvt_common.distinct import DistinctIds
 from hvt_common.link.wire import StillResult
 from hvt_common.priority import give_way
-from hvt_common.values import AccessUnit, Frame
+from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.choose import Chooser
 from hvt_edge.keyframes import KeyframePlan
 from hvt_edge.send import Sender
 from hvt_edge.sight import Seen, Sight
 
-__all__ = ["StillStage", "StillWorker"]
+__all__ = ["MAX_QUEUE_BYTES", "Reporter", "StillStage", "StillWorker"]
 
 _BEHIND_FRAMES = 3
 """With more frames waiting than this, detection is put off; decoding never is."""
+_LEAST_FRAMES = 2
+MAX_QUEUE_BYTES = 160 * 2**20
+"""Of frames that wait to be seen: 16 of 1280x720 and 1920x1080, 5 of 3840x2160."""
 _FINISH_S = 1.0
 
 
+class Reporter(Protocol):
+    """Tells the ground which tracks the edge has."""
+
+    def report(self, seen: Seen, *, now_ns: int) -> object:
+        """Send the tracks of one decision step, if it wants to."""
+        ...
+
+
 class StillStage:
-    """Takes each frame with its access unit, after the unit was sent."""
+    """Takes each frame with its access unit, if it has one, after the unit was sent.
+
+    With a ``reporter`` the edge's own tracks go out at each decision step, before the stills of it.
+    """
 
     def __init__(
-        self, sight: Sight, chooser: Chooser, *, sender: Sender, keyframes: KeyframePlan, media_type: str
+        self,
+        sight: Sight,
+        chooser: Chooser,
+        *,
+        sender: Sender,
+        keyframes: KeyframePlan,
+        reporter: Reporter | None = None,
     ) -> None:
         self._sight = sight
         self._chooser = chooser
         self._sender = sender
         self._keyframes = keyframes
-        self._media_type = media_type
+        self._reporter = reporter
+        self._latest_tracks: Tracks | None = None
         self._track_ids = DistinctIds()
         self._sight_ns = 0
         self._steps = 0
@@ -46,6 +66,14 @@ class StillStage:
     def tracks(self) -> int:
         """Distinct tracks so far."""
         return self._track_ids.count
+
+    @property
+    def latest_tracks(self) -> Tracks | None:
+        """Those of the frame that `send` took last; None before the first.
+
+        In lockstep it changes at the same point of the frame loop in every run, whatever `see` is doing meanwhile.
+        """
+        return self._latest_tracks
 
     @property
     def waiting(self) -> int:
@@ -57,8 +85,8 @@ class StillStage:
         """Mean time to decode, detect and track, over all frames."""
         return self._sight_ns / max(1, self._steps) / 1e6
 
-    def see(self, frame: Frame, unit: AccessUnit, *, hurry: bool = False) -> Seen:
-        """Decode, detect and track one frame."""
+    def see(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool = False) -> Seen:
+        """Decode, detect and track one frame; ``unit`` is None for one that is not part of the base stream."""
         began_ns = time.perf_counter_ns()
         seen = self._sight.see(frame, unit, hurry=hurry)
         self._sight_ns += time.perf_counter_ns() - began_ns
@@ -72,19 +100,28 @@ class StillStage:
         ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
         asks the plan.
         """
-        room = partial(self._sender.still_room_bytes, now_ns, media_type=self._media_type)
-        self._chooser.consider(seen, now_ns=now_ns, room_bytes=room())
+        self._latest_tracks = seen.tracks
+        if self._reporter is not None and seen.detected:
+            self._reporter.report(seen, now_ns=now_ns)
+        self._chooser.consider(seen, now_ns=now_ns, room_bytes=self._sender.still_room_bytes(now_ns))
         sent: set[int] = set()
         if self._keyframes.due(now_ns) if held is None else held:
             return sent
-        for still in self._chooser.stills(now_ns=now_ns, room_bytes=room):
-            self._sender.still(still, media_type=self._media_type, now_ns=now_ns)
+        for still in self._chooser.stills(
+            now_ns=now_ns, room=lambda one: self._sender.still_room_bytes(now_ns, still=one)
+        ):
+            self._sender.still(still, now_ns=now_ns)
             sent.add(still.sequence)
         return sent
 
     def hear(self, results: Sequence[StillResult]) -> None:
-        """What a ground made of stills counts for the next decision; one without a name is no opinion."""
+        """What a ground made of stills counts for the next decision; one without a name is no opinion.
+
+        A still that it could make nothing of for want of the base frame is sent once more.
+        """
         for result in results:
+            if result.again:
+                self._chooser.ask_again(result.still_sequence)
             if not result.class_name:
                 continue
             self._chooser.record_feedback(
@@ -102,9 +139,9 @@ class StillStage:
 class StillWorker:
     """Runs a `StillStage` in a thread of its own, so that detection never delays the base stream.
 
-    The queue is bounded; where it is `full` the frame loop drops the next frame before encoding. Before each frame
-    the thread asks ``hear`` for what grounds have reported. An error in it ends the process: `full`, `offer` and
-    `close` raise it.
+    The queue is bounded in frames and in bytes; where it is `full` the frame loop drops the next frame before
+    encoding. Before each frame the thread asks ``hear`` for what grounds have reported. An error in it ends the
+    process: `full`, `offer` and `close` raise it.
     """
 
     def __init__(
@@ -114,11 +151,14 @@ class StillWorker:
         hear: Callable[[], Sequence[StillResult]],
         clock: Callable[[], int],
         length: int = 16,
+        max_bytes: int = MAX_QUEUE_BYTES,
     ) -> None:
         self._stage = stage
         self._hear = hear
         self._clock = clock
-        self._frames: queue.Queue[tuple[Frame, AccessUnit] | None] = queue.Queue(length)
+        self._frames: queue.Queue[tuple[Frame, AccessUnit | None] | None] = queue.Queue(length)
+        self._most_frames = length
+        self._max_bytes = max_bytes
         self._error: BaseException | None = None
         self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-stills", daemon=True)
@@ -128,11 +168,14 @@ class StillWorker:
     def full(self) -> bool:
         """Whether the next `offer` would have to wait."""
         self._raise_error()  # a dead thread leaves a full queue, and `offer` is not called any more
-        return self._frames.full()
+        return self._frames.qsize() >= self._most_frames
 
-    def offer(self, frame: Frame, unit: AccessUnit) -> None:
-        """Hand over one frame, in order."""
+    def offer(self, frame: Frame, unit: AccessUnit | None) -> None:
+        """Hand over one frame, in order, with its access unit if it has one."""
         self._raise_error()
+        # All frames of a source have one size, so a bound in bytes is a bound in frames.
+        fitting = self._max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
+        self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
         self._frames.put((frame, unit))
 
     def close(self) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -13,18 +15,23 @@ __all__ = [
     "EVENTS",
     "LATENCY",
     "OVERFLOW",
+    "PATCHES",
     "REFINED",
     "SESSION",
     "STILLS",
+    "TOLD",
     "TRACKS",
     "TRACK_COUNT",
     "VIDEO",
+    "Front",
     "screen",
 ]
 
 VIDEO = "/base/video"
 TRACKS = "/base/tracks"
 REFINED = "/base/refined"
+TOLD = "/base/told"
+PATCHES = "/base/patches"
 STILLS = "/stills"
 CAPTIONS = "/stills/captions"
 OVERFLOW = "/stills/more"
@@ -37,11 +44,16 @@ SESSION = "/session"
 _PAPER = (14, 17, 22)
 """Background behind pictures."""
 
+Front = Literal["tracks", "enhanced"]
+"""The tab that lies in front."""
+
 
 def screen(
-    *, base_size: tuple[int, int], fps: float, budget_bps: float, clocked: bool, live: bool
+    *, base_size: tuple[int, int], fps: float, budget_bps: float, clocked: bool, live: bool, front: Front
 ) -> rrb.Blueprint:
     """Video with boxes, plots below; gallery of stills, session facts and events to the right.
+
+    The video has a second tab: with the stills in their places, and boxes only of tracks that a still has spoken on.
 
     Args:
         base_size: (width, height) of the base stream in pixels.
@@ -49,9 +61,10 @@ def screen(
         budget_bps: The budget in all; sets the height of the bitrate plot.
         clocked: Whether latencies are known; without them their plot is left out.
         live: Follow the newest data, rather than play from the beginning.
+        front: Which of the two tabs of the video is seen first.
     """
-    left = rrb.Vertical(_video(base_size), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
-    right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.35, 0.45, 1.1])
+    left = rrb.Vertical(_videos(base_size, front), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
+    right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.35, 0.62, 0.93])
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1.72, 1.0]),
         rrb.BlueprintPanel(state="hidden"),
@@ -68,12 +81,27 @@ def screen(
     )
 
 
-def _video(base_size: tuple[int, int]) -> rrb.Spatial2DView:
+def _videos(base_size: tuple[int, int], front: Front) -> rrb.Tabs:
+    return rrb.Tabs(
+        _video(base_size, "Base stream and tracks", without=(f"{PATCHES}/**",)),
+        # Boxes say which objects a still has spoken on; thin and without words, for the picture is the matter.
+        _video(base_size, "Enhanced: stills in their places", without=(TRACKS, TOLD), bare=REFINED),
+        active_tab=0 if front == "tracks" else 1,
+    )
+
+
+def _video(
+    base_size: tuple[int, int], name: str, *, without: tuple[str, ...], bare: str | None = None
+) -> rrb.Spatial2DView:
+    style = rr.Boxes2D.from_fields(radii=rr.Radius.ui_points(0.5), show_labels=False)
     return rrb.Spatial2DView(
         origin="/base",
-        name="Base stream and tracks",
+        contents=["/base/**", *(f"- {path}" for path in without)],
+        name=name,
         background=_PAPER,
         visual_bounds=rrb.VisualBounds2D(x_range=[0, base_size[0]], y_range=[0, base_size[1]]),
+        defaults=[rr.EncodedImage.from_fields(media_type="image/jpeg")],
+        overrides={bare: style} if bare is not None else None,
     )
 
 

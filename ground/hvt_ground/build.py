@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Literal, cast
 
 from hvt_common.link.wire import Info
+from hvt_common.vision.camera_motion import CameraMotion
 from hvt_common.vision.classify import Classifier, open_classifier
 from hvt_common.vision.detect import Detector, open_detector, warm_up
 from hvt_common.vision.track import ByteTracker, TrackerSettings, weak_confidence
+from hvt_ground.camera_path import CameraPath
 from hvt_ground.classify_stills import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.config import DETECTOR, NONE, GroundConfig
 from hvt_ground.events import Event
+from hvt_ground.fuse import Fusion, unified_names
 from hvt_ground.refine import Refiner
-from hvt_ground.sight import GroundSight
+from hvt_ground.sight import GroundSight, SightParts
 
 __all__ = ["Models", "make_sight", "output_path"]
 
@@ -58,33 +61,44 @@ def make_sight(
 ) -> GroundSight:
     """The eyes of one session."""
     detector, classifier = models.take()
-    reader: StillReader
-    if classifier is not None:
-        reader = CropReader(classifier)
-    elif config.classifier == DETECTOR:
-        reader = Redetection(detector, view=info.view)
-    else:
-        reader = NoReader()
-    tracker = ByteTracker(
-        TrackerSettings.starting_at(
-            config.confidence, camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion)
+    reader = _reader(config, detector, classifier, info=info)
+    motion = cast('Literal["off", "flow", "ecc"]', config.camera_motion)
+    names, edge_classes = unified_names(detector.class_names, info.class_names)
+    path = CameraPath(ahead_ticks=max(1, round(info.fps)))
+    parts = SightParts(
+        detector=detector,
+        tracker=ByteTracker(
+            TrackerSettings.starting_at(config.confidence, camera_motion=motion), fps=info.fps
         ),
-        fps=info.fps,
-    )
-    return GroundSight(
-        detector,
-        tracker,
         reader=reader,
         refiner=Refiner(
             cast('Literal["replace", "fuse"]', config.refine),
             fps=info.fps,
-            detector_classes=detector.class_names,
+            detector_classes=names,
             classifier_classes=reader.class_names,
         ),
+        fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
+        path=path,
+        camera=None if motion == "off" else CameraMotion(motion, scale=None),
+    )
+    return GroundSight(
+        parts,
         view=info.view,
+        fps=info.fps,
         detect_every=config.detect_every,
         emit=emit,
+        wants_base=isinstance(reader, Redetection),
     )
+
+
+def _reader(
+    config: GroundConfig, detector: Detector, classifier: Classifier | None, *, info: Info
+) -> StillReader:
+    if classifier is not None:
+        return CropReader(classifier, view=info.view)
+    if config.classifier == DETECTOR:
+        return Redetection(detector, view=info.view)
+    return NoReader()
 
 
 def output_path(wish: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:

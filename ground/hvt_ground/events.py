@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hvt_common.values import Boxes, Image
 
-__all__ = ["Enhanced", "Event", "Notice", "Origin", "Overlay", "Refinement", "Traffic", "VideoSample"]
+__all__ = ["Event", "Notice", "Origin", "Overlay", "Refinement", "Traffic", "VideoSample"]
 
 Origin = Literal["base", "edge", "edge+base", "still"]
 """Who knows of a track: the ground's own tracker on the base stream, the edge's report, both, or (``still``) nobody
@@ -33,7 +33,10 @@ class VideoSample:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """The ground's tracks at one frame, as parallel arrays ordered by track id."""
+    """The ground's tracks at one frame, as parallel arrays ordered by track id.
+
+    A tick that the base stream left out may have one too: what the edge reported, and the others predicted.
+    """
 
     frame_index: int
     capture_ns: int
@@ -55,7 +58,10 @@ class Overlay:
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """A still that was decoded and classified, and what it did."""
+    """A still that was decoded and classified, and what it did to one object.
+
+    A still that shows several objects makes one event for each, under the same number.
+    """
 
     frame_index: int
     capture_ns: int
@@ -76,18 +82,11 @@ class Refinement:
     reason: str
     """Why the edge's method sent it."""
     quality_pct: int
-
-
-@dataclass(frozen=True, slots=True)
-class Enhanced:
-    """The decoded base frame with the stills of that frame pasted in at their places: what the ground knows best."""
-
-    frame_index: int
-    capture_ns: int
-    image_bgr: Image
-    """At base resolution."""
-    boxes_base_px: Boxes
-    """(N, 4) where the N stills were pasted."""
+    still_bgr: Image | None = None
+    """The decoded still; needed where ``media_type`` is none that any viewer reads, such as a residual."""
+    crop_base_px: tuple[float, float, float, float] | None = None
+    """x1 y1 x2 y2, where the whole still lies in the base picture of its own frame (that of ``box_base_px``), not
+    clipped; None leaves it out of the enhanced picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,4 +118,4 @@ class Notice:
     text: str
 
 
-Event = VideoSample | Overlay | Refinement | Enhanced | Traffic | Notice
+Event = VideoSample | Overlay | Refinement | Traffic | Notice

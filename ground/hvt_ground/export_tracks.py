@@ -10,9 +10,11 @@ from hvt_ground.events import Event, Overlay
 
 __all__ = ["COLUMNS", "TrackTable"]
 
-COLUMNS = ("frame", "id", "x", "y", "w", "h", "confidence", "base_class", "class", "refined")
-"""``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``base_class`` is what the detector
-says of the base stream, ``class`` the same after refinement, ``refined`` 1 once a still has spoken."""
+COLUMNS = ("frame", "id", "x", "y", "w", "h", "confidence", "base_class", "class", "refined", "origin")
+"""``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``base_class`` is what the detectors
+say without stills, ``class`` the same after refinement, ``refined`` 1 once a still has spoken, ``origin`` who knows
+of the track: ``base``, ``edge``, ``edge+base`` or ``still``. A tick that the base stream left out has lines too where
+the edge reported it."""
 
 
 class TrackTable:
@@ -32,6 +34,7 @@ class TrackTable:
         """Append the tracks of an overlay."""
         if not isinstance(event, Overlay):
             return
+        origins = event.origins or ("base",) * len(event.track_ids)
         for row, track_id in enumerate(event.track_ids.tolist()):
             x1, y1, x2, y2 = event.boxes_base_px[row].tolist()
             self._writer.writerow(
@@ -46,6 +49,7 @@ class TrackTable:
                     event.base_classes[row],
                     event.classes[row],
                     int(event.refined[row]),
+                    origins[row],
                 )
             )
 

@@ -14,6 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
 from hvt_common.priority import give_way
+from hvt_common.values import Tracks
 from hvt_ground.sight import Picture, ReceivedStill
 
 __all__ = ["Eyes", "LockstepEyes", "RealtimeEyes"]
@@ -23,12 +24,19 @@ _WAITING_PICTURES = 24
 _BEHIND_PICTURES = 1
 _STILLS_AT_ONCE = 16
 _WAITING_STILLS = 256
+_WAITING_STEPS = 8
+"""Reports of the edge's tracks: the newest count, each says all."""
+_STEP_LAG = 2
+"""In lockstep a step counts from so many ticks on. It is sent right before the next access unit, which may overtake
+it by microseconds: this is what makes the order the same in every run."""
 _FINISH_S = 1.5
 _LEAVE_S = 1.0
 _AHEAD = 2
 
 See = Callable[[Picture, bool], None]
 """Called with a picture, and whether to hurry."""
+Step = Callable[[Tracks, int], None]
+"""Called with what the edge tracked at one tick, and that tick's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
 
 
@@ -49,6 +57,10 @@ class Eyes(Protocol):
         """Hand over a decoded frame."""
         ...
 
+    def step(self, tracks: Tracks, capture_ns: int) -> None:
+        """Hand over what the edge tracked at one tick."""
+        ...
+
     def still(self, still: ReceivedStill) -> None:
         """Hand over a still."""
         ...
@@ -65,13 +77,15 @@ class Eyes(Protocol):
 class RealtimeEyes:
     """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still."""
 
-    def __init__(self, see: See, read: Read, *, name: str) -> None:
+    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
         self._see = see
+        self._step = step
         self._read = read
         self.untracked = 0
         self.dropped: Counter[str] = Counter()
         self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
         self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
+        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
         self._wake = threading.Event()
         self._ending = threading.Event()
         self._given_up = threading.Event()
@@ -82,7 +96,7 @@ class RealtimeEyes:
     @property
     def idle(self) -> bool:
         """Nothing waits."""
-        return self._pictures.empty() and self._stills.empty()
+        return self._pictures.empty() and self._stills.empty() and not self._steps
 
     def picture(self, picture: Picture) -> None:
         """Queue a frame; where the queue is full the oldest goes untracked."""
@@ -96,6 +110,11 @@ class RealtimeEyes:
                     self.untracked += 1
                 except queue.Empty:
                     continue
+        self._wake.set()
+
+    def step(self, tracks: Tracks, capture_ns: int) -> None:
+        """Queue a report of tracks; where the queue is full the oldest goes."""
+        self._steps.append((tracks, capture_ns))
         self._wake.set()
 
     def still(self, still: ReceivedStill) -> None:
@@ -136,7 +155,7 @@ class RealtimeEyes:
             self._error = error
 
     def _work_off(self) -> None:
-        """See all pictures that came before the stills taken here, then read these."""
+        """See all pictures that came before the stills taken here, then the edge's tracks, then read the stills."""
         stills: list[ReceivedStill] = []
         while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
             stills.append(self._stills.get_nowait())
@@ -146,6 +165,8 @@ class RealtimeEyes:
             except queue.Empty:
                 break
             self._see(picture, self._pictures.qsize() > _BEHIND_PICTURES)
+        while self._steps and not self._given_up.is_set():
+            self._step(*self._steps.popleft())
         if stills:
             self._read(stills)
             self._wake.set()
@@ -154,13 +175,15 @@ class RealtimeEyes:
 class LockstepEyes:
     """Sees one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
 
-    def __init__(self, see: See, read: Read, *, name: str) -> None:
+    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
         self._see = see
+        self._step = step
         self._read = read
         self.untracked = 0
         self.dropped: Counter[str] = Counter()
         self._pending: deque[Future[None]] = deque()
         self._early: list[ReceivedStill] = []
+        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
         self._newest_frame = -1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-sight-{name}")
 
@@ -171,12 +194,17 @@ class LockstepEyes:
 
     def picture(self, picture: Picture) -> None:
         """See a frame, and read the stills of it that overtook it on the link."""
+        self._take_steps(before=picture.frame_index - _STEP_LAG + 1)
         self._newest_frame = picture.frame_index
         self._submit(self._worker.submit(self._see, picture, False))
         known = [one for one in self._early if one.header.frame_index <= self._newest_frame]
         if known:
             self._early = [one for one in self._early if one.header.frame_index > self._newest_frame]
             self._submit(self._worker.submit(self._read, known))
+
+    def step(self, tracks: Tracks, capture_ns: int) -> None:
+        """Take in a report of tracks before the frame that comes so many ticks later."""
+        self._steps.append((tracks, capture_ns))
 
     def still(self, still: ReceivedStill) -> None:
         """Read a still once its frame has been seen."""
@@ -191,6 +219,7 @@ class LockstepEyes:
     def close(self) -> bool:
         """Finish what waits."""
         try:
+            self._take_steps(before=None)
             while self._pending:
                 self._pending.popleft().result()
         finally:
@@ -200,6 +229,10 @@ class LockstepEyes:
 
     def raise_error(self) -> None:
         """Errors come out of `picture`, `still` and `close`."""
+
+    def _take_steps(self, *, before: int | None) -> None:
+        while self._steps and (before is None or self._steps[0][0].frame_index < before):
+            self._submit(self._worker.submit(self._step, *self._steps.popleft()))
 
     def _submit(self, future: Future[None]) -> None:
         self._pending.append(future)

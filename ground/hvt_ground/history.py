@@ -2,18 +2,21 @@
 
 A still arrives after its frame: it is matched to the tracks of that very frame and shown beside (or pasted
 into) the decoded picture of it. Tracks are small and kept for `track_frames`. Pictures are large: 1280x720 BGR
-is 2.7 MB, so the default bound of 96 MiB is 36 frames, 2.4 s at 15 fps. They are kept just as given, without
-a lossy detour, because a residual still must be applied to exactly the pixels that the edge had; a caller
-that hands in planar YUV 4:2:0 gets the same back and keeps twice as many.
+is 2.7 MB, so the default bound of 96 MiB is 36 frames, 2.4 s at 15 fps. Where the edge codes fewer frames than there
+are ticks, the same 36 reach back further. They are kept just as given, without a lossy detour, because a residual
+still must be applied to exactly the pixels that the edge had.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import replace
+
+import numpy as np
 
 from hvt_common.values import Image, Tracks
 
-__all__ = ["History"]
+__all__ = ["FilledLog", "History"]
 
 DEFAULT_MAX_BYTES = 96 * 1024 * 1024
 
@@ -70,13 +73,54 @@ class History:
         if len(self._tracks) > self._track_frames:
             self._tracks.popitem(last=False)
 
+    def revise_tracks(self, tracks: Tracks) -> None:
+        """Put in what is known by now of a frame, whether it has tracks here or not; what is too old stays out."""
+        if self.oldest_tracked is None or tracks.frame_index > (self.newest_tracked or 0):
+            self.add_tracks(tracks)
+        elif tracks.frame_index in self._tracks:
+            self._tracks[tracks.frame_index] = tracks
+        elif tracks.frame_index > self.oldest_tracked:
+            self._tracks[tracks.frame_index] = tracks
+            self._tracks = OrderedDict(sorted(self._tracks.items()))
+            if len(self._tracks) > self._track_frames:
+                self._tracks.popitem(last=False)
+
     def frame(self, frame_index: int) -> Image | None:
         """The picture of that frame as it was given; None if it was never decoded or is gone."""
         return self._frames.get(frame_index)
 
+    def frame_before(self, frame_index: int, *, within: int) -> Image | None:
+        """The picture of that frame or, where it was left out, of the newest one up to ``within`` frames before."""
+        exact = self._frames.get(frame_index)
+        if exact is not None:
+            return exact
+        before = [index for index in self._frames if frame_index - within <= index < frame_index]
+        return self._frames[before[-1]] if before else None
+
     def tracks(self, frame_index: int) -> Tracks | None:
         """The tracks at that frame; None if it was lost, is not tracked yet, or is gone."""
         return self._tracks.get(frame_index)
+
+    def tracks_between(self, frame_index: int, *, within: int) -> Tracks | None:
+        """The tracks at a frame that was left out, between those of the frames around it; None for any other.
+
+        Only tracks that are there before and after, no more than ``within`` frames apart, and on a straight line.
+        """
+        if frame_index in self._tracks:
+            return None
+        before = next((one for one in reversed(self._tracks) if one < frame_index), None)
+        after = next((one for one in self._tracks if one > frame_index), None)
+        if before is None or after is None or after - before > within:
+            return None
+        share = (frame_index - before) / (after - before)
+        return _between(self._tracks[before], self._tracks[after], frame_index, share=share)
+
+    def rename_track(self, kept_id: int, gone_id: int) -> None:
+        """Two tracks have turned out to be one: where only the second is listed it gets the id of the first."""
+        for index, tracks in self._tracks.items():
+            if gone_id in tracks.ids and kept_id not in tracks.ids:
+                ids = np.where(tracks.ids == gone_id, kept_id, tracks.ids)
+                self._tracks[index] = replace(tracks, ids=ids)
 
     def clear(self) -> None:
         """Forget everything: a new session counts its frames from 0 again."""
@@ -91,3 +135,41 @@ class History:
 def _require_rising(newest: int | None, frame_index: int) -> None:
     if newest is not None and frame_index <= newest:
         raise ValueError(f"frame {frame_index} after frame {newest}: frames rise; clear() begins a session")
+
+
+def _between(before: Tracks, after: Tracks, frame_index: int, *, share: float) -> Tracks:
+    _, old, new = np.intersect1d(before.ids, after.ids, assume_unique=True, return_indices=True)
+    boxes = (1 - share) * before.boxes_xyxy_px[old] + share * after.boxes_xyxy_px[new]
+    return Tracks(
+        frame_index=frame_index,
+        ids=before.ids[old],
+        boxes_xyxy_px=boxes.astype(np.float32),
+        confidences=before.confidences[old],
+        class_ids=before.class_ids[old],
+        born_frames=before.born_frames[old],
+        seen_frames=before.seen_frames[old],
+        started=np.zeros(len(old), np.bool_),
+    )
+
+
+class FilledLog:
+    """The tracks of a `History`, those between two frames filled in: a still may be of a tick without a picture."""
+
+    def __init__(self, history: History, *, within: int) -> None:
+        self._history = history
+        self._within = within
+
+    @property
+    def oldest_tracked(self) -> int | None:
+        """Frame index of the oldest tracks held."""
+        return self._history.oldest_tracked
+
+    @property
+    def newest_tracked(self) -> int | None:
+        """Frame index of the newest tracks held."""
+        return self._history.newest_tracked
+
+    def tracks(self, frame_index: int) -> Tracks | None:
+        """The tracks at that frame, or between those around it."""
+        exact = self._history.tracks(frame_index)
+        return self._history.tracks_between(frame_index, within=self._within) if exact is None else exact

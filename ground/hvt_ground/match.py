@@ -16,7 +16,7 @@ that has it.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +42,7 @@ Floats = npt.NDArray[np.float64]
 class Wanted:
     """A still for which a track is wanted."""
 
-    key: int
+    key: Hashable
     edge_track_id: int
     """Negative where the still belongs to no track of the edge."""
     box_base_px: tuple[float, float, float, float]
@@ -79,7 +79,7 @@ class Matcher:
 
     def match(
         self, wanted: Sequence[Wanted], tracks: Tracks, *, later: Iterable[Tracks], class_names: Sequence[str]
-    ) -> dict[int, Candidate]:
+    ) -> dict[Hashable, Candidate]:
         """A `Candidate` for each key of ``wanted``, all of which are stills of the frame of ``tracks``.
 
         ``later`` are the tracks of the following frames, in order, as far as a late confirmation counts.
@@ -99,6 +99,15 @@ class Matcher:
             known = np.union1d(known, after.ids)
         return {want.key: found[group[0].key] for group in groups for want in group}
 
+    def merge(self, kept_id: int, gone_id: int) -> None:
+        """Two ground tracks have turned out to be one, which goes on under the first id."""
+        for edge_id, (ground_id, frame_index) in self._ground_of.items():
+            if ground_id == gone_id:
+                self._ground_of[edge_id] = (kept_id, frame_index)
+        owner = self._edge_of.pop(gone_id, None)
+        if owner is not None:
+            self._edge_of.setdefault(kept_id, owner)
+
     def _assign(
         self,
         groups: Sequence[Sequence[Wanted]],
@@ -106,7 +115,7 @@ class Matcher:
         rows: npt.NDArray[np.intp],
         frame_index: int,
         class_names: Sequence[str],
-    ) -> dict[int, Candidate]:
+    ) -> dict[Hashable, Candidate]:
         """One to one among the tracks in ``rows``, by the key of each group's first; finds are remembered."""
         heads = [group[0] for group in groups]
         found = {head.key: Candidate() for head in heads}
@@ -184,7 +193,7 @@ def iou_matrix(boxes_a_px: Boxes, boxes_b_px: Boxes) -> Floats:
 
 
 def _by_edge_track(wanted: Sequence[Wanted]) -> list[list[Wanted]]:
-    groups: dict[tuple[str, int], list[Wanted]] = {}
+    groups: dict[tuple[str, Hashable], list[Wanted]] = {}
     for want in wanted:
         of_track = want.edge_track_id >= 0
         groups.setdefault(("track", want.edge_track_id) if of_track else ("still", want.key), []).append(want)

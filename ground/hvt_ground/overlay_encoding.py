@@ -1,7 +1,7 @@
 """What of an overlay is worth writing: only what a viewer would see change.
 
 A recording answers "what was here at frame N" with the latest value of every component, so a value that did not
-change need not be written again. Tracks are split into two layers, those whose class rests on the base stream
+change need not be written aga two layers, those whose class rests on the base stream
 alone and those that a still has spoken on. Each layer has *geometry* (centres and half sizes), *identity* (ids and
 classes), *labels* and *confidences*; each is written when it changed.
 
@@ -18,12 +18,14 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from hvt_ground.events import Overlay
+from hvt_ground.events import Origin, Overlay
 
 __all__ = [
     "CENTRE_STEP_PX",
     "HALF_SIZE_STEP_PX",
     "LAYERS",
+    "ORIGINS",
+    "TOLD_MARK",
     "Geometry",
     "Identity",
     "Layer",
@@ -36,8 +38,14 @@ CENTRE_STEP_PX = 0.75
 HALF_SIZE_STEP_PX = 1.0
 CONFIDENCE_STEP_PCT = 5
 
-Layer = Literal["tracks", "refined"]
-LAYERS: tuple[Layer, Layer] = ("tracks", "refined")
+Layer = Literal["tracks", "told", "refined"]
+LAYERS: tuple[Layer, ...] = ("tracks", "told", "refined")
+
+ORIGINS: tuple[Origin, ...] = ("base", "edge", "edge+base", "still")
+"""Origins by the number that stands for them in a recording."""
+
+TOLD_MARK = "○"
+_TOLD: tuple[Origin, ...] = ("edge", "still")
 
 _BOX_BYTES = 16  # two centres and two half sizes, float32
 _ROW_BYTES = 40  # row id, two times, offsets
@@ -72,6 +80,8 @@ class LayerUpdate:
     labels: tuple[str, ...] | None
     """N texts; never in the layer that is drawn without."""
     confidences_pct: tuple[int, ...] | None
+    origins: tuple[int, ...] | None = None
+    """N numbers of `ORIGINS`; never while all tracks are of the base stream."""
 
     @property
     def empty(self) -> bool:
@@ -81,6 +91,7 @@ class LayerUpdate:
             and self.identity is None
             and self.labels is None
             and self.confidences_pct is None
+            and self.origins is None
         )
 
 
@@ -105,6 +116,8 @@ class OverlayEncoder:
         self._share = share
         self._limit = float(credit_bytes)
         self._credit = float(credit_bytes)
+        self._newest_frame = -1
+        self._told_of = False
         self._shown = _Shown(
             np.empty(0, np.int64),
             np.empty((0, 2), np.float32),
@@ -112,7 +125,7 @@ class OverlayEncoder:
             np.empty(0, np.int64),
         )
         self._written: dict[Layer, LayerUpdate] = {
-            layer: LayerUpdate(layer, None, Identity((), (), ()), (), ()) for layer in LAYERS
+            layer: LayerUpdate(layer, None, Identity((), (), ()), (), (), ()) for layer in LAYERS
         }
 
     def earn(self, received_bytes: int) -> None:
@@ -120,9 +133,16 @@ class OverlayEncoder:
         self._credit = min(self._credit + self._share * received_bytes, self._limit)
 
     def encode(self, overlay: Overlay) -> list[LayerUpdate]:
-        """The updates that bring the screen to ``overlay``; none where nothing visible changed."""
+        """The updates that bring the screen to ``overlay``; none where nothing visible changed.
+
+        An overlay of an earlier frame than the last has been drawn over, and changes nothing.
+        """
+        if overlay.frame_index < self._newest_frame:
+            return []
+        self._newest_frame = overlay.frame_index
+        self._told_of = self._told_of or any(origin != "base" for origin in overlay.origins)
         shown = _held(self._shown, overlay)
-        wanted = [_layer(layer, overlay, shown) for layer in LAYERS]
+        wanted = [_layer(layer, overlay, shown, with_origins=self._told_of) for layer in LAYERS]
         updates = [_difference(self._written[update.layer], update) for update in wanted]
         updates = [update for update in updates if not update.empty]
         if not self._affordable(updates):
@@ -172,23 +192,38 @@ def _held(shown: _Shown, overlay: Overlay) -> _Shown:
     return result
 
 
-def _layer(layer: Layer, overlay: Overlay, shown: _Shown) -> LayerUpdate:
+def _layer(layer: Layer, overlay: Overlay, shown: _Shown, *, with_origins: bool) -> LayerUpdate:
     """Everything about one layer."""
     labelled = layer == "refined"
-    chosen = np.flatnonzero(overlay.refined if labelled else ~overlay.refined)
+    origins = overlay.origins or ("base",) * len(overlay.track_ids)
+    told = np.array([origin in _TOLD for origin in origins], np.bool_)
+    of_layer = {
+        "tracks": ~overlay.refined & ~told,
+        "told": ~overlay.refined & told,
+        "refined": overlay.refined,
+    }
+    chosen = np.flatnonzero(of_layer[layer])
     identity = Identity(
         track_ids=tuple(int(i) for i in overlay.track_ids[chosen]),
         classes_before=tuple(overlay.base_classes[i] for i in chosen),
         classes_after=tuple(overlay.classes[i] for i in chosen),
     )
     percent = tuple(int(p) for p in shown.confidences_pct[chosen])
-    parts = zip(identity.track_ids, identity.classes_before, identity.classes_after, percent, strict=True)
+    parts = zip(
+        identity.track_ids,
+        identity.classes_before,
+        identity.classes_after,
+        percent,
+        told[chosen].tolist(),
+        strict=True,
+    )
     return LayerUpdate(
         layer=layer,
         geometry=Geometry(shown.centres[chosen], shown.half_sizes[chosen]),
         identity=identity,
         labels=tuple(_label(*part) for part in parts) if labelled else (),
         confidences_pct=percent,
+        origins=tuple(ORIGINS.index(origins[i]) for i in chosen) if with_origins else (),
     )
 
 
@@ -197,14 +232,14 @@ def _difference(old: LayerUpdate, new: LayerUpdate) -> LayerUpdate:
     assert old.identity is not None
     assert new.identity is not None
     same_tracks = old.identity.track_ids == new.identity.track_ids
+    same_percent = same_tracks and old.confidences_pct == new.confidences_pct
     return LayerUpdate(
         layer=new.layer,
         geometry=None if same_tracks and _alike(old.geometry, new.geometry) else new.geometry,
         identity=None if old.identity == new.identity else new.identity,
         labels=None if old.labels == new.labels else new.labels,
-        confidences_pct=None
-        if same_tracks and old.confidences_pct == new.confidences_pct
-        else new.confidences_pct,
+        confidences_pct=None if same_percent else new.confidences_pct,
+        origins=None if old.origins == new.origins else new.origins,
     )
 
 
@@ -216,11 +251,12 @@ def _alike(old: Geometry | None, new: Geometry | None) -> bool:
     )
 
 
-def _label(track_id: int, before: str, after: str, confidence_pct: int) -> str:
+def _label(track_id: int, before: str, after: str, confidence_pct: int, told: bool) -> str:  # noqa: FBT001
     """``17 ✓`` where the still agreed with the base stream, ``17 car → van .93`` where it did not."""
+    mark = f" {TOLD_MARK}" if told else ""
     if before == after:
-        return f"{track_id} ✓"
-    return f"{track_id} {before} → {after} {confidence_text(confidence_pct)}"
+        return f"{track_id} ✓{mark}"
+    return f"{track_id} {before} → {after} {confidence_text(confidence_pct)}{mark}"
 
 
 def confidence_text(percent: int) -> str:

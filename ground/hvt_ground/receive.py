@@ -13,6 +13,7 @@ from hvt_common import __version__
 from hvt_common.link.clock import ClockOffset
 from hvt_common.link.inbox import Received
 from hvt_common.link.keys import DELIVERIES, Row, parse_key
+from hvt_common.link.ledger import Channel
 from hvt_common.link.wire import (
     MAX_STILL_RESULTS,
     BaseHeader,
@@ -20,6 +21,7 @@ from hvt_common.link.wire import (
     Info,
     RoiHeader,
     Status,
+    TrackStep,
     UnknownVersionError,
     WireError,
 )
@@ -120,6 +122,8 @@ class EdgeReceiver:
                 self._base(BaseHeader.parse(item.attachment, item.payload), item)
             elif row is Row.ROI:
                 self._still(RoiHeader.parse(item.attachment, item.payload), item)
+            elif row is Row.TRACKS:
+                self._tracks(TrackStep.parse(item.payload), item)
             elif row is Row.STATUS:
                 self._status(Status.parse(item.payload), item)
         except WireError as error:
@@ -158,6 +162,13 @@ class EdgeReceiver:
             return
         media_type = item.encoding.partition(";")[0] or DELIVERIES[Row.ROI].encoding
         session.still(header, item, media_type=media_type)
+
+    def _tracks(self, step: TrackStep, item: Received) -> None:
+        session = self.session
+        if session is None or step.session_id != session.info.session_id:
+            self._skip("tracks", WireError("tracks of another session"))
+            return
+        session.tracks(step, item)
 
     def _status(self, status: Status, item: Received) -> None:
         session = self.session
@@ -253,7 +264,9 @@ class EdgeReceiver:
         if self._ended_ns is not None and session.last_status is not None:
             wanted = session.last_status.base_messages, session.last_status.roi_messages
             have = session.frames_received, session.stills_received
-            complete = have[0] >= wanted[0] and have[1] >= wanted[1]
+            # A report does not count itself. Track steps have no number of their own there: they are metadata.
+            metadata = session.ledger.messages(Channel.META) > session.last_status.meta_messages
+            complete = have[0] >= wanted[0] and have[1] >= wanted[1] and metadata
             return complete or now_ns - self._ended_ns > _ENDED_PATIENCE_NS
         return not self.port.present.is_set() and now_ns - self._heard_ns > _GONE_NS
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -19,31 +19,30 @@ from rerun.chunk import Chunk
 
 from hvt_common.units import bitrate_text
 from hvt_ground import blueprint as names
+from hvt_ground.blueprint import Front
 from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
-from hvt_ground.gallery import SLOTS, Gallery, placed
 from hvt_ground.live_view import LiveSink
-from hvt_ground.overlay_encoding import LAYERS, Identity, Layer, OverlayEncoder
-from hvt_ground.palette import AMBER, GREY, VERMILLION, Rgb, class_colour
+from hvt_ground.overlay_encoding import LAYERS, Identity, Layer, LayerUpdate, OverlayEncoder
+from hvt_ground.palette import AMBER, GREY, VERMILLION, Rgb
+from hvt_ground.record_stills import Row, StillRows
+from hvt_ground.recording_room import TABLE_BYTES, Room
 from hvt_ground.rrd_file import RrdEncoder, RrdFile
 from hvt_ground.rrd_footer import add_footer
 from hvt_ground.rrd_tables import (
-    Captions,
     CodedIdentity,
-    Picture,
     Table,
     Text,
     box_columns,
-    caption_columns,
     confidence_columns,
-    hidden_picture_columns,
     identity_columns,
     label_columns,
     line_columns,
-    picture_columns,
+    origin_columns,
     text_columns,
+    told_columns,
+    told_identity_columns,
     video_columns,
 )
-from hvt_ground.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
 from hvt_ground.unchanging import class_chunk, unchanging_chunks
 
 __all__ = ["APPLICATION_ID", "FOLD_BYTES", "Recorder", "RecorderSettings"]
@@ -54,16 +53,10 @@ APPLICATION_ID = "hvt"
 FOLD_BYTES = 3 << 19
 """Payload of the journal at which it is folded; a fold costs some 50 kB, and this much is held in memory."""
 
-FIXED_BYTES = 100_000
-"""About what the blueprint and the static values cost."""
-
-HIDDEN_CROP_RATIO = 1.3
-"""A still that is not shown keeps its base crop while the recording is smaller than this times the bytes received."""
-
 DIMMED = 0.75
 """Brightness of the boxes that no still has spoken on, beside those one has."""
 
-_LAYER_PATHS: dict[Layer, str] = {"tracks": names.TRACKS, "refined": names.REFINED}
+_LAYER_PATHS: dict[Layer, str] = {"tracks": names.TRACKS, "told": names.TOLD, "refined": names.REFINED}
 _NOTICE_COLOURS: dict[str, Rgb] = {"info": GREY, "warning": AMBER, "error": VERMILLION}
 _NOTICE_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
@@ -87,6 +80,8 @@ class RecorderSettings:
     """Further lines of the session panel: ``{"method": "M5", "source": "clip.mp4"}``."""
     clocked: bool = True
     """Whether latencies will be known; False leaves their plot out."""
+    front: Front = "tracks"
+    """The tab of the video that is seen first."""
     live_url: str | None = None
     """Where a viewer listens, from `hvt_ground.live_view`; None shows nothing live."""
 
@@ -105,15 +100,13 @@ class Recorder:
         self._settings = settings
         self._lock = threading.Lock()
         self._overlays = OverlayEncoder()
-        self._gallery = Gallery()
-        self._captions: Captions = (("", GREY),) * SLOTS
+        self._room = Room()
+        self._stills = StillRows(self._room)
         self._class_ids: dict[str, int] = {}
         self._classes_written: dict[Layer, int] = dict.fromkeys(LAYERS, 0)
         self._contexts: dict[Layer, Chunk] = {}
         self._tables: dict[tuple[str, str], Table[Any]] = {}
         self._pending_bytes = 0
-        self._received_bytes = 0
-        self._logged_bytes = FIXED_BYTES
         self._last_sample: int | None = None
         self._closed = False
         self._file = RrdFile(settings.path) if settings.path is not None else None
@@ -190,6 +183,7 @@ class Recorder:
                 budget_bps=settings.budget_bps,
                 clocked=settings.clocked,
                 live=sink is self._live,
+                front=settings.front,
             )
             data = sink.blueprint(screen) + sink.chunks(chunks)
             if sink is self._encoder and self._file is not None:
@@ -220,9 +214,14 @@ class Recorder:
         table = self._tables.get(key)
         if table is None:
             table = self._tables[key] = Table(path, columns)
+        if not table:
+            self._room.logged_bytes += TABLE_BYTES
         self._pending_bytes += size_bytes
-        self._logged_bytes += size_bytes
+        self._room.logged_bytes += size_bytes
         return table.add(event.frame_index, event.capture_ns, value)
+
+    def _rows(self, rows: Sequence[Row], event: Event) -> list[Chunk]:
+        return [self._row(row.path, row.columns, event, row.value, size_bytes=row.size_bytes) for row in rows]
 
     # -- the events -------------------------------------------------------------------------------------------
 
@@ -232,7 +231,8 @@ class Recorder:
             return []
         self._last_sample = sample.frame_index
         size = len(sample.data)
-        self._earn(size)
+        self._room.received_bytes += size
+        self._overlays.earn(size)
         return [self._row(names.VIDEO, video_columns, sample, sample.data, size_bytes=size)]
 
     def _decodable(self, sample: VideoSample) -> bool:
@@ -242,19 +242,26 @@ class Recorder:
         return sample.frame_index > self._last_sample and bool(sample.data)
 
     def _overlay(self, overlay: Overlay) -> list[Chunk]:
-        chunks = []
+        chunks = self._rows(self._stills.overlay(overlay), overlay)
         for update in self._overlays.encode(overlay):
-            path = _LAYER_PATHS[update.layer]
-            if update.geometry is not None:
-                size = 6 * len(update.geometry.centres_px)
-                chunks.append(self._row(path, box_columns, overlay, update.geometry, size_bytes=size))
-            if update.identity is not None:
-                chunks += self._identity(overlay, update.layer, update.identity)
-            if update.labels is not None:
-                size = 5 * len(update.labels)
-                chunks.append(self._row(path, label_columns, overlay, update.labels, size_bytes=size))
-            if update.confidences_pct is not None:
-                chunks.append(self._row(path, confidence_columns, overlay, update.confidences_pct))
+            chunks += self._layer(overlay, update)
+        return chunks
+
+    def _layer(self, overlay: Overlay, update: LayerUpdate) -> list[Chunk]:
+        path, chunks = _LAYER_PATHS[update.layer], []
+        if update.geometry is not None:
+            size = 6 * len(update.geometry.centres_px)
+            columns = told_columns if update.layer == "told" else box_columns
+            chunks.append(self._row(path, columns, overlay, update.geometry, size_bytes=size))
+        if update.identity is not None:
+            chunks += self._identity(overlay, update.layer, update.identity)
+        if update.labels is not None:
+            size = 5 * len(update.labels)
+            chunks.append(self._row(path, label_columns, overlay, update.labels, size_bytes=size))
+        if update.confidences_pct is not None:
+            chunks.append(self._row(path, confidence_columns, overlay, update.confidences_pct))
+        if update.origins is not None:
+            chunks.append(self._row(path, origin_columns, overlay, update.origins))
         return chunks
 
     def _identity(self, overlay: Overlay, layer: Layer, identity: Identity) -> list[Chunk]:
@@ -271,58 +278,18 @@ class Recorder:
             )
             chunks.append(self._contexts[layer])
         size = 2 * len(identity.track_ids)
-        chunks.append(self._row(_LAYER_PATHS[layer], identity_columns, overlay, coded, size_bytes=size))
+        columns = told_identity_columns if layer == "told" else identity_columns
+        chunks.append(self._row(_LAYER_PATHS[layer], columns, overlay, coded, size_bytes=size))
         return chunks
 
     def _class_id(self, name: str) -> int:
         return self._class_ids.setdefault(name, len(self._class_ids))
 
     def _refinement(self, refinement: Refinement) -> list[Chunk]:
-        changed = refinement.class_before != refinement.class_after
-        colour = class_colour(refinement.class_after)
-        told = Text(event_text(refinement), "INFO", colour if changed else GREY)
-        chunks = [self._row(names.EVENTS, text_columns, refinement, told, size_bytes=len(told.text))]
-        still = still_picture(refinement)
-        if still is None:
-            return chunks
-        self._earn(len(refinement.still))
-        base = base_picture(refinement, still_size=still[1], limit_bytes=round(0.8 * len(refinement.still)))
-        slot = self._gallery.take(refinement.capture_ns, changed=changed)
-        if slot is None:
-            return chunks + self._hidden_pair(refinement, base, still)
-        # A slot's old base crop must not stand beside a new still: the frame's absence is shown as a blank.
-        chunks += self._pair(refinement, slot, base or BLANK, still)
-        captions = list(self._captions)
-        captions[slot] = (caption(refinement), colour)
-        self._captions = tuple(captions)
-        return [
-            *chunks,
-            self._row(names.CAPTIONS, caption_columns, refinement, self._captions, size_bytes=160),
-        ]
-
-    def _hidden_pair(self, refinement: Refinement, base: Coded | None, still: Coded) -> list[Chunk]:
-        """All slots are held: kept where it can be found but not seen, the base crop as far as bytes allow."""
-        data = still[0]
-        path = names.OVERFLOW
-        chunks = [self._row(f"{path}/still", hidden_picture_columns, refinement, data, size_bytes=len(data))]
-        if base is not None and self._logged_bytes < HIDDEN_CROP_RATIO * self._received_bytes:
-            data = base[0]
-            chunks.append(
-                self._row(f"{path}/base", hidden_picture_columns, refinement, data, size_bytes=len(data))
-            )
-        return chunks
-
-    def _earn(self, received_bytes: int) -> None:
-        self._received_bytes += received_bytes
-        self._overlays.earn(received_bytes)
-
-    def _pair(self, refinement: Refinement, slot: int, base: Coded, still: Coded) -> list[Chunk]:
-        chunks = []
-        for name, (data, size) in (("base", base), ("still", still)):
-            picture = Picture(data, placed(slot, size, right=name == "still"))
-            path = f"{names.STILLS}/{slot}/{name}"
-            chunks.append(self._row(path, picture_columns, refinement, picture, size_bytes=len(data)))
-        return chunks
+        before = self._room.received_bytes
+        rows = self._stills.refinement(refinement)
+        self._overlays.earn(self._room.received_bytes - before)
+        return self._rows(rows, refinement)
 
     def _traffic(self, traffic: Traffic) -> list[Chunk]:
         rates = (traffic.total_bps, traffic.base_bps, traffic.roi_bps, traffic.budget_bps)

@@ -12,7 +12,7 @@ stills of the track say (see `Belief`). Frames are the only clock here; `History
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from typing import Generic, Literal, Protocol, TypeVar
 
@@ -87,6 +87,13 @@ class StillSeen(Generic[P]):
     """Of the classifier, over the `Refiner`'s ``classifier_classes``."""
     carried: P
     """Whatever the caller wants back with it (the coded still, its header)."""
+    part: int = 0
+    """Which of the objects that the still shows: each is offered by itself, under the still's sequence number."""
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Sequence and part."""
+        return self.sequence, self.part
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,23 +186,23 @@ class Refiner(Generic[P]):
         self._confirm_frames = round(confirm_s * fps)
         self._forget_frames = round(forget_s * fps)
         self._matcher = Matcher(iou=iou, owned_frames=self._forget_frames)
-        self._held: dict[int, _Held[P]] = {}  # by still sequence, oldest offer first
-        self._seen: OrderedDict[int, None] = OrderedDict()
+        self._held: dict[tuple[int, int], _Held[P]] = {}  # by still sequence and part, oldest offer first
+        self._seen: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._beliefs: OrderedDict[int, Belief] = OrderedDict()  # by ground track id, longest unseen first
 
     def offer(self, still: StillSeen[P], *, now_frame: int) -> list[Settled[P]]:
         """Take a still; returns what had to make room for it (almost always nothing).
 
-        ``now_frame`` is the newest frame that was decoded. A sequence number that was here before is ignored.
+        ``now_frame`` is the newest frame that was decoded. A part of a still that was here before is ignored.
         """
-        if still.sequence in self._seen:
+        if still.key in self._seen:
             self.counters.replayed += 1
             return []
         self.counters.offered += 1
-        self._seen[still.sequence] = None
+        self._seen[still.key] = None
         if len(self._seen) > _REMEMBERED_STILLS:
             self._seen.popitem(last=False)
-        self._held[still.sequence] = _Held(still, now_frame + self._hold_frames)
+        self._held[still.key] = _Held(still, now_frame + self._hold_frames)
         if len(self._held) <= MAX_HELD:
             return []
         oldest = next(iter(self._held))
@@ -213,7 +220,7 @@ class Refiner(Generic[P]):
         for frame_index in sorted(by_frame):
             settled += self._settle_frame(by_frame[frame_index], log, now_frame)
         for done in settled:
-            del self._held[done.still.sequence]
+            del self._held[done.still.key]
         return settled
 
     def end(self) -> list[Settled[P]]:
@@ -222,8 +229,27 @@ class Refiner(Generic[P]):
         self._held.clear()
         return ended
 
+    def merge(self, kept_id: int, gone_id: int) -> None:
+        """Two tracks have turned out to be one: what is believed of the one that is gone holds for the other.
+
+        Where both were refined, the track that stays keeps its own belief.
+        """
+        belief = self._beliefs.pop(gone_id, None)
+        if belief is not None:
+            self._beliefs.setdefault(kept_id, belief)
+        self._matcher.merge(kept_id, gone_id)
+
     def shown(self, tracks: Tracks) -> Shown:
         """The classes to show for the tracks of one frame; frames must not go back."""
+        for track_id in tracks.ids.tolist():
+            belief = self._beliefs.get(track_id)
+            if belief is not None:
+                self._touch(track_id, belief, tracks.frame_index)
+        self._forget(tracks.frame_index)
+        return self.preview(tracks)
+
+    def preview(self, tracks: Tracks) -> Shown:
+        """The classes that would be shown for these tracks; changes nothing, so any frame may be asked for."""
         base_classes = tuple(self._labels.detector[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)
         confidences = tracks.confidences.astype(np.float32)  # a copy
@@ -234,8 +260,6 @@ class Refiner(Generic[P]):
                 continue
             reading = self._read(belief, tracks, row)
             classes[row], confidences[row], refined[row] = reading.class_name, reading.confidence, True
-            self._touch(track_id, belief, tracks.frame_index)
-        self._forget(tracks.frame_index)
         return Shown(base_classes, tuple(classes), confidences, refined)
 
     # One frame's stills.
@@ -248,8 +272,8 @@ class Refiner(Generic[P]):
         found = self._match(held, tracks, log)
         newest = log.newest_tracked
         settled: list[Settled[P]] = []
-        for waiting in sorted(held, key=lambda waiting: waiting.still.sequence):
-            candidate = found[waiting.still.sequence]
+        for waiting in sorted(held, key=lambda waiting: waiting.still.key):
+            candidate = found[waiting.still.key]
             if candidate.tracks is not None:
                 settled.append(self._speak(waiting.still, candidate.tracks, candidate.row))
             elif now_frame > waiting.last_frame or (
@@ -272,10 +296,10 @@ class Refiner(Generic[P]):
                 settled.append(self._unmatched(waiting.still, "late"))
         return settled
 
-    def _match(self, held: list[_Held[P]], tracks: Tracks, log: TrackLog) -> dict[int, Candidate]:
+    def _match(self, held: list[_Held[P]], tracks: Tracks, log: TrackLog) -> dict[Hashable, Candidate]:
         wanted = [
             Wanted(
-                key=waiting.still.sequence,
+                key=waiting.still.key,
                 edge_track_id=waiting.still.edge_track_id,
                 box_base_px=waiting.still.box_base_px,
                 class_name=waiting.still.class_name,

@@ -30,9 +30,14 @@ __all__ = [
     "identity_columns",
     "label_columns",
     "line_columns",
+    "origin_columns",
+    "patch_columns",
     "picture_columns",
+    "place_columns",
     "static_chunk",
     "text_columns",
+    "told_columns",
+    "told_identity_columns",
     "video_columns",
 ]
 
@@ -42,7 +47,7 @@ Columns = Iterable[rr.ComponentColumn]
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A JPEG of the gallery."""
+    """A JPEG with a place."""
 
     data: bytes
     place: Placement
@@ -90,6 +95,10 @@ class Table(Generic[T]):
         self._values.append(value)
         return self._chunk(slice(-1, None))
 
+    def __bool__(self) -> bool:
+        """Whether there are rows since the last `take`."""
+        return bool(self._values)
+
     def take(self) -> Chunk | None:
         """All rows since the last call as one chunk; None where there are none."""
         if not self._values:
@@ -118,6 +127,14 @@ def video_columns(samples: Sequence[bytes]) -> Columns:
     return rr.VideoStream.columns(sample=list(samples))
 
 
+def told_columns(rows: Sequence[Geometry]) -> Columns:
+    """Ellipses in the boxes of the layer of tracks that the base stream does not show, a row."""
+    return rr.Ellipses2D.columns(
+        centers=np.concatenate([row.centres_px for row in rows]),
+        half_sizes=np.concatenate([row.half_sizes_px for row in rows]),
+    ).partition([len(row.centres_px) for row in rows])
+
+
 def box_columns(rows: Sequence[Geometry]) -> Columns:
     """The boxes of one layer a row."""
     return rr.Boxes2D.columns(
@@ -128,8 +145,17 @@ def box_columns(rows: Sequence[Geometry]) -> Columns:
 
 def identity_columns(rows: Sequence[CodedIdentity]) -> Columns:
     """Ids and classes of one layer a row. Class ids are those of the layer's annotation context."""
+    return _identity_columns(rows, rr.Boxes2D)
+
+
+def told_identity_columns(rows: Sequence[CodedIdentity]) -> Columns:
+    """The same of the layer that is drawn as ellipses."""
+    return _identity_columns(rows, rr.Ellipses2D)
+
+
+def _identity_columns(rows: Sequence[CodedIdentity], shape: type[rr.Boxes2D | rr.Ellipses2D]) -> Columns:
     lengths = [len(row.track_ids) for row in rows]
-    drawn = rr.Boxes2D.columns(class_ids=np.array([i for row in rows for i in row.after], np.uint16))
+    drawn = shape.columns(class_ids=np.array([i for row in rows for i in row.after], np.uint16))
     told = rr.AnyValues.columns(
         track_id=pa.array([i for row in rows for i in row.track_ids], pa.uint32()),
         class_before=pa.array([i for row in rows for i in row.before], pa.uint16()),
@@ -143,6 +169,12 @@ def label_columns(rows: Sequence[tuple[str, ...]]) -> Columns:
     return rr.Boxes2D.columns(labels=texts).partition([len(row) for row in rows])
 
 
+def origin_columns(rows: Sequence[tuple[int, ...]]) -> Columns:
+    """The origins of the tracks of one layer a row, numbers of `overlay_encoding.ORIGINS`."""
+    numbers = pa.array([value for row in rows for value in row], pa.uint8())
+    return rr.AnyValues.columns(origin=numbers).partition([len(row) for row in rows])
+
+
 def confidence_columns(rows: Sequence[tuple[int, ...]]) -> Columns:
     """The confidences of one layer in percent a row."""
     percent = pa.array([value for row in rows for value in row], pa.uint8())
@@ -151,11 +183,25 @@ def confidence_columns(rows: Sequence[tuple[int, ...]]) -> Columns:
 
 def picture_columns(rows: Sequence[Picture]) -> Columns:
     """One picture a row, with its place in the gallery."""
-    places = rr.Transform3D.columns(
-        translation=[(row.place.x, row.place.y, 0.0) for row in rows],
-        scale=[(row.place.scale, row.place.scale, 1.0) for row in rows],
-    )
+    places = place_columns([row.place for row in rows])
     return [*hidden_picture_columns([row.data for row in rows]), *places]
+
+
+def place_columns(rows: Sequence[Placement]) -> rr.ComponentColumnList:
+    """Where a picture lies, one place a row."""
+    # The viewer reads a transform as a whole: what a row leaves out is not taken from the row before.
+    return rr.Transform3D.columns(
+        translation=[(place.x, place.y, 0.0) for place in rows],
+        scale=[(place.scale, place.scale, 1.0) for place in rows],
+    )
+
+
+def patch_columns(rows: Sequence[Picture | None]) -> Columns:
+    """One picture a row, with its place on the base picture; None takes it off."""
+    there = [row for row in rows if row is not None]
+    lengths = [int(row is not None) for row in rows]
+    blobs = rr.EncodedImage.columns(blob=[row.data for row in there])
+    return [*blobs.partition(lengths), *place_columns([row.place for row in there]).partition(lengths)]
 
 
 def hidden_picture_columns(rows: Sequence[bytes]) -> Columns:

@@ -13,7 +13,16 @@ from hvt_common.latency import LatencyStats
 from hvt_common.link.inbox import Received
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
-from hvt_common.link.wire import BaseHeader, Info, RoiHeader, Status, StillResult
+from hvt_common.link.wire import (
+    BaseHeader,
+    Info,
+    RoiHeader,
+    Status,
+    StillResult,
+    TrackStep,
+    TrackStepDecoder,
+)
+from hvt_common.values import Tracks
 from hvt_common.vision.hevc import BaseDecoder
 from hvt_ground.events import Event, Notice, Traffic, VideoSample
 from hvt_ground.export_tracks import TrackTable
@@ -62,6 +71,8 @@ class GroundSession:
         self.frames_decoded = 0
         self.frames_received = 0
         self.stills_received = 0
+        self.steps_received = 0
+        """Reports of the edge's tracks."""
         self.last_frame_index = -1
         """The last frame that was decoded, tracked and drawn."""
         self.last_status: Status | None = None
@@ -69,6 +80,8 @@ class GroundSession:
         """What the reassembly counted in this session; filled in when it ends."""
         self._keys = EdgeKeys(info.edge)
         self._decoder = BaseDecoder()
+        self._step_decoder = TrackStepDecoder()
+        self._last_step = -1
         self._to_local_ns = to_local_ns
         self._clock = clock
         self._report = report
@@ -80,7 +93,7 @@ class GroundSession:
         self._results_lock = threading.Lock()
         self._still_sequences = DistinctIds(remember=4096)
         eyes = LockstepEyes if self.lockstep else RealtimeEyes
-        self._eyes: Eyes = eyes(self._see, self._read, name=info.edge)
+        self._eyes: Eyes = eyes(self._see, self._step, self._read, name=info.edge)
 
     # What the receiving thread brings
 
@@ -117,6 +130,21 @@ class GroundSession:
         self.ledger.record_fate("received", header.reason)
         still = ReceivedStill(header, item.payload, media_type)
         self._eyes.still(still)
+
+    def tracks(self, step: TrackStep, item: Received) -> None:
+        """Take what the edge tracked at one tick; one that is not newer than the last is ignored.
+
+        Raises:
+            WireError: its boxes make no sense.
+        """
+        if step.sequence <= self._last_step:
+            return
+        self._last_step = step.sequence
+        self._count(Row.TRACKS, Channel.META, item, at_ns=step.send_ns)
+        self.steps_received += 1
+        tracks = self._step_decoder.decode(step)
+        if tracks is not None:
+            self._eyes.step(tracks, step.capture_ns)
 
     def status(self, status: Status, item: Received) -> None:
         """Take the edge's report; one that is not newer than the last is ignored."""
@@ -184,6 +212,10 @@ class GroundSession:
         self._hear_results()
         if self.lockstep:
             self._report()
+
+    def _step(self, tracks: Tracks, capture_ns: int) -> None:
+        self.sight.edge_step(tracks, capture_ns=capture_ns)
+        self._hear_results()
 
     def _read(self, stills: Sequence[ReceivedStill]) -> None:
         self.sight.read(stills)

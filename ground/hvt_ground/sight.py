@@ -1,4 +1,4 @@
-"""What the ground sees: detections and tracks on the base stream, and what the stills say of them."""
+"""What the ground sees: the base stream, the edge's own tracks and the stills, as one list of tracks."""
 
 from __future__ import annotations
 
@@ -9,18 +9,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvt_common.distinct import DistinctIds
-from hvt_common.errors import UserError
-from hvt_common.link.wire import RoiHeader, StillResult, fitted_text
-from hvt_common.values import Image, Posterior, Tracks, View
+from hvt_common.link.wire import StillResult
+from hvt_common.values import Image, Tracks, View
+from hvt_common.vision.camera_motion import CameraMotion
 from hvt_common.vision.detect import Detector
-from hvt_common.vision.still_codecs import StillError, still_codec
 from hvt_common.vision.track import ByteTracker
-from hvt_ground.classify_stills import Decoded, StillReader
-from hvt_ground.events import Event, Notice, Overlay, Refinement
+from hvt_ground.camera_path import CameraPath
+from hvt_ground.classify_stills import StillReader
+from hvt_ground.decode_stills import ReceivedStill
+from hvt_ground.events import Event, Overlay
+from hvt_ground.fuse import Fused, Fusion
 from hvt_ground.history import History
-from hvt_ground.refine import Refiner, Settled, StillSeen
+from hvt_ground.refine import Refiner, Shown
+from hvt_ground.still_stage import Carried, Moment, StillStage
 
-__all__ = ["GroundSight", "Picture", "ReceivedStill"]
+__all__ = ["GroundSight", "Picture", "ReceivedStill", "SightParts"]
+
+_SECOND_NS = 1_000_000_000
+_FARTHEST_S = 60
+"""A step further ahead of all that is known is not believed: nothing that comes after it could be shown."""
+_GAP_S = 1.0
+"""For how long the base stream may leave out ticks and still tell where tracks were between."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,251 +44,242 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class ReceivedStill:
-    """A still as it came, its header checked."""
+class SightParts:
+    """What the eyes of one session are made of; none of it may be shared with another session."""
 
-    header: RoiHeader
-    data: bytes
-    media_type: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Carried:
-    """What a still brings along while it waits for its track."""
-
-    received: ReceivedStill
-    base_crop_bgr: Image | None
-    known: bool
-    """False where nothing could be said of it."""
+    detector: Detector
+    tracker: ByteTracker
+    reader: StillReader
+    refiner: Refiner[Carried]
+    """Over the unified names of the fused list."""
+    fusion: Fusion
+    path: CameraPath
+    """The one that ``fusion`` moves boxes by."""
+    camera: CameraMotion | None
+    """None where the camera's motion is not followed."""
 
 
 class GroundSight:
-    """One session's eyes. Used by one thread; ``emit`` takes the events."""
+    """One session's eyes. Used by one thread; ``emit`` takes the events.
+
+    Args:
+        parts: detector, tracker, fusion and so on.
+        view: between source and base pixels.
+        fps: ticks a second.
+        detect_every: ticks from one detection to the next, at least.
+        wants_base: whether the reader looks at the base frame of a still.
+        emit: takes the events.
+    """
 
     def __init__(
         self,
-        detector: Detector,
-        tracker: ByteTracker,
+        parts: SightParts,
         *,
-        reader: StillReader,
-        refiner: Refiner[_Carried],
         view: View,
+        fps: float,
         detect_every: int,
         emit: Callable[[Event], None],
+        wants_base: bool = False,
     ) -> None:
-        self._detector = detector
-        self._tracker = tracker
-        self._reader = reader
-        self._refiner = refiner
-        self._view = view
+        self._parts = parts
         self._detect_every = detect_every
+        self._tick_ns = _SECOND_NS / fps
+        self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
         self._history = History()
+        self._stills = StillStage(
+            parts.reader,
+            parts.refiner,
+            history=self._history,
+            fusion=parts.fusion,
+            view=view,
+            wants_base=wants_base,
+            gap_ticks=max(1, round(_GAP_S * fps)),
+            emit=emit,
+        )
         self._detected_frame: int | None = None
-        self._newest = (0, 0)
-        self._results: list[StillResult] = []
+        self._camera_frame: int | None = None
+        self._leaves_out = False
+        """Whether there are ticks without a picture."""
+        self._now = Moment()
+        self._picture_ns = 0
+        self._own: Tracks | None = None
+        self._listed_tick = -1
         self._track_ids = DistinctIds()
         self.detections_run = 0
-        self.stills_dropped: Counter[str] = Counter()
-        """Stills of which nothing could be made, by reason."""
-        self.outcomes: Counter[str] = Counter()
-        """What became of the others."""
+        self.steps_used = 0
+        """Reports of the edge's tracks that were taken in."""
 
     @property
     def tracks(self) -> int:
-        """Distinct tracks so far."""
+        """Distinct tracks so far, whoever saw them."""
         return self._track_ids.count
 
     @property
     def refined(self) -> int:
         """Distinct tracks on whose class a still has spoken."""
-        return self._refiner.counters.tracks_refined
+        return self._parts.refiner.counters.tracks_refined
 
     @property
     def class_changes(self) -> int:
         """Stills after which the class that is shown was another."""
-        return self._refiner.counters.class_changes
+        return self._parts.refiner.counters.class_changes
+
+    @property
+    def stills_dropped(self) -> Counter[str]:
+        """Stills of which nothing could be made, by reason; ``base_missing`` were asked for again."""
+        return self._stills.dropped
+
+    @property
+    def outcomes(self) -> Counter[str]:
+        """What became of each object in the others."""
+        return self._stills.outcomes
 
     def see(self, picture: Picture, *, hurry: bool) -> None:
         """Take the next frame; with ``hurry`` detection waits for a later one."""
-        index, image = picture.frame_index, picture.image_bgr
-        self._newest = (index, picture.capture_ns)
-        self._history.add_frame(index, image)
-        due = self._detected_frame is None or index - self._detected_frame >= self._detect_every
-        if due and not hurry:
-            self._detected_frame = index
-            self.detections_run += 1
-            tracks = self._tracker.update(self._detector.detect(image), frame_index=index, image_bgr=image)
-        else:
-            tracks = self._tracker.predict(frame_index=index, image_bgr=image)
-        self._history.add_tracks(tracks)
-        self._track_ids.add(tracks.ids.tolist())
-        self._settle()
-        self._emit(self._overlay(tracks, picture.capture_ns))
+        index = picture.frame_index
+        self._history.add_frame(index, picture.image_bgr)
+        self._follow_camera(picture)
+        own = self._own = self._track(picture, hurry=hurry)
+        self._picture_ns = picture.capture_ns
+        ahead = self._now.frame_index > index
+        shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
+        self._now = Moment(*shown_at, picture_index=index)
+        self._parts.fusion.take_own(own)
+        self._show(own, picture.capture_ns)
+
+    def edge_step(self, step: Tracks, *, capture_ns: int | None = None) -> None:
+        """Take what the edge's tracker listed at one tick: ids and class ids the edge's, boxes in base pixels.
+
+        A step of a tick that is newer than all that was shown is shown at once: the base stream may leave that tick
+        out. ``capture_ns`` is that tick's; None reckons it from the newest picture.
+        """
+        tick = step.frame_index
+        if tick - max(self._now.frame_index, self._now.picture_index) > self._farthest or self._own is None:
+            return
+        own = self._own_at(tick)
+        if not self._parts.fusion.take_step(step, own=own):
+            return
+        self.steps_used += 1
+        if tick > self._now.frame_index:
+            at_ns = self._capture_ns(tick) if capture_ns is None else capture_ns
+            self._now = Moment(tick, at_ns, self._now.picture_index)
+            self._show(own, at_ns)
+            return
+        self._carry_merges()
+        self._history.revise_tracks(self._parts.fusion.listed(own).tracks)
+        self._stills.look_again(self._now)
 
     def read(self, stills: Sequence[ReceivedStill]) -> None:
         """Take stills, in the order in which they came; those of one frame are looked at together."""
-        by_frame: dict[int, list[tuple[ReceivedStill, Decoded]]] = {}
-        for still in stills:
-            decoded = self._decode(still)
-            if decoded is not None:
-                by_frame.setdefault(still.header.frame_index, []).append((still, decoded))
-        for frame_index, pairs in by_frame.items():
-            base_bgr = self._history.frame(frame_index)
-            posteriors = self._reader.read([decoded for _, decoded in pairs], base_bgr)
-            for (still, decoded), posterior in zip(pairs, posteriors, strict=True):
-                self._offer(still, decoded, posterior, base_bgr)
-        self._settle()
+        self._stills.take(stills, self._now)
+        self._carry_merges()
+
+    def list_at(self, frame_index: int) -> Overlay:
+        """What would be shown at a tick, from all that is known now; changes nothing.
+
+        The tick must not lie before the newest decoded frame (`ValueError`). Nothing known is an empty list.
+        """
+        if frame_index < self._now.picture_index:
+            raise ValueError(f"tick {frame_index} lies before the newest frame, {self._now.picture_index}")
+        fused = self._parts.fusion.listed(self._own_at(frame_index))
+        shown = self._parts.refiner.preview(fused.tracks)
+        return _overlay(fused, shown, self._capture_ns(frame_index))
 
     def take_results(self) -> list[StillResult]:
         """Return and forget what the edge wants to hear of its stills."""
-        results, self._results = self._results, []
-        return results
+        return self._stills.take_results()
 
     def end(self) -> None:
         """The session is over: what still waits is given out as unmatched."""
-        for settled in self._refiner.end():
-            self._settled(settled)
+        self._stills.end(self._now)
 
-    # Stills
+    # The base stream
 
-    def _decode(self, still: ReceivedStill) -> Decoded | None:
-        header = still.header
-        try:
-            image = still_codec(header.codec).decode(
-                still.data, size=self._coded_size(header), parameters=header.parameters
-            )
-        except (StillError, UserError) as error:
-            self.stills_dropped["undecodable"] += 1
-            self._notice("warning", f"still {header.sequence} cannot be decoded: {error}")
-            self._answer(header, None)
-            return None
-        return Decoded(image, header.crop_source_px, self._box_base_px(header), header.frame_index)
+    def _track(self, picture: Picture, *, hurry: bool) -> Tracks:
+        index, image = picture.frame_index, picture.image_bgr
+        due = self._detected_frame is None or index - self._detected_frame >= self._detect_every
+        if hurry or not due:
+            return self._parts.tracker.predict(frame_index=index, image_bgr=image)
+        self._detected_frame = index
+        self.detections_run += 1
+        found = self._parts.detector.detect(image)
+        return self._parts.tracker.update(found, frame_index=index, image_bgr=image)
 
-    def _coded_size(self, header: RoiHeader) -> tuple[int, int]:
-        """(width, height) as announced. A still may be shrunk, never be larger than what it shows."""
-        x1, y1, x2, y2 = header.crop_source_px
-        size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
-        inside = x2 <= self._view.source_size[0] and y2 <= self._view.source_size[1]
-        width, height = size
-        if not (inside and isinstance(width, int) and isinstance(height, int)):
-            raise StillError(f"crop {header.crop_source_px} is not of this source")
-        if not (0 < width <= x2 - x1 and 0 < height <= y2 - y1):
-            raise StillError(f"size {width}x{height} is larger than what it shows")
-        return width, height
-
-    def _offer(
-        self, still: ReceivedStill, decoded: Decoded, posterior: Posterior | None, base_bgr: Image | None
-    ) -> None:
-        header = still.header
-        crop = None if base_bgr is None else _cut(base_bgr, decoded.crop_source_px, view=self._view)
-        carried = _Carried(still, crop, known=posterior is not None)
-        self._answer(header, posterior)
-        if posterior is None:
-            self.outcomes["unread"] += 1
-            self._emit(
-                self._refinement(carried, None, header.class_name, header.class_name, header.confidence)
-            )
+    def _follow_camera(self, picture: Picture) -> None:
+        """Estimate the camera's motion, but only where boxes have to be moved along between pictures."""
+        camera, parts = self._parts.camera, self._parts
+        last = self._now.picture_index
+        self._leaves_out = self._leaves_out or (last >= 0 and picture.frame_index > last + 1)
+        if camera is None or not (self._leaves_out or parts.fusion.knows_from_afar):
+            self._camera_frame = None
             return
-        seen = StillSeen(
-            sequence=header.sequence,
-            frame_index=header.frame_index,
-            capture_ns=header.capture_ns,
-            edge_track_id=header.track_id,
-            box_base_px=decoded.box_base_px,
-            class_name=header.class_name,
-            posterior=posterior,
-            carried=carried,
-        )
-        for settled in self._refiner.offer(seen, now_frame=self._newest[0]):
-            self._settled(settled)
+        if self._camera_frame is None:
+            camera.reset()
+        affine = camera.step(picture.image_bgr)
+        if self._camera_frame is not None:
+            parts.path.add(affine, start=self._camera_frame, end=picture.frame_index)
+        self._camera_frame = picture.frame_index
 
-    def _settle(self) -> None:
-        for settled in self._refiner.settle(self._history, now_frame=self._newest[0]):
-            self._settled(settled)
+    def _own_at(self, tick: int) -> Tracks:
+        """Our tracker's list at a tick: as it was, or moved on from the newest frame."""
+        own = self._own
+        if own is None:
+            return _nothing(tick)
+        if tick > own.frame_index:
+            ahead = self._parts.tracker.extrapolated(frame_index=tick)
+            boxes = ahead.boxes_xyxy_px.astype(np.float64)
+            moved = self._parts.path.carry(boxes, start=own.frame_index, end=tick)
+            return replace(ahead, boxes_xyxy_px=moved.astype(np.float32))
+        before = self._parts.fusion.own_at(tick)
+        return _nothing(tick) if before is None else replace(before, frame_index=tick)
 
-    def _settled(self, settled: Settled[_Carried]) -> None:
-        self.outcomes[settled.outcome] += 1
-        if settled.track_id is not None:
-            self._name_track(settled.still.sequence, settled.track_id)
-        before, after = settled.class_before, settled.class_after
-        self._emit(
-            self._refinement(settled.still.carried, settled.track_id, before, after, settled.confidence)
-        )
+    def _capture_ns(self, tick: int) -> int:
+        return self._picture_ns + round((tick - self._now.picture_index) * self._tick_ns)
 
-    def _refinement(
-        self, carried: _Carried, track_id: int | None, before: str, after: str, confidence: float
-    ) -> Refinement:
-        header = carried.received.header
-        # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already.
-        frame_index, capture_ns = self._newest
-        return Refinement(
-            frame_index=frame_index,
-            capture_ns=capture_ns,
-            still_sequence=header.sequence,
-            track_id=track_id,
-            edge_track_id=header.track_id,
-            box_base_px=self._box_base_px(header),
-            still=carried.received.data,
-            media_type=carried.received.media_type,
-            base_crop_bgr=carried.base_crop_bgr,
-            class_before=before,
-            class_after=after,
-            confidence=confidence,
-            reason=header.reason,
-            quality_pct=header.quality_pct,
-        )
+    # The list
 
-    def _answer(self, header: RoiHeader, posterior: Posterior | None) -> None:
-        """The edge hears of every still, so that a lockstep edge waits for none in vain; no name is no opinion."""
-        self._results.append(
-            StillResult(
-                still_sequence=header.sequence,
-                track_id=header.track_id,
-                class_name=fitted_text(posterior.class_name, 64) if posterior else "",
-                confidence=posterior.confidence if posterior else 0.0,
-                entropy_nats=min(20.0, posterior.entropy_nats) if posterior else 0.0,
-                ground_track_id=-1,  # until it has settled
-                again=False,
-            )
-        )
+    def _show(self, own: Tracks, capture_ns: int) -> None:
+        """Put the list at the tick of ``own`` on record and, where nothing newer has been shown, give it out."""
+        self._carry_merges()
+        fused = self._parts.fusion.listed(own)
+        self._history.revise_tracks(fused.tracks)
+        self._track_ids.add(fused.tracks.ids.tolist())
+        self._stills.look_again(self._now)
+        if own.frame_index > self._listed_tick:
+            self._listed_tick = own.frame_index
+            self._emit(_overlay(fused, self._parts.refiner.shown(fused.tracks), capture_ns))
 
-    def _name_track(self, still_sequence: int, ground_track_id: int) -> None:
-        """Add the track that a still refined to its answer, if that has not been reported yet."""
-        for place, result in enumerate(self._results):
-            if result.still_sequence == still_sequence:
-                self._results[place] = replace(result, ground_track_id=ground_track_id)
-
-    # Tracks
-
-    def _overlay(self, tracks: Tracks, capture_ns: int) -> Overlay:
-        shown = self._refiner.shown(tracks)
-        return Overlay(
-            frame_index=tracks.frame_index,
-            capture_ns=capture_ns,
-            track_ids=tracks.ids,
-            boxes_base_px=tracks.boxes_xyxy_px,
-            base_classes=shown.base_classes,
-            classes=shown.classes,
-            confidences=shown.confidences,
-            refined=shown.refined,
-        )
-
-    def _box_base_px(self, header: RoiHeader) -> tuple[float, float, float, float]:
-        x1, y1, x2, y2 = self._view.to_base(np.array([header.box_source_px], np.float32))[0].tolist()
-        return x1, y1, x2, y2
-
-    def _notice(self, level: str, text: str) -> None:
-        assert level in ("info", "warning", "error")
-        self._emit(Notice(*self._newest, level, text))  # type: ignore[arg-type]
+    def _carry_merges(self) -> None:
+        for kept_id, gone_id in self._parts.fusion.take_merged():
+            self._parts.refiner.merge(kept_id, gone_id)
+            self._history.rename_track(kept_id, gone_id)
 
 
-def _cut(base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View) -> Image | None:
-    """The same padded box of the base frame, whole pixels, clipped; None where nothing of it is inside."""
-    x1, y1, x2, y2 = view.to_base(np.array([crop_source_px], np.float32))[0]
-    height, width = base_bgr.shape[:2]
-    left, top = max(0, int(np.floor(x1))), max(0, int(np.floor(y1)))
-    right, bottom = min(width, int(np.ceil(x2))), min(height, int(np.ceil(y2)))
-    if right <= left or bottom <= top:
-        return None
-    return base_bgr[top:bottom, left:right].copy()
+def _overlay(fused: Fused, shown: Shown, capture_ns: int) -> Overlay:
+    tracks = fused.tracks
+    return Overlay(
+        frame_index=tracks.frame_index,
+        capture_ns=capture_ns,
+        track_ids=tracks.ids,
+        boxes_base_px=tracks.boxes_xyxy_px,
+        base_classes=shown.base_classes,
+        classes=shown.classes,
+        confidences=shown.confidences,
+        refined=shown.refined,
+        origins=fused.origins,
+    )
+
+
+def _nothing(tick: int) -> Tracks:
+    none = np.empty(0, np.int64)
+    return Tracks(
+        frame_index=tick,
+        ids=none,
+        boxes_xyxy_px=np.empty((0, 4), np.float32),
+        confidences=np.empty(0, np.float32),
+        class_ids=np.empty(0, np.int32),
+        born_frames=none,
+        seen_frames=none,
+        started=np.empty(0, np.bool_),
+    )

@@ -15,6 +15,7 @@ Coded = tuple[bytes, tuple[int, int]]
 """A JPEG and its (width, height) in pixels."""
 
 _QUALITIES_PCT = (75, 65, 55)
+_STILL_QUALITY_PCT = 85
 
 
 def caption(refinement: Refinement) -> str:
@@ -36,19 +37,26 @@ def event_text(refinement: Refinement) -> str:
 def still_picture(refinement: Refinement) -> Coded | None:
     """The still as received where it is a JPEG, else the same pixels as JPEG; None if undecodable.
 
-    The viewer shows neither WebP nor AVIF, and one media type for all pictures need not be written with each.
+    The viewer shows neither WebP nor AVIF nor what only the ground can decode, and one media type for all pictures
+    need not be written with each.
     """
-    if not refinement.still:
-        return None
-    pixels = cv2.imdecode(np.frombuffer(refinement.still, np.uint8), cv2.IMREAD_COLOR)
-    if pixels is None:
+    pixels = refinement.still_bgr
+    if pixels is None or refinement.media_type == "image/jpeg":
+        pixels = _decoded(refinement.still)
+    if pixels is None or pixels.size == 0:
         return None
     size = (pixels.shape[1], pixels.shape[0])
-    return (
-        refinement.still
-        if refinement.media_type == "image/jpeg"
-        else _jpeg(pixels.astype(np.uint8), quality_pct=90)
-    ), size
+    if refinement.media_type == "image/jpeg":
+        return refinement.still, size
+    return _jpeg(pixels, quality_pct=_STILL_QUALITY_PCT), size
+
+
+def _decoded(data: bytes) -> Image | None:
+    """What OpenCV makes of a coded picture; None where it does not know the format."""
+    if not data:
+        return None
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    return None if pixels is None else pixels.astype(np.uint8)
 
 
 def base_picture(refinement: Refinement, *, still_size: tuple[int, int], limit_bytes: int) -> Coded | None:

@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 MAX_EDGES = 64
 """More edge ids than this are not served: each costs a thread, and ids cost a sender nothing."""
 _INBOX_MESSAGES = 1024
-_SUBSCRIBED = (Row.BASE, Row.ROI, Row.STATUS)
+_SUBSCRIBED = (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS)
 _ASK_S = 1.0
 
 

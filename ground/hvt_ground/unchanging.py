@@ -10,6 +10,7 @@ from rerun.chunk import Chunk
 
 from hvt_ground import blueprint as names
 from hvt_ground.gallery import SLOTS, frame_of
+from hvt_ground.overlay_encoding import TOLD_MARK
 from hvt_ground.palette import BASE_LINE, BUDGET_LINE, GREY, STILL_LINE, TOTAL_LINE, class_colour, dimmed
 from hvt_ground.rrd_tables import static_chunk
 
@@ -24,12 +25,15 @@ _BITRATE = (
 _LATENCY = (("to receive", BASE_LINE, 2.0), ("to overlay", STILL_LINE, 2.0))
 _TRACKS = (("tracks", GREY, 2.0), ("refined", STILL_LINE, 2.5))
 
+_LEGEND = f"□ seen on the base  ·  {TOLD_MARK} told by edge or still only  ·  **thick** a still spoke  ·  ✓ it agreed"
+
 
 def unchanging_chunks(*, title: str, facts: Mapping[str, str]) -> list[Chunk]:
     """All static chunks of a recording whose session panel shows ``title`` and ``facts``."""
     return [
         static_chunk(names.VIDEO, rr.VideoStream.from_fields(codec=rr.VideoCodec.H265)),
         static_chunk(names.TRACKS, _box_style(width=1.0, draw_order=10.0, labels=False)),
+        static_chunk(names.TOLD, _ellipse_style(width=1.0, draw_order=15.0)),
         static_chunk(names.REFINED, _box_style(width=2.5, draw_order=20.0, labels=True)),
         static_chunk(names.CAPTIONS, _gallery_frames()),
         static_chunk(names.BITRATE, _lines(_BITRATE)),
@@ -61,6 +65,12 @@ def _box_style(*, width: float, draw_order: float, labels: bool) -> rr.Boxes2D:
     )
 
 
+def _ellipse_style(*, width: float, draw_order: float) -> rr.Ellipses2D:
+    return rr.Ellipses2D.from_fields(
+        line_radii=rr.Radius.ui_points(width / 2), draw_order=draw_order, show_labels=False
+    )
+
+
 def _gallery_frames() -> rr.Boxes2D:
     frames = np.array([frame_of(slot) for slot in range(SLOTS)])
     return rr.Boxes2D.from_fields(
@@ -80,4 +90,5 @@ def _lines(lines: tuple[tuple[str, tuple[int, int, int], float], ...]) -> rr.Ser
 
 
 def _facts(title: str, facts: Mapping[str, str]) -> str:
-    return "  ·  ".join([f"**{title}**", *(f"{name} **{value}**" for name, value in facts.items())])
+    told = "  ·  ".join([f"**{title}**", *(f"{name} **{value}**" for name, value in facts.items())])
+    return f"{told}\n\n{_LEGEND}"

@@ -341,6 +341,32 @@ def test_gaps_are_stepped_like_predicted_frames() -> None:
     np.testing.assert_array_equal(left.boxes_xyxy_px, right.boxes_xyxy_px)
 
 
+@given(seed=seeds, ahead=st.integers(0, 80))
+@settings(max_examples=40, deadline=None)
+def test_looking_ahead_shows_what_prediction_would_and_changes_nothing(seed: int, ahead: int) -> None:
+    """A list shown between two frames would differ from the track, or move it."""
+    asked, other = ByteTracker(fps=15), ByteTracker(fps=15)
+    detections = scene(seed)
+    for tracker in (asked, other):
+        run(tracker, detections[:-1], every=2)
+    before = other.update(detections[-1], frame_index=20)
+    assert asked.update(detections[-1], frame_index=20).ids.tolist() == before.ids.tolist()
+    shown = asked.extrapolated(frame_index=20 + ahead)
+    asked.extrapolated(frame_index=50)
+    foreseen = other.predict(frame_index=20 + ahead) if ahead else before
+    assert shown.frame_index == foreseen.frame_index
+    assert shown.ids.tolist() == foreseen.ids.tolist()
+    np.testing.assert_array_equal(shown.boxes_xyxy_px, foreseen.boxes_xyxy_px)
+    assert shown.seen_frames.tolist() == foreseen.seen_frames.tolist()
+    assert not shown.started.any()
+    np.testing.assert_array_equal(
+        asked.predict(frame_index=20 + ahead + 1).boxes_xyxy_px,
+        other.predict(frame_index=20 + ahead + 1).boxes_xyxy_px,
+    )
+    with pytest.raises(ValueError, match="must not be below"):
+        asked.extrapolated(frame_index=20 + ahead)
+
+
 def test_the_class_follows_the_votes() -> None:
     """A car seen once as a truck would change its label, or a wrong first label would stay for ever."""
     tracker, box = ByteTracker(fps=30), (0, 0, 40, 40)

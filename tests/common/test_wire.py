@@ -16,6 +16,7 @@ from hypothesis.strategies import SearchStrategy
 from hvt_common.link.wire import (
     MAX_PAYLOAD_BYTES,
     MAX_STILL_RESULTS,
+    AlsoShown,
     BaseHeader,
     ControlAnswer,
     ControlRequest,
@@ -28,6 +29,7 @@ from hvt_common.link.wire import (
     RoiHeader,
     Status,
     StillResult,
+    TrackStep,
     UnknownVersionError,
     WireError,
     kinds,
@@ -36,6 +38,7 @@ from hvt_common.link.wire.fields import (
     I63,
     U32,
     U64,
+    Blob,
     Choice,
     Flag,
     Int,
@@ -55,6 +58,7 @@ DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "wire.md"
 MESSAGES: tuple[type[Message], ...] = (
     BaseHeader,
     RoiHeader,
+    TrackStep,
     Info,
     Status,
     ControlRequest,
@@ -86,6 +90,16 @@ ROI = RoiHeader(
     codec="jpeg",
     quality_pct=65,
     parameters={"base": 9_099, "gain": 1.5, "how": "residual"},
+    also=(AlsoShown(track_id=60, box_source_px=(40.0, 2.5, 104.875, 70.0)),),
+)
+STEP = TrackStep(
+    session_id=0x1234567890ABCDEF,
+    sequence=1_800,
+    frame_index=9_100,
+    capture_ns=1_790_000_000_123_456_789,
+    send_delay_ns=44_000_000,
+    reference=1_799,
+    boxes=bytes(range(120)),
 )
 HEALTH = Health(
     frames_captured=9_101,
@@ -163,15 +177,16 @@ FEEDBACK = Feedback(
             confidence=0.9,
             entropy_nats=0.25,
             ground_track_id=12,
+            again=False,
         ),
     ),
 )
 REQUEST = ControlRequest(session_id=0, command="keyframe", arguments={})
 ANSWER = ControlAnswer(session_id=7, accepted=False, reason="this edge does not know set-method")
-EXAMPLES: tuple[Message, ...] = (BASE, ROI, INFO, STATUS, REQUEST, ANSWER, FEEDBACK)
+EXAMPLES: tuple[Message, ...] = (BASE, ROI, STEP, INFO, STATUS, REQUEST, ANSWER, FEEDBACK)
 
 
-def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911 - one case for each kind
+def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911, PLR0912 - one case for each kind
     """Any value that a field of this kind may have."""
     match kind:
         case Int(low, high):
@@ -182,6 +197,8 @@ def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911 - one case fo
             return st.floats(low, high)
         case Flag():
             return st.booleans()
+        case Blob(max_bytes):
+            return st.binary(max_size=min(max_bytes, 300))
         case Text(max_bytes):
             return st.text(st.characters(codec="utf-8").filter(str.isprintable), max_size=max_bytes // 4)
         case Choice(words):
@@ -194,6 +211,10 @@ def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911 - one case fo
             return st.lists(value_of(inner), max_size=min(max_items, 6)).map(tuple)
         case MapOf(inner, max_items, key_bytes):
             return st.dictionaries(value_of(Text(key_bytes)), value_of(inner), max_size=min(max_items, 6))
+        case Nested(of) if of is AlsoShown:
+            place = st.tuples(st.integers(-2000, 0), st.integers(-2000, 0), st.integers(0, 2000), st.just(7))
+            box = place.map(lambda box: tuple(one / 8 for one in box))
+            return st.builds(of, track_id=value_of(Int(0, U32)), box_source_px=box)
         case Nested(of):
             return st.builds(of, **{name: value_of(inner) for name, inner in kinds(of)})
     raise AssertionError(kind)
@@ -229,7 +250,8 @@ def test_examples_survive_the_wire(message):
 def test_typical_sizes_are_small():
     """Metadata would eat the bits that stills need."""
     assert len(BASE.pack()) <= 40
-    assert len(ROI.pack()) <= 125
+    assert len(ROI.pack()) <= 150
+    assert len(STEP.pack()) <= 45 + len(STEP.boxes)
     assert len(STATUS.pack()) <= 240
     assert len(REQUEST.pack()) <= 20
 
@@ -270,7 +292,7 @@ def test_arbitrary_bytes_are_a_wire_error(data, message):
 @settings(max_examples=300, deadline=None)
 def test_well_formed_nonsense_with_a_good_checksum_is_a_wire_error_or_bounded(values, message):
     """A sender that packs and seals rightly but fills fields wrongly would get through."""
-    data = sealed([1, *(values if isinstance(values, list) else [values])])
+    data = sealed([WIRE_VERSION, *(values if isinstance(values, list) else [values])])
     try:
         parsed = message.parse(data)
     except WireError:
@@ -319,7 +341,7 @@ def base_fields(**changed: object) -> bytes:
         "send_delay_ns": 5,
         "flags": 1,
     }
-    return sealed([1, *(fields | changed).values()])
+    return sealed([WIRE_VERSION, *(fields | changed).values()])
 
 
 def test_the_independent_packing_is_accepted():
@@ -427,7 +449,9 @@ def test_info_gives_the_view():
     assert view == View.fitted((3840, 2160), (1280, 720), fit="crop")
 
 
-@pytest.mark.parametrize("message", [*MESSAGES, Health, StillResult], ids=lambda message: message.__name__)
+@pytest.mark.parametrize(
+    "message", [*MESSAGES, AlsoShown, Health, StillResult], ids=lambda message: message.__name__
+)
 def test_the_document_lists_every_field_with_its_bounds(message):
     """Whoever writes a subscriber from docs/wire.md would read the wrong field."""
     section = DOCUMENT.read_text(encoding="utf-8").split(f"### `{message.__name__}`", 1)[1].split("\n#", 1)[0]

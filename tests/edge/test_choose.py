@@ -11,13 +11,16 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from base_coded import StandIn
 from clips import START_NS, hard_pictures
-from hvt_common.values import Frame, Tracks, View
+from hvt_common.values import Frame, Still, Tracks, View
+from hvt_common.vision.still_codecs import JpegCodec
 from hvt_edge.candidates import Candidate, TrackMemory
 from hvt_edge.choose import Chooser, ChooserSettings
 from hvt_edge.methods.base import Request, Step
 from hvt_edge.sight import Seen
 from hvt_edge.still import StillMaker
+from hvt_edge.still_gate import Gate
 from hvt_edge.still_queue import QueueSettings
 from hvt_edge.suppress import Suppression
 
@@ -54,21 +57,26 @@ class Rig:
         cooldown: float = 0.0,
         most_bytes: int = 20_000,
         picture: np.ndarray = PICTURE,
+        maker: StillMaker | None = None,
+        **settings,
     ) -> None:
-        self.picture = picture
+        self.picture, self.memory = picture, TrackMemory()
         self.fates: Counter[tuple[str, str]] = Counter()
         view = View.fitted(SIZE, SIZE, fit="letterbox")
         self.chooser = Chooser(
             method or ByScore(),
             suppression=Suppression.for_cooldown(cooldown),
-            maker=StillMaker(),
-            memory=TrackMemory(),
+            maker=maker or StillMaker(),
+            memory=self.memory,
             view=view,
             class_names=("car",),
-            settings=ChooserSettings(fps=3, most_bytes=most_bytes, queue=QueueSettings(max_length=3)),
+            settings=ChooserSettings(
+                fps=3, most_bytes=most_bytes, queue=QueueSettings(max_length=3), **settings
+            ),
             on_fate=lambda fate, reason: self.fates.update([(fate, reason)]),
         )
         self.number = -1
+        self.sent: list[Still] = []
 
     @property
     def now_ns(self) -> int:
@@ -97,10 +105,11 @@ class Rig:
     def stills(self, room: int) -> list[int]:
         """Send what fits ``room`` in all; the tracks of the stills."""
         sent, left = [], [room]
-        for still in self.chooser.stills(now_ns=self.now_ns, room_bytes=lambda: left[-1]):
+        for still in self.chooser.stills(now_ns=self.now_ns, room=lambda _still: left[-1]):
             assert len(still.data) <= left[-1]
             left.append(left[-1] - len(still.data))
             sent.append(still.track_id)
+            self.sent.append(still)
         return sent
 
 
@@ -181,7 +190,7 @@ def test_sequence_numbers_count_stills_and_nothing_else():
     for step in range(4):
         rig.consider({1: SMALL, 2: box_at(7)}, base=PICTURE if step % 2 else FLAT)
         numbers += [
-            still.sequence for still in rig.chooser.stills(now_ns=rig.now_ns, room_bytes=lambda: 10**6)
+            still.sequence for still in rig.chooser.stills(now_ns=rig.now_ns, room=lambda _still: 10**6)
         ]
         rig.number += 3  # past the rest of what was refused
     assert numbers == list(range(len(numbers)))
@@ -196,6 +205,126 @@ def test_closing_says_what_becomes_of_those_that_wait():
     assert rig.fates == {("dropped", "ended"): 2}
 
 
+# Neighbours, the gate, and stills that build on the base
+
+NEIGHBOURS = {1: (20.0, 20.0, 44.0, 40.0), 2: (46.0, 22.0, 70.0, 42.0), 3: (400.0, 200.0, 440.0, 240.0)}
+BASE_CODED = StillMaker(codec=StandIn(), fallback=JpegCodec())
+BLURRED = cv2.GaussianBlur(PICTURE, (0, 0), 3)
+
+
+def test_neighbours_share_a_still_and_all_of_them_count_as_sent():
+    """Headers would be paid twice for one place, or the neighbour sent again right after."""
+    rig = Rig(share=True, cooldown=5.0)
+    rig.consider(NEIGHBOURS)
+    assert rig.stills(100_000) == [3, 2]
+    alone, pair = rig.sent
+    assert (alone.also, [track for track, _ in pair.also]) == ((), [1])
+    assert pair.crop_source_px == (16, 17, 74, 45)
+    assert all(rig.memory._histories[track].sent_count == 1 for track in (1, 2, 3))
+    assert rig.fates == {("sent", "test"): 2}, "one for each still"
+    rig.consider(NEIGHBOURS)
+    assert rig.stills(100_000) == []
+    assert rig.fates["deferred", "cooldown"] == 3
+
+
+def test_without_the_setting_each_has_its_own():
+    """The paper's methods would send other stills than the paper says."""
+    rig = Rig()
+    rig.consider(NEIGHBOURS)
+    assert rig.stills(100_000) == [3, 2, 1]
+
+
+def test_the_cost_of_a_shared_still_is_learnt_by_what_it_codes():
+    """The method would believe that stills are larger than they are, and wait for room that it does not need."""
+    rig = Rig(share=True)
+    rig.consider({1: NEIGHBOURS[1], 2: NEIGHBOURS[2]})
+    assert rig.stills(100_000) == [2]
+    area, size = 58 * 28, len(rig.sent[0].data)
+    sums = rig.chooser._cost_of("jpeg")._sums
+    assert sums.x / sums.one == area
+    assert sums.y / sums.one == size
+
+
+def test_the_gate_holds_back_what_the_base_shows_well_before_the_method_chooses():
+    """The places in the queue would go to stills that add little."""
+    good = BLURRED.copy()
+    good[:, 320:] = PICTURE[:, 320:]
+    good[:, 320:] = cv2.add(good[:, 320:], (3, 3, 3, 0))  # a little too bright: 38 dB, and no edge is lost
+    boxes = {track: box_at(track) for track in (1, 2)} | {9: (450.0, 100.0, 500.0, 140.0)}
+    rig = Rig(gate=Gate(psnr_y_db=36.0))
+    rig.consider(boxes, base=good)
+    assert rig.fates == {("dropped", "base_good"): 1}
+    assert rig.stills(100_000) == [2, 1]
+    rig.consider(boxes, base=good)
+    assert rig.fates["deferred", "refused"] == 1
+    ungated = Rig(maker=BASE_CODED)
+    ungated.consider(boxes, base=good)
+    assert 9 in ungated.stills(100_000)
+
+
+def test_stills_that_build_on_the_base_wait_for_a_frame_that_has_one():
+    """A step on a tick that is not coded would be lost, or its stills be sent without what they build on."""
+    rig = Rig(maker=BASE_CODED)
+    rig.consider({1: SMALL}, base=None)
+    assert rig.stills(100_000) == []
+    rig.consider({1: SMALL}, base=BLURRED, detected=False)
+    assert rig.stills(100_000) == [1]
+    assert (rig.sent[0].codec, rig.sent[0].frame_index) == ("stand-in", 1)
+    rig.consider({1: SMALL}, base=BLURRED, detected=False)
+    assert rig.stills(100_000) == [], "one step, one decision"
+    plain = Rig()
+    plain.consider({1: SMALL}, base=None)
+    assert plain.stills(100_000) == [1], "what needs no base waits for none"
+
+
+def test_a_still_without_its_base_is_sent_once_more_and_only_once():
+    """The object would stay unseen, or a ground could make the edge send for ever."""
+    rig = Rig(maker=BASE_CODED, cooldown=60.0)
+    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
+    assert rig.stills(100_000) == [2, 1]
+    for sequence in (1, 1, 7, 2**32 - 1):
+        rig.chooser.ask_again(sequence)
+    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
+    assert rig.stills(100_000) == [1]
+    first, again = rig.sent[1:]
+    assert (again.sequence, again.reason, again.codec, again.parameters) == (2, "again", "jpeg", {"again": 1})
+    for name in ("frame_index", "capture_ns", "track_id", "box_source_px", "crop_source_px", "class_name"):
+        assert getattr(again, name) == getattr(first, name)
+    crop = PICTURE[
+        first.crop_source_px[1] : first.crop_source_px[3], first.crop_source_px[0] : first.crop_source_px[2]
+    ]
+    seen = JpegCodec().decode(again.data, size=crop.shape[1::-1])
+    assert np.mean((seen.astype(float) - crop) ** 2) < 150
+    assert rig.memory._histories[1].sent_count == 1, "its rest began with the first"
+    for sequence in (1, 2):
+        rig.chooser.ask_again(sequence)
+    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
+    assert rig.stills(100_000) == []
+    assert rig.fates["sent", "again"] == 1
+
+
+def test_the_newer_wish_of_a_track_makes_the_old_still_needless():
+    """Bits would go to the object as it was, while its present picture waits."""
+    rig = Rig(maker=BASE_CODED)
+    rig.consider({1: SMALL}, base=BLURRED)
+    assert rig.stills(100_000) == [1]
+    rig.chooser.ask_again(0)
+    rig.consider({1: SMALL}, base=BLURRED)
+    assert rig.stills(100_000) == [1]
+    assert [one.reason for one in rig.sent] == ["test", "test"]
+    assert rig.stills(100_000) == []
+
+
+def test_stills_of_other_codecs_are_never_sent_again():
+    """A forged request would double what a ground already has."""
+    rig = Rig(cooldown=60.0)
+    rig.consider({1: SMALL})
+    assert rig.stills(100_000) == [1]
+    rig.chooser.ask_again(0)
+    rig.consider({1: SMALL})
+    assert rig.stills(100_000) == []
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     st.lists(
@@ -204,16 +333,16 @@ def test_closing_says_what_becomes_of_those_that_wait():
         max_size=15,
     ),
     st.sampled_from([0.0, 1.0]),
+    st.sampled_from([0.0, 30.0]),
 )
-def test_every_candidate_of_a_step_has_exactly_one_fate(steps, cooldown):
+def test_every_candidate_of_a_step_has_exactly_one_fate(steps, cooldown, gate_db):
     """The table of fates would not add up to the candidates there were."""
-    rig, candidates = Rig(cooldown=cooldown), 0
+    rig, candidates = Rig(cooldown=cooldown, gate=Gate(psnr_y_db=gate_db)), 0
     for tracks, room, good in steps:
         rig.consider({one: box_at(one) for one in sorted(tracks)}, base=PICTURE if good else FLAT)
         candidates += len(tracks)
         rig.stills(room)
         assert rig.chooser.waiting <= 3
-        assert set(rig.chooser._held_up) <= {one.request.candidate.track_id for one in rig.chooser._queue}
-        assert len(rig.chooser._base_frames) <= 3
+        assert set(rig.chooser._held_up) <= {one.track_id for one in rig.chooser._queue}
     rig.chooser.close()
     assert sum(rig.fates.values()) == candidates

@@ -9,6 +9,7 @@ from clips import framed, hard_pictures, smooth_pictures
 from hvt_common.errors import UserError
 from hvt_common.vision.hevc import BaseDecoder
 from hvt_edge.encode import PRESETS, BaseEncoder, EncoderSettings, keyframe_floor_bytes, minimum_bps
+from hvt_edge.regions import MOST_REGIONS, Region
 
 SIZE = (320, 192)
 VPS, SPS, PPS, IDR = 32, 33, 34, (19, 20)
@@ -31,10 +32,27 @@ def is_idr(data: bytes) -> bool:
     return {VPS, SPS, PPS} <= set(types) and any(one in IDR for one in types)
 
 
-def encode(pictures, keyframes=(), **changes):
+def encode(pictures, keyframes=(), regions=lambda _index: (), **changes):
     """Access units of pictures."""
     encoder = BaseEncoder(settings(**changes))
-    return [encoder.encode(frame, keyframe=frame.index in keyframes) for frame in framed(pictures)]
+    return [
+        encoder.encode(frame, keyframe=frame.index in keyframes, regions=regions(frame.index))
+        for frame in framed(pictures)
+    ]
+
+
+def errors_at(pictures, units, box):
+    """Mean square error inside a box and outside it, over the last pictures."""
+    decoder = BaseDecoder()
+    decoded = [decoder.decode(unit.data) for unit in units]
+    inside = np.zeros(pictures[0].shape[:2], bool)
+    inside[box[1] : box[3], box[0] : box[2]] = True
+    squares = [
+        (one.astype(np.float64) - picture) ** 2
+        for one, picture in zip(decoded[-6:], pictures[-6:], strict=True)
+    ]
+    square = np.mean(squares, axis=(0, -1))
+    return float(square[inside].mean()), float(square[~inside].mean())
 
 
 def test_each_frame_gives_its_unit_at_once():
@@ -128,3 +146,107 @@ def test_at_the_minimum_the_target_is_still_followed(size, count):
     assert 0.7 * keyframe_floor_bytes(size) < len(units[0].data) < 1.3 * keyframe_floor_bytes(size)
     run_bps = 8 * sum(len(unit.data) for unit in units[1:]) / (count / 15)
     assert run_bps <= 1.1 * target
+
+
+BOX = (96, 64, 192, 128)
+
+
+@pytest.mark.parametrize("preset", ["ultrafast", "superfast", "veryfast"])
+def test_a_region_gets_a_better_picture(preset):
+    """R0, pulses and rolling pulses would all change nothing."""
+    pictures = hard_pictures(24, size=SIZE)[:20]
+    plain = errors_at(pictures, encode(pictures, preset=preset, side_data=True), BOX)
+    units = encode(pictures, preset=preset, side_data=True, regions=lambda _: [Region(BOX, -0.2)])
+    better = errors_at(pictures, units, BOX)
+    assert better[0] < 0.7 * plain[0]
+    assert better[1] > plain[1], "the rest pays for it"
+
+
+def test_where_regions_overlap_the_deeper_one_counts():
+    """A pulse over a frame with tracks would take from the tracks what they had."""
+    pictures = hard_pictures(24, size=SIZE)[:16]
+    both = [Region((0, 0, *SIZE), 0.1), Region(BOX, -0.2)]
+    first, second = (
+        encode(pictures, side_data=True, regions=lambda _, order=order: order) for order in (both, both[::-1])
+    )
+    assert [unit.data for unit in first] == [unit.data for unit in second]
+    inside, outside = errors_at(pictures, first, BOX)
+    assert inside < 0.7 * outside
+
+
+def test_regions_that_come_late_and_go_again_are_safe():
+    """x265 ends the process where side data comes to a stream that began without."""
+    pictures = hard_pictures(30, size=SIZE)
+    wanted = {10: [Region(BOX, -0.3)], 11: [Region((0, 0, *SIZE), -0.3)], 20: [Region(BOX, 0.2)] * 300}
+    units = encode(pictures, keyframes=(15,), side_data=True, regions=lambda index: wanted.get(index, ()))
+    plain = encode(pictures, keyframes=(15,))
+    assert [unit.data for unit in units[:10]] == [unit.data for unit in plain[:10]]
+    assert units[10].data != plain[10].data
+    decoder = BaseDecoder()
+    assert all(decoder.decode(unit.data) is not None for unit in units)
+
+
+def test_side_data_alone_changes_no_byte():
+    """Figures with a plan that asks for nothing could not be compared with those without."""
+    pictures = hard_pictures(20, size=SIZE)
+    plain, marked = (encode(pictures, keyframes=(7,), side_data=one) for one in (False, True))
+    assert [unit.data for unit in plain] == [unit.data for unit in marked]
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        Region((-50, -50, 10, 10), -0.2),
+        Region((300, 180, 5000, 5000), -0.2),
+        Region((40, 40, 40, 90), -0.2),
+        Region((90, 90, 40, 40), -0.2),
+        Region((900, 900, 950, 950), -0.2),
+        Region(BOX, -7.0),
+        Region(BOX, float("nan")),
+    ],
+)
+def test_a_region_at_or_beyond_the_rim_is_cut(region):
+    """A track that leaves the picture would end the edge."""
+    pictures = hard_pictures(6, size=SIZE)
+    units = encode(pictures, side_data=True, regions=lambda index: [region] * (index % 2))
+    decoder = BaseDecoder()
+    assert all(decoder.decode(unit.data) is not None for unit in units)
+
+
+def test_more_regions_than_are_taken_are_left_out():
+    """A crowd of a thousand tracks would cost more time than its frame."""
+    pictures = hard_pictures(4, size=SIZE)
+    wanted = [Region((x, y, x + 8, y + 8), -0.1) for x in range(0, 320, 8) for y in range(0, 192, 8)]
+    assert len(wanted) > MOST_REGIONS
+    units = encode(pictures, side_data=True, regions=lambda _: wanted)
+    few = encode(pictures, side_data=True, regions=lambda _: wanted[:MOST_REGIONS])
+    assert [unit.data for unit in units] == [unit.data for unit in few]
+
+
+def test_the_quantiser_is_told():
+    """``--fps auto`` would decide on nothing."""
+    pictures = hard_pictures(12, size=SIZE)
+    means = []
+    for bitrate in (100_000, 800_000):
+        encoder = BaseEncoder(settings(bitrate_bps=bitrate))
+        for frame in framed(pictures):
+            encoder.encode(frame)
+        means.append(encoder.mean_qp)
+    assert 0 < means[1] < means[0] - 4
+    assert means[0] <= 51 + 6
+
+
+def test_a_new_encoder_goes_on_in_the_same_stream():
+    """A change of frame rate would stop the ground's decoder, or mix two pictures."""
+    pictures = hard_pictures(20, size=SIZE)
+    frames = framed(pictures)
+    decoder = BaseDecoder()
+    for encoder, part in (
+        (BaseEncoder(settings(bitrate_bps=800_000)), frames[:10]),
+        (BaseEncoder(settings(bitrate_bps=800_000, fps=5.0, side_data=True)), frames[10::3]),
+    ):
+        for frame in part:
+            decoded = decoder.decode(encoder.encode(frame, keyframe=frame is part[0]).data)
+            error = (decoded.astype(np.float64) - frame.base_bgr).mean()
+            assert decoded.shape == (SIZE[1], SIZE[0], 3)
+            assert abs(error) < 3

@@ -10,7 +10,7 @@ from hvt_edge.feedback import FeedbackInbox
 U32 = 2**32 - 1
 
 
-def result(sequence: int, *, track: int = 1, name: str = "car") -> StillResult:
+def result(sequence: int, *, track: int = 1, name: str = "car", again: bool = False) -> StillResult:
     """One still's class."""
     return StillResult(
         still_sequence=sequence,
@@ -19,6 +19,7 @@ def result(sequence: int, *, track: int = 1, name: str = "car") -> StillResult:
         confidence=0.9,
         entropy_nats=0.1,
         ground_track_id=-1,
+        again=again,
     )
 
 
@@ -68,6 +69,24 @@ def test_lockstep_takes_exactly_the_stills_it_waited_for_in_their_order():
     assert [one.still_sequence for one in inbox.take_up_to(10)] == [4]
 
 
+def test_a_shared_still_has_an_answer_for_each_of_its_tracks():
+    """Of neighbours in one still only one would ever get a class."""
+    inbox = FeedbackInbox()
+    inbox.receive(report(result(0, track=5), result(0, track=3), result(0, track=5, name="bus")), now_ns=1)
+    assert [(one.track_id, one.class_name) for one in inbox.take_up_to(0)] == [(3, "car"), (5, "car")]
+
+
+def test_a_request_for_a_still_is_heard_beside_the_opinion_of_another_ground():
+    """Of two grounds the one that missed a picture would never see the object."""
+    inbox = FeedbackInbox()
+    inbox.receive(report(result(4)), now_ns=1)
+    for _ in range(2):
+        inbox.receive(report(result(4, name="", again=True), receiver=2), now_ns=2)
+    assert [one.again for one in inbox.take()] == [False, True]
+    inbox.receive(report(result(5, name="", again=True)), now_ns=3)
+    assert inbox.wait_for(frame_index=-1, stills={5}, timeout_s=0), "it is an answer too"
+
+
 def test_waiting_ends_when_frame_and_stills_are_there_or_the_time_is_up():
     """A lockstep edge would run ahead of its ground, or wait for ever for one that is gone."""
     inbox = FeedbackInbox()
@@ -107,7 +126,7 @@ def test_hostile_reports_take_no_memory_and_do_not_hide_true_ones():
     for number in range(0, 100_000, 32):
         never_asked = tuple(result(U32 - number - one) for one in range(32))
         inbox.receive(report(*never_asked, frame=U32, base=2**53 - 1), now_ns=1)
-    assert len(inbox._answered) <= 2048
+    assert max(len(inbox._answered), len(inbox._known)) <= 2048
     inbox.receive(report(result(5)), now_ns=2)
     assert inbox.wait_for(frame_index=9, stills={5}, timeout_s=0)
     assert [one.still_sequence for one in inbox.take_up_to(5)] == [5]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_edge.candidates import Belief, Candidate
-from hvt_edge.methods import METHODS, CostEstimate, CostModel, Step, method
+from hvt_edge.methods import METHODS, CostEstimate, CostModel, Step, method, tuning
 
 SECOND = 1_000_000_000
 FPS = 15.0
@@ -263,6 +263,16 @@ def test_cost_is_always_positive_and_never_falls_with_area(observed):
     assert line.mean_bytes > 0
 
 
+def test_each_codec_starts_at_its_own_cost():
+    """The first stills of a session would be held back, or joined, by the price of another codec."""
+    assert CostModel.of_codec("jpeg").estimate() == CostModel().estimate()
+    assert CostModel.of_codec("my-codec").estimate() == CostModel().estimate()
+    residual = CostModel.of_codec("residual").estimate()
+    assert residual.of_px(6_000) == pytest.approx(460)
+    assert residual.mean_bytes == pytest.approx(520)
+    assert CostModel.of_codec("h264-intra").estimate().of_px(6_000) == pytest.approx(660)
+
+
 def test_same_areas_do_not_upset_the_cost():
     """All stills of one size would make the estimate blow up."""
     model = CostModel()
@@ -273,7 +283,7 @@ def test_same_areas_do_not_upset_the_cost():
 
 def test_registry_names_all_and_says_what_is_accepted():
     """A typing error would end in a traceback, or in another method than the one asked for."""
-    assert [*METHODS][:6] == ["M0", "M1", "M2", "M3", "M4", "M5"]
+    assert [*METHODS][:7] == ["M0", "M1", "M2", "M3", "M4", "M5", "M6"]
     assert {*METHODS} >= {"permissive", "conf_size_top1", "strict_small_only", "balanced_top2"}
     assert method("m5").name == "M5"
     assert method("M1", every_frames=30).requests([candidate(last_sent_frame=280)], step()) == []
@@ -286,3 +296,15 @@ def test_registry_names_all_and_says_what_is_accepted():
             method("M4", area_share=bad)
     with pytest.raises(FrozenInstanceError):
         method("M4").area_share = 1.0
+
+
+def test_tuning_reads_what_a_user_writes():
+    """A weight would be ignored, or a slip end in a traceback."""
+    assert tuning(["min_gain=0.05, look_ahead=2", "min_gain=0.1"]) == {"min_gain": 0.1, "look_ahead": 2.0}
+    assert tuning([]) == {}
+    assert method("M6", **tuning(["min_gain=0.5"])).requests([candidate()], step()) == []
+    for bad in ("min_gain", "min_gain=", "=3", "min gain=3", "min_gain=much", ""):
+        with pytest.raises(UserError, match=r"--tune .* is not accepted: write KEY=VALUE"):
+            tuning([bad])
+    with pytest.raises(UserError, match="method M6 has no parameter 'weight'"):
+        method("M6", **tuning(["weight=1"]))

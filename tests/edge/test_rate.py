@@ -8,7 +8,7 @@ from clips import framed, hard_pictures, real_pictures
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.ledger import overhead_bytes
 from hvt_edge.encode import BaseEncoder, EncoderSettings, minimum_bps
-from hvt_edge.rate import encoder_settings, least_base_bps
+from hvt_edge.rate import PULSE_VBV_S, encoder_settings, least_base_bps
 from hvt_edge.send import BASE_ATTACHMENT_BYTES, STATUS_BYTES
 
 SIZE, FPS = (1280, 720), 15
@@ -94,3 +94,33 @@ def test_the_least_share_is_kept():
         sum(line_bits(hard_pictures(count, size=size), settings, keyframes=(100,))) / (count / FPS)
         <= 1.05 * least
     )
+
+
+@pytest.mark.parametrize("every_n", [3, 5])
+def test_fewer_frames_leave_more_for_each_and_keep_the_share(every_n):
+    """With ``--fps auto`` the base would overspend, or waste what headers no longer take."""
+    fps = FPS / every_n
+    settings = encoder_settings(
+        size=SIZE, fps=fps, preset="veryfast", total_bps=400_000, base_bps=320_000, edge_id="edge-1"
+    )
+    assert settings.bitrate_bps > asked(320_000, 400_000).bitrate_bps + 3_000
+    assert settings.vbv_s * fps >= 0.999, "x265 takes no VBV that holds less than a frame"
+    pictures = hard_pictures(300, size=SIZE)[::every_n]
+    encoder = BaseEncoder(settings)
+    payload = sum(len(encoder.encode(frame).data) for frame in framed(pictures, fps=fps))
+    header = len(pictures) * 110
+    assert 0.85 * 320_000 <= 8 * (payload + header) / (len(pictures) / fps) <= 1.03 * 320_000
+    assert least_base_bps(SIZE, fps, edge_id="edge-1") < 0.6 * least_base_bps(SIZE, FPS, edge_id="edge-1")
+
+
+def test_whole_frame_pulses_get_the_buffer_they_need():
+    """The pulse would be asked for and not happen."""
+    both = [
+        encoder_settings(
+            size=SIZE, fps=FPS, preset="veryfast", total_bps=400_000, base_bps=base, edge_id="a", pulses=True
+        )
+        for base in (320_000, 400_000)
+    ]
+    assert [one.vbv_s for one in both] == [PULSE_VBV_S] * 2
+    assert all(one.side_data for one in both)
+    assert not asked(320_000, 400_000).side_data

@@ -96,6 +96,75 @@ def test_what_a_cropped_base_does_not_show_is_no_candidate():
     assert len(seen.tracks) == 0
 
 
+def sparse(eyes: Sight, *, every: int, hurried: frozenset[int] = frozenset()) -> list:
+    """All ticks, of which only each n-th is coded, as with ``--fps auto``."""
+    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
+    return [
+        eyes.see(
+            replace(frame, source_bgr=frame.base_bgr),
+            encoder.encode(frame) if frame.index % every == 0 else None,
+            hurry=frame.index in hurried,
+        )
+        for frame in FRAMES
+    ]
+
+
+@pytest.mark.parametrize(
+    ("candidates", "every", "detected"),
+    [
+        ("source", 1, [0, 5, 10, 15, 20, 25]),
+        ("source", 2, [0, 6, 12, 18, 24]),
+        ("source", 5, [0, 5, 10, 15, 20, 25]),
+        ("source", 15, [0, 6, 11, 15, 20, 25]),
+        ("source", 8, [0, 6, 8, 13, 16, 21, 24, 29]),
+        ("decoded", 2, [0, 6, 12, 18, 24]),
+        ("decoded", 8, [0, 8, 16, 24]),
+        ("decoded", 15, [0, 15]),
+    ],
+)
+def test_where_few_ticks_are_coded_each_of_them_has_its_own_detection(candidates, every, detected):
+    """Stills could not be cut where the base has no picture, or would be chosen by what was seen before it."""
+    seen = sparse(sight(candidates=candidates), every=every)
+    assert [one.frame.index for one in seen if one.detected] == detected
+    assert [one.frame.index for one in seen if one.coded] == list(range(0, 30, every))
+    for one in seen:
+        assert (one.base_bgr is None) == (not one.coded)
+        assert one.tracks.frame_index == one.frame.index
+    if every > 5:
+        assert all(one.detected for one in seen if one.coded)
+
+
+def test_ticks_that_are_not_coded_still_move_the_tracks():
+    """At a frame a second, tracks would jump, and the tracks channel have nothing to say between."""
+    seen = sparse(sight(candidates="source", detect_every=3), every=10)
+    for one in seen[7:]:
+        assert one.tracks.ids.tolist() == [1]
+        np.testing.assert_allclose(one.tracks.boxes_xyxy_px[0], square_box(one.frame.index), atol=6)
+
+
+def test_a_hurried_coded_tick_is_made_up_for():
+    """With a slow detector and few coded ticks, detection would be put off until the next coded one."""
+    seen = sparse(sight(candidates="source"), every=15, hurried=frozenset({15}))
+    assert [one.frame.index for one in seen if one.detected] == [0, 6, 11, 16, 21, 26]
+
+
+def test_with_candidates_of_the_source_the_camera_is_followed_on_the_source():
+    """Tracks would be moved by what the coder left of the picture, and not at all between coded ticks."""
+    given: list[bool] = []
+
+    class Watched(ByteTracker):
+        def predict(self, *, frame_index, image_bgr=None):
+            given.append(image_bgr is FRAMES[frame_index].base_bgr)
+            return super().predict(frame_index=frame_index, image_bgr=image_bgr)
+
+    for candidates, followed in (("source", True), ("decoded", False)):
+        tracker = Watched(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
+        settings = SightSettings(candidates=candidates)
+        sparse(Sight(RedSquares(), tracker, view=VIEW, settings=settings), every=2)
+        assert set(given) == {followed}
+        given.clear()
+
+
 class Out:
     """Keeps what was put."""
 
@@ -137,7 +206,6 @@ class Rig:
             chooser,
             sender=sender,
             keyframes=self.keyframes,
-            media_type="image/jpeg",
         )
         self.keyframes.done(FRAMES[0].capture_ns)
 
@@ -182,6 +250,7 @@ def test_what_the_ground_says_counts_and_no_opinion_does_not():
         "confidence": 0.9,
         "entropy_nats": 0.2,
         "ground_track_id": 3,
+        "again": False,
     }
     rig.stage.hear([StillResult(class_name="", **answer)])
     assert rig.memory._histories[1].belief is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import av
@@ -11,12 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from base_coded import Hopeless, StandIn
 from hvt_common.values import Frame, Still, View
-from hvt_common.vision.still_codecs import JpegCodec, jpeg_size
+from hvt_common.vision.base_crop import base_crop, coded_size
+from hvt_common.vision.still_codecs import BaseMissingError, JpegCodec, still_codec
+from hvt_common.vision.still_codecs.jpeg import jpeg_size
 from hvt_edge.candidates import Candidate
-from hvt_edge.crop import base_crop, coded_size
+from hvt_edge.crop import crop_box
 from hvt_edge.methods import Request
-from hvt_edge.still import NoStill, StillMaker, crop_box
+from hvt_edge.still import NoStill, StillMaker
 
 SIZE = (1280, 720)
 CODEC = JpegCodec()
@@ -123,7 +127,7 @@ def test_a_still_says_what_it_shows():
     assert (still.class_name, still.reason, still.codec, still.quality_pct) == ("car", "utility", "jpeg", 65)
     assert jpeg_size(still.data) == (130, 78)
     crop = source[191:269, 285:415]
-    assert still.data == CODEC.encode(np.ascontiguousarray(crop), quality_pct=65)
+    assert still.data == CODEC.encode(np.ascontiguousarray(crop), quality_pct=65).data
 
 
 @given(limit=st.integers(300, 8_000), side=st.integers(10, 150), seed=st.integers(0, 3))
@@ -135,7 +139,7 @@ def test_never_larger_than_admitted_and_the_best_that_fits(limit, side, seed):
     made = make(source, box, limit=limit)
     x1, y1, x2, y2 = crop_box(box, padding=0.15, source_size=(400, 300))
     crop = np.ascontiguousarray(source[y1:y2, x1:x2])
-    sizes = {quality: len(CODEC.encode(crop, quality_pct=quality)) for quality in range(35, 66)}
+    sizes = {quality: len(CODEC.encode(crop, quality_pct=quality).data) for quality in range(35, 66)}
     fitting = [quality for quality, size in sizes.items() if size <= limit]
     if isinstance(made, NoStill):
         assert made.reason == "too_large"
@@ -241,16 +245,51 @@ def carpark(data, count: int) -> list[np.ndarray]:
     raise AssertionError("clip is shorter than expected")
 
 
-@pytest.mark.realdata
-@pytest.mark.parametrize(("kbps", "raised"), [(650, False), (1800, True)])
-def test_every_still_is_closer_to_the_source_than_the_base(data, kbps, raised):
-    """The operator would pay for a still that shows less than the video."""
+def flown(data, *, kbps: int) -> tuple[list[np.ndarray], list[np.ndarray], View, int]:
+    """Source frames, what the ground decodes of them, the map between them, and the width of the border."""
     sources = carpark(data, 24)
     left = (SIZE[0] - 1100) // 2
     padded = [cv2.copyMakeBorder(one, 0, 0, left, left, cv2.BORDER_CONSTANT) for one in sources]
     shown = decoded_base(padded, kbps=kbps)
     assert len(shown) == len(sources)
-    view = View.fitted((1100, 720), SIZE, fit="letterbox")
+    return sources, shown, View.fitted((1100, 720), SIZE, fit="letterbox"), left
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(("kbps", "most"), [(400, 0.5), (800, 0.35)])
+def test_stills_on_the_decoded_base_cost_a_part_and_show_as_much(data, kbps, most):
+    """The codec that both sides need the base for would not be worth it, or not fit the ground's pictures."""
+    sources, shown, view, _ = flown(data, kbps=kbps)
+    residual, intra = still_codec("residual"), still_codec("h264-intra")
+    built_maker = StillMaker(codec=residual, fallback=intra, fidelity_db=38.0)
+    plain_maker = StillMaker(fidelity_db=38.0)
+    built_bytes = plain_bytes = 0
+    for row in range(4):
+        for column in range(4):
+            x, y = 60.0 + 240.3 * column, 40.0 + 160.7 * row
+            box = (x, y, x + 92.0, y + 58.0)
+            built = make(sources[20], box, base=shown[20], view=view, index=20, maker=built_maker)
+            plain = make(sources[20], box, base=shown[20], view=view, index=20, maker=plain_maker)
+            if isinstance(built, NoStill):
+                assert isinstance(plain, NoStill)
+                continue
+            crop, base = built.crop_source_px, None
+            size = (crop[2] - crop[0], crop[3] - crop[1])
+            if built.codec == "residual":
+                base = base_crop(shown[20], view=view, crop_source_px=crop, size=size)
+            seen = still_codec(built.codec).decode(
+                built.data, size=size, parameters=built.parameters, base_bgr=base
+            )
+            assert psnr_db(seen, crop_px(sources[20], built)) >= 38 - 1e-6
+            built_bytes, plain_bytes = built_bytes + len(built.data), plain_bytes + len(plain.data)
+    assert 0 < built_bytes < most * plain_bytes
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(("kbps", "raised"), [(650, False), (1800, True)])
+def test_every_still_is_closer_to_the_source_than_the_base(data, kbps, raised):
+    """The operator would pay for a still that shows less than the video."""
+    sources, shown, view, left = flown(data, kbps=kbps)
     stills, asked = [], 0
     for index in (8, 16, 23):
         for row in range(5):
@@ -272,3 +311,169 @@ def test_every_still_is_closer_to_the_source_than_the_base(data, kbps, raised):
         assert mse(sent, truth) < mse(base, truth)
         assert mse(luma(sent), luma(truth)) < mse(luma(base), luma(truth))
     assert any(still.quality_pct > 65 for still in stills) == raised
+
+
+# Codecs that build on the base, and fidelity
+
+CAR = (300.0, 200.0, 420.0, 280.0)
+BASE_CODED = StillMaker(codec=StandIn(), fallback=CODEC)
+
+
+def blurred(source: np.ndarray) -> np.ndarray:
+    """What a base of few bits shows: the shapes without their texture."""
+    return cv2.GaussianBlur(source, (0, 0), 2)
+
+
+def shown_of(still: Still, *, base: np.ndarray | None = None, view: View | None = None) -> np.ndarray:
+    """What the ground sees: it has nothing but the still's header, its bytes and its own base frame."""
+    x1, y1, x2, y2 = still.crop_source_px
+    size = (int(still.parameters.get("w", x2 - x1)), int(still.parameters.get("h", y2 - y1)))
+    if still.codec == "jpeg":
+        return CODEC.decode(still.data, size=size)
+    view = view or View.fitted(SIZE, SIZE, fit="letterbox")
+    seen = base_crop(base, view=view, crop_source_px=still.crop_source_px, size=size)
+    return StandIn().decode(still.data, size=size, parameters=still.parameters, base_bgr=seen)
+
+
+def crop_px(source: np.ndarray, still: Still) -> np.ndarray:
+    """The source's pixels of a still."""
+    x1, y1, x2, y2 = still.crop_source_px
+    return source[y1:y2, x1:x2]
+
+
+def psnr_db(one: np.ndarray, other: np.ndarray) -> float:
+    """Luma PSNR."""
+    return 10 * np.log10(255**2 / max(1e-9, mse(luma(one), luma(other))))
+
+
+def test_a_still_that_builds_on_the_base_says_so_and_can_be_undone():
+    """The ground would have a still that it cannot show."""
+    source = scene(*SIZE)
+    base = blurred(source)
+    still = make(source, CAR, base=base, maker=BASE_CODED)
+    assert (still.codec, still.media_type) == ("stand-in", "image/webp")
+    assert set(still.parameters) == {"c"}
+    assert psnr_db(shown_of(still, base=base), crop_px(source, still)) > 30
+    with pytest.raises(BaseMissingError):
+        shown_of(still, base=np.roll(base, 1, axis=1))
+
+
+def test_a_long_crop_says_its_coded_size_beside_the_codecs_own_parameters():
+    """The ground would decode to the wrong size, or lose the reference to the base."""
+    source = scene(3840, 2160)
+    view = View.fitted((3840, 2160), SIZE, fit="letterbox")
+    base = cv2.resize(blurred(source), SIZE, interpolation=cv2.INTER_AREA)
+    still = make(source, (1000.0, 800.0, 1700.0, 1200.0), base=base, maker=BASE_CODED, limit=10**6)
+    assert (still.parameters["w"], still.parameters["h"]) == (512, 293)
+    assert "c" in still.parameters
+    assert shown_of(still, base=base, view=view).shape == (293, 512, 3)
+
+
+def test_without_a_base_frame_the_fallback_serves():
+    """A still of a tick that was not coded could never be shown, or would never be sent."""
+    still = make(scene(*SIZE), CAR, maker=BASE_CODED)
+    assert (still.codec, still.media_type, still.parameters) == ("jpeg", "image/jpeg", {})
+
+
+@pytest.mark.parametrize("fidelity_db", [0.0, 36.0])
+def test_where_the_base_shows_something_else_the_fallback_is_smaller(fidelity_db):
+    """An object that has just come into view would cost more bits than with no base at all."""
+    source = scene(*SIZE)
+    elsewhere = scene(*SIZE, seed=5)
+    maker = StillMaker(codec=StandIn(), fallback=CODEC, fidelity_db=fidelity_db)
+    chosen = make(source, CAR, base=elsewhere, maker=maker)
+    # What it would have been: no fallback ever beats a still of the same codec in size.
+    built = make(
+        source,
+        CAR,
+        base=elsewhere,
+        maker=StillMaker(codec=StandIn(), fallback=Hopeless(), fidelity_db=fidelity_db),
+    )
+    assert chosen.codec == "jpeg"
+    assert len(chosen.data) < len(built.data)
+    crop = crop_px(source, chosen)
+    assert psnr_db(shown_of(chosen), crop) >= psnr_db(shown_of(built, base=elsewhere), crop) - 1e-6
+
+
+@given(target=st.floats(26, 42), side=st.integers(12, 160), seed=st.integers(0, 3), built=st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_fidelity_is_reached_with_the_fewest_bytes(target, side, seed, built):
+    """The classifier would get less than it needs, or bits would be spent on what it does not see."""
+    grey = cv2.cvtColor(scene(400, 300, seed=seed), cv2.COLOR_BGR2GRAY)
+    source = cv2.merge([grey] * 3)
+    base, view = blurred(source), View.fitted((400, 300), (400, 300), fit="letterbox")
+    box = (100.0, 80.0, 100.0 + side, 80.0 + side)
+    maker = StillMaker(codec=StandIn() if built else CODEC, fallback=Hopeless(), fidelity_db=target)
+    still = make(source, box, base=base if built else None, maker=maker, view=view)
+    x1, y1, x2, y2 = crop_box(box, padding=0.15, source_size=(400, 300))
+    crop, seen = source[y1:y2, x1:x2].copy(), base[y1:y2, x1:x2].copy()
+    if isinstance(still, NoStill):
+        assert still.reason == "base_good"
+        assert psnr_db(seen, crop) > target - 0.1
+        return
+    reached = psnr_db(shown_of(still, base=base, view=view), crop)
+    assert reached >= target - 1e-6 or still.quality_pct == 95
+    if still.quality_pct == 1:
+        return
+    one_less = {"quality_pct": still.quality_pct - 1, "base_bgr": seen if built else None}
+    lower = maker.codec.encode(crop, **one_less)
+    undone = maker.codec.decode(
+        lower.data, size=(x2 - x1, y2 - y1), parameters=lower.parameters, base_bgr=one_less["base_bgr"]
+    )
+    # Qualities dip by a little from step to step; and just above the base's own fidelity it has to be beaten too.
+    assert psnr_db(undone, crop) < target + 0.3 or (
+        built and psnr_db(undone, crop) < psnr_db(seen, crop) + 0.5
+    )
+
+
+def test_fidelity_that_does_not_fit_gives_the_best_that_does():
+    """Where room is short nothing at all would be seen sharp."""
+    source = scene(*SIZE)
+    base = blurred(source)
+    maker = StillMaker(codec=StandIn(), fallback=CODEC, fidelity_db=40.0)
+    whole = make(source, CAR, base=base, maker=maker)
+    assert psnr_db(shown_of(whole, base=base), crop_px(source, whole)) >= 40
+    tight = make(source, CAR, base=base, maker=maker, limit=len(whole.data) * 2 // 3)
+    assert len(tight.data) <= len(whole.data) * 2 // 3
+    crop = crop_px(source, tight)
+    assert psnr_db(base[185:295, 279:441][: crop.shape[0], : crop.shape[1]], crop) < psnr_db(
+        shown_of(tight, base=base), crop
+    )
+    assert tight.quality_pct < whole.quality_pct
+
+
+def test_parameters_take_their_part_of_the_admission():
+    """A still of just the room would overrun the window by what the codec writes into the header."""
+    source = scene(*SIZE)
+    base = blurred(source)
+    view = View.fitted(SIZE, SIZE, fit="letterbox")
+    cut = BASE_CODED.cut(frame_of(source), request_for(CAR), view=view, base_bgr=base)
+    whole = BASE_CODED.code(cut, sequence=0, room=lambda _: 10**6)
+    limit = len(whole.data) + 3
+
+    def room(still: Still) -> int:
+        return limit - 10 * len(still.parameters)
+
+    still = BASE_CODED.code(cut, sequence=0, room=room)
+    assert len(still.data) <= limit - 10
+    assert still.quality_pct < whole.quality_pct
+
+
+def test_one_still_of_several_beats_the_base_at_each_of_them():
+    """A neighbour that the base shows well would be shown worse by the still it shares."""
+    source = scene(*SIZE)
+    base = cv2.imdecode(
+        cv2.imencode(".jpg", source, [cv2.IMWRITE_JPEG_QUALITY, 75])[1], cv2.IMREAD_COLOR
+    )  # better than a still of quality 65, but for one place
+    base[200:280, 300:420] = blurred(source)[200:280, 300:420]
+    lead = request_for(CAR)
+    other = replace(request_for((440.0, 200.0, 560.0, 280.0)).candidate, track_id=7)
+    both = replace(lead, also=(other,))
+    view = View.fitted(SIZE, SIZE, fit="letterbox")
+    still = StillMaker().make(frame_of(source), both, sequence=0, view=view, limit_bytes=10**6, base_bgr=base)
+    assert still.also == ((7, other.box_source_px),)
+    assert still.crop_source_px == (282, 188, 578, 292)
+    shown = shown_of(still)
+    for x1, x2 in ((300, 420), (440, 560)):
+        truth = source[200:280, x1:x2]
+        assert mse(shown[12:92, x1 - 282 : x2 - 282], truth) < mse(base[200:280, x1:x2], truth)

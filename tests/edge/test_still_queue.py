@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_common.values import Frame
+from hvt_common.values import Still
 from hvt_edge.candidates import Candidate
+from hvt_edge.cut import Cut
 from hvt_edge.methods.base import Request
 from hvt_edge.still_queue import QueueSettings, StillQueue, Waiting
 
-PICTURE = np.zeros((4, 4, 3), np.uint8)
+DRAFT = Still(0, 0, 0, 1, (0, 0, 4, 4), (0, 0, 4, 4), "car", 0.5, "test", "jpeg", 65, b"")
+CUT = Cut(DRAFT, np.zeros((4, 4, 3), np.uint8), None, None)
 
 
 def wish(track: int, score: float, *, since_ns: int = 0) -> Waiting:
@@ -28,7 +32,16 @@ def wish(track: int, score: float, *, since_ns: int = 0) -> Waiting:
         crop_area_px=16,
         born_frame=0,
     )
-    return Waiting(Request(candidate, "test", score), Frame(0, 0, PICTURE, PICTURE), since_ns)
+    return Waiting(Request(candidate, "test", score), CUT, since_ns)
+
+
+def shared(lead: Waiting, *others: Waiting) -> Waiting:
+    """One still for several."""
+    draft = replace(
+        lead.cut.draft, also=tuple((one.track_id, one.request.candidate.box_source_px) for one in others)
+    )
+    request = replace(lead.request, also=tuple(one.request.candidate for one in others))
+    return replace(lead, request=request, cut=replace(lead.cut, draft=draft))
 
 
 def tracks(queue: StillQueue) -> list[int]:
@@ -86,6 +99,34 @@ def test_what_waited_too_long_leaves():
     assert tracks(queue) == [2]
     assert queue.clear() == [young]
     assert len(queue) == 0
+
+
+def test_a_shared_wish_keeps_every_track_to_one_wish():
+    """A track would be sent twice, in its own still and in its neighbour's."""
+    queue = StillQueue()
+    pair = shared(wish(1, 0.9), wish(2, 0.4), wish(3, 0.4))
+    assert queue.offer(pair) == []
+    assert 3 in queue
+    alone = wish(2, 0.5, since_ns=5)
+    assert queue.offer(alone) == [], "it only gets off the shared one"
+    (kept,) = (one for one in queue if one.track_id == 1)
+    assert kept.track_ids == {1, 3}
+    assert [track for track, _ in kept.cut.draft.also] == [3]
+    other = shared(wish(4, 0.2), wish(1, 0.2), wish(3, 0.2))
+    assert [(gone.track_id, why) for gone, why in queue.offer(other)] == [(1, "replaced")]
+    assert sorted(map(tuple, (sorted(one.track_ids) for one in queue))) == [(1, 3, 4), (2,)]
+
+
+def test_only_what_would_stay_is_worth_the_cutting():
+    """Crops would be taken out of frames for wishes that leave at once, or wishes refused that would have stayed."""
+    queue = StillQueue(QueueSettings(max_length=2))
+    for one in (wish(1, 0.5), wish(2, 0.3)):
+        assert queue.admits(one.request, now_ns=0)
+        queue.offer(one)
+    for score, track, stays in ((0.2, 3, False), (0.3, 3, False), (0.31, 3, True), (0.1, 2, True)):
+        asked = wish(track, score)
+        assert queue.admits(asked.request, now_ns=0) == stays
+    assert queue.offer(wish(3, 0.31))[0][0].track_id == 2
 
 
 @given(

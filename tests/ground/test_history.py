@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flight import tracks_at
 from hvt_common.values import Tracks
-from hvt_ground.history import History
+from hvt_ground.history import FilledLog, History
 
 
 def picture(value, *, height=4, width=6):
@@ -76,6 +77,57 @@ def test_tracks_are_found_by_frame_and_bounded():
     assert history.tracks(3).frame_index == 3
     assert history.tracks(0) is None
     assert history.tracks(2) is None
+
+
+def listed(frame_index, boxes):
+    """Tracks from ``{id: left edge}``."""
+    return tracks_at(frame_index, {i: (left, 0.0, left + 10, 10.0) for i, left in boxes.items()})
+
+
+def test_what_is_learned_later_is_put_where_it_belongs():
+    """A still of a track that the edge reported late would match nothing at its frame."""
+    history = History(track_frames=4)
+    for index in (0, 2, 4):
+        history.revise_tracks(listed(index, {1: 0.0}))
+    history.revise_tracks(listed(2, {1: 5.0, 2: 50.0}))
+    history.revise_tracks(listed(3, {1: 7.0}))
+    assert history.tracks(2).ids.tolist() == [1, 2]
+    assert history.newest_tracked == 4
+    history.revise_tracks(listed(1, {1: 3.0}))
+    assert history.oldest_tracked == 1, "no more than four"
+    history.revise_tracks(listed(0, {1: 3.0}))
+    assert history.tracks(0) is None, "what is gone does not come back"
+    history.rename_track(1, 2)
+    assert history.tracks(2).ids.tolist() == [1, 2]
+    assert history.tracks(3).ids.tolist() == [1]
+    history.rename_track(9, 1)
+    assert history.tracks(3).ids.tolist() == [9]
+
+
+def test_between_two_frames_tracks_lie_on_a_line():
+    """Where the base leaves ticks out, stills of them would refine nothing; or something far away."""
+    history = History()
+    history.add_tracks(listed(0, {1: 0.0, 2: 90.0}))
+    history.add_tracks(listed(4, {1: 8.0, 3: 50.0}))
+    history.add_tracks(listed(24, {1: 8.0}))
+    log = FilledLog(history, within=15)
+    assert log.tracks(3).ids.tolist() == [1]
+    np.testing.assert_allclose(log.tracks(3).boxes_xyxy_px, [[6, 0, 16, 10]])
+    assert log.tracks(4) is history.tracks(4)
+    assert log.tracks(12) is None, "twenty frames are no gap but an outage"
+    assert log.tracks(25) is None
+    assert (log.oldest_tracked, log.newest_tracked) == (0, 24)
+
+
+def test_a_tick_without_a_picture_has_the_one_before_it():
+    """Re-detection would have no surroundings for a still of such a tick."""
+    history = History()
+    history.add_frame(4, picture(4))
+    history.add_frame(9, picture(9))
+    assert int(history.frame_before(8, within=5)[0, 0, 0]) == 4
+    assert int(history.frame_before(9, within=5)[0, 0, 0]) == 9
+    assert history.frame_before(3, within=5) is None
+    assert history.frame_before(15, within=5) is None
 
 
 def test_a_new_session_begins_with_clear():

@@ -155,7 +155,11 @@ def test_a_finer_still_is_shown_beside_an_enlarged_crop(events: list[Event], tmp
     path = tmp_path / "a.rrd"
     with Recorder(settings(path)) as recorder:
         recorder.log(dataclasses.replace(refinement, still=still, media_type="image/png"))
-        recorder.log(dataclasses.replace(refinement, still=still, media_type="image/png", base_crop_bgr=None))
+        recorder.log(
+            dataclasses.replace(
+                refinement, still_sequence=1, still=still, media_type="image/png", base_crop_bgr=None
+            )
+        )
     read = Recording(path)
     shapes = [cv2.imdecode(np.frombuffer(data, np.uint8), 1).shape for _, data in read.base_crops()]
     assert large.shape in shapes

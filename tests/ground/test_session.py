@@ -7,7 +7,7 @@ from typing import Self
 
 import pytest
 
-from flight import Flight, Port, RedSquares, SameAnswer, sight_of
+from flight import Flight, Port, RedSquares, SameAnswer, sight_of, square_box
 from hvt_common.link.inbox import Inbox, Received
 from hvt_common.link.ledger import Channel, overhead_bytes
 from hvt_common.link.wire import Info
@@ -116,6 +116,64 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
         assert rig.port.keyframe_requests == 0
 
 
+@pytest.mark.parametrize("pace", ["realtime", "lockstep"])
+def test_the_edges_tracks_are_counted_and_shown(pace):
+    """The two sides' accounts would differ, or the third channel would be paid for and not used."""
+    flight = Flight(20, pace=pace)
+    far = (220.0, 20.0, 250.0, 50.0)
+    with Rig() as rig:
+        rig.port.flight = flight
+        steps = [flight.step(index, {31: square_box(index), 32: far}) for index in (0, 5, 10)]
+        items = [*bases(flight, *range(6)), *steps[:2], *bases(flight, *range(6, 12)), steps[2]]
+        items += bases(flight, *range(12, 20))
+        for item in items:
+            rig.put(item)
+            rig.settle()
+        session = rig.receiver.session
+        assert (session.steps_received, session.ledger.messages(Channel.META)) == (3, 3)
+        assert session.ledger.line_bytes == sum(
+            len(one.payload)
+            + len(one.attachment)
+            + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
+            for one in items
+        )
+        assert session.sight.tracks == 2
+        assert session.sight.steps_used == 3
+        assert session.sight.list_at(19).origins == ("edge+base", "edge")
+
+
+def test_tracks_that_make_no_sense_are_counted_and_skipped():
+    """One damaged report would end the ground, or show boxes that nobody saw."""
+    flight, stranger = Flight(10), Flight(2)
+    with Rig() as rig:
+        rig.port.flight = flight
+        good = [flight.step(index, {31: square_box(index)}) for index in (2, 3)]
+        rig.put(*bases(flight, 0, 1, 2, 3), good[0], good[0])
+        rig.put(flight.step(4, {31: square_box(4)}, boxes=b"\xff" * 40, reference=-1))
+        rig.put(stranger.step(0, {1: square_box(0)}), Received(good[1].key, b"\x93\x02", b"", "", 1))
+        rig.settle()
+        session = rig.receiver.session
+        assert (session.steps_received, session.sight.steps_used) == (2, 1)
+        assert rig.receiver.unusable == 3
+        rig.put(*bases(flight, *range(4, 10)), flight.status(base=10))
+        rig.settle()
+        assert session.last_frame_index == 9
+
+
+def test_the_end_waits_for_the_last_tracks():
+    """The ground's account would lack the last tracks: the report of the end overtakes them."""
+    flight = Flight(3)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2), flight.status(base=3, meta=1, state="ended"))
+        rig.settle()
+        assert not rig.receiver.idle
+        rig.put(flight.step(2, {31: square_box(2)}))
+        wait_for(lambda: rig.receiver.idle, timeout_s=1.5)
+        (session,) = rig.receiver.done
+        assert (session.steps_received, session.sight.steps_used) == (1, 1)
+
+
 def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
     """One lost message would freeze the picture, or fill it with garbage that looks like a picture."""
     with Rig() as rig:
@@ -154,7 +212,7 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
         session = rig.receiver.session
         assert (session.frames_received, session.frames_decoded, session.stills_received) == (3, 3, 1)
         assert session.ledger.messages(Channel.META) == 1
-        assert rig.receiver.unusable == 2
+        assert rig.receiver.unusable == 3
         rig.put(broken)
         rig.settle()
         wait_for(lambda: rig.port.keyframe_requests >= 1)

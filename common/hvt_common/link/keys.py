@@ -90,9 +90,7 @@ DELIVERIES: Mapping[Row, Delivery] = MappingProxyType(
             "BLOCK",
             encoding="image/jpeg",
         ),
-        Row.TRACKS: Delivery(
-            Direction.EDGE_TO_GROUND, "the edge's own tracks (reserved)", "DATA_LOW", "DROP"
-        ),
+        Row.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "TrackStep", "DATA_LOW", "DROP"),
         Row.STATUS: Delivery(Direction.EDGE_TO_GROUND, "Status", "INTERACTIVE_LOW", "DROP"),
         Row.INFO: Delivery(Direction.GROUND_ASKS, "empty question, Info", "INTERACTIVE_HIGH", "BLOCK"),
         Row.CONTROL: Delivery(

@@ -11,7 +11,7 @@ rate of detection; a track has a class.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -170,6 +170,24 @@ class ByteTracker:
         self._table.started[:] = False
         return self._listed(frame_index)
 
+    def extrapolated(self, *, frame_index: int) -> Tracks:
+        """What `predict` would list at this or a later frame if the camera stood still; nothing is changed.
+
+        For lists to show between frames that are given to the tracker. ``started`` is False throughout.
+        A `ValueError` means that ``frame_index`` lies before the last frame.
+        """
+        last = frame_index if self._frame_index is None else self._frame_index
+        if frame_index < last:
+            raise ValueError(f"frame_index is {frame_index}, must not be below the last one, {last}")
+        table = self._table
+        elapsed = frame_index - last
+        states = table.states.copy()
+        for _ in range(min(elapsed, self._buffer_frames + 2)):
+            kalman.predict(states)
+        ended = elapsed > self._buffer_frames + 1
+        listed = self._listed(frame_index, states=states[:0] if ended else states)
+        return replace(listed, started=np.zeros(len(listed), bool))
+
     def _advance(self, frame_index: int, image_bgr: Image | None, *, hold_unconfirmed: bool) -> None:
         """Bring all states to this frame: Kalman steps, then the camera's motion."""
         if self._frame_index is not None and frame_index <= self._frame_index:
@@ -311,11 +329,12 @@ class ByteTracker:
         duplicate[a[~lost_is_shorter]] = True
         return duplicate
 
-    def _listed(self, frame_index: int) -> Tracks:
+    def _listed(self, frame_index: int, *, states: kalman.States | None = None) -> Tracks:
         table = self._table
-        boxes = kalman.boxes_of(table.states)
+        boxes = kalman.boxes_of(table.states if states is None else states)
         area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-        rows = ((table.phase == TRACKED) & (area > self._settings.min_box_area_px2)).nonzero()[0]
+        tracked = table.phase[: len(boxes)] == TRACKED
+        rows = (tracked & (area > self._settings.min_box_area_px2)).nonzero()[0]
         votes = table.votes[rows]
         return Tracks(
             frame_index=frame_index,

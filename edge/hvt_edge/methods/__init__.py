@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hvt_edge.methods.base import Method, Request, Step
 from hvt_edge.methods.cost import CostEstimate, CostModel
-from hvt_edge.methods.registry import METHODS, MethodEntry, method
+from hvt_edge.methods.registry import METHODS, MethodEntry, method, tuning
 from hvt_edge.methods.selectors import SELECTORS, Selector, select
 
 __all__ = [
@@ -19,4 +19,5 @@ __all__ = [
     "Step",
     "method",
     "select",
+    "tuning",
 ]

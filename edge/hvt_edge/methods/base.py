@@ -12,7 +12,10 @@ from typing import Protocol
 from hvt_edge.candidates import Candidate
 from hvt_edge.methods.cost import CostEstimate
 
-__all__ = ["Method", "Request", "Step", "ranked"]
+__all__ = ["STILL_OVERHEAD_BYTES", "Method", "Request", "Step", "ranked"]
+
+STILL_OVERHEAD_BYTES = 180.0
+"""With the usual names: 91 of header and 83 of framing and TCP for JPEG, 18 more for a residual's parameters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,10 @@ class Step:
     """What a still is expected to cost, learnt from those already sent."""
     room_bytes: float
     """What the rolling budget would admit now."""
+    still_overhead_bytes: float = STILL_OVERHEAD_BYTES
+    """Line bytes that a still takes beside its payload: header, framing, transport."""
+    from_source: bool = False
+    """Whether candidates were detected on the source (``--candidates source``): the base may not show them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +47,8 @@ class Request:
     """In a word or two, for the ledger, the wire and the viewer."""
     score: float
     """The queue sends the highest first; comparable within one method only."""
+    also: tuple[Candidate, ...] = ()
+    """Neighbours that the same still shows (`hvt_edge.neighbours`), by track id; never ``candidate`` itself."""
 
 
 class Method(Protocol):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
 from types import MappingProxyType
@@ -17,9 +17,11 @@ from hvt_edge.methods.m2 import OnStart
 from hvt_edge.methods.m3 import Uncertain
 from hvt_edge.methods.m4 import Small
 from hvt_edge.methods.m5 import Utility
+from hvt_edge.methods.m6 import ExpectedGain
+from hvt_edge.methods.r0 import TracksFirst
 from hvt_edge.methods.selectors import SELECTORS, SelectorMethod
 
-__all__ = ["METHODS", "MethodEntry", "method"]
+__all__ = ["METHODS", "MethodEntry", "method", "tuning"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +50,13 @@ _SELECTOR_HELP = {
 METHODS: Mapping[str, MethodEntry] = MappingProxyType(
     {
         "M0": _entry(VideoOnly, "video only: no stills"),
+        "R0": _entry(TracksFirst, "video only, active tracks quantised better (--roi-depth)"),
         "M1": _entry(Periodic, "every track each 15 frames, most overdue first"),
         "M2": _entry(OnStart, "when a track begins or is found again"),
         "M3": _entry(Uncertain, "tracks of low confidence: detector's, or classifier's once known"),
         "M4": _entry(Small, "tracks that are small in the frame"),
         "M5": _entry(Utility, "most utility per byte: uncertain, small, not refined lately"),
+        "M6": _entry(ExpectedGain, "most expected gain per byte, from what the base lost of each track"),
         **{
             row.name: MethodEntry(
                 partial(SelectorMethod, row), _SELECTOR_HELP[row.name], MappingProxyType({})
@@ -78,3 +82,20 @@ def method(name: str, **parameters: float) -> Method:
         if not math.isfinite(value) or value < 0:
             raise UserError(f"parameter {key} of method {name} is {value!r}: write a number from 0")
     return entry.make(**parameters)
+
+
+def tuning(texts: Iterable[str]) -> dict[str, float]:
+    """What ``--tune KEY=VALUE`` says, for `method`; each text may hold several, with commas between.
+
+    Raises `UserError` for what is not of that form; whether the method has such a parameter, `method` says.
+    """
+    parameters: dict[str, float] = {}
+    for part in (part.strip() for text in texts for part in text.split(",")):
+        key, equals, value = part.partition("=")
+        try:
+            parameters[key.strip()] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals or not key.strip().isidentifier():
+            raise UserError(f"--tune {part!r} is not accepted: write KEY=VALUE, such as min_gain=0.05")
+    return parameters

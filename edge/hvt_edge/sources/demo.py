@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from hvt_common.values import Fit, Frame
-from hvt_edge.resample import Resizer, capture_time_ns, exact_rate
+from hvt_edge.resample import BaseSize, Resizer, capture_time_ns, exact_rate
 from hvt_edge.scene import Scene
 from hvt_edge.scene.truth import frame_times
 from hvt_edge.sources.contract import Source
@@ -23,9 +23,7 @@ class DemoSource(Source):
 
     live = False
 
-    def __init__(
-        self, *, size: tuple[int, int], fps: float, fit: Fit, seed: int, max_frames: int | None
-    ) -> None:
+    def __init__(self, *, size: BaseSize, fps: float, fit: Fit, seed: int, max_frames: int | None) -> None:
         self.scene = Scene(seed)
         self.class_names = self.scene.class_names
         self.fps = fps

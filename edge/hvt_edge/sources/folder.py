@@ -12,7 +12,7 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.values import Fit, Frame, Image
-from hvt_edge.resample import Resizer, base_frame_count, capture_time_ns, exact_rate, hold
+from hvt_edge.resample import BaseSize, Resizer, base_frame_count, capture_time_ns, exact_rate, hold
 from hvt_edge.sources.contract import Source
 
 __all__ = ["FolderSource", "sequence_files"]
@@ -48,7 +48,7 @@ class FolderSource(Source):
         self,
         spec: str,
         *,
-        size: tuple[int, int],
+        size: BaseSize,
         fps: float,
         fit: Fit,
         max_frames: int | None = None,

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from hvt_common.errors import UserError
 from hvt_common.values import Fit, Frame, Image
-from hvt_edge.resample import Gate, Resizer
+from hvt_edge.resample import BaseSize, Gate, Resizer
 from hvt_edge.sources.contract import Source
 
 __all__ = ["Grabber", "LiveSource", "Shot", "SignalLost"]
@@ -61,7 +61,7 @@ class LiveSource(Source):
     frame_count = None
 
     def __init__(
-        self, grabber: Grabber, *, size: tuple[int, int], fps: float, fit: Fit, max_frames: int | None = None
+        self, grabber: Grabber, *, size: BaseSize, fps: float, fit: Fit, max_frames: int | None = None
     ) -> None:
         self.fps, self._limit = fps, max_frames
         self._grabber = grabber

@@ -17,7 +17,7 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.values import Fit, Frame, Image
-from hvt_edge.resample import Resizer, base_frame_count, capture_time_ns, exact_rate, hold
+from hvt_edge.resample import BaseSize, Resizer, base_frame_count, capture_time_ns, exact_rate, hold
 from hvt_edge.sources.contract import Source
 
 __all__ = ["VideoSource", "upright_bgr", "without_password"]
@@ -39,7 +39,7 @@ class VideoSource(Source):
         self,
         spec: str,
         *,
-        size: tuple[int, int],
+        size: BaseSize,
         fps: float,
         fit: Fit,
         max_frames: int | None = None,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from typing import Final, Protocol
 
-from hvt_study.commands import score, sweep, track
+from hvt_study.commands import score, sight, sweep, track
 
 __all__ = ["COMMANDS", "Command"]
 
@@ -28,6 +28,7 @@ class Command(Protocol):
 
 COMMANDS: Final[dict[str, Command]] = {
     "score": score,
+    "sight": sight,
     "sweep": sweep,
     "track": track,
 }

@@ -21,6 +21,7 @@ from hvt_common.link.wire.sealed import (
     kinds,
 )
 from hvt_common.link.wire.stream import MAX_ALSO, AlsoShown, BaseHeader, Flags, RoiHeader
+from hvt_common.link.wire.track_step import TrackStep, TrackStepDecoder, TrackStepEncoder
 
 __all__ = [
     "MAX_ALSO",
@@ -41,6 +42,9 @@ __all__ = [
     "RoiHeader",
     "Status",
     "StillResult",
+    "TrackStep",
+    "TrackStepDecoder",
+    "TrackStepEncoder",
     "UnknownVersionError",
     "WireError",
     "fitted_class_names",

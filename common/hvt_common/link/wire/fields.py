@@ -15,6 +15,7 @@ __all__ = [
     "I63",
     "U32",
     "U64",
+    "Blob",
     "Choice",
     "Flag",
     "Int",
@@ -174,6 +175,23 @@ class Text(Kind):
 
     def _describe(self) -> str:
         return f"str ≤ {self.max_bytes} B"
+
+
+@dataclass(frozen=True, slots=True)
+class Blob(Kind):
+    """At most ``max_bytes`` bytes with a coding of their own."""
+
+    max_bytes: int
+
+    def _decode(self, raw: Any) -> Any:
+        if type(raw) is not bytes:
+            raise WireError(f"{type(raw).__name__} in place of bytes")
+        if len(raw) > self.max_bytes:
+            raise WireError(f"{len(raw)} bytes where at most {self.max_bytes} are allowed")
+        return raw
+
+    def _describe(self) -> str:
+        return f"bin ≤ {self.max_bytes} B"
 
 
 def fitted_text(text: str, max_bytes: int) -> str:

@@ -9,14 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Protocol
 
 from hvt_common.values import Image
 
-__all__ = ["BaseMissingError", "CodedCrop", "Parameters", "StillCodec", "StillError"]
+__all__ = ["NO_PARAMETERS", "BaseMissingError", "CodedCrop", "Parameters", "StillCodec", "StillError"]
 
 Parameters = Mapping[str, int | float | str]
 """At most 6 of them, keys of at most 16 bytes: they cross the link in the still's header, and cost bytes there."""
+
+NO_PARAMETERS: Parameters = MappingProxyType({})
+"""Nothing beside the bytes."""
 
 
 class StillError(Exception):
@@ -65,7 +69,7 @@ class StillCodec(Protocol):
         data: bytes,
         *,
         size: tuple[int, int],
-        parameters: Parameters = {},
+        parameters: Parameters = NO_PARAMETERS,
         base_bgr: Image | None = None,
     ) -> Image:
         """The crop again, BGR, exactly ``size`` (width, height).

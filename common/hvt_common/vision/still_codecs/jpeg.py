@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hvt_common.values import Image
-from hvt_common.vision.still_codecs.contract import CodedCrop, Parameters, StillError
+from hvt_common.vision.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
 
 __all__ = ["JpegCodec", "jpeg_size"]
 
@@ -46,7 +46,7 @@ class JpegCodec:
         data: bytes,
         *,
         size: tuple[int, int],
-        parameters: Parameters = {},  # noqa: ARG002
+        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
         base_bgr: Image | None = None,  # noqa: ARG002
     ) -> Image:
         """The crop again; an EXIF orientation is ignored, so that the size is the one in the header."""

@@ -1,0 +1,109 @@
+"""How large and how frequent base frames are to be at a given rate: a small model, fitted to measurements.
+
+Fewer frames get more bits each. Measured on a still and on a fast moving camera from 100 to 400 kbps
+(docs/base-stream.md), F1 and class agreement of tracks rise down to three to five frames a second wherever x265 needs
+a mean quantiser above about 32, provided that what lies between two frames is predicted from both. Smaller pictures
+lose more objects than their bits win, so the size falls last.
+"""
+
+from __future__ import annotations
+
+import math
+
+from hvt_common.errors import UserError
+
+__all__ = ["SIZES", "better_every_n", "choose_base", "most_every_n", "sizes_of"]
+
+SIZES = ((1280, 720), (960, 540), (640, 360), (480, 270), (320, 180))
+"""The ladder of ``--size auto`` for a source of 16:9; others keep its areas and their own aspect ratio. It ends where
+x265 still codes 15 frames a second on two cores; ``--size`` may ask for more."""
+
+_STEPS = (1, 2, 3, 5, 8, 15)
+"""The ladder of n: each n-th tick is coded."""
+_LEAST_FPS = 2.0
+"""A budget's window of a second holds two frames at least (see config)."""
+
+_LEAST_SIDE_PX = 64
+# Bits for each pixel of a coded frame: from where a size is worth its pixels, and a frame its place.
+_SIZE_BITS_PER_PX = 0.020
+_RATE_BITS_PER_PX = 0.040
+_QP_FAR_TOO_COARSE = 36.0
+_QP_TOO_COARSE = 32.0
+_QP_FINE = 25.0
+
+
+def choose_base(
+    payload_bps: float,
+    source_size: tuple[int, int],
+    *,
+    size: tuple[int, int] | None,
+    fps: float | None,
+    most_fps: float,
+    least_fps: float = _LEAST_FPS,
+) -> tuple[tuple[int, int], int]:
+    """The base stream's (width, height), and n where each n-th tick of ``most_fps`` is coded.
+
+    Args:
+        payload_bps: what x265 gets, without headers of any transport.
+        source_size: (width, height) of the source; with ``size`` None the base is never larger.
+        size: what the user asks for; None is ``--size auto``.
+        fps: what the user asks for: the ticks themselves, so n is 1. None is ``--fps auto``.
+        most_fps: rate of the ticks where ``fps`` is None.
+        least_fps: the lowest rate of coded frames.
+
+    Raises:
+        UserError: the source is too small for any base stream.
+    """
+    ticks_fps = most_fps if fps is None else fps
+    most_n = 1 if fps is not None else most_every_n(most_fps, least_fps=least_fps)
+    if size is None:
+        # The rate at the lowest frame rate that is wanted: what the size costs can be had back in frames.
+        size = _size_for(payload_bps / ticks_fps * min(most_n, 3), source_size)
+    bits_per_px = payload_bps / ticks_fps / (size[0] * size[1])
+    fitting = [n for n in _STEPS if n <= most_n and bits_per_px * n >= _RATE_BITS_PER_PX]
+    return size, fitting[0] if fitting else max(n for n in _STEPS if n <= most_n)
+
+
+def better_every_n(every_n: int, *, mean_qp: float, most_every_n: int) -> int:
+    """One step of the ladder, or two, towards the band of the quantiser (0…51) in which frames are worth their bits.
+
+    The band is 7 wide; a step moved the quantiser by 1 to 2.5, two together by 4 at most: the choice settles.
+    """
+    steps = [n for n in _STEPS if n <= most_every_n]
+    at = max((index for index, n in enumerate(steps) if n <= every_n), default=0)
+    if mean_qp > _QP_TOO_COARSE:
+        at += 2 if mean_qp > _QP_FAR_TOO_COARSE else 1
+    elif mean_qp < _QP_FINE:
+        at -= 1
+    return steps[min(len(steps) - 1, max(0, at))]
+
+
+def most_every_n(fps: float, *, least_fps: float = _LEAST_FPS) -> int:
+    """The largest n of the ladder that leaves ``least_fps`` of ``fps`` ticks a second."""
+    return max((n for n in _STEPS if fps / n >= least_fps), default=1)
+
+
+def _size_for(bits_per_frame: float, source_size: tuple[int, int]) -> tuple[int, int]:
+    """The largest of the ladder that the bits of a frame fill; the smallest where none is."""
+    sizes = sizes_of(source_size)
+    fitting = [size for size in sizes if bits_per_frame / (size[0] * size[1]) >= _SIZE_BITS_PER_PX]
+    return fitting[0] if fitting else sizes[-1]
+
+
+def sizes_of(source_size: tuple[int, int]) -> list[tuple[int, int]]:
+    """The ladder for a source of this (width, height), largest first: its aspect ratio, even sides, none larger."""
+    width, height = source_size
+    if min(width, height) < _LEAST_SIDE_PX:
+        raise UserError(
+            f"the source has {width}x{height} pixels, and a base stream has {_LEAST_SIDE_PX} on each side at least: "
+            "give --size"
+        )
+    whole = (width // 2 * 2, height // 2 * 2)
+    sizes = [whole]
+    for area in (wide * high for wide, high in SIZES):
+        scale = math.sqrt(area / (width * height))
+        size = (round(width * scale / 2) * 2, round(height * scale / 2) * 2)
+        if min(size) >= _LEAST_SIDE_PX and size[0] * size[1] < 0.9 * sizes[-1][0] * sizes[-1][1]:
+            sizes.append(size)
+    largest = SIZES[0][0] * SIZES[0][1]
+    return [size for size in sizes if size[0] * size[1] <= 1.05 * largest] or [whole]

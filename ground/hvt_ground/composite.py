@@ -1,0 +1,133 @@
+"""The base picture with the sharp stills in their places.
+
+Crops map to base pixels by `View`, which is affine, so a still is pasted with sub-pixel alignment: boxes map by
+their edges, `cv2.warpAffine` by pixel centres. The picture may also be made larger than the base (``zoom``), for a
+network whose input is: it would enlarge the base itself, and the stills have the detail that the base has not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Image, View
+
+__all__ = ["Patch", "Placed", "composite", "patch_of"]
+
+_FEATHER_PX = 1.5
+"""Width of the seam in pixels of the result. A hard edge is a contour that a detector looks at."""
+
+
+class Placed(Protocol):
+    """What can be pasted."""
+
+    @property
+    def image_bgr(self) -> Image:
+        """The still, at the size at which it was coded."""
+
+    @property
+    def crop_source_px(self) -> tuple[int, int, int, int]:
+        """What it shows, whole source pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A still on the pixel grid of the result."""
+
+    left: int
+    top: int
+    image_bgr: Image
+    opacity: npt.NDArray[np.float32]
+    """(height, width) 0…1: what of each pixel the still covers, soft at the seam."""
+
+
+def composite(base_bgr: Image, stills: Sequence[Placed], *, view: View, zoom: float = 1.0) -> Image:
+    """The base picture with each still in its place, ``zoom`` times as large as the base; a copy.
+
+    Later stills lie over earlier ones.
+    """
+    picture = _enlarged(base_bgr, zoom)
+    for still in stills:
+        patch = patch_of(still, view=view, zoom=zoom, size=(picture.shape[1], picture.shape[0]))
+        if patch is not None:
+            _paste(picture, patch)
+    return picture
+
+
+def patch_of(still: Placed, *, view: View, zoom: float, size: tuple[int, int]) -> Patch | None:
+    """The still resampled to the pixels of a result of ``size`` that it touches; None where it touches none.
+
+    Cubic where it is enlarged, area means where it is shrunk.
+    """
+    x1, y1, x2, y2 = _place(still.crop_source_px, view, zoom)
+    left, top = max(0, math.floor(x1)), max(0, math.floor(y1))
+    right, bottom = min(size[0], math.ceil(x2)), min(size[1], math.ceil(y2))
+    if right <= left or bottom <= top:
+        return None
+    still_height, still_width = still.image_bgr.shape[:2]
+    step_x, step_y = still_width / (x2 - x1), still_height / (y2 - y1)
+    origin = ((left - x1) * step_x, (top - y1) * step_y)
+    image = _resampled(still.image_bgr, origin, (step_x, step_y), (right - left, bottom - top))
+    across = _coverage(np.arange(left, right) + 0.5, x1, x2)
+    down = _coverage(np.arange(top, bottom) + 0.5, y1, y2)
+    return Patch(left, top, image, np.outer(down, across).astype(np.float32))
+
+
+def _place(crop_source_px: tuple[int, int, int, int], view: View, zoom: float) -> list[float]:
+    """Where a crop lies in the result: x1 y1 x2 y2, double precision."""
+    offset = view.offset_px * 2
+    return [(edge * view.scale + offset[axis]) * zoom for axis, edge in enumerate(crop_source_px)]
+
+
+def _enlarged(base_bgr: Image, zoom: float) -> Image:
+    if zoom == 1:
+        return base_bgr.copy()
+    height, width = base_bgr.shape[:2]
+    size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
+    return _resampled(base_bgr, (0.0, 0.0), (1 / zoom, 1 / zoom), size)
+
+
+def _resampled(
+    image_bgr: Image, origin_px: tuple[float, float], step_px: tuple[float, float], size: tuple[int, int]
+) -> Image:
+    """``size`` pixels of an image, from the corner ``origin_px`` on, ``step_px`` image pixels for each."""
+    fine = max(1, math.ceil(max(step_px) - 1e-6))
+    step_x, step_y = step_px[0] / fine, step_px[1] / fine
+    # Pixel i covers i…i+1: its centre is at i + 0.5, and warpAffine counts centres.
+    matrix = np.array(
+        [
+            [step_x, 0, origin_px[0] + (step_x - 1) / 2],
+            [0, step_y, origin_px[1] + (step_y - 1) / 2],
+        ],
+        np.float64,
+    )
+    result = cv2.warpAffine(
+        image_bgr,
+        matrix,
+        (size[0] * fine, size[1] * fine),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    if fine > 1:
+        result = cv2.resize(result, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(result, np.uint8)
+
+
+def _coverage(centres: npt.NDArray[np.floating[Any]], first: float, last: float) -> npt.NDArray[np.float64]:
+    """How much each pixel of a line shows of the interval ``first``…``last``, rising over the feather."""
+    depth = np.minimum(centres - first, last - centres) + 0.5
+    return np.asarray(np.clip(depth / _FEATHER_PX, 0, 1), np.float64)
+
+
+def _paste(picture: Image, patch: Patch) -> None:
+    height, width = patch.opacity.shape
+    place = picture[patch.top : patch.top + height, patch.left : patch.left + width]
+    opacity = patch.opacity[..., None]
+    mixed = place * (1 - opacity) + patch.image_bgr * opacity
+    np.copyto(place, np.rint(mixed).astype(np.uint8))

@@ -1,0 +1,159 @@
+"""A small certificate authority in a folder: one CA for the fleet, a key with a certificate for each machine.
+
+The common name of a certificate is the name of the machine: an edge's id, a ground's name. Zenoh's access control
+goes by it (`zenoh_files`). ECDSA on P-256 as in RFC 5480; private keys are PKCS #8 and readable by their owner only.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import ipaddress
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from hvt_common.errors import UserError
+
+__all__ = ["CA_DAYS", "MACHINE_DAYS", "Authority"]
+
+CA_DAYS = 3650
+MACHINE_DAYS = 825
+"""The longest that common TLS libraries accept for a server."""
+_CLOCKS_APART = dt.timedelta(hours=1)
+"""A drone's clock may be behind: a certificate holds from a little before it was made."""
+
+
+class Authority:
+    """The CA of one fleet. ``ca.key`` signs for all of it: it stays in this folder."""
+
+    def __init__(self, folder: Path, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
+        self.folder = folder
+        self._key = key
+        self._certificate = certificate
+
+    @classmethod
+    def create(cls, folder: Path) -> Authority:
+        """Make a new CA in the folder; `UserError` where one is there already, or the folder cannot be written."""
+        if (folder / "ca.key").exists() or (folder / "ca.pem").exists():
+            raise UserError(f"{folder} already holds a CA: use it, or name another folder with --dir")
+        key = ec.generate_private_key(ec.SECP256R1())
+        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "hvt-ca")])
+        public = key.public_key()
+        usage = x509.KeyUsage(
+            digital_signature=False,
+            content_commitment=False,
+            key_encipherment=False,
+            data_encipherment=False,
+            key_agreement=False,
+            key_cert_sign=True,
+            crl_sign=True,
+            encipher_only=False,
+            decipher_only=False,
+        )
+        certificate = (
+            _dated(x509.CertificateBuilder(), days=CA_DAYS)
+            .subject_name(name)
+            .issuer_name(name)
+            .public_key(public)
+            .serial_number(x509.random_serial_number())
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(usage, critical=True)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+            .sign(key, hashes.SHA256())
+        )
+        _make_folder(folder)
+        _write_key(folder / "ca.key", key)
+        _write(folder / "ca.pem", certificate.public_bytes(serialization.Encoding.PEM), mode=0o644)
+        return cls(folder, key, certificate)
+
+    @classmethod
+    def open(cls, folder: Path) -> Authority:
+        """The CA of the folder; `UserError` where there is none, or its files are not what they should be."""
+        try:
+            key = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), password=None)
+            certificate = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
+        except FileNotFoundError:
+            raise UserError(f"{folder} holds no CA: make one with hvt-ground keys new-ca") from None
+        except (OSError, ValueError, TypeError) as error:
+            raise UserError(f"the CA in {folder} cannot be read: {error}") from None
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or certificate.public_key() != key.public_key():
+            raise UserError(f"ca.key and ca.pem in {folder} do not belong together: restore them from a copy")
+        return cls(folder, key, certificate)
+
+    def issue(self, name: str, *, hosts: Sequence[str] = ()) -> None:
+        """Write ``name.key`` and ``name.pem``; an older pair of that name is replaced.
+
+        Args:
+            name: the common name; also accepted as a host name.
+            hosts: names or addresses at which others connect to this machine.
+        """
+        key = ec.generate_private_key(ec.SECP256R1())
+        authority_id = x509.SubjectKeyIdentifier.from_public_key(self._key.public_key())
+        certificate = (
+            _dated(x509.CertificateBuilder(), days=MACHINE_DAYS)
+            .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)]))
+            .issuer_name(self._certificate.subject)
+            .public_key(key.public_key())
+            .serial_number(x509.random_serial_number())
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(
+                x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]),
+                critical=False,
+            )
+            .add_extension(
+                x509.SubjectAlternativeName([_host(one) for one in (name, *hosts)]), critical=False
+            )
+            .add_extension(
+                x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(authority_id), critical=False
+            )
+            .sign(self._key, hashes.SHA256())
+        )
+        _write_key(self.folder / f"{name}.key", key)
+        _write(self.folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM), mode=0o644)
+
+
+def _dated(builder: x509.CertificateBuilder, *, days: int) -> x509.CertificateBuilder:
+    now = dt.datetime.now(dt.UTC)
+    return builder.not_valid_before(now - _CLOCKS_APART).not_valid_after(now + dt.timedelta(days=days))
+
+
+def _host(text: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(text))
+    except ValueError:
+        pass
+    try:
+        return x509.DNSName(text)
+    except ValueError:
+        raise UserError(f"--host {text!r} is neither an address nor a host name") from None
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"the folder {folder} cannot be made ({error.strerror})") from None
+
+
+def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    _write(path, pem, mode=0o600)
+
+
+def _write(path: Path, content: bytes, *, mode: int) -> None:
+    """Whole or not at all, and never readable by others for a moment."""
+    fresh = path.with_name(path.name + ".new")
+    try:
+        fresh.unlink(missing_ok=True)
+        with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(content)
+        fresh.replace(path)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({error.strerror})") from None

@@ -1,0 +1,211 @@
+"""The ground's end of a flight: takes what the link delivers, when it does, and keeps the list of every tick."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import numpy as np
+
+from hvt_common.link.inbox import Received
+from hvt_common.link.keys import Row, parse_key
+from hvt_common.link.wire import BaseHeader, Info, RoiHeader, Status, StillResult, TrackStep
+from hvt_common.values import Tracks, View
+from hvt_common.vision.classify import Classifier
+from hvt_common.vision.detect import Detector
+from hvt_ground.build import Models, make_sight
+from hvt_ground.config import GroundConfig
+from hvt_ground.events import Event, Overlay
+from hvt_ground.eyes import LockstepEyes, Read, See, Step
+from hvt_ground.session import GroundSession
+from hvt_ground.sight import Picture, ReceivedStill
+from hvt_study.list_score import Listed
+from hvt_study.serial_link import Arrival, SerialLink
+
+__all__ = ["GroundSide", "InlineExecutor", "SharedModels"]
+
+_MOST_RESULTS = 1024
+_T = TypeVar("_T")
+
+
+class InlineExecutor(ThreadPoolExecutor):
+    """Does everything at once in the thread that asks: what is done side by side in flight comes one by one here."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def submit(self, fn: Callable[..., _T], /, *args: Any, **kwargs: Any) -> Future[_T]:
+        """Do it now."""
+        future: Future[_T] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+class SharedModels(Models):
+    """Models that are open already; flights of one process take turns with them."""
+
+    def __init__(self, detector: Detector, classifier: Classifier | None = None) -> None:
+        self._shared = detector, classifier
+
+    def take(self) -> tuple[Detector, Classifier | None]:
+        """The same for every session."""
+        return self._shared
+
+
+class _Eyes(LockstepEyes):
+    """Sees at once; stills that come within one tick are read together, as in real time."""
+
+    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
+        super().__init__(see, step, read, name=name)
+        self._worker = InlineExecutor()
+        self._gathered: list[ReceivedStill] = []
+
+    def picture(self, picture: Picture) -> None:
+        self.read_gathered()
+        super().picture(picture)
+
+    def still(self, still: ReceivedStill) -> None:
+        if still.header.frame_index > self._newest_frame:
+            super().still(still)  # it overtook its frame
+        else:
+            self._gathered.append(still)
+
+    def step(self, tracks: Tracks, capture_ns: int) -> None:
+        self._step(tracks, capture_ns)  # the simulated link leaves no doubt about the order
+
+    def read_gathered(self) -> None:
+        """Read what has come since the last time."""
+        gathered, self._gathered = self._gathered, []
+        if gathered:
+            self._read(gathered)
+
+
+class _Session(GroundSession):
+    """Sees in the thread that brings the messages."""
+
+    def __init__(self, info: Info, **named: Any) -> None:
+        super().__init__(info, recorder=None, recording=None, **named)
+        self._inline = _Eyes(self._see, self._step, self._read, name=info.edge)
+        self._eyes = self._inline
+
+    def read_stills(self) -> None:
+        """Read those that have come since the last picture."""
+        self._inline.read_gathered()
+
+
+class GroundSide:
+    """Takes what arrives over ``link`` as time goes on; keeps the list of every tick, in source pixels.
+
+    ``info`` is the edge's, with the rate of ticks as its frame rate.
+    """
+
+    def __init__(
+        self, info: Info, *, config: GroundConfig, models: Models, link: SerialLink[Received]
+    ) -> None:
+        self._link = link
+        self._now_ns = info.started_ns
+        self._view = View(info.source_size, info.base_size, info.view_scale, info.view_offset_px)
+        self._session = _Session(
+            info,
+            sight_of=lambda emit: make_sight(config, models, info=info, emit=self._heard_by(emit)),
+            to_local_ns=lambda at_ns: at_ns,
+            clock=lambda: self._now_ns,
+            report=lambda: None,
+        )
+        self._newest = Listed()
+        self._decoded = False
+        self._behind_ns = 0
+        """By how much the newest picture came after its capture."""
+        self._uncoded: deque[tuple[int, int]] = deque()
+        self.lists: dict[int, Listed] = {}
+        """By tick."""
+        self.results: deque[tuple[int, StillResult]] = deque()
+        """What the edge is to hear, with the time at which it does."""
+        self.arrivals: list[Arrival[Received]] = []
+        """Everything, in order."""
+        self.base_delays_ns: list[int] = []
+        """Capture to arrival of every picture."""
+        self.shown_ns: list[tuple[int, int]] = []
+        """(arrival, capture) of every picture."""
+
+    def pass_over(self, tick: int, *, capture_ns: int) -> None:
+        """This tick is not coded; its list is taken when the others of its time are."""
+        self._uncoded.append((tick, capture_ns))
+
+    def advance(self, now_ns: int | None) -> None:
+        """Take in what has arrived by now; None: all there is, to the end."""
+        for arrival in self._link.arrived(now_ns):
+            self._take_uncoded(until_ns=arrival.arrival_ns)
+            self._now_ns = arrival.arrival_ns
+            self.arrivals.append(arrival)
+            self._receive(arrival)
+            self._answer(arrival)
+        self._session.read_stills()
+        if self.arrivals:
+            self._answer(self.arrivals[-1])
+        self._take_uncoded(until_ns=now_ns)
+
+    def close(self) -> None:
+        """Take in what is left and end the session."""
+        self.advance(None)
+        self._session.close()
+
+    def _receive(self, arrival: Arrival[Received]) -> None:
+        """As `hvt_ground.receive` hands on what is whole and in order."""
+        item = arrival.message
+        row = (parse_key(item.key) or ("", None))[1]
+        if row is Row.BASE:
+            self._picture(BaseHeader.parse(item.attachment, item.payload), arrival)
+        elif row is Row.ROI:
+            header = RoiHeader.parse(item.attachment, item.payload)
+            self._session.still(header, item, media_type=item.encoding)
+        elif row is Row.TRACKS:
+            self._session.tracks(TrackStep.parse(item.payload), item)
+        elif row is Row.STATUS:
+            self._session.status(Status.parse(item.payload), item)
+
+    def _answer(self, last: Arrival[Received]) -> None:
+        """What the ground has to say goes back in the time that the newest message took to come."""
+        back_ns = self._now_ns + (last.arrival_ns - last.enter_ns)
+        self.results.extend((back_ns, one) for one in self._session.take_results(_MOST_RESULTS))
+
+    def _picture(self, header: BaseHeader, arrival: Arrival[Received]) -> None:
+        while self._uncoded and self._uncoded[0][0] < header.frame_index:
+            self._take_list(self._uncoded.popleft()[0])
+        self._behind_ns = arrival.arrival_ns - header.capture_ns
+        self.base_delays_ns.append(self._behind_ns)
+        self.shown_ns.append((arrival.arrival_ns, header.capture_ns))
+        starts = not self._decoded
+        self._decoded = True
+        whole = self._session.base(header, arrival.message, decode=True, starts_run=starts)
+        assert whole, f"the base frame {header.frame_index} cannot be decoded"
+        self.lists[header.frame_index] = self._newest
+
+    def _take_uncoded(self, *, until_ns: int | None) -> None:
+        while self._uncoded:
+            tick, capture_ns = self._uncoded[0]
+            if until_ns is not None and capture_ns + self._behind_ns > until_ns:
+                return
+            self._uncoded.popleft()
+            self._take_list(tick)
+
+    def _take_list(self, tick: int) -> None:
+        """What an operator is shown at a tick of which no picture comes."""
+        if self._decoded:
+            self._note(self._session.sight.list_at(tick))
+        self.lists[tick] = self._newest
+
+    def _heard_by(self, emit: Callable[[Event], None]) -> Callable[[Event], None]:
+        def tell(event: Event) -> None:
+            if isinstance(event, Overlay):
+                self._note(event)
+            emit(event)
+
+        return tell
+
+    def _note(self, overlay: Overlay) -> None:
+        boxes = self._view.to_source(overlay.boxes_base_px)
+        limits = np.array([*self._view.source_size, *self._view.source_size], np.float32)
+        self._newest = Listed(np.clip(boxes, 0, limits), tuple(overlay.classes))

@@ -1,0 +1,75 @@
+"""A still codec that HVT has never heard of, installed beside it, through the whole pipeline."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from processes import Link
+from rrd import Recording
+from third_party_codec import install
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+FRAMES = 60
+
+
+def fly(link: Link, scene: Path, *edge_settings: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Six seconds of the drawn scene with stills of everything that moves; both summaries."""
+    ground = link.ground("--once", "--record", "flight.rrd", "--classifier", "none")
+    edge = link.edge(
+        *("--source", str(scene), "--fps", "10", "--max-frames", str(FRAMES), "--pace", "lockstep"),
+        *("--size", "640x360", "--budget", "1200kbps", "--preset", "ultrafast", "--detector", "motion"),
+        *("--method", "M5", "--cooldown", "1s", "--wait", "60s", *edge_settings),
+    )
+    return edge.finish(), ground.finish(within_s=30)
+
+
+@pytest.fixture
+def acme(tmp_path, monkeypatch) -> None:
+    """Every process that starts now has the package installed."""
+    folder = install(tmp_path / "site", {"acme-pixels": "PixelCodec", "acme-broken": "NoSuchThing"})
+    old = os.environ.get("PYTHONPATH")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *([old] if old else [])]))
+
+
+def test_stills_of_another_codec_reach_the_recording(link, scene, acme):
+    """A better codec of tomorrow would need a fork of HVT on both sides."""
+    edge, ground = fly(link, scene, "--still-codec", "acme-pixels")
+    assert edge["stills"]["sent"] == ground["stills"]["received"] > 5
+    assert edge["roi_bytes"] == ground["roi_bytes"] > 0
+    assert len(Recording(link.folder / "flight.rrd").stills()) >= 5
+
+
+def test_a_broken_plug_in_is_one_sentence(link, scene, acme):
+    """A traceback in place of the name of the package to mend."""
+    edge = link.edge("--source", str(scene), "--still-codec", "acme-broken")
+    assert edge.wait(within_s=30) == 2
+    assert "still codec 'acme-broken' of package acme_codecs" in edge.said
+    assert "Traceback" not in edge.said
+
+
+def test_a_ground_without_the_codec_flies_on(link, scene, acme, monkeypatch):
+    """One unknown codec would take the operator's whole picture away."""
+    with_codec = os.environ["PYTHONPATH"]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(with_codec.split(os.pathsep)[1:]))
+    ground = link.ground("--once", "--record", "flight.rrd", "--classifier", "none")
+    monkeypatch.setenv("PYTHONPATH", with_codec)
+    edge = link.edge(
+        *("--source", str(scene), "--fps", "10", "--max-frames", str(FRAMES), "--pace", "lockstep"),
+        *("--size", "640x360", "--budget", "1200kbps", "--preset", "ultrafast", "--detector", "motion"),
+        *("--method", "M5", "--cooldown", "1s", "--wait", "60s", "--still-codec", "acme-pixels"),
+    )
+    sent, seen = edge.finish(), ground.finish(within_s=30)
+    assert sent["stills"]["sent"] > 5
+    assert seen["frames_decoded"] == FRAMES
+    assert Recording(link.folder / "flight.rrd").stills() == []
+
+
+def test_the_package_is_found_by_its_metadata_alone(acme):
+    """The test itself would prove nothing, were the module imported in another way."""
+    assert "acme_codecs" not in sys.modules
