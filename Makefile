@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test check lint type format bench bench-peers clean help
+.PHONY: setup demo test check lint type format bench bench-stills bench-sight bench-peers link clean help
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -44,6 +44,15 @@ format: setup    ## write what `make check` wants to see
 
 bench: setup     ## speed and memory as ratios against a peer or a floor, measured in one run
 	@$(BIN)/python -m bench
+
+bench-stills: setup ## still codecs on real crops: bytes at equal quality, time to encode and decode
+	@$(BIN)/python -m bench.stills
+
+bench-sight: setup ## what the ground sees at each bitrate, method by method, on a car park and on small objects
+	@$(BIN)/python -m bench.sight
+
+link: setup      ## the link laboratory: SCENARIO=steady-1M CLIP=clip.mp4 runs one
+	@PYTHONPATH=tests $(BIN)/python -m link
 
 bench-peers: setup ## the tracker beside roboflow trackers, which get an environment of their own (they are large)
 	@test -x build/peers/bin/python || $(PYTHON) -m venv build/peers

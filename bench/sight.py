@@ -31,7 +31,7 @@ _RATES = (150_000, 200_000, 300_000, 400_000, 800_000)
 _CLIPS = {
     "carpark": "clips/drone_carpark.mp4",
     "highway": "still:aerial_highway.jpg",
-    "street": "still:visdrone/0000001_02999_d_0000005.jpg",
+    "street": "still:visdrone/0000001_02999_d_0000005.jpg@1.2",
 }
 _OUT = Path("build/sight")
 _DOC = ROOT / "docs" / "sight.md"

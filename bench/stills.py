@@ -3,8 +3,8 @@
 Crops are boxes of the VisDrone detector on drone_carpark; residuals build on base streams of 400 and 800 kbps. Every
 codec codes every crop at each step of a ladder. Bytes at equal Y-PSNR are read off crop by crop at what Pillow's JPEG
 q65 (optimised Huffman tables, the paper's still) reaches; bytes at equal KL where the mean over crops of KL(answer on
-the pristine crop || answer on the still) is that of JPEG q65, with MobileNetV2. Between two steps the line is straight
-in the logarithm of bytes.
+the pristine crop || answer on the still) is that of JPEG q65, with MobileNetV2. Between two steps the line is
+straight in the logarithm of bytes.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ KBPS = (800, 400)
 TAKEN = range(12, 150, 18)
 """Frames whose boxes are cut out, in ticks."""
 BOXES_A_FRAME = 26
-JUDGED_EVERY = 4
-"""The classifier sees every fourth crop."""
+JUDGED_EVERY = 3
+"""The classifier sees every third crop."""
 LADDER = (1, 10, 20, 30, 42, 54, 65, 76, 87, 98)
 BARS = {"h264-intra": 0.60, "hevc-intra": 0.60, "residual at 800 kbps": 0.25, "residual at 400 kbps": 0.40}
 SPEED_BAR_MS = 2.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from hvt_common.errors import UserError
 from hvt_common.link.wire import RoiHeader
 from hvt_common.values import Image, View
-from hvt_common.vision.base_crop import base_crop
+from hvt_common.vision.base_crop import MAX_SIDE_PX, base_crop
 from hvt_common.vision.still_codecs import BaseMissingError, StillError, still_codec
 
 __all__ = ["ReceivedStill", "decode_still", "needs_base"]
@@ -64,4 +64,6 @@ def _coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
         raise StillError(f"crop {header.crop_source_px} is not of this source")
     if not (0 < width <= x2 - x1 and 0 < height <= y2 - y1):
         raise StillError(f"size {width}x{height} is larger than what it shows")
+    if max(width, height) > MAX_SIDE_PX:
+        raise StillError(f"size {width}x{height} is larger than any still, whose sides are up to {MAX_SIDE_PX}")
     return width, height

@@ -16,7 +16,7 @@ from hvt_edge.source import open_source
 from hvt_edge.sources.contract import Source
 from hvt_edge.sources.demo import DemoSource
 from hvt_study.list_score import Listed
-from hvt_study.virtual_camera import SCHEME, VirtualCamera
+from hvt_study.virtual_camera import SCHEME, open_camera
 
 __all__ = ["TICK_FPS", "Clip", "TickSource", "clip_name", "share_clip"]
 
@@ -75,7 +75,8 @@ class TickSource(Source):
 
 def clip_name(spec: str) -> str:
     """How a clip is called in tables: the file without folder and ending."""
-    return Path(spec.removeprefix(SCHEME)).stem or spec
+    name = Path(spec.removeprefix(SCHEME)).name
+    return Path(name.partition("@")[0]).stem or spec
 
 
 def share_clip(spec: str, *, max_frames: int | None, folder: Path) -> Clip:
@@ -114,7 +115,7 @@ class _Reel:
 
 def _open(spec: str, *, most: int | None) -> _Reel:
     if spec.startswith(SCHEME):
-        camera = VirtualCamera(Path(spec.removeprefix(SCHEME)), fps=TICK_FPS)
+        camera = open_camera(spec, fps=TICK_FPS)
         return _Reel(
             lambda: islice(camera.images(), most),
             lambda index: None if (seen := camera.truth(index)) is None else Listed(*seen),

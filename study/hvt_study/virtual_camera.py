@@ -1,7 +1,7 @@
 """A clip from one aerial picture: a virtual camera pans and zooms over it, and the boxes follow exactly.
 
-The picture with its mirror image on either side is the land; the camera flies along it from the right to the left,
-sways, and climbs and sinks a little. It never sees finer than the picture's own pixels, so that nothing is invented.
+The picture, mirrored at each of its edges, is the land; the camera flies along it from the right to the left, sways,
+and climbs and sinks a little. It never sees finer than the picture's own pixels, so that nothing is invented.
 Every frame has sensor noise of its own, without which a still picture would be cheaper to code than anything a camera
 delivers. Objects do not move by themselves. The same file gives the same pixels, always.
 
@@ -26,25 +26,28 @@ from hvt_common.errors import UserError
 from hvt_common.values import Boxes, Image
 from hvt_common.vision.class_names import VISDRONE_NAMES
 
-__all__ = ["SCHEME", "Annotations", "VirtualCamera", "read_annotations"]
+__all__ = ["SCHEME", "Annotations", "VirtualCamera", "open_camera", "read_annotations"]
 
 SCHEME = "still:"
-"""``still:FILE`` is a virtual camera over that picture."""
+"""``still:FILE`` is a virtual camera over that picture, ``still:FILE@1.5`` one that sees 1.5 times its height."""
 
 _DURATION_S = 14.0
-_WINDOW_SHARE = 0.94
-"""Height of the window over the picture's at its widest: what is left is room to sway in."""
+_USUAL_VIEW = 0.87
+_LEAST_VIEW, _MOST_VIEW = 0.1, 3.0
 _CLIMB = 0.08
 """By how much the window grows and shrinks again."""
-_REACH = 0.3
-"""The way goes from so many widths of the picture on one side of it to as many on the other: at its fastest,
-half-way, six pixels a frame of 1280 at 15 fps, a drone at 12 m/s that sees 160 m."""
+_REACH, _SWAY = 0.35, 0.034
+"""The way goes from so many widths of the window on one side of the picture's middle to as many on the other: at its
+fastest, half-way, seven pixels a frame of 1280 at 15 fps, a drone at 13 m/s that sees 160 m. It sways by so many
+heights of the window, so that the usual one stays within the picture."""
 _SWAY_S, _CLIMB_S = 5.0, 8.0
 _NOISE_LEVELS = 2.0
 """Standard deviation of the noise of a small camera's sensor by day, of 256 levels."""
 _LEAST_VISIBLE = 0.6
 """An object of which the window shows less is not asked for."""
 _LEAST_SIDE_PX = 64
+_TILES = (-2, -1, 0, 1, 2)
+"""Mirror images on each axis: enough for the widest view on its whole way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +97,14 @@ class VirtualCamera:
     """
 
     picture_path: Path
+    view_heights: float = _USUAL_VIEW
+    """Height of what it sees at its lowest, in heights of the picture; beyond about 0.9 mirrored land is in view."""
     fps: float = 15.0
     annotations: Annotations | None = field(init=False)
-    """Of the whole land."""
+    """Of the picture and of all its mirror images that may come into view."""
     size: tuple[int, int] = field(init=False)
     """(width, height) of its frames in pixels: those of the window at its narrowest, and even."""
-    _land: Image = field(init=False, repr=False)
+    _picture: Image = field(init=False, repr=False)
     _noise: npt.NDArray[np.int8] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -111,13 +116,15 @@ class VirtualCamera:
                 f"picture {self.picture_path} is not one of at least {_LEAST_SIDE_PX}x{_LEAST_SIDE_PX} pixels: "
                 "give a JPEG or PNG file"
             )
-        self._land = np.concatenate([picture[:, ::-1], picture, picture[:, ::-1]], axis=1).astype(np.uint8)
+        self._picture = np.asarray(picture, np.uint8)
         high, wide = picture.shape[:2]
         # One aspect ratio for all pictures, that of the usual base stream.
-        across = min(wide, high * 16 / 9) * _WINDOW_SHARE / (1 + _CLIMB)
+        across = min(wide, high * 16 / 9) * self.view_heights
         self.size = (int(across) // 2 * 2, int(across * 9 / 16) // 2 * 2)
         beside = self.picture_path.with_suffix(".txt")
-        self.annotations = _mirrored(read_annotations(beside), width=wide) if beside.is_file() else None
+        self.annotations = (
+            _mirrored(read_annotations(beside), size=(wide, high)) if beside.is_file() else None
+        )
         rng = np.random.default_rng(0)
         shape = (self.size[1] + 64, self.size[0] + 64, 3)
         self._noise = np.clip(rng.normal(0, _NOISE_LEVELS, shape).round(), -127, 127).astype(np.int8)
@@ -132,7 +139,7 @@ class VirtualCamera:
         rng = np.random.default_rng(1)
         for index in range(self.frame_count):
             seen = cv2.warpAffine(
-                self._land,
+                self._picture,
                 self._to_frame(index),
                 self.size,
                 flags=cv2.INTER_LINEAR,
@@ -157,13 +164,13 @@ class VirtualCamera:
         return boxes[asked], names, np.concatenate([ignored[there > 0], partly])
 
     def _to_frame(self, index: int) -> npt.NDArray[np.float64]:
-        """(2, 3): from pixels of the land to those of the frame, pixel centres at whole numbers."""
+        """(2, 3): from pixels of the picture to those of the frame, pixel centres at whole numbers."""
         t_s = index / self.fps
-        high, wide = self._land.shape[0], self._land.shape[1] // 3
         zoom = 1 / (1 + _CLIMB * (0.5 - 0.5 * math.cos(2 * math.pi * t_s / _CLIMB_S)))
-        middle = 1.5 * wide - 0.5 * self.size[0] / zoom
-        x = middle + _REACH * wide * math.cos(math.pi * t_s / _DURATION_S)
-        y = (high - self.size[1] / zoom) * (0.5 + 0.5 * math.sin(2 * math.pi * t_s / _SWAY_S))
+        high, wide = self._picture.shape[:2]
+        along, across = math.cos(math.pi * t_s / _DURATION_S), math.sin(2 * math.pi * t_s / _SWAY_S)
+        x = wide / 2 + (_REACH * along - 0.5 / zoom) * self.size[0]
+        y = high / 2 + (_SWAY * across - 0.5 / zoom) * self.size[1]
         shift = 0.5 * zoom - 0.5
         return np.array([[zoom, 0, shift - x * zoom], [0, zoom, shift - y * zoom]])
 
@@ -179,15 +186,41 @@ class VirtualCamera:
         return clipped.astype(np.float32), inside / np.maximum(area, 1e-9)
 
 
-def _mirrored(found: Annotations, *, width: int) -> Annotations:
-    """Those of a picture of this width between two mirror images of it."""
-    flip = np.array([-1, 1, -1, 1], np.float32)
-    right = np.array([width, 0, width, 0], np.float32)
-    both = []
-    for boxes in (found.boxes_px, found.ignored_px):
-        mirrored = (boxes * flip + right)[:, [2, 1, 0, 3]]
-        both.append(np.concatenate([mirrored, boxes + right, mirrored + 2 * right]))
-    return Annotations(both[0], found.classes * 3, both[1])
+def open_camera(spec: str, *, fps: float) -> VirtualCamera:
+    """The camera of ``still:PICTURE`` or ``still:PICTURE@HEIGHT``."""
+    text = spec.removeprefix(SCHEME)
+    name, separator, height = text.rpartition("@")
+    if not separator or Path(text).is_file():
+        return VirtualCamera(Path(text), fps=fps)
+    try:
+        heights = float(height)
+    except ValueError:
+        heights = math.nan
+    if not _LEAST_VIEW <= heights <= _MOST_VIEW:
+        raise UserError(
+            f"{spec!r} asks for a view of {height!r} heights of the picture: "
+            f"give a number from {_LEAST_VIEW:g} to {_MOST_VIEW:g}"
+        )
+    return VirtualCamera(Path(name), heights, fps)
+
+
+def _mirrored(found: Annotations, *, size: tuple[int, int]) -> Annotations:
+    """Those of a picture of this (width, height), mirrored at each of its edges again and again."""
+    tiles = [(across, down) for down in _TILES for across in _TILES]
+    boxes = [_in_tile(found.boxes_px, tile, size=size) for tile in tiles]
+    ignored = [_in_tile(found.ignored_px, tile, size=size) for tile in tiles]
+    return Annotations(np.concatenate(boxes), found.classes * len(tiles), np.concatenate(ignored))
+
+
+def _in_tile(boxes: Boxes, tile: tuple[int, int], *, size: tuple[int, int]) -> Boxes:
+    """Where the boxes of the picture lie in one of its images, (0, 0) being itself."""
+    moved = boxes.copy()
+    for axis, (number, side) in enumerate(zip(tile, size, strict=True)):
+        ends = boxes[:, [axis, axis + 2]]
+        if number % 2:
+            ends = side - ends[:, ::-1]
+        moved[:, [axis, axis + 2]] = ends + number * side
+    return moved
 
 
 def _boxes(rows: list[list[float]]) -> Boxes:

@@ -50,13 +50,13 @@ _SELECTOR_HELP = {
 METHODS: Mapping[str, MethodEntry] = MappingProxyType(
     {
         "M0": _entry(VideoOnly, "video only: no stills"),
-        "R0": _entry(TracksFirst, "video only, active tracks quantised better (--roi-depth)"),
         "M1": _entry(Periodic, "every track each 15 frames, most overdue first"),
         "M2": _entry(OnStart, "when a track begins or is found again"),
         "M3": _entry(Uncertain, "tracks of low confidence: detector's, or classifier's once known"),
         "M4": _entry(Small, "tracks that are small in the frame"),
         "M5": _entry(Utility, "most utility per byte: uncertain, small, not refined lately"),
         "M6": _entry(ExpectedGain, "most expected gain per byte, from what the base lost of each track"),
+        "R0": _entry(TracksFirst, "video only, active tracks quantised better (--roi-depth)"),
         **{
             row.name: MethodEntry(
                 partial(SelectorMethod, row), _SELECTOR_HELP[row.name], MappingProxyType({})

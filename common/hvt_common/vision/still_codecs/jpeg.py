@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import cv2
-import numpy as np
 
 from hvt_common.values import Image
 from hvt_common.vision.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
+from hvt_common.vision.still_codecs.cv_still import imdecoded, imencoded
 
 __all__ = ["JpegCodec", "jpeg_size"]
 
@@ -29,17 +29,13 @@ class JpegCodec:
 
     name: str = field(default="jpeg", init=False)
     media_type: str = field(default="image/jpeg", init=False)
-
     needs_base: bool = field(default=False, init=False)
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
         """Code a crop of at least one pixel."""
         flags = [cv2.IMWRITE_JPEG_QUALITY, quality_pct, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
         flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
-        done, data = cv2.imencode(".jpg", crop_bgr, flags)
-        if not done:
-            raise RuntimeError(f"JPEG encoder refused a crop of shape {crop_bgr.shape}")
-        return CodedCrop(data.tobytes())
+        return CodedCrop(imencoded(".jpg", crop_bgr, flags))
 
     def decode(
         self,
@@ -53,14 +49,7 @@ class JpegCodec:
         width, height = jpeg_size(data)
         if (width, height) != size:
             raise StillError(f"JPEG of {width}x{height} in place of {size[0]}x{size[1]}")
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except cv2.error as error:
-            raise StillError(f"JPEG does not decode: {error.err}") from error
-        if image is None or image.shape != (height, width, 3):
-            raise StillError(f"JPEG of {width}x{height} does not decode")
-        return np.asarray(image, np.uint8)
+        return imdecoded(data, size=size, what="JPEG")
 
 
 def jpeg_size(data: bytes) -> tuple[int, int]:

@@ -1,0 +1,108 @@
+"""The same script on the kernel's own TCP, between two network namespaces."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from link.netns import GROUND_HOST, Namespaces, UnavailableError
+from link.script import LinkState, Piece, Script
+
+pytestmark = pytest.mark.integration
+
+RECEIVE = """
+import socket, sys, time
+with socket.create_server(("", 7000)) as listener:
+    print("up", flush=True)
+    far, _ = listener.accept()
+    while data := far.recv(65536):
+        print(time.time(), len(data))
+"""
+SEND = """
+import socket, sys, time
+near = socket.socket()
+near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8192)
+near.connect((sys.argv[1], 7000))
+ends = time.time() + float(sys.argv[2])
+while time.time() < ends:
+    near.sendall(bytes(1448))
+"""
+ON_ETHERNET = 1448 / (1448 + 52 + 14)
+
+
+@pytest.fixture
+def carried():
+    """Runs a sender as fast as TCP takes it over a script; returns when (after its begin) how many bytes came."""
+
+    def run(script: Script, *, seconds: float) -> list[tuple[float, int]]:
+        try:
+            with Namespaces(script) as link:
+                receiver = subprocess.Popen(
+                    [*link.prefix("ground"), sys.executable, "-c", RECEIVE], stdout=subprocess.PIPE, text=True
+                )
+                assert receiver.stdout.readline() == "up\n"
+                began_s = link.begin()
+                send = [*link.prefix("edge"), sys.executable, "-c", SEND, GROUND_HOST, str(seconds)]
+                subprocess.run(send, check=True, timeout=60)
+                out, _ = receiver.communicate(timeout=60)
+        except UnavailableError as error:
+            pytest.skip(str(error))
+        return [(float(at) - began_s, int(size)) for at, size in map(str.split, out.splitlines())]
+
+    return run
+
+
+def script(*pieces: tuple[float, LinkState], lasts_s: float) -> Script:
+    """A script by hand."""
+    return Script(tuple(Piece(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=16_000)
+
+
+def bps(got, begin_s: float, end_s: float) -> float:
+    """Payload bits a second in a span."""
+    return 8 * sum(size for at, size in got if begin_s <= at < end_s) / (end_s - begin_s)
+
+
+def test_the_shaper_follows_the_script(carried):
+    """The one carrier with a real TCP would be another link than the relay's."""
+    line = script((0, LinkState(1_000_000)), (4, LinkState(400_000)), lasts_s=8)
+    got = carried(line, seconds=8)
+    assert bps(got, 1, 4) == pytest.approx(1_000_000 * ON_ETHERNET, rel=0.03)
+    assert bps(got, 5, 8) == pytest.approx(400_000 * ON_ETHERNET, rel=0.03)
+
+
+def test_a_link_that_is_down_carries_nothing(carried):
+    """As the relay's darkness."""
+    light = LinkState(2_000_000)
+    line = script((0, light), (1, LinkState(2_000_000, dark=True)), (2, light), lasts_s=5)
+    got = carried(line, seconds=5)
+    assert bps(got, 0.3, 1.0) > 1e6
+    assert bps(got, 1.1, 2.0) == 0
+    assert bps(got, 3.5, 5.0) > 1e6
+
+
+def test_loss_costs_throughput(carried):
+    """Five percent of loss would be none."""
+    clean, lossy = (
+        bps(carried(script((0, LinkState(20_000_000, loss=loss)), lasts_s=2), seconds=2), 0, 2)
+        for loss in (0, 0.2)
+    )
+    assert lossy < 0.7 * clean
+
+
+def test_nothing_is_left_behind(carried):
+    """The machine would fill with namespaces."""
+    carried(script((0, LinkState(5_000_000)), lasts_s=1), seconds=0.2)
+    left = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+    assert "hvt-link-" not in left
+
+
+def test_what_is_missing_is_named(monkeypatch):
+    """`make link CARRIER=netns` on a laptop would end in a traceback."""
+    monkeypatch.setenv("PATH", "/nonexistent")
+    with (
+        pytest.raises(UnavailableError, match="needs the command ip"),
+        Namespaces(script((0, LinkState(1)), lasts_s=1)),
+    ):
+        pass
