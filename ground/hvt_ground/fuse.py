@@ -288,7 +288,9 @@ class Fusion:
         """Remember where our own boxes are at this tick: how they move from here moves the edge's box too."""
         centres = (own.boxes_xyxy_px[:, :2] + own.boxes_xyxy_px[:, 2:]).astype(np.float64) / 2
         for row, own_id in enumerate(own.ids.tolist()):
-            self._by_own[own_id].own_then = (centres[row], tick)
+            entity = self._by_own.get(own_id)  # a step that comes late finds tracks merged away since
+            if entity is not None:
+                entity.own_then = (centres[row], tick)
 
     # After news
 

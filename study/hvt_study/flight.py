@@ -23,19 +23,21 @@ from typing import Any, cast
 
 import numpy as np
 
-from hvt_common.errors import UserError
 from hvt_common.link.inbox import Received
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.ledger import LedgerSummary, overhead_bytes
 from hvt_common.link.wire import BaseHeader, Info, RoiHeader, Status, StillResult, TrackStep
 from hvt_common.values import Fit, Frame
-from hvt_common.vision.detect import Detector
+from hvt_common.vision.detect import MOTION, Detector
+from hvt_common.vision.tiles import tiled
 from hvt_edge.app import Edge
+from hvt_edge.build import base_size
 from hvt_edge.clock import SteadyClock
 from hvt_edge.config import EdgeConfig
 from hvt_edge.feedback import FeedbackInbox
 from hvt_edge.pace_lockstep import LockstepPace
 from hvt_edge.resample import Resizer
+from hvt_edge.sources.contract import Source
 from hvt_ground.build import Models
 from hvt_ground.config import GroundConfig
 from hvt_study.cached_detector import CachedDetector
@@ -236,7 +238,8 @@ class _Edge(Edge):
     """The edge's own app over a clip of ticks and a simulated link."""
 
     def __init__(self, plan: FlightPlan, *, detector: Detector, models: Models) -> None:
-        super().__init__(replace(plan.edge, quiet=True), stop=threading.Event())
+        # The detector is open already: the app is told of one that costs nothing to open.
+        super().__init__(replace(plan.edge, quiet=True, detector=MOTION, tiles="off"), stop=threading.Event())
         self._plan = plan
         self._detector = detector
         self._models = models
@@ -262,18 +265,19 @@ class _Edge(Edge):
             digest=outlet.digest,
         )
 
-    def _open_detector(self) -> Detector:
-        return self._detector
+    def _make_flow(self, stack: ExitStack, source: Source, detector: Detector) -> Any:  # noqa: ARG002
+        config = self._plan.edge
+        own = tiled(self._detector, config.tiles) if config.candidates == "source" else self._detector
+        return super()._make_flow(stack, source, own)
 
     def _open_source(self) -> TickSource:
         config, clip = self._plan.edge, self._plan.clip
-        if isinstance(config.size, str):
-            raise UserError(f"--size {config.size} is not known to the study: give WIDTHxHEIGHT")
-        fixed = coded_ticks(clip.ticks, TICK_FPS if isinstance(config.fps, str) else config.fps)
-        resizer = Resizer(clip.source_size, config.size, fit=cast("Fit", config.fit))
-        return TickSource(clip, resizer, ticks=fixed)
+        # With --fps auto the edge sees every tick, and leaves out by itself what it does not code.
+        fps = TICK_FPS if isinstance(config.fps, str) else config.fps
+        resizer = Resizer(clip.source_size, base_size(config), fit=cast("Fit", config.fit))
+        return TickSource(clip, resizer, ticks=coded_ticks(clip.ticks, fps))
 
-    def _open_link(self, stack: ExitStack, source: Any, class_names: tuple[str, ...]) -> Any:  # noqa: ARG002
+    def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> Any:  # noqa: ARG002
         link: SerialLink[Received] = SerialLink(rate_bps=self._plan.link_bps)
         info = Info.parse(self._info(source, class_names, _START_NS))
         self._outlet = _Outlet(link, edge_id=self._config.edge_id)
@@ -288,10 +292,10 @@ class _Edge(Edge):
     def _wait_for_ground(self, *_: Any) -> None:
         """It is there."""
 
-    def _make_pace(self, base: Any, stills: Any, source: Any, link: Any) -> Any:  # noqa: ARG002
+    def _make_pace(self, flow: Any, source: Source) -> LockstepPace:  # noqa: ARG002
         self._pace = _Pace(
-            base,
-            stills,
+            flow.base,
+            flow.stills,
             inbox=self._inbox,
             ground=self.ground,
             outlet=self._outlet,
@@ -303,8 +307,8 @@ class _Edge(Edge):
         )
         return self._pace
 
-    def _say_goodbye(self, *stages: Any) -> None:
-        super()._say_goodbye(*stages)
+    def _say_goodbye(self, flow: Any) -> None:
+        super()._say_goodbye(flow)
         if self._pace is not None:
             self._pace.pass_over(self._plan.clip.ticks)
 

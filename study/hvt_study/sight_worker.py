@@ -102,7 +102,8 @@ def edge_config(shop: Workshop, job: Job) -> EdgeConfig:
     flags += ["--size", f"{width}x{height}", "--budget", f"{job.rate_bps}bps", "--threads", "1"]
     flags += ["--confidence", f"{_CONFIDENCE:g}", "--provider", shop.provider, *job.flags]
     if job.fps is not None:
-        flags += ["--fps", f"{job.fps:g}"]
+        # The budget's window has to hold two frames.
+        flags += ["--fps", f"{job.fps:g}", "--window", f"{max(1.0, 2 / job.fps):g}s"]
     config, _ = load(EdgeConfig, flags, program="hvt-edge", description="")
     return check_edge(config)
 

@@ -124,7 +124,7 @@ def test_a_password_is_not_printed(edge, free_port):
         *(("source-fps", value, "0.1 to 1000") for value in ("0", "1e6")),
         *(("threads", value, "1 to 64") for value in ("0", "1000")),
         *(("confidence", value, "0.01 to 1") for value in ("0", "2")),
-        ("method", "M9", "M0, M1, M2, M3, M4, M5, permissive"),
+        ("method", "M9", "M0, M1, M2, M3, M4, M5, M6, R0, permissive"),
         ("method", "m5", "M5"),
         ("regime", "high", "low, moderate"),
         ("preset", "placebo", "ultrafast"),
