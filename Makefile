@@ -51,8 +51,9 @@ bench-stills: setup ## still codecs on real crops: bytes at equal quality, time 
 bench-sight: setup ## what the ground sees at each bitrate, method by method, on a car park and on small objects
 	@$(BIN)/python -m bench.sight
 
-link: setup      ## the link laboratory: SCENARIO=steady-1M CLIP=clip.mp4 runs one
-	@PYTHONPATH=tests $(BIN)/python -m link
+link: setup      ## edge and ground over bad links; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns SEED=
+	@PYTHONPATH=tests $(BIN)/python -m link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
+		$(if $(LASTS),--lasts $(LASTS)) $(if $(CARRIER),--carrier $(CARRIER)) $(if $(SEED),--seed $(SEED))
 
 bench-peers: setup ## the tracker beside roboflow trackers, which get an environment of their own (they are large)
 	@test -x build/peers/bin/python || $(PYTHON) -m venv build/peers

@@ -18,6 +18,7 @@ import zenoh
 
 from hvt_common.config import PATH, TEXT, load, option, switch, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.link.diagnose import LinkWatch
 from hvt_common.link.session import open_session
 from hvt_common.link.zenoh_config import LinkSettings, configure
 
@@ -66,7 +67,7 @@ def run(argv: Sequence[str] | None) -> int:
     zenoh.init_log_from_env_or("error")
     # Blocked before Zenoh starts its threads, so that the signals wait for sigwait and reach nobody else.
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
-    with open_session(settings) as session:
+    with open_session(settings) as session, LinkWatch(session, settings, served=lambda _name: True):
         print(f"{PROGRAM} {session.zid()} listens on {', '.join(listen) or 'nothing'}", flush=True)
         signal.sigwait(STOP_SIGNALS)
     return 0

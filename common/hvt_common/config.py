@@ -22,11 +22,12 @@ from typing import Any, NoReturn, Protocol, TypeVar
 import tomli_w
 
 from hvt_common.errors import UserError
-from hvt_common.units import parse_bitrate, parse_duration_s, parse_share, parse_size
+from hvt_common.units import parse_bitrate, parse_bytes, parse_duration_s, parse_share, parse_size
 
 __all__ = [
     "AUTO",
     "BITRATE",
+    "BYTES",
     "DURATION",
     "PATH",
     "SHARE",
@@ -83,6 +84,7 @@ def _decimal(number: float) -> str:
 TEXT = Kind("TEXT", _plain)
 PATH = Kind("FILE", _path)
 BITRATE = Kind("RATE", parse_bitrate, lambda bps: f"{_decimal(bps / 1000)}kbps")
+BYTES = Kind("SIZE", parse_bytes, lambda size: f"{_decimal(size / 1_000_000)}MB")
 DURATION = Kind("TIME", parse_duration_s, lambda seconds: f"{_decimal(seconds)}s")
 SHARE = Kind("SHARE", parse_share, float)
 SIZE = Kind("WxH", parse_size, lambda size: f"{size[0]}x{size[1]}")

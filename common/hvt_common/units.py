@@ -7,15 +7,18 @@ import re
 
 from hvt_common.errors import UserError
 
-__all__ = ["bitrate_text", "parse_bitrate", "parse_duration_s", "parse_share", "parse_size"]
+__all__ = ["bitrate_text", "parse_bitrate", "parse_bytes", "parse_duration_s", "parse_share", "parse_size"]
 
 _NUMBER = r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)"
 _BITRATE = re.compile(_NUMBER + r"\s*(bps|bit/s|kbps|kbit/s|k|Mbps|Mbit/s|M)?", re.IGNORECASE)
 _DURATION = re.compile(_NUMBER + r"\s*(ms|s|min|m|h)?")
+_BYTES = re.compile(_NUMBER + r"\s*(B|kB|MB|GB)?", re.IGNORECASE)
 _SIZE = re.compile(r"([0-9]{1,9})\s*[xX]\s*([0-9]{1,9})")
 _BITRATE_UNITS = {"": 1, "b": 1, "k": 1_000, "m": 1_000_000}
+_BYTES_UNITS = {"": 1, "b": 1, "kb": 1_000, "mb": 1_000_000, "gb": 1_000_000_000}
 _DURATION_UNITS = {"": 1.0, "ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 _LIMIT_BPS = 1_000_000_000
+_LIMIT_BYTES = 10**12
 _LIMIT_S = 10_000_000.0
 
 
@@ -28,6 +31,17 @@ def parse_bitrate(text: str, *, name: str) -> int:
     if not match or not 1 <= bps <= _LIMIT_BPS:
         raise UserError(f"{name} {text!r} is not a bitrate: write 800kbps, 0.8Mbps or 800000 (bits a second)")
     return round(bps)
+
+
+def parse_bytes(text: str, *, name: str) -> int:
+    """``200MB`` → 200000000 bytes; a bare number is bytes."""
+    match = _BYTES.fullmatch(text.strip())
+    size_bytes = float(match[1]) * _BYTES_UNITS[(match[2] or "").lower()] if match else math.nan
+    if not 0 <= size_bytes <= _LIMIT_BYTES:
+        raise UserError(
+            f"{name} {text!r} is not a number of bytes: write 200MB, 64kB or 1GB, at most 1000 GB"
+        )
+    return round(size_bytes)
 
 
 def parse_duration_s(text: str, *, name: str) -> float:

@@ -11,21 +11,17 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from hvt_common.errors import UserError
+from hvt_common.link.diagnose import LinkWatch
 from hvt_common.link.keys import EdgeKeys
 from hvt_common.link.ledger import Ledger
 from hvt_common.link.session import open_session
-from hvt_common.link.wire import (
-    Command,
-    ControlAnswer,
-    ControlRequest,
-    Feedback,
-    Status,
-)
+from hvt_common.link.wire import Feedback, Status
 from hvt_common.link.zenoh_config import LinkSettings
 from hvt_common.report import StatusLine, check_writable
 from hvt_common.units import bitrate_text
 from hvt_common.values import Fit
 from hvt_common.vision.detect import Detector
+from hvt_edge.adapt import RateController, RateSettings
 from hvt_edge.base_stage import BaseStage
 from hvt_edge.build import (
     SECOND_NS,
@@ -37,20 +33,23 @@ from hvt_edge.build import (
     make_detector,
     make_encoder,
     make_keyframes,
+    make_on_demand,
     make_regions,
     make_sight,
     make_split,
     warm_up_for,
 )
 from hvt_edge.clock import SteadyClock
+from hvt_edge.commands import Commands, Served
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.counts import FrameCounts
 from hvt_edge.feedback import FeedbackInbox
 from hvt_edge.pace_lockstep import LockstepPace
 from hvt_edge.pace_realtime import RealtimePace
+from hvt_edge.pacer import Pacer
 from hvt_edge.publish import EdgeLink
 from hvt_edge.record_base import BaseRecorder
-from hvt_edge.renew import Renewal
+from hvt_edge.renew import HeldCadence, Renewal
 from hvt_edge.reports import make_info, make_status
 from hvt_edge.scene.truth import write_truth
 from hvt_edge.send import Sender
@@ -64,6 +63,8 @@ __all__ = ["Edge"]
 
 _GOODBYE_S = 1.5
 _MILLION = 1_000_000
+_MOST_WAIT_NS = SECOND_NS // 10
+"""A frame that would wait longer for the budget's window is dropped before it is encoded."""
 
 
 @contextmanager
@@ -108,6 +109,15 @@ class Edge:
         self._ledger = Ledger(window_ns=round(config.window * SECOND_NS))
         self._keyframes = make_keyframes(config)
         self._inbox = FeedbackInbox()
+        self._pacer = self._make_pacer()
+        self._commands = Commands(
+            config,
+            session_id=self._session_id,
+            keyframes=self._keyframes,
+            clock=self._clock,
+            window_ns=lambda: self._now_ns,
+        )
+        self._watch: LinkWatch | None = None
         self._started_ns = 0
         self._now_ns = 0
         self._status_sequence = 0
@@ -161,6 +171,7 @@ class Edge:
             session_id=self._session_id,
             lockstep=self._lockstep,
             wait_until=self._wait_until,
+            pacer=self._pacer,
         )
         renewal = Renewal(
             config,
@@ -168,6 +179,7 @@ class Edge:
             every_n=every_n,
             sender=sender,
             split=make_split(config, view.base_size),
+            pacer=self._pacer,
         )
         base = BaseStage(
             encoder,
@@ -176,8 +188,12 @@ class Edge:
             recorder=recorder,
             first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
             plan=make_regions(config, view.base_size),
-            cadence=make_cadence(config, every_n),
+            cadence=HeldCadence(make_cadence(config, every_n), renewal.least_every_n),
             renew=renewal,
+            admits=lambda now_ns: self._admits(sender, now_ns),
+        )
+        on_demand = make_on_demand(
+            config, view=view, class_names=detector.class_names, most_bytes=sender.most_still_bytes
         )
         chooser = make_chooser(
             config,
@@ -186,8 +202,10 @@ class Edge:
             most_bytes=sender.most_still_bytes(),
             on_fate=sender.fate,
             observe=renewal.observe,
+            asked=on_demand,
         )
         renewal.on_change = lambda: chooser.set_most_bytes(sender.most_still_bytes())
+        self._commands.serve(Served(on_demand, renewal, chooser, base_size=view.base_size))
         stills = StillStage(
             make_sight(config, detector=detector, view=view),
             chooser,
@@ -228,17 +246,20 @@ class Edge:
             connect=config.connect,
             zenoh_config=config.zenoh_config,
             insecure=config.insecure,
+            name=config.edge_id,
         )
         session = stack.enter_context(open_session(settings))
-        return stack.enter_context(
+        link = stack.enter_context(
             EdgeLink(
                 session,
                 EdgeKeys(config.edge_id),
                 answer_info=lambda received_ns: self._info(source, class_names, received_ns),
-                answer_control=self._control,
+                answer_control=self._commands.answer,
                 hear=self._hear,
             )
         )
+        self._watch = stack.enter_context(LinkWatch(session, settings, served=lambda _ground: link.heard()))
+        return link
 
     def _wait_for_ground(self, link: EdgeLink, source: Source, line: StatusLine) -> None:
         """A recorded source can wait for its audience; a camera cannot."""
@@ -293,7 +314,30 @@ class Edge:
             live=source.live,
             counts=self._counts,
             stop=self._stop,
+            follow=lambda now_ns: self._follow(flow, now_ns),
         )
+
+    # The link's rate
+
+    def _make_pacer(self) -> Pacer | None:
+        config = self._config
+        if not config.adapts:
+            return None
+        return Pacer(RateController(RateSettings(ceiling_bps=config.budget_bps, floor_bps=config.floor_bps)))
+
+    def _follow(self, flow: _Flow, now_ns: int) -> None:
+        """Before each frame: what the link carries decides on budget, base rate and keyframe."""
+        if self._pacer is None:
+            return
+        back = self._pacer.link(flow.link.heard(), now_ns=now_ns)
+        if flow.renewal.follow(now_ns) or back:
+            self._keyframes.renew(now_ns)
+
+    def _admits(self, sender: Sender, now_ns: int) -> bool:
+        """Whether a frame may be coded now; what is held back would only wait and grow old."""
+        if self._pacer is None:
+            return True
+        return self._pacer.admits_base(now_ns) and sender.base_wait_ns(now_ns) <= _MOST_WAIT_NS
 
     def _wait_until(self, at_ns: int) -> None:
         """Let the budget's window make room; media time needs no waiting."""
@@ -304,21 +348,14 @@ class Edge:
 
     def _hear(self, feedback: Feedback) -> None:
         if feedback.session_id == self._session_id:
-            self._inbox.receive(feedback, now_ns=self._clock())
-
-    def _control(self, request: ControlRequest) -> ControlAnswer:
-        reason = ""
-        if request.session_id not in (0, self._session_id):
-            reason = "that session has ended"
-        elif request.command == Command.KEYFRAME:
-            self._keyframes.request(self._now_ns)
-        else:
-            reason = f"this edge does not serve {request.command!r}"
-        return ControlAnswer(session_id=self._session_id, accepted=not reason, reason=reason)
+            now_ns = self._clock()
+            self._inbox.receive(feedback, now_ns=now_ns)
+            if self._pacer is not None:
+                self._pacer.hear(feedback, now_ns=now_ns)
 
     def _info(self, source: Source, class_names: tuple[str, ...], received_ns: int) -> bytes:
         info = make_info(
-            self._config,
+            self._commands.config,
             session_id=self._session_id,
             started_ns=self._started_ns,
             view=source.view,
@@ -330,13 +367,16 @@ class Edge:
 
     def _report(self, flow: _Flow, line: StatusLine) -> None:
         self._send_status("running", flow)
-        media_s = self._counts.duration_s(self._config.tick_fps)
+        config = self._commands.config
+        media_s = self._counts.duration_s(config.tick_fps)
         rate_bps = self._ledger.window_bytes(None, self._now_ns) * 8 * SECOND_NS / self._ledger.window_ns
         sent = sum(self._ledger.fates("sent").values())
-        heard = "a ground listens" if flow.link.heard() else "no ground listens"
+        allowed_bps = config.budget_bps if self._pacer is None else self._pacer.rate_bps
+        unlinked = self._watch is not None and self._watch.trouble  # which the log has said
+        heard = "a ground listens" if flow.link.heard() else "no link" if unlinked else "no ground listens"
         line.show(
             f"{self._config.edge_id} {media_s:6.1f} s  {bitrate_text(rate_bps)} of "
-            f"{bitrate_text(self._config.budget_bps)}  {self._config.method}  stills {sent}, {flow.stills.waiting} "
+            f"{bitrate_text(allowed_bps)}  {config.method}  stills {sent}, {flow.stills.waiting} "
             f"waiting  tracks {flow.stills.tracks}  {heard}"
         )
 
@@ -381,11 +421,11 @@ class Edge:
         return EdgeRun(
             edge=config.edge_id,
             session=f"{self._session_id:016x}",
-            method=config.method,
+            method=self._commands.config.method,
             frames=counts.encoded,
             frames_dropped=counts.dropped,
             duration_s=self._counts.duration_s(self._config.tick_fps),
-            budget_bps=config.budget_bps,
+            budget_bps=self._commands.highest_budget_bps,
             base_bps=flow.renewal.base_bps,
             keyframes=self._keyframes.sent,
             keyframe_requests=self._keyframes.requests,

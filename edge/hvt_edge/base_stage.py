@@ -29,6 +29,7 @@ class BaseStage:
         renew: called with (n, ``now_ns``) before each keyframe, each n-th tick being coded from it on. Returns an
             encoder newly opened for that, where anything has changed, or None to go on with the one there is. x265
             takes neither another frame rate nor another bit rate once it is open. Needed where the cadence changes.
+        admits: asked with ``now_ns`` before a tick is coded; where it says no, the frame is held back (`held`).
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class BaseStage:
         plan: RegionPlan | None = None,
         cadence: Cadence | None = None,
         renew: Callable[[int, int], BaseEncoder | None] | None = None,
+        admits: Callable[[int], bool] = lambda _now_ns: True,
     ) -> None:
         self._encoder = encoder
         self._keyframes = keyframes
@@ -51,6 +53,9 @@ class BaseStage:
         self._plan = plan
         self._cadence = cadence or Cadence()
         self._renew = renew
+        self._admits = admits
+        self.held = False
+        """Whether the last tick was to be coded and could not be, because the link is busy."""
 
     @property
     def every_n(self) -> int:
@@ -64,7 +69,11 @@ class BaseStage:
         """
         fits = self._sender.keyframe_fits(self._keyframe_bytes, now_ns=now_ns)
         keyframe = self._keyframes.now(now_ns, fits=fits)
+        self.held = False
         if not keyframe and not self._cadence.codes(frame.index):
+            return None
+        if not self._admits(now_ns):
+            self.held = True
             return None
         if keyframe:
             self._begin_run(frame.index, now_ns=now_ns)

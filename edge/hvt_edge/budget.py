@@ -110,6 +110,20 @@ class RollingBudget:
         self._adopt(replace(self._settings, base_bps=base_bps, fps=fps))
         self._tokens = min(self._cap, self._tokens)
 
+    def set_total(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
+        """Another total from now on. The base stream's rate may stay above it until x265 is opened anew.
+
+        What went out under the former total still counts: after a step down, messages wait until the window has room.
+        """
+        settings = self._settings
+        self._refill(now_ns)
+        self._settings = replace(settings, total_bps=total_bps)
+        self._total = total_bps * settings.window_ns / 8 / _SECOND_NS
+        if (base_bps, fps) != (settings.base_bps, settings.fps):
+            self.set_base(base_bps, fps, now_ns=now_ns)
+        self._cap = self._settings.still_bps * settings.carry_s / 8
+        self._tokens = min(self._cap, self._tokens)
+
     @property
     def base_step_bytes(self) -> float:
         """What one base frame takes on average at B_v, in line bytes."""

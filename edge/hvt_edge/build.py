@@ -16,12 +16,14 @@ from hvt_edge.base_model import choose_base, most_every_n
 from hvt_edge.budget import BudgetSettings, RollingBudget
 from hvt_edge.cadence import Cadence, MeasuredCadence
 from hvt_edge.candidates import Candidate, TrackMemory
-from hvt_edge.choose import Chooser, ChooserSettings
-from hvt_edge.config import LEAST_FPS, EdgeConfig, parse_grid
+from hvt_edge.choose import Asked, Chooser, ChooserSettings
+from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, parse_grid
 from hvt_edge.encode import BaseEncoder
-from hvt_edge.keyframes import KeyframePlan, KeyframeSettings
+from hvt_edge.frame_ring import FrameRing, RingSettings
+from hvt_edge.keyframes import KeyframePlan, KeyframeSettings, keyframe_interval_s
 from hvt_edge.methods.base import Step
 from hvt_edge.methods.registry import method, tuning
+from hvt_edge.on_demand import OnDemand
 from hvt_edge.pulses import PulsePlan, RegionPlan, RollingPlan, TrackRegions, combined
 from hvt_edge.rate import encoder_settings, least_base_bps, payload_bps
 from hvt_edge.resample import BaseSize
@@ -41,6 +43,7 @@ __all__ = [
     "make_detector",
     "make_encoder",
     "make_keyframes",
+    "make_on_demand",
     "make_regions",
     "make_sight",
     "make_split",
@@ -110,19 +113,13 @@ def make_chooser(
     most_bytes: int,
     on_fate: Callable[[str, str], None],
     observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
+    asked: Asked | None = None,
 ) -> Chooser:
     """Method, suppression, queue and still stage; ``most_bytes`` is the largest payload the budget ever admits."""
-    codec = still_codec(config.still_codec)
     return Chooser(
         method(config.method, **tuning(config.tune)),
         suppression=make_suppression(config),
-        maker=StillMaker(
-            codec=codec,
-            fallback=still_codec(config.fallback_codec) if codec.needs_base else None,
-            quality_pct=config.jpeg_quality,
-            fidelity_db=config.fidelity,
-            padding=config.padding,
-        ),
+        maker=_still_maker(config),
         memory=TrackMemory(padding=config.padding),
         view=view,
         class_names=class_names,
@@ -135,6 +132,28 @@ def make_chooser(
         ),
         on_fate=on_fate,
         observe=observe,
+        asked=asked,
+    )
+
+
+def make_on_demand(
+    config: EdgeConfig, *, view: View, class_names: tuple[str, ...], most_bytes: Callable[[], int]
+) -> OnDemand:
+    """The ring of source frames, and who serves stills from it."""
+    ring = FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS)))
+    return OnDemand(
+        ring, maker=_still_maker(config), view=view, class_names=class_names, most_bytes=most_bytes
+    )
+
+
+def _still_maker(config: EdgeConfig) -> StillMaker:
+    codec = still_codec(config.still_codec)
+    return StillMaker(
+        codec=codec,
+        fallback=still_codec(config.fallback_codec) if codec.needs_base else None,
+        quality_pct=config.jpeg_quality,
+        fidelity_db=config.fidelity,
+        padding=config.padding,
     )
 
 
@@ -237,4 +256,7 @@ def make_regions(config: EdgeConfig, size: tuple[int, int]) -> RegionPlan | None
 
 def make_keyframes(config: EdgeConfig) -> KeyframePlan:
     """Keyframes on a long schedule and on demand."""
-    return KeyframePlan(KeyframeSettings(interval_ns=round(config.keyframe_interval * SECOND_NS)))
+    interval_s = config.keyframe_interval
+    if isinstance(interval_s, str):
+        interval_s = keyframe_interval_s(config.fixed_size or DEFAULT_SIZE, config.base_bps)
+    return KeyframePlan(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from hvt_common.values import Still, View
 from hvt_edge.candidates import Candidate, TrackMemory
@@ -21,7 +22,7 @@ from hvt_edge.still_gate import Gate
 from hvt_edge.still_queue import QueueSettings, StillQueue, Waiting
 from hvt_edge.suppress import Suppression
 
-__all__ = ["Chooser", "ChooserSettings"]
+__all__ = ["Asked", "Chooser", "ChooserSettings"]
 
 _FULL_SHARE = 0.9
 """With so much of the most a still can ever be given, it is no use to wait for more."""
@@ -49,11 +50,33 @@ class ChooserSettings:
     """Whether candidates were found on the source, and may be unknown to the ground."""
 
 
+class Asked(Protocol):
+    """Stills that somebody asked for (`hvt_edge.on_demand`)."""
+
+    @property
+    def waiting(self) -> int:
+        """How many wait for room."""
+        ...
+
+    def see(self, seen: Seen) -> None:
+        """Take in a frame."""
+        ...
+
+    def stills(self, *, now_ns: int, room: Room, next_sequence: Callable[[], int]) -> Iterator[Still]:
+        """Yield those that may go now."""
+        ...
+
+    def close(self) -> None:
+        """No more will be sent."""
+        ...
+
+
 class Chooser:
     """Decides at each step who is wanted, and hands out stills as the budget has room for them.
 
     ``on_fate(fate, reason)`` is called with ``sent``, ``deferred`` or ``dropped`` for every candidate that a step
     did not simply pass over; ``observe(candidates, step)`` with all tracks of each step, those that rest included.
+    ``asked`` are the stills that grounds ask for: they go before all others.
     """
 
     def __init__(
@@ -68,8 +91,10 @@ class Chooser:
         settings: ChooserSettings,
         on_fate: Callable[[str, str], None],
         observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
+        asked: Asked | None = None,
     ) -> None:
         self._method = method
+        self._asked = asked
         self._suppression = suppression
         self._maker = maker
         self._memory = memory
@@ -97,6 +122,8 @@ class Chooser:
 
         Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
         """
+        if self._asked is not None:
+            self._asked.see(seen)
         if self._method.video_only:
             return
         due = seen.detected or self._put_off
@@ -125,6 +152,9 @@ class Chooser:
         self._wish_again(now_ns)
         for _, reason in self._queue.expire(now_ns):
             self._on_fate("dropped", reason)
+        yield from self._asked_for(now_ns=now_ns, room=room)
+        if self._asked is not None and self._asked.waiting:
+            return  # it waits for its room; none of the others takes that away
         while (waiting := self._queue.best()) is not None:
             if not self._may_go(waiting, room(self._draft(waiting)), now_ns=now_ns):
                 break  # the most useful waits for its room; a lesser one does not slip in before it
@@ -141,6 +171,10 @@ class Chooser:
             track_id, class_name=class_name, confidence=confidence, entropy_nats=entropy_nats
         )
 
+    def set_method(self, method: Method) -> None:
+        """From the next decision step on; what waits already stays."""
+        self._method = method
+
     def set_most_bytes(self, most_bytes: int) -> None:
         """The largest admission that the budget can give from now on, payload."""
         self._most_bytes = most_bytes
@@ -153,6 +187,8 @@ class Chooser:
         """What still waits will not be sent any more."""
         for _ in self._queue.clear():
             self._on_fate("dropped", "ended")
+        if self._asked is not None:
+            self._asked.close()
 
     # Wishes
 
@@ -223,6 +259,14 @@ class Chooser:
             self._on_fate("deferred" if reason == "replaced" else "dropped", reason)
 
     # Stills
+
+    def _asked_for(self, *, now_ns: int, room: Room) -> Iterator[Still]:
+        if self._asked is None:
+            return
+        for still in self._asked.stills(now_ns=now_ns, room=room, next_sequence=lambda: self._sequence):
+            self._sequence += 1
+            self._on_fate("sent", still.reason)
+            yield still
 
     def _draft(self, waiting: Waiting) -> Still:
         return replace(waiting.cut.draft, sequence=self._sequence)

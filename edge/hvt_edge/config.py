@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hvt_common.config import (
+    AUTO,
     BITRATE,
+    BYTES,
     DURATION,
     PATH,
     SHARE,
@@ -35,13 +37,23 @@ from hvt_edge.rate import least_base_bps
 from hvt_edge.source import check_shape
 from hvt_edge.split import FIRST_SHARE
 
-__all__ = ["LEAST_FPS", "REGIMES", "EdgeConfig", "Regime", "check", "check_rate", "parse_grid"]
+__all__ = [
+    "DEFAULT_SIZE",
+    "LEAST_FPS",
+    "REGIMES",
+    "EdgeConfig",
+    "Regime",
+    "check",
+    "check_rate",
+    "parse_grid",
+]
 
 
 DEFAULT_FPS = 15.0
 DEFAULT_SIZE = (1280, 720)
 _LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, 60.0
 _R0_DEPTH = 0.1
+_MIN_BUDGET_BPS = 100_000
 _MOST_CELLS = 64
 LEAST_FPS = 2.0
 """To this ``--fps auto`` may fall: two frames in a window of a second."""
@@ -96,6 +108,12 @@ class EdgeConfig:
     regime: str | None = option(
         choice(*REGIMES), None, "a budget of the paper: low 0.80 Mbps, moderate 1.40 Mbps"
     )
+    adapt: bool = switch(
+        "follow the link's rate below --budget by the ground's reports; never in lockstep", default=True
+    )
+    min_budget: int | None = option(
+        BITRATE, None, "what --adapt never goes below", shown_default="100kbps, at most --budget"
+    )
     window: float = option(DURATION, 1.0, "the budget holds in every rolling window of this length")
 
     method: str = option(choice(*METHODS), "M5", "who gets a still, and when")
@@ -127,6 +145,12 @@ class EdgeConfig:
         number(0, 60, unit=" dB"), 0.0, "no still where the base is already this good (luma PSNR); 0: no gate"
     )
     padding: float = option(number(0, 1), 0.15, "margin around a box, as a share of its sides")
+    ring: int = option(
+        BYTES, 256_000_000, "memory for source frames, from which stills are served on demand; 0 for none"
+    )
+    ring_time: float = option(
+        DURATION, 5.0, "how far back those go; where memory is short, with frames left out"
+    )
 
     detector: str = option(
         TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
@@ -162,7 +186,11 @@ class EdgeConfig:
     roi_depth: float = option(
         number(0, 1), 0.0, "quantise active tracks better by so much; 0 for not, 0.1 for --method R0"
     )
-    keyframe_interval: float = option(DURATION, 10.0, "time between keyframes; 0 for on demand only")
+    keyframe_interval: float | str = option(
+        or_auto(DURATION),
+        AUTO,
+        "time between keyframes beside those that grounds ask for; 0 for none; auto: 10s, up to 60s on a thin link",
+    )
     pace: str = option(
         choice("realtime", "lockstep"), "realtime", "play at the clip's speed, or as fast as all parts allow"
     )
@@ -189,6 +217,16 @@ class EdgeConfig:
         """B_tot in bits a second."""
         assert self.budget is not None, "check() fills it"
         return self.budget
+
+    @property
+    def floor_bps(self) -> int:
+        """What ``--adapt`` never goes below, in bits a second."""
+        return min(self.budget_bps, self.min_budget or _MIN_BUDGET_BPS)
+
+    @property
+    def adapts(self) -> bool:
+        """Whether the rate follows the link; in lockstep the same input gives the same bytes."""
+        return self.adapt and self.pace == "realtime"
 
     @property
     def share(self) -> float:
@@ -237,6 +275,11 @@ def check(config: EdgeConfig) -> EdgeConfig:
         raise UserError(
             f"--window {config.window:g}s is not accepted: give {_LEAST_WINDOW_S:g}s to {_MOST_WINDOW_S:g}s, and two "
             f"frames at least (shorter, and a keyframe fills more than a window)"
+        )
+    if config.min_budget is not None and config.min_budget > config.budget_bps:
+        raise UserError(
+            f"--min-budget {bitrate_text(config.min_budget)} is more than --budget "
+            f"{bitrate_text(config.budget_bps)}: give less, or the same for a rate that does not change"
         )
     _check_stills(config)
     _check_regions(config)

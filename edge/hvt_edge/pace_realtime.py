@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
@@ -18,7 +19,10 @@ __all__ = ["RealtimePace"]
 
 
 class RealtimePace:
-    """Takes frames when they are due, drops those it cannot take before they are encoded, never after."""
+    """Takes frames when they are due, drops those it cannot take before they are encoded, never after.
+
+    ``follow(now_ns)`` is called before each frame, so that rates can follow the link.
+    """
 
     def __init__(
         self,
@@ -31,6 +35,7 @@ class RealtimePace:
         live: bool,
         counts: FrameCounts,
         stop: threading.Event,
+        follow: Callable[[int], None] = lambda _now_ns: None,
     ) -> None:
         self._base = base
         self._stills = stills
@@ -39,6 +44,7 @@ class RealtimePace:
         self._live = live
         self._counts = counts
         self._stop = stop
+        self._follow = follow
         self._worker = StillWorker(stills, hear=inbox.take, clock=clock)
         self.now_ns = clock()
         """The time that windows go by, of the newest frame."""
@@ -50,12 +56,15 @@ class RealtimePace:
             self._counts.dropped += 1
             return
         self.now_ns = self._clock()
+        self._follow(self.now_ns)
         began_ns = time.perf_counter_ns()
         unit = self._base.encode(frame, now_ns=self.now_ns, tracks=self._stills.latest_tracks)
         if unit is not None:
             self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
             self.now_ns = self._clock()
             self._base.send(unit, now_ns=self.now_ns)
+        elif self._base.held:
+            self._counts.dropped += 1
         self._worker.offer(frame, unit)
 
     def __enter__(self) -> Self:

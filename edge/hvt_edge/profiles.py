@@ -25,6 +25,9 @@ PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "video_share": "auto",
                 "lend": True,
                 "group_stills": True,
+                "gate": 32.0,
+                "fidelity": 36.0,
+                "roi_depth": 0.1,
             }
         ),
     }

@@ -16,6 +16,7 @@ from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
 from hvt_common.link.wire import AlsoShown, BaseHeader, Flags, RoiHeader, Status, fitted_text
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.budget import RollingBudget
+from hvt_edge.pacer import Pacer
 
 __all__ = [
     "BASE_ATTACHMENT_BYTES",
@@ -74,7 +75,8 @@ def _encoding(still: Still) -> str:
 class Sender:
     """Sends access units, stills, tracks and status, and accounts for each.
 
-    ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep.
+    ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` is told of all
+    that goes out, and holds stills while the link is busy.
     """
 
     def __init__(
@@ -87,8 +89,10 @@ class Sender:
         session_id: int,
         lockstep: bool,
         wait_until: Callable[[int], None],
+        pacer: Pacer | None = None,
     ) -> None:
         self._outlet = outlet
+        self._pacer = pacer
         self._ledger = ledger
         self._budget = budget
         self._keys = EdgeKeys(edge_id)
@@ -117,6 +121,8 @@ class Sender:
             attachment = header.pack(unit.data)
             line_bytes = self._count(Row.BASE, Channel.BASE, unit.data, attachment, at_ns=at_ns)
             self._budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
+            if self._pacer is not None:
+                self._pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
         self._wait_until(at_ns)
         self._outlet.put(Row.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Row.BASE].encoding)
         return line_bytes
@@ -129,6 +135,8 @@ class Sender:
         """
         with self._lock:
             room = self._budget.still_room(now_ns)
+        if self._pacer is not None and not self._pacer.admits_still(now_ns):
+            return 0
         if still is None:
             return self._payload_bytes(room, STILL_ATTACHMENT_BYTES, DELIVERIES[Row.ROI].encoding)
         attachment_bytes = len(self._still_header(still, send_ns=now_ns).pack())
@@ -150,6 +158,8 @@ class Sender:
                 Row.ROI, Channel.ROI, still.data, attachment, at_ns=now_ns, encoding=encoding
             )
             self._budget.record_still(line_bytes, now_ns=now_ns)
+            if self._pacer is not None:
+                self._pacer.sent_still(still.sequence, line_bytes, now_ns=now_ns)
         self._outlet.put(Row.ROI, still.data, attachment=attachment, encoding=encoding)
 
     def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
@@ -167,6 +177,17 @@ class Sender:
         """The base stream's share of the budget and its rate of frames, from the keyframe that comes next."""
         with self._lock:
             self._budget.set_base(base_bps, fps, now_ns=now_ns)
+
+    def set_total(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
+        """The total budget from now on; see `RollingBudget.set_total`."""
+        with self._lock:
+            self._budget.set_total(total_bps, base_bps, fps, now_ns=now_ns)
+
+    def base_wait_ns(self, now_ns: int) -> int:
+        """How long an average base frame would wait for the budget's window, were it sent now."""
+        with self._lock:
+            line_bytes = round(self._budget.base_step_bytes)
+            return max(0, self._budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
 
     def keyframe_fits(self, line_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a keyframe of so many line bytes leaves the budget whole."""
@@ -187,6 +208,8 @@ class Sender:
             payload = make(at_ns)
             line_bytes = self._count(row, Channel.META, payload, b"", at_ns=at_ns)
             self._budget.record_metadata(line_bytes, now_ns=at_ns)
+            if self._pacer is not None:
+                self._pacer.sent_other(line_bytes, now_ns=at_ns)
         self._wait_until(at_ns)
         self._outlet.put(row, payload, encoding=DELIVERIES[row].encoding)
 

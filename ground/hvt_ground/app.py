@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
+from hvt_common.link.diagnose import LinkWatch
 from hvt_common.link.keys import check_edge_pattern
 from hvt_common.link.session import open_session
 from hvt_common.link.wire import Info
@@ -72,10 +73,11 @@ class Ground:
             self._make_record_folder()
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges))
+            watch = stack.enter_context(LinkWatch(session, settings, served=link.sees))
             self._on_started()
             self._say_where(line)
             try:
-                self._serve(link, line)
+                self._serve(link, line, watch)
             finally:
                 self._close_receivers()
         return self._summaries()
@@ -114,18 +116,23 @@ class Ground:
 
     # Serving
 
-    def _serve(self, link: GroundLink, line: StatusLine) -> None:
+    def _serve(self, link: GroundLink, line: StatusLine, watch: LinkWatch) -> None:
         ticks = 0
         while not self._stop.wait(_TICK_S):
             for port in link.ports():
                 if port.edge not in self._receivers:
                     self._receivers[port.edge] = EdgeReceiver(port, open_session=self._open_session)
+                    if not watch.may_command(port.edge):
+                        line.note(
+                            f"hvt-ground: {self._config.zenoh_config} lets it watch {port.edge}, not command it: no "
+                            "keyframes or stills on demand, and no changes of its settings"
+                        )
             for receiver in self._receivers.values():
                 if receiver.error is not None:
                     raise receiver.error
             ticks += 1
             if ticks % 10 == 0:
-                line.show(self._status_text())
+                line.show(self._status_text() or ("no link" if watch.trouble else "no edge yet"))
             if ticks % _CLOCK_EVERY_TICKS == 0:
                 self._refresh_clocks()
             if self._config.once and self._all_ended():
@@ -211,7 +218,7 @@ class Ground:
                 f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}  tracks "
                 f"{session.sight.tracks}, {session.sight.refined} refined{age}"
             )
-        return " | ".join(parts) or "no edge yet"
+        return " | ".join(parts)
 
     def _summaries(self) -> list[dict[str, Any]]:
         return [

@@ -2,12 +2,14 @@
 
 Fusion is naive Bayes in log space over the classifier's classes, with a flat prior:
 
-    log P(c) = sum over stills of log max(p_i(c), 1e-4)  +  0.5 log b(c)  -  log Z
+    log P(c) = sum over stills of n_i log max(p_i(c), 1e-4)  +  log b(c)  -  log Z
 
-The floor keeps one confident mistake from being a veto for ever. ``b`` is what the detector says on the base
-stream *now*: its confidence for its class, the rest spread evenly over the others, and nothing at all below
-1/C. It counts as half a still however often it was repeated, because the votes of successive frames are
-nearly the same measurement, and only where the detector's class has a namesake among the classifier's.
+The floor keeps one confident mistake from being a veto for ever. ``n_i`` is how much the still showed that the base
+did not, 0…1 (`still_stage`). ``b`` is what the detector says on the base stream *now*: its confidence for the class
+that its track has voted for, the rest spread evenly over the others, and nothing at all below 1/C. It counts as one
+still however often it was repeated, because the votes of successive frames are nearly the same measurement, and
+only where the detector's class has a namesake among the classifier's. With half a still, and all stills alike, class
+agreement on a car park at 200 kbps was 0.952 in place of 0.983, and 0.785 in place of 0.804 on small objects.
 
 Log-probabilities are summed as integers (in units of 2^-20 nat): the sum does not depend on the order in which
 stills arrive, to the last bit, and does not drift.
@@ -26,7 +28,7 @@ from hvt_common.values import Posterior
 __all__ = ["BASE_WEIGHT", "PROBABILITY_FLOOR", "Belief", "Labels", "Reading"]
 
 PROBABILITY_FLOOR = 1e-4
-BASE_WEIGHT = 0.5
+BASE_WEIGHT = 1.0
 _UNITS_PER_NAT = 1 << 20
 
 
@@ -71,8 +73,12 @@ class Belief:
         self._order = (-1, -1)
         self._log_sum: npt.NDArray[np.int64] | None = None
 
-    def hear(self, posterior: Posterior, labels: Labels, *, order: tuple[int, int]) -> bool:
+    def hear(
+        self, posterior: Posterior, labels: Labels, *, order: tuple[int, int], news: float = 1.0
+    ) -> bool:
         """Take a still's posterior; True if it is the newest so far by ``order`` (frame index, sequence).
+
+        ``news`` (0…1) is what it counts in the sum.
 
         ``ValueError`` if it does not have one probability for each of the classifier's classes.
         """
@@ -82,7 +88,7 @@ class Belief:
         said = np.where(
             np.isfinite(said), said, 0.0
         )  # a model that overflows says nothing, and vetoes nothing
-        logs = np.rint(np.log(np.clip(said, PROBABILITY_FLOOR, 1.0)) * _UNITS_PER_NAT).astype(np.int64)
+        logs = np.rint(np.log(np.clip(said, PROBABILITY_FLOOR, 1.0)) * news * _UNITS_PER_NAT).astype(np.int64)
         self._log_sum = logs if self._log_sum is None else self._log_sum + logs
         if order < self._order:
             return False

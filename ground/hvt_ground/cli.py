@@ -11,7 +11,6 @@ from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.report import print_table, say, start_log, write_json
 from hvt_ground.config import GroundConfig, check
-from hvt_ground.fleet import command as keys
 
 __all__ = ["main"]
 
@@ -29,7 +28,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     if words[:1] == ["keys"]:
+        from hvt_ground.fleet import command as keys  # noqa: PLC0415 - who serves edges needs neither of these
+
         return keys.run(words[1:])
+    if words and not words[0].startswith("-"):
+        from hvt_ground.ask import command as asking  # noqa: PLC0415
+
+        if words[0] in asking.COMMANDS:
+            return asking.run(words)
     try:  # only now: without Rerun this is a sentence, not a traceback
         from hvt_ground.app import Ground  # noqa: PLC0415
         from hvt_ground.summary import table  # noqa: PLC0415

@@ -65,5 +65,7 @@ def _coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
     if not (0 < width <= x2 - x1 and 0 < height <= y2 - y1):
         raise StillError(f"size {width}x{height} is larger than what it shows")
     if max(width, height) > MAX_SIDE_PX:
-        raise StillError(f"size {width}x{height} is larger than any still, whose sides are up to {MAX_SIDE_PX}")
+        raise StillError(
+            f"size {width}x{height} is larger than any still, whose sides are up to {MAX_SIDE_PX}"
+        )
     return width, height

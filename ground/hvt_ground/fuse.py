@@ -60,7 +60,10 @@ REACH_S = 1.0
 HALF_LIFE_S = 0.3
 EDGE_BOX_WEIGHT = 4.0
 """A box from the source overlaps the truth better than ours on a base of 200 kbit/s even when it is 0.5 s old."""
-EDGE_CLASS_WEIGHT = 2.0
+EDGE_CLASS_WEIGHT = 0.85
+"""Nearly as much as ours: it saw the source, but the drone's network is often the smaller one. The surer says."""
+ALONE_CONFIDENCE = 0.3
+"""Of what the edge alone reports at less, one in two is nothing."""
 CORRECTION_WEIGHT = 0.5
 """A still's box stands against one box of ours at that frame, and each is off by a little."""
 FORGET_S = 10.0
@@ -110,6 +113,7 @@ class Fusion:
             edge_box_weight=EDGE_BOX_WEIGHT,
             edge_class_weight=edge_class_weight,
             correction_weight=CORRECTION_WEIGHT,
+            alone_confidence=ALONE_CONFIDENCE,
             same_iou=SAME_IOU,
             twin_iou=TWIN_IOU,
         )

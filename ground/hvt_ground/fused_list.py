@@ -32,6 +32,8 @@ class Rules:
     edge_box_weight: float
     edge_class_weight: float
     correction_weight: float
+    alone_confidence: float
+    """Below it what only the edge sees is not listed."""
     same_iou: float
     """Of one class, seen by the edge and only by us."""
     twin_iou: float
@@ -103,7 +105,8 @@ def _lines(entities: Sequence[Entity], own: Tracks, rules: Rules) -> list[_Line]
     lines = []
     for entity in entities:
         origin = entity.origin(rows, own.frame_index, patience=rules.patience)
-        if origin is not None and entity.id:
+        unsure = origin == "edge" and entity.far_vote.confidence < rules.alone_confidence
+        if origin is not None and entity.id and not unsure:
             lines.append(_Line(entity, origin, rows.get(entity.own_id)))
     return sorted(lines, key=lambda line: line.entity.id)
 

@@ -26,6 +26,7 @@ from hvt_common.link.wire import (
     WireError,
 )
 from hvt_ground.reassemble import Arrival, Counters, Reassembler
+from hvt_ground.reception import Reception, StepFree
 from hvt_ground.session import GroundSession
 from hvt_ground.subscribe import EdgePort
 
@@ -34,7 +35,6 @@ __all__ = ["EdgeReceiver"]
 _log = logging.getLogger(__name__)
 
 _SECOND_NS = 1_000_000_000
-_REPORT_NS = _SECOND_NS // 2
 _ENDED_PATIENCE_NS = 2 * _SECOND_NS
 """How long the rest of a session may take to arrive after its edge has said that it ended."""
 _GONE_NS = 5 * _SECOND_NS
@@ -65,7 +65,8 @@ class EdgeReceiver:
         self._receiver_id = secrets.randbits(64)
         self._report_sequence = 0
         self._report_lock = threading.Lock()
-        self._next_report_ns = 0
+        self._reception = Reception()
+        self._step_free = StepFree(wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
         self._ended_ns: int | None = None
         self._ended_id: int | None = None
         self._first_status: tuple[Status, Received] | None = None
@@ -151,6 +152,14 @@ class EdgeReceiver:
         own = item
         if arrival.payload is not item.payload:
             own = replace(item, payload=arrival.payload, attachment=arrival.header.pack(arrival.payload))
+        # Of one that waited behind a hole only the number counts: the time is that of the message that freed it.
+        if own is item:
+            self._reception.base(
+                arrival.header,
+                size_bytes=own.size_bytes,
+                arrived_ns=self._without_steps_ns(item.received_ns),
+                delay_ms=None if session.lockstep else self._delay_ms(arrival.header, item),
+            )
         decodable = arrival.verdict == "decode"
         if not session.base(arrival.header, own, decode=decodable, starts_run=arrival.starts_run):
             self.reassembler.decoder_failed()
@@ -161,6 +170,9 @@ class EdgeReceiver:
             self._skip("roi", WireError("a still of another session"))
             return
         media_type = item.encoding.partition(";")[0] or DELIVERIES[Row.ROI].encoding
+        self._reception.still(
+            header.sequence, size_bytes=item.size_bytes, arrived_ns=self._without_steps_ns(item.received_ns)
+        )
         session.still(header, item, media_type=media_type)
 
     def _tracks(self, step: TrackStep, item: Received) -> None:
@@ -193,6 +205,8 @@ class EdgeReceiver:
             self._skip("info", WireError("the edge does not say what its session is"))
             return
         self._ended_ns = None
+        with self._report_lock:
+            self._reception = Reception(lockstep=info.pace == "lockstep")
         self.session = self._open_session(info, self)
         first, self._first_status = self._first_status, None
         if first is not None:
@@ -251,8 +265,7 @@ class EdgeReceiver:
         if session is None:
             return
         session.raise_error()
-        if now_ns >= self._next_report_ns:
-            self._next_report_ns = now_ns + _REPORT_NS
+        if self._reception.due(now_ns=self._without_steps_ns(time.time_ns())):
             self._report(session)
         if self._is_over(session, now_ns):
             gone = self._ended_ns is None
@@ -273,13 +286,15 @@ class EdgeReceiver:
     def _report(self, session: GroundSession) -> None:
         counters = self.reassembler.counters.since(self._counted)
         with self._report_lock:
-            delay_ms = session.receive_latency.percentile(50)
+            send_ns = self._without_steps_ns(time.time_ns())
+            measured = self._reception.take(send_ns)
+            delay_ms = measured.delay_p50_ms
             error_ns = self.clock_offset.error_ns
             feedback = Feedback(
                 session_id=session.info.session_id,
                 receiver_id=self._receiver_id,
                 sequence=self._report_sequence,
-                send_ns=time.time_ns(),
+                send_ns=send_ns,
                 last_frame_index=session.last_frame_index,
                 base_messages=session.frames_received,
                 base_bytes=session.ledger.base_bytes,
@@ -287,13 +302,22 @@ class EdgeReceiver:
                 roi_bytes=session.ledger.roi_bytes,
                 lost=counters.lost,
                 corrupt=counters.corrupt,
-                delay_p50_ms=-1.0 if session.lockstep or delay_ms is None else min(delay_ms, 3_600_000.0),
+                base_sequence=measured.base_sequence,
+                base_held_us=measured.base_held_us,
+                still_sequence=measured.still_sequence,
+                delay_p50_ms=-1.0 if delay_ms is None else min(delay_ms, 3_600_000.0),
                 clock_offset_ns=self.clock_offset.offset_ns or 0,
                 clock_error_ns=-1 if error_ns is None else error_ns,
                 stills=session.take_results(MAX_STILL_RESULTS),
             )
             self._report_sequence += 1
             self.port.report(feedback)
+
+    def _without_steps_ns(self, noted_ns: int) -> int:
+        return self._step_free.time_ns(noted_ns, wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
+
+    def _delay_ms(self, header: BaseHeader, item: Received) -> float:
+        return max(0.0, (item.received_ns - self.clock_offset.to_local_ns(header.capture_ns)) / 1e6)
 
     def _skip(self, row: str, error: WireError) -> None:
         self.unusable += 1

@@ -87,6 +87,8 @@ class StillSeen(Generic[P]):
     """Of the classifier, over the `Refiner`'s ``classifier_classes``."""
     carried: P
     """Whatever the caller wants back with it (the coded still, its header)."""
+    news: float = 1.0
+    """How much the still shows that the base did not, 0…1; see `news`."""
     part: int = 0
     """Which of the objects that the still shows: each is offered by itself, under the still's sequence number."""
 
@@ -325,7 +327,9 @@ class Refiner(Generic[P]):
                 self._beliefs.popitem(last=False)
         else:
             before = self._read(belief, tracks, row).class_name
-        newest = belief.hear(still.posterior, self._labels, order=(still.frame_index, still.sequence))
+        newest = belief.hear(
+            still.posterior, self._labels, order=(still.frame_index, still.sequence), news=still.news
+        )
         self._touch(track_id, belief, still.frame_index)
         after = self._read(belief, tracks, row)
         self.counters.matched += 1

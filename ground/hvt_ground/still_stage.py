@@ -10,7 +10,8 @@ import numpy as np
 
 from hvt_common.link.wire import RoiHeader, StillResult, fitted_text
 from hvt_common.values import Image, Posterior, View
-from hvt_common.vision.still_codecs import BaseMissingError, StillError
+from hvt_common.vision.base_crop import base_crop
+from hvt_common.vision.still_codecs import BaseMissingError, StillError, psnr_y_db
 from hvt_ground.classify_stills import Box, Decoded, Reading, StillReader
 from hvt_ground.decode_stills import ReceivedStill, decode_still, needs_base
 from hvt_ground.events import Event, Notice, Refinement
@@ -20,6 +21,8 @@ from hvt_ground.refine import Refiner, Settled, StillSeen
 
 __all__ = ["Carried", "Moment", "StillStage"]
 
+SAME_DB, OTHER_DB = 38.0, 26.0
+"""Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
 MAX_WAITING = 64
 """Stills that wait for their base frame; beyond, the oldest is read without it."""
 
@@ -175,6 +178,7 @@ class StillStage:
     ) -> None:
         header = still.header
         crop = None if base_bgr is None else _cut(base_bgr, header.crop_source_px, view=self._view)
+        news = self._news(decoded)
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
             carried = Carried(still, decoded, track_id, box, reading.box_base_px, crop)
@@ -193,10 +197,27 @@ class StillStage:
                 class_name=header.class_name,
                 posterior=reading.posterior,
                 carried=carried,
+                news=news,
                 part=part,
             )
             for settled in self._refiner.offer(seen, now_frame=now.frame_index):
                 self._settled(settled, now)
+
+    def _news(self, decoded: Decoded) -> float:
+        """How much a still shows that the base did not, 0…1.
+
+        A detector that names the same pixels twice has not seen them twice. On a base near the source the many
+        votes of the track are worth more than one more of a still.
+        """
+        base_bgr = self._history.frame(decoded.frame_index)
+        if base_bgr is None:
+            return 1.0
+        height, width = decoded.image_bgr.shape[:2]
+        seen = base_crop(
+            base_bgr, view=self._view, crop_source_px=decoded.crop_source_px, size=(width, height)
+        )
+        nearness_db = psnr_y_db(seen, decoded.image_bgr)
+        return float(np.clip((SAME_DB - nearness_db) / (SAME_DB - OTHER_DB), 0.0, 1.0))
 
     def _settled(self, settled: Settled[Carried], now: Moment) -> None:
         self.outcomes[settled.outcome] += 1

@@ -10,6 +10,7 @@ from typing import Self
 
 import zenoh
 
+from hvt_common.link.diagnose import control_unanswered
 from hvt_common.link.inbox import Inbox, Received
 from hvt_common.link.keys import EdgeKeys, Row, matches, parse_key, selector
 from hvt_common.link.session import ask, declare_publisher, subscribe
@@ -24,6 +25,8 @@ MAX_EDGES = 64
 _INBOX_MESSAGES = 1024
 _SUBSCRIBED = (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS)
 _ASK_S = 1.0
+_UNANSWERED = 3
+"""So many questions on control in a row without an answer are no accident."""
 
 
 class EdgePort:
@@ -34,6 +37,7 @@ class EdgePort:
         self.inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest")
         self.present = threading.Event()
         """Set while the edge's liveliness token is there."""
+        self._unanswered = 0
         self._session = session
         self._keys = EdgeKeys(edge)
         self._feedback = declare_publisher(session, Row.FEEDBACK, keys=self._keys)
@@ -52,12 +56,20 @@ class EdgePort:
     def request_keyframe(self) -> None:
         """Ask for a keyframe; does not wait for the answer, which is the keyframe."""
         request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
+        answered = threading.Event()
+        handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(
+            lambda _reply: answered.set(), lambda: self._note_control(answered=answered.is_set())
+        )
         try:
-            self._session.get(
-                self._keys.key(Row.CONTROL), lambda _reply: None, payload=request.pack(), timeout=_ASK_S
-            )
+            self._session.get(self._keys.key(Row.CONTROL), handler, payload=request.pack(), timeout=_ASK_S)
         except zenoh.ZError as error:
             _log.debug("%s: keyframe request not sent: %s", self.edge, error)
+
+    def _note_control(self, *, answered: bool) -> None:
+        """Say once that nothing is answered: a question without the right to ask is dropped in silence."""
+        self._unanswered = 0 if answered else self._unanswered + 1
+        if self._unanswered == _UNANSWERED and self.present.is_set():
+            _log.warning("%s", control_unanswered(self.edge))
 
     def report(self, feedback: Feedback) -> None:
         """Publish a receiver report."""
@@ -87,6 +99,11 @@ class GroundLink:
         """All edges that have been seen so far."""
         with self._lock:
             return list(self._ports.values())
+
+    def sees(self, edge: str) -> bool:
+        """Whether this edge has shown itself, by its token or a message."""
+        with self._lock:
+            return edge in self._ports
 
     def put(self, item: Received) -> None:
         """Take a message from Zenoh's callback."""

@@ -53,14 +53,17 @@ METHODS: Mapping[str, MethodRow] = MappingProxyType(
                 "video and stills of what it lacks",
                 unlike="M5-jpeg",
             ),
-            MethodRow("pulse", (*_VIDEO_ONLY, *_BLIND, "--pulse", "1s"), "a better whole frame each second"),
-            MethodRow("rolling", (*_VIDEO_ONLY, "--rolling", "5x3"), "a better part of each frame, in turn"),
+            MethodRow(
+                "pulse", (*_VIDEO_ONLY, *_BLIND, "--pulse", "2s"), "a better whole frame every two seconds"
+            ),
+            MethodRow("rolling", (*_VIDEO_ONLY, "--rolling", "8x4"), "a better part of each frame, in turn"),
             MethodRow("tracks", (*_VIDEO_ONLY, *_SOURCE), "video, and what the edge sees in the source"),
             MethodRow(
                 "M6",
                 (
                     *("--method", "M6", "--still-codec", "residual", *_SOURCE),
                     *("--fps", "auto", "--video-share", "auto", "--lend", "--group-stills"),
+                    *("--gate", "32", "--fidelity", "36", "--roi-depth", "0.1"),
                 ),
                 "all of it, as the rate and the scene allow",
                 unlike="M5-residual",

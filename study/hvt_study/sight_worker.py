@@ -109,13 +109,14 @@ def edge_config(shop: Workshop, job: Job) -> EdgeConfig:
 
 
 def ground_config(shop: Workshop) -> GroundConfig:
-    """The ground of every flight: re-detection reads the stills."""
+    """The ground of every flight: re-detection reads the stills, and what they say is weighed with the base's votes."""
     classifier = "none" if shop.detector == MOTION else "detector"
     return check_ground(
         replace(
             GroundConfig(),
             detector=shop.detector,
             classifier=classifier,
+            refine="fuse",
             confidence=_CONFIDENCE,
             threads=1,
             provider=shop.provider,

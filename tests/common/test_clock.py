@@ -68,3 +68,14 @@ def test_contradictory_times_are_left_out():
     assert not clock.add(t0_ns=10, t1_ns=0, t2_ns=100, t3_ns=20)
     assert not clock.add(t0_ns=0, t1_ns=50, t2_ns=40, t3_ns=90)
     assert clock.offset_ns is None
+
+
+def test_a_clock_that_was_set_is_believed_at_once():
+    """For a minute every latency would be wrong by the step."""
+    clock = ClockOffset()
+    exchange(clock, at_ns=0, offset_ns=0, out_ns=MS, held_ns=0, back_ns=MS)
+    exchange(clock, at_ns=20_000 * MS, offset_ns=3_600_000 * MS, out_ns=40 * MS, held_ns=0, back_ns=40 * MS)
+    assert clock.offset_ns == 3_600_000 * MS
+    exchange(clock, at_ns=40_000 * MS, offset_ns=3_600_000 * MS, out_ns=90 * MS, held_ns=0, back_ns=10 * MS)
+    assert clock.offset_ns == 3_600_000 * MS  # the better of those after the step
+    assert clock.error_ns == 40 * MS

@@ -75,7 +75,7 @@ def test_ultralytics_boxes_come_out_exactly_and_suppressed_by_class(tmp_path: Pa
     """One car would count as five, or a person before a car would vanish."""
     table = empty(4 + 2, 84)
     table[0, :, 3] = [30, 20, 20, 10, 0.3, 0.7]
-    table[0, :, 9] = [31, 20, 20, 10, 0.0, 0.8]
+    table[0, :, 9] = [34, 20, 20, 10, 0.0, 0.8]
     table[0, :, 60] = [30, 20, 20, 10, 0.9, 0.1]
     table[0, :, 70] = [50, 50, 10, 10, 0.1, 0.26]
     table[0, :, 71] = [50, 20, 10, 10, 0.1, 0.24]
@@ -84,7 +84,18 @@ def test_ultralytics_boxes_come_out_exactly_and_suppressed_by_class(tmp_path: Pa
     )
     np.testing.assert_allclose(found.confidences, [0.9, 0.8, 0.26], rtol=1e-5)
     assert found.class_ids.tolist() == [0, 1, 1]
-    np.testing.assert_allclose(found.boxes_xyxy_px, [[20, 15, 40, 25], [21, 15, 41, 25], [45, 45, 55, 55]])
+    np.testing.assert_allclose(found.boxes_xyxy_px, [[20, 15, 40, 25], [24, 15, 44, 25], [45, 45, 55, 55]])
+
+
+def test_two_names_of_one_vehicle_are_one_detection(tmp_path: Path) -> None:
+    """Each van would be two tracks, a car and a van, in every list and every count."""
+    table = empty(4 + 2, 84)
+    table[0, :, 3] = [30, 20, 20, 10, 0.7, 0.0]
+    table[0, :, 9] = [31, 20, 20, 10, 0.0, 0.8]
+    found = open_detector(str(constant_model(tmp_path / "m.onnx", table))).detect(
+        np.zeros((64, 64, 3), np.uint8)
+    )
+    assert found.class_ids.tolist() == [1]
 
 
 def test_end_to_end_boxes_come_out_exactly(tmp_path: Path) -> None:
@@ -394,7 +405,9 @@ def reference(path: Path, image: np.ndarray, *, confidence: float, size: tuple[i
             box = np.array([cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2]) - [left, top, left, top]
             rows.append((np.clip(box / ratio, 0, [width, height] * 2), scores.max(), scores.argmax()))
     boxes, scores, classes = (np.array(column) for column in zip(*rows, strict=True))
-    return [rows[i] for i in plain_suppression(boxes, scores, classes, 0.45)]
+    by_class = plain_suppression(boxes, scores, classes, 0.45)
+    kept = plain_suppression(boxes[by_class], scores[by_class], np.zeros(len(by_class), int), 0.8)
+    return [rows[by_class[i]] for i in kept]
 
 
 def street(data: Path) -> tuple[np.ndarray, Path]:

@@ -375,7 +375,9 @@ def test_the_subscriber_of_the_document_writes_the_video(endpoint, tmp_path):
     def answer(question: bytes) -> bytes:
         if ControlRequest.parse(question).command == Command.KEYFRAME:
             asked.set()
-        return ControlAnswer(session_id=7, accepted=True, reason="").pack()
+        return ControlAnswer(
+            session_id=7, accepted=True, reason="", still_ask=-1, frame_index=-1, tracks=()
+        ).pack()
 
     with open_session(LinkSettings("edge", listen=(endpoint,))) as session:
         publisher = declare_publisher(session, Row.BASE, keys=KEYS)

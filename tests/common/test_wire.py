@@ -29,6 +29,7 @@ from hvt_common.link.wire import (
     RoiHeader,
     Status,
     StillResult,
+    TrackNow,
     TrackStep,
     UnknownVersionError,
     WireError,
@@ -166,6 +167,9 @@ FEEDBACK = Feedback(
     roi_bytes=0,
     lost=0,
     corrupt=0,
+    base_sequence=U32,
+    base_held_us=66_000,
+    still_sequence=-1,
     delay_p50_ms=-1,
     clock_offset_ns=-I63,
     clock_error_ns=-1,
@@ -182,7 +186,14 @@ FEEDBACK = Feedback(
     ),
 )
 REQUEST = ControlRequest(session_id=0, command="keyframe", arguments={})
-ANSWER = ControlAnswer(session_id=7, accepted=False, reason="this edge does not know set-method")
+ANSWER = ControlAnswer(
+    session_id=7,
+    accepted=True,
+    reason="",
+    still_ask=3,
+    frame_index=9_100,
+    tracks=(TrackNow(track_id=57, class_id=3, confidence=0.613, box_source_px=(-3.125, 10.0, 90.875, 64.5)),),
+)
 EXAMPLES: tuple[Message, ...] = (BASE, ROI, STEP, INFO, STATUS, REQUEST, ANSWER, FEEDBACK)
 
 
@@ -450,7 +461,7 @@ def test_info_gives_the_view():
 
 
 @pytest.mark.parametrize(
-    "message", [*MESSAGES, AlsoShown, Health, StillResult], ids=lambda message: message.__name__
+    "message", [*MESSAGES, AlsoShown, Health, StillResult, TrackNow], ids=lambda message: message.__name__
 )
 def test_the_document_lists_every_field_with_its_bounds(message):
     """Whoever writes a subscriber from docs/wire.md would read the wrong field."""

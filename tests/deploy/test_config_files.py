@@ -68,13 +68,3 @@ def test_zenoh_reads_the_file(file: Path) -> None:
     config, _ = configure(LinkSettings(role="ground", connect=connect, zenoh_config=file))
     assert config.get_json("transport/shared_memory/enabled") == "false"
     assert config.get_json("scouting/multicast/enabled") == "false"
-
-
-def test_the_router_with_keys_is_the_router_with_keys_added() -> None:
-    """Two files that drift apart would make a router behave differently for being secured."""
-    plain = json5.loads((DEPLOY / "zenoh" / "router.json5").read_text(encoding="utf-8"))
-    keyed = json5.loads((DEPLOY / "zenoh" / "router-tls.json5").read_text(encoding="utf-8"))
-    assert keyed["transport"]["link"].pop("tls")["enable_mtls"] is True
-    assert plain.pop("listen") == {"endpoints": ["tcp/127.0.0.1:7447"]}
-    assert keyed.pop("listen") == {"endpoints": ["tls/0.0.0.0:7447"]}
-    assert keyed == plain

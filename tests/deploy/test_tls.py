@@ -1,112 +1,226 @@
-"""The keys of deploy/make-keys.sh in the TLS configurations of deploy/zenoh, over real sessions."""
+"""The documented way to keys: the files of ``hvt-ground keys``, over real sessions and a real router."""
 
 from __future__ import annotations
 
-import json
-import shutil
 import subprocess
+import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+import zenoh
 
+from fleet_keys import Fleet
+from hvt_common.errors import UserError
 from hvt_common.link.keys import EdgeKeys, Row, selector
-from hvt_common.link.session import declare_publisher, open_session
+from hvt_common.link.session import ask, declare_publisher, open_session, serve
 from hvt_common.link.zenoh_config import LinkSettings
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
-MAKE_KEYS = DEPLOY / "make-keys.sh"
+EDGES = ("rov-1", "uav-1")
+WRITTEN = (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS)
 
-pytestmark = [
-    pytest.mark.integration,
-    pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed"),
-]
+pytestmark = pytest.mark.integration
 
 
 @pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a CA and the keys of a ground on loopback and of an edge, from the script users run."""
-    folder = tmp_path_factory.mktemp("tls")
-    subprocess.run([MAKE_KEYS, folder, "ground", "127.0.0.1", "localhost"], check=True, capture_output=True)
-    subprocess.run([MAKE_KEYS, folder, "edge"], check=True, capture_output=True)
-    return folder
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    """Two edges, a ground for all, a guest that watches one of them, and a router."""
+    fleet = Fleet(tmp_path_factory.mktemp("keys") / "own")
+    for edge in EDGES:
+        fleet.keys("add-edge", edge, "--host", "127.0.0.1")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    fleet.keys("add-ground", "guest", "--watch-only", "--edges", "uav-*")
+    fleet.keys("add-router", "hub", "--host", "127.0.0.1")
+    return fleet
 
 
-def _settled(name: str, keys: Path, folder: Path) -> Path:
-    """A file of deploy/zenoh with the folder of the keys put in."""
-    file = folder / name
-    text = (DEPLOY / "zenoh" / name).read_text(encoding="utf-8")
-    assert "/etc/hvt/tls/" in text
-    file.write_text(text.replace("/etc/hvt/tls/", f"{keys}/"), encoding="utf-8")
-    return file
+class _Edge:
+    """All that an edge declares."""
+
+    def __init__(self, session: zenoh.Session, name: str) -> None:
+        self.session, self.keys = session, EdgeKeys(name)
+        self.reports: list[bytes] = []
+        self.publishers = {row: declare_publisher(session, row, keys=self.keys) for row in WRITTEN}
+        for row in (Row.INFO, Row.CONTROL):
+            serve(session, row, keys=self.keys, answer=lambda _question, row=row: f"{row} of {name}".encode())
+        session.declare_subscriber(
+            self.keys.key(Row.FEEDBACK), lambda sample: self.reports.append(sample.payload.to_bytes())
+        )
+        self._token = session.liveliness().declare_token(self.keys.key(Row.ALIVE))
+
+    def wanted(self) -> bool:
+        return all(one.matching_status.matching for one in self.publishers.values())  # type: ignore[attr-defined]
+
+    def write(self) -> None:
+        for row, publisher in self.publishers.items():
+            publisher.put(self.keys.key(row).encode())
 
 
-def test_private_keys_are_private(keys: Path) -> None:
-    """A key that other users of the machine can read is no key."""
-    made = {file.name for file in keys.iterdir()}
-    assert {"ca.key", "ca.pem", "ground.key", "ground.pem", "edge.key", "edge.pem"} <= made
-    assert {file.stat().st_mode & 0o077 for file in keys.glob("*.key")} == {0}
+class _Ground:
+    """All that a ground declares, and what came of it."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
+        self.came: list[str] = []
+        for row in (*WRITTEN, Row.ALIVE):
+            take = lambda sample: self.came.append(str(sample.key_expr))  # noqa: E731
+            if row is Row.ALIVE:
+                session.liveliness().declare_subscriber(selector(row), take, history=True)
+            else:
+                session.declare_subscriber(selector(row), take)
+
+    def asked(self, row: Row) -> list[bytes | None]:
+        return [ask(self.session, row, keys=EdgeKeys(edge), question=b"", timeout_s=1.5) for edge in EDGES]
+
+    def report(self, text: bytes) -> None:
+        for edge in EDGES:
+            self.session.put(EdgeKeys(edge).key(Row.FEEDBACK), text)
 
 
-def test_the_certificate_of_a_listener_names_its_addresses(keys: Path) -> None:
-    """Zenoh compares the name in the endpoint with the certificate: without it no edge connects."""
-    command = ["openssl", "x509", "-in", str(keys / "ground.pem"), "-noout", "-ext", "subjectAltName"]
-    text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    assert "DNS:ground, IP Address:127.0.0.1, DNS:localhost" in text
+def _until(true: Callable[[], object], what: str, *, within_s: float = 20.0) -> None:
+    deadline_s = time.monotonic() + within_s
+    while not true():
+        assert time.monotonic() < deadline_s, f"not in time: {what}"
+        time.sleep(0.01)
 
 
-def test_make_keys_says_how_it_is_used() -> None:
-    """Called without arguments it must not make keys anywhere."""
-    done = subprocess.run([MAKE_KEYS], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "make-keys.sh DIR NAME" in done.stderr
+@contextmanager
+def _router(file: Path, endpoint: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, str(DEPLOY / "router.py"), "--zenoh-config", str(file), "--listen", endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert "listens on" in process.stdout.readline()
+            yield process
+        finally:
+            process.kill()
 
 
-def test_an_edge_with_a_key_gets_through(keys: Path, tmp_path: Path, free_port: int) -> None:
-    """The documented way onto a network: if it fails, people fall back to --insecure."""
+def _all(edges: tuple[str, ...]) -> set[str]:
+    return {EdgeKeys(edge).key(row) for edge in edges for row in (*WRITTEN, Row.ALIVE)}
+
+
+def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_port: int) -> None:
+    """Behind a router an edge cannot tell who asks: the router has to keep the rights, row by row."""
     endpoint = f"tls/127.0.0.1:{free_port}"
-    ground = LinkSettings(
-        role="ground", listen=(endpoint,), zenoh_config=_settled("ground-tls.json5", keys, tmp_path)
+    with ExitStack() as stack:
+        stack.enter_context(_router(fleet.file("hub"), endpoint))
+
+        def opened(name: str, role: str) -> zenoh.Session:
+            settings = fleet.settings(name, role, connect=(endpoint,))  # type: ignore[arg-type]
+            return stack.enter_context(open_session(settings))
+
+        edges = {name: _Edge(opened(name, "edge"), name) for name in EDGES}
+        base, guest = _Ground(opened("base", "ground")), _Ground(opened("guest", "ground"))
+        _until(lambda: all(edge.wanted() for edge in edges.values()), "the streams are wanted")
+        _until(lambda: EdgeKeys("uav-1").key(Row.ALIVE) in guest.came, "the guest sees the edge")
+        for edge in edges.values():
+            edge.write()
+        _until(lambda: set(base.came) == _all(EDGES), "the ground has all rows of both")
+        _until(lambda: set(guest.came) == _all(("uav-1",)), "the guest has all rows of its edge, and no more")
+        assert base.asked(Row.INFO) == [b"info of rov-1", b"info of uav-1"]
+        assert base.asked(Row.CONTROL) == [b"control of rov-1", b"control of uav-1"]
+        assert guest.asked(Row.INFO) == [None, b"info of uav-1"]
+        assert guest.asked(Row.CONTROL) == [None, None]
+        guest.report(b"guest")
+        base.report(b"base")
+        _until(lambda: b"base" in edges["rov-1"].reports, "the ground's report arrives")
+        _until(lambda: set(edges["uav-1"].reports) == {b"base", b"guest"}, "both reports arrive")
+        assert edges["rov-1"].reports == [b"base"]
+
+
+@pytest.mark.parametrize("listens", ["ground", "edge"])
+def test_direct_either_side_may_listen(fleet: Fleet, free_port: int, listens: str) -> None:
+    """A drone with a public address and a ground behind a home router: the same files have to do."""
+    where = (f"tls/127.0.0.1:{free_port}",)
+    there, here = (
+        ({"listen": where}, {"connect": where})
+        if listens == "ground"
+        else ({"connect": where}, {"listen": where})
     )
-    edge = LinkSettings(
-        role="edge", connect=(endpoint,), zenoh_config=_settled("edge-tls.json5", keys, tmp_path)
-    )
-    with open_session(ground) as receiving, open_session(edge) as sending:
-        samples = receiving.declare_subscriber(selector(Row.BASE))
-        publisher = declare_publisher(sending, Row.BASE, keys=EdgeKeys("uav-1"))
-        deadline_s = time.monotonic() + 20
-        while not publisher.matching_status.matching:
-            assert time.monotonic() < deadline_s, "the edge did not get in"
-            time.sleep(0.01)
-        assert len(list(receiving.info.peers_zid())) == 1
-        publisher.put(b"over tls")
-        assert samples.recv().payload.to_bytes() == b"over tls"
+    with (
+        open_session(fleet.settings("base", "ground", **there)) as ground_session,
+        open_session(fleet.settings("uav-1", "edge", **here)) as edge_session,
+    ):
+        ground, edge = _Ground(ground_session), _Edge(edge_session, "uav-1")
+        _until(edge.wanted, "the streams are wanted")
+        edge.write()
+        _until(lambda: set(ground.came) == _all(("uav-1",)), "all rows arrive")
+        assert ground.asked(Row.CONTROL) == [None, b"control of uav-1"]
+        ground.report(b"base")
+        _until(lambda: edge.reports == [b"base"], "the report arrives")
 
 
-def test_an_edge_without_a_key_stays_out(keys: Path, tmp_path: Path, free_port: int) -> None:
-    """Knowing the CA must not be enough: anybody can read a certificate off the wire."""
-    endpoint = f"tls/127.0.0.1:{free_port}"
-    ground = LinkSettings(
-        role="ground", listen=(endpoint,), zenoh_config=_settled("ground-tls.json5", keys, tmp_path)
-    )
-    stranger_file = tmp_path / "stranger.json5"
-    tls = {"root_ca_certificate": str(keys / "ca.pem")}
-    stranger_file.write_text(json.dumps({"transport": {"link": {"tls": tls}}}), encoding="utf-8")
-    stranger = LinkSettings(role="edge", connect=(endpoint,), zenoh_config=stranger_file)
-    with open_session(ground) as receiving, open_session(stranger) as calling:
-        time.sleep(1.5)  # several attempts: a connecting side tries every 0.2 to 1 s
-        assert list(receiving.info.peers_zid()) == []
-        assert list(calling.info.peers_zid()) == []
-
-
-def test_a_ground_with_keys_may_listen_beyond_this_machine(
-    keys: Path, tmp_path: Path, free_port: int
+@pytest.mark.parametrize(("who", "said"), [("base", b"control of uav-1"), ("guest", None)])
+def test_who_asks_by_way_of_a_ground_has_its_own_rights(
+    fleet: Fleet, free_port: int, who: str, said: bytes | None
 ) -> None:
+    """`hvt-ground still` connects to the ground: a guest must not command with the ground's rights."""
+    where = (f"tls/127.0.0.1:{free_port}",)
+    with (
+        open_session(fleet.settings("base", "ground", listen=where)),
+        open_session(fleet.settings("uav-1", "edge", connect=where)) as edge_session,
+        open_session(LinkSettings("asker", connect=where, zenoh_config=fleet.file(who))) as asker,
+    ):
+        edge = _Edge(edge_session, "uav-1")
+        _until(lambda: ask(asker, Row.INFO, keys=edge.keys, question=b"", timeout_s=1), "info is answered")
+        answer = ask(asker, Row.CONTROL, keys=edge.keys, question=b"", timeout_s=1.5)
+        assert answer == said
+
+
+def test_who_asks_with_keys_of_another_fleet_is_told(fleet: Fleet, tmp_path: Path, free_port: int) -> None:
+    """'Nobody answers' would be said of a ground that is running."""
+    other = Fleet(tmp_path / "other")
+    other.keys("add-ground", "base")
+    where = (f"tls/127.0.0.1:{free_port}",)
+    settings = LinkSettings("asker", connect=where, zenoh_config=other.file("base"))
+    with (
+        open_session(fleet.settings("base", "ground", listen=where)),
+        pytest.raises(UserError, match=r"^no link: tls/.*: its certificate was not signed by the CA in"),
+        open_session(settings),
+    ):
+        pass
+
+
+def test_a_router_says_who_is_not_named(fleet: Fleet, tmp_path: Path, free_port: int) -> None:
+    """A new drone on an old router file: nothing arrives, and the router is the one that drops it."""
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    old = fleet.file("hub").read_text()
+    try:
+        fleet.keys("add-edge", "new-1")
+        file = tmp_path / "old.json5"
+        file.write_text(old)
+        with (
+            _router(file, endpoint) as router,
+            open_session(fleet.settings("new-1", "edge", connect=(endpoint,))),
+        ):
+            assert router.stderr is not None
+            lines: list[str] = []
+            stream = router.stderr
+            threading.Thread(target=lambda: lines.append(stream.readline()), daemon=True).start()
+            _until(lambda: lines, "the router says it")
+            assert (
+                f"'new-1' has a certificate of this CA, but {file} does not name it: what it sends is dropped"
+                in lines[0]
+            )
+    finally:
+        fleet.keys("remove", "new-1")
+
+
+def test_a_ground_with_keys_may_listen_beyond_this_machine(fleet: Fleet, free_port: int) -> None:
     """With keys --insecure must not be needed, or everybody would set it."""
-    ground = LinkSettings(
-        role="ground",
-        listen=(f"tls/0.0.0.0:{free_port}",),
-        zenoh_config=_settled("ground-tls.json5", keys, tmp_path),
-    )
-    with open_session(ground):
+    with open_session(fleet.settings("base", "ground", listen=(f"tls/0.0.0.0:{free_port}",))):
+        pass
+
+
+def test_without_keys_only_loopback(free_port: int) -> None:
+    """What nobody has thought about must not be open to a network."""
+    with (
+        pytest.raises(UserError, match=r"without keys .* accept it with --insecure"),
+        open_session(LinkSettings("ground", listen=(f"tcp/0.0.0.0:{free_port}",))),
+    ):
         pass

@@ -213,12 +213,12 @@ def test_the_class_is_that_of_the_surer_side():
     ours = tracks_at(0, {1: A, 2: B})
     ours.confidences[:] = (0.4, 0.95)
     theirs = tracks_at(0, {70: A, 71: B}, class_id=1)
-    theirs.confidences[:] = 0.3
+    theirs.confidences[:] = 0.6
     ground.fusion.take_own(ours)
     ground.fusion.take_step(theirs, own=ours)
     fused = ground.fusion.listed(ours)
     assert [ground.names[i] for i in fused.tracks.class_ids] == ["bus", "car"]
-    np.testing.assert_allclose(fused.tracks.confidences, [0.4, 0.95])
+    np.testing.assert_allclose(fused.tracks.confidences, [0.6, 0.95])
 
 
 def test_names_that_only_the_edge_has_are_added():

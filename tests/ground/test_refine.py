@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -379,19 +380,31 @@ def test_fusing_multiplies_what_the_stills_say():
     assert ground.refiner.shown(tracks(11, {1: A}, **van)).classes == ("truck",)
 
 
-def test_fusing_counts_the_base_as_half_a_still():
+def test_fusing_counts_the_base_as_one_still():
     """What the base says in every frame would drown the stills, or not count at all."""
     ground = Ground("fuse")
     ground.run(5, 9, {1: A})
     ground.offer(still(0, 8, posterior=says(0.1, 0.42, 0.48)))
     for frame_index in range(9, 40):
         shown = ground.refiner.shown(tracks(frame_index, {1: A}, confidences={1: 0.8}))
-    weights = np.array([0.1 * 0.1**0.5, 0.42 * 0.8**0.5, 0.48 * 0.1**0.5])
+    weights = np.array([0.1 * 0.1, 0.42 * 0.8, 0.48 * 0.1])
     assert shown.classes == ("car",)
     assert shown.confidences[0] == pytest.approx(weights[1] / weights.sum(), abs=1e-5)
     unsure = ground.refiner.shown(tracks(40, {1: A}, confidences={1: 0.2}))
     assert unsure.classes == ("truck",), "a confidence below 1/C says nothing"
     assert unsure.confidences[0] == pytest.approx(0.48, abs=1e-5)
+
+
+def test_a_still_that_shows_nothing_new_says_nothing_new():
+    """On a good base one more look at the same pixels would outvote all the looks before."""
+    ground = Ground("fuse")
+    ground.run(5, 9, {1: A})
+    ground.offer(replace(still(0, 8, posterior=says(0.02, 0.08, 0.9)), news=0.0))
+    ground.offer(replace(still(1, 8, posterior=says(0.02, 0.08, 0.9)), news=0.25))
+    shown = ground.refiner.shown(tracks(9, {1: A}, confidences={1: 0.8}))
+    weights = np.array([0.02**0.25 * 0.1, 0.08**0.25 * 0.8, 0.9**0.25 * 0.1])
+    assert shown.classes == ("car",)
+    assert shown.confidences[0] == pytest.approx(weights[1] / weights.sum(), abs=1e-4)
 
 
 def test_fusing_survives_certainty_and_long_runs():

@@ -27,7 +27,8 @@ Carrier = Literal["relay", "netns"]
 _TIMED_GROUND = Path(__file__).with_name("timed_ground.py")
 _START_S = 60.0
 _END_S = 25.0
-_TELL_S = 1.0
+_TAKES_IN_S = 2.5
+"""How long the ground may take in what is on its way when the edge has ended."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ class Run:
     @property
     def script(self) -> Script:
         """What the link will do."""
-        return self.scenario.script(self.length, seed=self.seed, lasts=self.lasts)
+        script = self.scenario.script(self.length, seed=self.seed, lasts=self.lasts)
+        return script.without_delay() if self.carrier == "netns" else script
 
 
 def run(asked: Run) -> Outcome:
@@ -75,7 +77,7 @@ def run(asked: Run) -> Outcome:
             sides = {"edge": [], "ground": []}
             listen, connect = f"tcp/127.0.0.1:{port}", f"tcp/127.0.0.1:{link.port}"
         ground = stack.enter_context(_Process("ground", asked.folder, [
-            *sides["ground"], sys.executable, str(_TIMED_GROUND), str(timing), "--listen", listen, "--once",
+            *sides["ground"], sys.executable, str(_TIMED_GROUND), str(timing), "--listen", listen,
             *(["--insecure"] if asked.carrier == "netns" else []), "--record", str(asked.folder / "run.rrd"),
             *asked.ground_arguments,
         ]))  # fmt: skip
@@ -88,7 +90,10 @@ def run(asked: Run) -> Outcome:
         began_s = link.begin()
         with Watch({"edge": edge.process.pid, "ground": ground.process.pid}) as watch:
             _wait(began_s + script.lasts_s, edge, ground)
-        codes = {"edge": edge.end(), "ground": ground.end(patience_s=_END_S)}
+        codes = {"edge": edge.end()}
+        # Not --once: a ground with it leaves in an outage that is longer than its patience.
+        _wait(time.time() + _TAKES_IN_S, ground)
+        codes["ground"] = ground.end()
     return Outcome(
         scenario=asked.scenario.name,
         script=script,
@@ -128,26 +133,22 @@ class _Process(Running):
                 stderr=err,
             )
 
-    def end(self, *, patience_s: float = 0.0) -> int | None:
-        """Wait, then Ctrl-C, then kill; the exit code, None where it had to be killed."""
-        for sign, wait_s in ((None, patience_s), (signal.SIGINT, _END_S)):
-            if sign is not None and self.alive:
-                self.process.send_signal(sign)
-            try:
-                return self.process.wait(wait_s)
-            except subprocess.TimeoutExpired:
-                continue
-        self.kill()
-        return None
+    def end(self) -> int | None:
+        """Ctrl-C where it still runs, then kill; the exit code, None where it had to be killed."""
+        if self.alive:
+            self.process.send_signal(signal.SIGINT)
+        try:
+            return self.process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return None
 
     def left(self) -> Any:
-        """Its summary; of several sessions the one with most frames, None where it left none."""
+        """Its summary; several (after an outage) as one; None where it left none."""
         if not self._summary.exists():
             return None
         content = self.summary()
-        if isinstance(content, list):
-            return max(content, key=lambda one: one["frames"], default=None)
-        return content
+        return _summed(content) if isinstance(content, list) else content
 
     def __enter__(self) -> Self:
         return self
@@ -155,3 +156,14 @@ class _Process(Running):
     def __exit__(self, *_error: object) -> None:
         if self.alive:
             self.kill()
+
+
+def _summed(summaries: list[dict[str, Any]]) -> dict[str, Any] | None:
+    if not summaries:
+        return None
+    counts = {
+        name: sum(one[name] for one in summaries)
+        for name, value in summaries[0].items()
+        if isinstance(value, int | float)
+    }
+    return {**counts, "stills": {"received": sum(one["stills"]["received"] for one in summaries)}}

@@ -232,9 +232,10 @@ def _accounts(outcome: Outcome) -> dict[str, float | int | None]:
 
 
 def _processes(outcome: Outcome) -> dict[str, float | int | None]:
-    found: dict[str, float | int | None] = {}
+    found: dict[str, float | int | None] = {
+        f"{name}, exit code": code for name, code in outcome.exit_codes.items()
+    }
     for name, samples in outcome.samples.items():
-        found[f"{name}, exit code"] = outcome.exit_codes.get(name)
         found[f"{name}, peak memory MB"] = max((one.resident_mb for one in samples), default=None)
         if len(samples) < 8:
             continue

@@ -39,6 +39,8 @@ _FLIGHT_SEGMENTS = 256
 """Of a connection: the receive window of the far end, 370 kB."""
 _FLIGHT_DATAGRAMS = 4096
 _OUTLIVES_SCRIPT_S = 120.0
+_CLOSE_WAIT = 8
+"""Linux's number of the TCP state in which the peer has closed."""
 
 
 class Relay:
@@ -151,6 +153,9 @@ async def _connection(relay: Relay, near: socket.socket) -> None:
     near.setblocking(False)
     # In darkness a first packet is lost too: who connects then hears nothing until the link is back.
     await _until(relay.up.script.light_s(time.monotonic()))
+    if near.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 1)[0] == _CLOSE_WAIT:
+        near.close()  # who has given up meanwhile was never heard of at the other end
+        return
     far = socket.socket()
     far.setblocking(False)
     far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BYTES)

@@ -132,6 +132,16 @@ class Script:
         first = replace(self.pieces[0].state, dark=False, loss=0.0)
         return replace(self, pieces=(Piece(0.0, first),))
 
+    def without_delay(self) -> Script:
+        """What namespaces can play: a floor that counted a delay they do not have would flatter."""
+        return replace(
+            self,
+            pieces=tuple(
+                replace(piece, state=replace(piece.state, delay_s=0.0, jitter_s=0.0, reorder=0.0))
+                for piece in self.pieces
+            ),
+        )
+
     def _index(self, t_s: float) -> int:
         return max(0, bisect_right(self._starts, t_s) - 1)
 

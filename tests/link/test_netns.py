@@ -29,6 +29,29 @@ ends = time.time() + float(sys.argv[2])
 while time.time() < ends:
     near.sendall(bytes(1448))
 """
+COUNT = """
+import socket
+one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+one.bind(("", 7000))
+print("up", flush=True)
+one.settimeout(10)
+came = 0
+try:
+    while True:
+        came += len(one.recv(2000)) == 100
+        one.settimeout(1)
+except TimeoutError:
+    print(came)
+"""
+FLOOD = """
+import socket, sys, time
+time.sleep(0.5)
+one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+for _ in range(4000):
+    one.sendto(bytes(100), (sys.argv[1], 7000))
+    time.sleep(0.0004)
+"""
 ON_ETHERNET = 1448 / (1448 + 52 + 14)
 
 
@@ -45,8 +68,11 @@ def carried():
                 assert receiver.stdout.readline() == "up\n"
                 began_s = link.begin()
                 send = [*link.prefix("edge"), sys.executable, "-c", SEND, GROUND_HOST, str(seconds)]
-                subprocess.run(send, check=True, timeout=60)
-                out, _ = receiver.communicate(timeout=60)
+                try:
+                    subprocess.run(send, check=True, timeout=30)
+                    out, _ = receiver.communicate(timeout=30)
+                finally:
+                    receiver.kill()
         except UnavailableError as error:
             pytest.skip(str(error))
         return [(float(at) - began_s, int(size)) for at, size in map(str.split, out.splitlines())]
@@ -66,29 +92,37 @@ def bps(got, begin_s: float, end_s: float) -> float:
 
 def test_the_shaper_follows_the_script(carried):
     """The one carrier with a real TCP would be another link than the relay's."""
-    line = script((0, LinkState(1_000_000)), (4, LinkState(400_000)), lasts_s=8)
-    got = carried(line, seconds=8)
-    assert bps(got, 1, 4) == pytest.approx(1_000_000 * ON_ETHERNET, rel=0.03)
-    assert bps(got, 5, 8) == pytest.approx(400_000 * ON_ETHERNET, rel=0.03)
+    line = script((0, LinkState(1_000_000)), (3, LinkState(400_000)), lasts_s=6)
+    got = carried(line, seconds=6)
+    assert bps(got, 1, 3) == pytest.approx(1_000_000 * ON_ETHERNET, rel=0.03)
+    assert bps(got, 3.5, 6) == pytest.approx(400_000 * ON_ETHERNET, rel=0.03)
 
 
 def test_a_link_that_is_down_carries_nothing(carried):
     """As the relay's darkness."""
     light = LinkState(2_000_000)
-    line = script((0, light), (1, LinkState(2_000_000, dark=True)), (2, light), lasts_s=5)
-    got = carried(line, seconds=5)
+    line = script((0, light), (1, LinkState(2_000_000, dark=True)), (2, light), lasts_s=4)
+    got = carried(line, seconds=4)
     assert bps(got, 0.3, 1.0) > 1e6
     assert bps(got, 1.1, 2.0) == 0
-    assert bps(got, 3.5, 5.0) > 1e6
+    assert bps(got, 3.0, 4.0) > 1e6
 
 
-def test_loss_costs_throughput(carried):
-    """Five percent of loss would be none."""
-    clean, lossy = (
-        bps(carried(script((0, LinkState(20_000_000, loss=loss)), lasts_s=2), seconds=2), 0, 2)
-        for loss in (0, 0.2)
-    )
-    assert lossy < 0.7 * clean
+def test_loss_is_the_scripts_share():
+    """Five percent of loss would be none. (Datagrams: under loss in both directions TCP's pace is a lottery)."""
+    line = script((0, LinkState(20_000_000)), (0.01, LinkState(20_000_000, loss=0.1)), lasts_s=60)
+    try:
+        with Namespaces(line) as link:
+            receive = [*link.prefix("ground"), sys.executable, "-c", COUNT]
+            with subprocess.Popen(receive, stdout=subprocess.PIPE, text=True) as receiver:
+                assert receiver.stdout.readline() == "up\n"
+                link.begin()
+                send = [*link.prefix("edge"), sys.executable, "-c", FLOOD, GROUND_HOST]
+                subprocess.run(send, check=True, timeout=30)
+                came = int(receiver.communicate(timeout=30)[0])
+    except UnavailableError as error:
+        pytest.skip(str(error))
+    assert came / 4000 == pytest.approx(0.9, abs=0.02)
 
 
 def test_nothing_is_left_behind(carried):

@@ -173,6 +173,25 @@ def test_a_tcp_connection_is_dark_in_darkness(listener):
     assert [at for at, _ in got if at - began > 1.6], "and light again after it"
 
 
+def test_who_gave_up_in_darkness_was_never_there(listener):
+    """The ground would be busy with the corpses of the edge's tries, and late for the living one."""
+    light = LinkState(2_000_000)
+    line = script((0, light), (0.1, LinkState(2_000_000, dark=True)), (0.8, light), lasts_s=2)
+    with Relay(line, target_port=listener.getsockname()[1]) as relay:
+        relay.begin()
+        time.sleep(0.2)
+        for _ in range(3):
+            socket.create_connection(("127.0.0.1", relay.port)).close()
+        with socket.create_connection(("127.0.0.1", relay.port)) as stays:
+            stays.sendall(b"here")
+            far, _ = listener.accept()
+            with far:
+                assert far.recv(10) == b"here"
+        listener.settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            listener.accept()
+
+
 def test_datagrams_pass_both_ways_and_are_counted():
     """Over UDP nothing would come back."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as target:

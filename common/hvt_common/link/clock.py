@@ -8,6 +8,11 @@ from dataclasses import dataclass
 __all__ = ["ClockOffset"]
 
 
+_DRIFT_PPM = 500
+"""How fast two clocks may part at most (RFC 5905: 500 ppm is what NTP corrects)."""
+_ROUNDING_NS = 1_000_000
+
+
 @dataclass(frozen=True, slots=True)
 class _Sample:
     at_ns: int
@@ -20,7 +25,8 @@ class ClockOffset:
 
     With ``t0`` asked (ours), ``t1`` received and ``t2`` answered (theirs), ``t3`` heard (ours), the offset is
     ``((t1 - t0) + (t2 - t3)) / 2`` and the round trip ``(t3 - t0) - (t2 - t1)`` (RFC 5905, section 8). The true
-    offset lies within half a round trip of the estimate, whatever the two directions each took.
+    offset lies within half a round trip of the estimate, whatever the two directions each took. Where a new exchange
+    and the one before exclude each other a clock was set: those before the step are forgotten.
     """
 
     def __init__(self, *, window_ns: int = 60_000_000_000, keep: int = 64) -> None:
@@ -35,7 +41,11 @@ class ClockOffset:
         if held_ns < 0 or round_trip_ns < 0:
             return False
         offset_ns = ((t1_ns - t0_ns) + (t2_ns - t3_ns)) // 2
-        self._samples.append(_Sample(t3_ns, offset_ns, round_trip_ns))
+        sample = _Sample(t3_ns, offset_ns, round_trip_ns)
+        # Two truths that exclude each other: one of the clocks was set in between, and what was before is history.
+        while self._samples and not _agree(self._samples[-1], sample):
+            self._samples.pop()
+        self._samples.append(sample)
         while self._samples[0].at_ns <= t3_ns - self._window_ns:
             self._samples.popleft()
         return True
@@ -58,3 +68,9 @@ class ClockOffset:
 
     def _best(self) -> _Sample | None:
         return min(self._samples, key=lambda sample: sample.round_trip_ns, default=None)
+
+
+def _agree(one: _Sample, other: _Sample) -> bool:
+    """Whether some offset lies within the error of both, drift between them allowed for."""
+    drift_ns = _DRIFT_PPM * abs(other.at_ns - one.at_ns) // 1_000_000 + _ROUNDING_NS
+    return 2 * abs(one.offset_ns - other.offset_ns) <= one.round_trip_ns + other.round_trip_ns + 2 * drift_ns

@@ -16,6 +16,8 @@ from contextlib import contextmanager
 import zenoh
 
 from hvt_common.errors import UserError
+from hvt_common.link.certificate import check_own_keys
+from hvt_common.link.diagnose import visit
 from hvt_common.link.inbox import Inbox, Received, Sink
 from hvt_common.link.keys import DELIVERIES, MSGPACK_ENCODING, EdgeKeys, Row
 from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, configure, without_build_paths
@@ -42,13 +44,15 @@ def open_session(settings: LinkSettings) -> Iterator[zenoh.Session]:
     """A running session; closed within a second on the way out, whatever state the link is in.
 
     A connecting side does not wait for the other: it goes on trying for as long as the session is open. Raises
-    UserError for endpoints, files and ports that cannot be used.
+    UserError for endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh's own log is heard.
     """
     config, listen = configure(settings)
+    check_own_keys(config, listen=listen, name=settings.name, now_s=time.time())
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        raise UserError(_open_failure(str(error), listen)) from None
+        raise UserError(_open_failure(str(error), listen, config)) from None
     try:
         yield session
     finally:
@@ -123,7 +127,7 @@ def serve(
     return session.declare_queryable(key, reply)
 
 
-def _open_failure(text: str, listen: tuple[str, ...]) -> str:
+def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> str:
     found = re.search(r"listener bound to ([^\s#]+?)(#\S+)?:? ", text)
     endpoint = found[1] if found else ", ".join(listen)
     if "Address already in use" in text:
@@ -132,6 +136,11 @@ def _open_failure(text: str, listen: tuple[str, ...]) -> str:
         )
     if "Cannot assign requested address" in text:
         return f"cannot listen on {endpoint}: this machine has no such address"
+    if nobody := re.search(r"Unable to connect to any of \[(.+)\]", text):
+        endpoints = ", ".join(re.findall(r"\(([^()]+)\)", nobody[1])) or nobody[1]
+        if "tls/" in endpoints:  # somebody may well answer, and refuse
+            return "no link: " + "; ".join(visit(config))
+        return f"nobody answers at {endpoints}: start a ground or a router there, or connect to where one is"
     where = f"cannot listen on {endpoint}" if listen else "cannot open the Zenoh session"
     return f"{where}: {without_build_paths(text)}"
 

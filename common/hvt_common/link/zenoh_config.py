@@ -47,12 +47,23 @@ _DEFAULTS: Mapping[str, Any] = {
     "transport/link/rx/max_message_size": 2 * MAX_PAYLOAD_BYTES,
 }
 
+_ASKER: Mapping[str, Any] = {
+    "mode": "client",
+    # A client waits for its link when it starts; whoever asks wants to know soon that there is none.
+    "connect/timeout_ms": 3000,
+    "connect/exit_on_failure": True,
+}
+
 
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """How a process takes part. With neither endpoint here nor in the file, a ground listens, an edge connects."""
+    """How a process takes part. With neither endpoint here nor in the file, a ground listens, the others connect.
 
-    role: Literal["edge", "ground"]
+    An ``asker`` only asks: it never listens, and connects as Zenoh's *client*, so that a ground or a router that it
+    connects to passes on what it asks and what is answered.
+    """
+
+    role: Literal["edge", "ground", "asker"]
     listen: tuple[str, ...] = ()
     """Such as ``tcp/127.0.0.1:7447``; what is given here replaces what the file says."""
     connect: tuple[str, ...] = ()
@@ -60,19 +71,21 @@ class LinkSettings:
     """A JSON5 file of Zenoh's own settings, which go before our defaults."""
     insecure: bool = False
     """Allow listening beyond loopback without keys."""
+    name: str | None = None
+    """Who this machine is: the id of an edge, which its certificate has to bear; None for whoever that names."""
 
 
 def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     """Zenoh's configuration and the endpoints it will listen on; UserError for what cannot be used."""
     config, said = _read_config(settings.zenoh_config)
-    for path, value in _DEFAULTS.items():
+    for path, value in {**_DEFAULTS, **(_ASKER if settings.role == "asker" else {})}.items():
         if not _mentions(said, path):
             config.insert_json5(path, json.dumps(value))
     listen, connect = settings.listen, settings.connect
     file_listen = _endpoints(said, "listen")
     if not (listen or connect or file_listen or _endpoints(said, "connect")):
         listen = (DEFAULT_ENDPOINT,) if settings.role == "ground" else ()
-        connect = (DEFAULT_ENDPOINT,) if settings.role == "edge" else ()
+        connect = () if settings.role == "ground" else (DEFAULT_ENDPOINT,)
     for endpoint in (*listen, *connect):
         _check_endpoint(endpoint)
     if listen or not file_listen:

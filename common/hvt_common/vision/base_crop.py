@@ -1,7 +1,7 @@
 """What the base frame shows of a crop of the source, at the size at which the crop is coded.
 
-Edge and ground compute it from the same decoded pixels with the same arithmetic: a residual still is the difference to
-it, and a still has to be closer to the source than it.
+Edge and ground compute it from the same decoded pixels with the same arithmetic: a residual still is the difference
+to it, and a still has to be closer to the source than it.
 """
 
 from __future__ import annotations

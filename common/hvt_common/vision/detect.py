@@ -29,6 +29,11 @@ _MAX_FREE_SIDE = 1920
 _MAX_SIDE = 8192
 
 
+_TWIN_IOU = 0.8
+"""Two boxes that overlap more are one object, whatever their classes: networks call one vehicle a car and a van. A
+rider and the bicycle below overlap less."""
+
+
 class Detector(Protocol):
     """Finds objects in one image after the other; one instance serves one stream."""
 
@@ -129,7 +134,13 @@ class OnnxDetector:
         output = self.model.run(tensor)[self._output_index].astype(np.float32, copy=False)
         found = self.head.decode(output, confidence=self._confidence, input_size=input_size)
         if self.head.suppresses:
-            kept = suppress(found.boxes_input_px, found.scores, found.class_ids, iou=self._nms_iou)
+            kept = suppress(
+                found.boxes_input_px,
+                found.scores,
+                found.class_ids,
+                iou=self._nms_iou,
+                any_class_iou=_TWIN_IOU,
+            )
         else:
             kept = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
         boxes = letterbox.to_image(found.boxes_input_px[kept])

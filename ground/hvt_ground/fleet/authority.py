@@ -85,17 +85,18 @@ class Authority:
             raise UserError(f"ca.key and ca.pem in {folder} do not belong together: restore them from a copy")
         return cls(folder, key, certificate)
 
-    def issue(self, name: str, *, hosts: Sequence[str] = ()) -> None:
-        """Write ``name.key`` and ``name.pem``; an older pair of that name is replaced.
+    def issue(self, name: str, *, hosts: Sequence[str] = (), now: dt.datetime | None = None) -> None:
+        """Write ``name.key`` and ``name.pem``; an older pair of that name is replaced, but not withdrawn.
 
         Args:
             name: the common name; also accepted as a host name.
             hosts: names or addresses at which others connect to this machine.
+            now: when its time begins to count, with a time zone; None for this moment.
         """
         key = ec.generate_private_key(ec.SECP256R1())
         authority_id = x509.SubjectKeyIdentifier.from_public_key(self._key.public_key())
         certificate = (
-            _dated(x509.CertificateBuilder(), days=MACHINE_DAYS)
+            _dated(x509.CertificateBuilder(), days=MACHINE_DAYS, now=now)
             .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)]))
             .issuer_name(self._certificate.subject)
             .public_key(key.public_key())
@@ -116,9 +117,28 @@ class Authority:
         _write_key(self.folder / f"{name}.key", key)
         _write(self.folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM), mode=0o644)
 
+    def valid_until(self, name: str) -> str:
+        """The day on which a machine's certificate ends; says so where it cannot be read."""
+        try:
+            certificate = x509.load_pem_x509_certificate((self.folder / f"{name}.pem").read_bytes())
+        except (OSError, ValueError):
+            return f"? ({name}.pem cannot be read)"
+        return f"{certificate.not_valid_after_utc:%Y-%m-%d}"
 
-def _dated(builder: x509.CertificateBuilder, *, days: int) -> x509.CertificateBuilder:
-    now = dt.datetime.now(dt.UTC)
+    def forget(self, name: str) -> None:
+        """Delete the pair of a machine. A copy elsewhere still holds: what ends it is that no rule names it."""
+        for suffix in ("key", "pem"):
+            path = self.folder / f"{name}.{suffix}"
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise UserError(f"{path} cannot be deleted ({error.strerror})") from None
+
+
+def _dated(
+    builder: x509.CertificateBuilder, *, days: int, now: dt.datetime | None = None
+) -> x509.CertificateBuilder:
+    now = now or dt.datetime.now(dt.UTC)
     return builder.not_valid_before(now - _CLOCKS_APART).not_valid_after(now + dt.timedelta(days=days))
 
 

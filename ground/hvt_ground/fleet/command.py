@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from hvt_common.errors import UserError
 from hvt_common.report import say
-from hvt_ground.fleet.roster import Ground, Roster
-from hvt_ground.fleet.zenoh_files import KEYS_FOLDER, edge_file, ground_file
+from hvt_ground.fleet.roster import Ground, Roster, Router
+from hvt_ground.fleet.zenoh_files import KEYS_FOLDER, edge_file, ground_file, router_file
+
+if TYPE_CHECKING:
+    from hvt_ground.fleet.authority import Authority
 
 __all__ = ["run"]
 
@@ -39,49 +42,65 @@ def run(argv: Sequence[str]) -> int:
         )
         return 0
     authority = Authority.open(folder)
-    roster = Roster.read(folder)
-    if arguments.command == "add-edge":
-        roster = roster.with_edge(arguments.name)
-        authority.issue(arguments.name)
-    elif arguments.command == "add-ground":
-        ground = Ground(arguments.name, tuple(arguments.host), command=not arguments.watch_only)
-        roster = roster.with_ground(ground)
-        authority.issue(arguments.name, hosts=arguments.host)
-    if arguments.command != "list":
-        roster.write(folder)
-        _write_files(roster, folder, keys_folder=arguments.keys_folder)
-        name = arguments.name
-        say(f"{name}: copy ca.pem, {name}.pem, {name}.key and {name}.json5 from {folder} to the machine")
-        _say_others(roster, name, edge=arguments.command == "add-edge")
+    before = Roster.read(folder)
+    if arguments.command == "list":
+        _list(before, authority)
+        return 0
+    after = _changed(before, arguments)
+    name: str = arguments.name
+    if arguments.command == "remove":
+        authority.forget(name)
+        (folder / f"{name}.json5").unlink(missing_ok=True)
     else:
-        _list(roster)
+        authority.issue(name, hosts=arguments.host)
+    after.write(folder)
+    changed = _write_files(after, folder, keys_folder=arguments.keys_folder)
+    if arguments.command != "remove":
+        say(f"{name}: copy ca.pem, {name}.pem, {name}.key and {name}.json5 from {folder} to the machine")
+    if others := ", ".join(f"{one}.json5" for one in changed if one != name):
+        say(f"changed with it, copy again and restart what uses them: {others}")
     return 0
 
 
-def _write_files(roster: Roster, folder: Path, *, keys_folder: str) -> None:
+def _changed(roster: Roster, arguments: argparse.Namespace) -> Roster:
+    name: str = arguments.name
+    if arguments.command == "add-edge":
+        return roster.with_edge(name)
+    if arguments.command == "add-router":
+        return roster.with_router(Router(name, tuple(arguments.host)))
+    if arguments.command == "add-ground":
+        command = not arguments.watch_only
+        return roster.with_ground(Ground(name, tuple(arguments.host), command=command, edges=arguments.edges))
+    return roster.without(name)
+
+
+def _write_files(roster: Roster, folder: Path, *, keys_folder: str) -> list[str]:
+    """The names of those whose file is new or another than before."""
     files = {name: edge_file(name, roster, folder=keys_folder) for name in roster.edges}
     files |= {one.name: ground_file(one, roster, folder=keys_folder) for one in roster.grounds}
+    files |= {one.name: router_file(one, roster, folder=keys_folder) for one in roster.routers}
+    changed = []
     for name, text in files.items():
         path = folder / f"{name}.json5"
         try:
+            if path.exists() and path.read_text(encoding="utf-8") == text:
+                continue
             path.write_text(text, encoding="utf-8")
         except OSError as error:
             raise UserError(f"{path} cannot be written ({error.strerror})") from None
+        changed.append(name)
+    return changed
 
 
-def _say_others(roster: Roster, name: str, *, edge: bool) -> None:
-    others = [one.name for one in roster.grounds] if edge else list(roster.edges)
-    if others:
-        files = ", ".join(f"{one}.json5" for one in others)
-        say(f"{files}: written anew, because {name} is in them; copy them again")
-
-
-def _list(roster: Roster) -> None:
-    for edge in roster.edges:
-        print(f"edge    {edge}")
-    for ground in roster.grounds:
-        rights = "watches and commands" if ground.command else "watches"
-        print(f"ground  {ground.name}  {rights}  {' '.join(ground.hosts)}".rstrip())
+def _list(roster: Roster, authority: Authority) -> None:
+    rights = {
+        one.name: f"{'watches and commands' if one.command else 'watches'} {one.edges}"
+        for one in roster.grounds
+    }
+    for name, kind in roster.names.items():
+        print(
+            f"{kind:<7} {name:<20} key until {authority.valid_until(name)}  {rights.get(name, '')}".rstrip()
+        )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -90,16 +109,24 @@ def _parser() -> argparse.ArgumentParser:
     new_ca = commands.add_parser("new-ca", help="make the CA of a fleet, once")
     add_edge = commands.add_parser("add-edge", help="a key for an edge; NAME is its --edge-id")
     add_ground = commands.add_parser("add-ground", help="a key for a ground")
-    listing = commands.add_parser("list", help="who belongs to the fleet")
-    for one in (new_ca, add_edge, add_ground, listing):
-        one.add_argument("--dir", type=Path, default=_DIR, help="folder of the fleet's keys [hvt-keys]")
-    for one in (add_edge, add_ground):
+    add_router = commands.add_parser("add-router", help="a key for a router between them")
+    remove = commands.add_parser("remove", help="take all rights from a machine, such as one that is lost")
+    listing = commands.add_parser("list", help="who belongs to the fleet, and until when")
+    for one in (new_ca, add_edge, add_ground, add_router, remove, listing):
+        one.add_argument("--dir", type=Path, default=_DIR, help=f"folder of the fleet's keys [{_DIR}]")
+    for one in (add_edge, add_ground, add_router, remove):
         one.add_argument("name", metavar="NAME")
         one.add_argument(
-            "--keys-folder", default=KEYS_FOLDER, help=f"where the keys lie on that machine [{KEYS_FOLDER}]"
+            "--keys-folder", default=KEYS_FOLDER, help=f"where the keys lie on the machines [{KEYS_FOLDER}]"
         )
-    add_ground.add_argument(
-        "--host", action="append", required=True, help="name or address that edges connect to; repeatable"
-    )
+    for one in (add_edge, add_ground, add_router):
+        one.add_argument(
+            "--host",
+            action="append",
+            default=[],
+            required=one is add_router,
+            help="name or address that others connect to, where this machine listens; repeatable",
+        )
+    add_ground.add_argument("--edges", default="*", help="which edges it may watch, for example 'uav-*' [*]")
     add_ground.add_argument("--watch-only", action="store_true", help="without the right to command")
     return parser

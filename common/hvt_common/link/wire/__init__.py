@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from hvt_common.link.wire.dialogue import (
     MAX_STILL_RESULTS,
+    MAX_TRACKS_NOW,
     Command,
     ControlAnswer,
     ControlRequest,
     Feedback,
     StillResult,
+    TrackNow,
 )
 from hvt_common.link.wire.fields import WireError, fitted_text
 from hvt_common.link.wire.reports import Health, Info, Status, fitted_class_names
@@ -27,6 +29,7 @@ __all__ = [
     "MAX_ALSO",
     "MAX_PAYLOAD_BYTES",
     "MAX_STILL_RESULTS",
+    "MAX_TRACKS_NOW",
     "WIRE_VERSION",
     "AlsoShown",
     "BaseHeader",
@@ -42,6 +45,7 @@ __all__ = [
     "RoiHeader",
     "Status",
     "StillResult",
+    "TrackNow",
     "TrackStep",
     "TrackStepDecoder",
     "TrackStepEncoder",

@@ -7,13 +7,38 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
-from hvt_common.link.wire.fields import I63, U32, U64, Flag, Int, ListOf, MapOf, Scalar, Scaled, Text, carried
+from hvt_common.link.wire.fields import (
+    I63,
+    U32,
+    U64,
+    Flag,
+    Int,
+    ListOf,
+    MapOf,
+    Scalar,
+    Scaled,
+    Text,
+    TupleOf,
+    carried,
+)
 from hvt_common.link.wire.sealed import Message, Nested
 
-__all__ = ["MAX_STILL_RESULTS", "Command", "ControlAnswer", "ControlRequest", "Feedback", "StillResult"]
+__all__ = [
+    "MAX_STILL_RESULTS",
+    "MAX_TRACKS_NOW",
+    "Command",
+    "ControlAnswer",
+    "ControlRequest",
+    "Feedback",
+    "StillResult",
+    "TrackNow",
+]
 
 MAX_STILL_RESULTS = 32
+MAX_TRACKS_NOW = 64
+"""How many tracks one answer lists; of more, those seen with the most confidence."""
 _COUNT = Int(0, 2**53 - 1)
+_FAR_PX = 32767
 
 
 class Command(StrEnum):
@@ -21,6 +46,10 @@ class Command(StrEnum):
 
     KEYFRAME = "keyframe"
     STILL = "still"
+    STILL_FATE = "still-fate"
+    """What became of a still that was accepted."""
+    TRACKS = "tracks"
+    """What the edge tracks now, by its own ids."""
     SET_BUDGET = "set-budget"
     SET_METHOD = "set-method"
 
@@ -37,13 +66,34 @@ class ControlRequest(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TrackNow:
+    """A track of the edge, as an answer lists it."""
+
+    track_id: int = carried(Int(0, U32))
+    class_id: int = carried(Int(0, 2047))
+    """Index into `Info.class_names`."""
+    confidence: float = carried(Scaled(0, 1, 1000))
+    box_source_px: tuple[float, float, float, float] = carried(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    """x1, y1, x2, y2 in eighths of a pixel."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ControlAnswer(Message):
     """Payload of the answer on ``control``."""
+
+    MAX_BYTES: ClassVar[int] = 4096
 
     session_id: int = carried(Int(0, U64))
     accepted: bool = carried(Flag())
     reason: str = carried(Text(200))
     """One sentence; empty where accepted."""
+    still_ask: int = carried(Int(-1, U32))
+    """The number of the still that was accepted: it comes on ``roi`` with the parameter ``ask`` of this value; -1
+    for any other command."""
+    frame_index: int = carried(Int(-1, U32))
+    """The frame that the still shows, or whose tracks these are; -1 where neither."""
+    tracks: tuple[TrackNow, ...] = carried(ListOf(Nested(TrackNow), MAX_TRACKS_NOW))
+    """For the command ``tracks``; else empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +123,7 @@ class Feedback(Message):
     """Random, new at each start of the ground: several grounds may report on one edge."""
     sequence: int = carried(Int(0, U32))
     send_ns: int = carried(Int(0, I63))
-    """The ground's clock."""
+    """The ground's clock as it was at its start, carried on without steps."""
     last_frame_index: int = carried(Int(-1, U32))
     """The last frame that the ground is done with; -1 before the first. A lockstep edge waits for it."""
     base_messages: int = carried(_COUNT)
@@ -84,6 +134,12 @@ class Feedback(Message):
     """Messages of base and roi that never came."""
     corrupt: int = carried(_COUNT)
     """Messages that came and could not be used."""
+    base_sequence: int = carried(Int(-1, U32))
+    """The highest of ``base`` that has come; -1 for none. With what follows, the edge follows the link's rate."""
+    base_held_us: int = carried(Int(0, U32))
+    """How long before ``send_ns`` it came: ``send_ns`` minus this is its time of arrival."""
+    still_sequence: int = carried(Int(-1, U32))
+    """The highest of ``roi`` that has come; -1 for none."""
     delay_p50_ms: float = carried(Scaled(-1, 3_600_000, 10))
     """Median capture to receive since the last report, clocks reconciled; -1 where unknown."""
     clock_offset_ns: int = carried(Int(-I63, I63))

@@ -1,0 +1,252 @@
+"""Our own keys as the Zenoh configuration names them, and whether they are fit for use: checked before the start.
+
+Certificates are read by Python's own ``ssl``: a TLS handshake in memory, both ends of it here, shows what the other
+side would see. So neither side needs a package for certificates.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import ssl
+import stat
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from hvt_common.errors import UserError
+
+__all__ = ["Certificate", "KeyPair", "TlsFiles", "check_own_keys", "dated", "plain_key_only"]
+
+_log = logging.getLogger(__name__)
+
+_NO_CHECK_TIME = ssl.VerifyFlags(0x200000)
+"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which ``ssl`` passes on but does not name."""
+_SOON_S = 30 * 86_400.0
+_SECURED = ("tls/", "quic/")
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """What stands in a certificate."""
+
+    name: str
+    """Its common name: who the machine is for the other side's access control. Empty where it has none."""
+    hosts: tuple[str, ...]
+    """Host names and addresses at which it may be reached."""
+    not_before_s: float
+    """Unix time."""
+    not_after_s: float
+    """Unix time."""
+
+    @classmethod
+    def of(cls, said: dict[str, Any]) -> Certificate:
+        """From what ``SSLSocket.getpeercert`` tells."""
+        names = [value for group in said.get("subject", ()) for key, value in group if key == "commonName"]
+        return cls(
+            name=names[0] if names else "",
+            hosts=tuple(
+                value for kind, value in said.get("subjectAltName", ()) if kind in ("DNS", "IP Address")
+            ),
+            not_before_s=float(ssl.cert_time_to_seconds(said["notBefore"])),
+            not_after_s=float(ssl.cert_time_to_seconds(said["notAfter"])),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class KeyPair:
+    """A certificate and its private key, PEM."""
+
+    certificate: Path
+    key: Path
+
+    def read(self, *, listens: bool) -> Certificate:
+        """What the other side would see; UserError for files that cannot be used. Says nothing of time or CA."""
+        try:
+            said = _shown(self, listens=listens)
+        except ssl.SSLError as error:
+            raise UserError(_unusable(self, error)) from None
+        return Certificate.of(said)
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """The files that the ``transport.link.tls`` part of a Zenoh configuration names."""
+
+    root_ca: Path | None = None
+    connect: KeyPair | None = None
+    """Shown where we connect."""
+    listen: KeyPair | None = None
+    """Shown where we listen."""
+    verify_name: bool = True
+    """Whether the host that we connect to has to be in its certificate."""
+
+    @classmethod
+    def of(cls, config: zenoh.Config) -> TlsFiles:
+        """UserError where half of a pair is missing. Keys given as base64 text are Zenoh's own affair."""
+        said = json.loads(config.get_json("transport/link/tls")) or {}
+        root = said.get("root_ca_certificate")
+        return cls(
+            root_ca=Path(root) if root else None,
+            connect=_pair(said, "connect"),
+            listen=_pair(said, "listen"),
+            verify_name=said.get("verify_name_on_connect") is not False,
+        )
+
+
+def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float) -> None:
+    """Raise UserError for keys with which nobody would let us in; warn of what will soon be, or may be, a fault.
+
+    Args:
+        config: the configuration in use.
+        listen: the endpoints that will be listened on.
+        name: who this machine has to be by its certificate: the id of an edge; None for anybody.
+        now_s: Unix time.
+    """
+    files = TlsFiles.of(config)
+    connect = json.loads(config.get_json("connect/endpoints")) or []
+    if isinstance(connect, dict):
+        connect = [one for group in connect.values() for one in group]
+    listens, connects = _any_secured(listen), _any_secured(connect)
+    if not (listens or connects):
+        return
+    if files.root_ca is not None:
+        _check_readable(files.root_ca, setting="root_ca_certificate")
+        _check_ca(files.root_ca)
+    for pair, in_use, side in ((files.listen, listens, "listen"), (files.connect, connects, "connect")):
+        if pair is not None and in_use:
+            _check_pair(pair, side=side, name=name, now_s=now_s)
+    if listens and files.listen is None and not _in_base64(config, "listen"):
+        raise UserError(
+            f"listening on {next(one for one in listen if one.startswith(_SECURED))} takes listen_certificate and "
+            "listen_private_key in --zenoh-config: hvt-ground keys makes them"
+        )
+
+
+def dated(time_s: float) -> str:
+    """A moment as people read it, UTC."""
+    import datetime as dt  # noqa: PLC0415
+
+    return dt.datetime.fromtimestamp(time_s, dt.UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def plain_key_only() -> str:
+    """For ``load_cert_chain``: without it an encrypted key would ask for its password on the terminal, for ever."""
+    raise _EncryptedKeyError
+
+
+class _EncryptedKeyError(ssl.SSLError):
+    reason = "ENCRYPTED_KEY"
+
+
+def _any_secured(endpoints: Sequence[str]) -> bool:
+    # An endpoint may carry files of its own behind '#': those are Zenoh's affair.
+    return any(one.startswith(_SECURED) and "certificate" not in one for one in endpoints)
+
+
+def _in_base64(config: zenoh.Config, side: str) -> bool:
+    with suppress(zenoh.ZError):
+        return json.loads(config.get_json(f"transport/link/tls/{side}_certificate_base64")) is not None
+    return False
+
+
+def _pair(said: dict[str, Any], side: str) -> KeyPair | None:
+    certificate, key = said.get(f"{side}_certificate"), said.get(f"{side}_private_key")
+    if certificate is None or key is None:
+        if certificate != key:
+            given, missing = ("certificate", "private_key") if key is None else ("private_key", "certificate")
+            if said.get(f"{side}_{missing}_base64") is None:
+                raise UserError(f"--zenoh-config gives {side}_{given} but no {side}_{missing}: give both")
+        return None
+    return KeyPair(Path(certificate), Path(key))
+
+
+def _check_pair(pair: KeyPair, *, side: str, name: str | None, now_s: float) -> None:
+    _check_readable(pair.certificate, setting=f"{side}_certificate")
+    _check_readable(pair.key, setting=f"{side}_private_key")
+    if pair.key.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
+        _log.warning("%s: every user of this machine can read this key; chmod 640 %s", pair.key, pair.key)
+    certificate = pair.read(listens=side == "listen")
+    if certificate.not_after_s < now_s:
+        raise UserError(
+            f"{pair.certificate}: this certificate expired on {dated(certificate.not_after_s)} (it is "
+            f"{dated(now_s)} here): make a new one with hvt-ground keys"
+        )
+    if name is not None and certificate.name != name:
+        raise UserError(
+            f"--edge-id {name}: {pair.certificate} is the certificate of {certificate.name!r}, which may write as "
+            f"{certificate.name!r} only: use that --edge-id, or the keys of {name} (hvt-ground keys add-edge {name})"
+        )
+    if (
+        certificate.not_before_s > now_s
+    ):  # no error: a machine without a clock of its own learns the time later
+        _log.warning(
+            "%s: this certificate holds from %s, and it is %s here: nobody lets it in before; is the clock right?",
+            pair.certificate,
+            dated(certificate.not_before_s),
+            dated(now_s),
+        )
+    elif certificate.not_after_s < now_s + _SOON_S:
+        _log.warning(
+            "%s: this certificate expires on %s: make a new one in time with hvt-ground keys",
+            pair.certificate,
+            dated(certificate.not_after_s),
+        )
+
+
+def _check_readable(path: Path, *, setting: str) -> None:
+    try:
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"{path}, the {setting} of --zenoh-config, cannot be read ({error.strerror}): name a file that "
+            "this user can read"
+        ) from None
+
+
+def _check_ca(path: Path) -> None:
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_verify_locations(path)
+    except ssl.SSLError:
+        raise UserError(
+            f"{path}, the root_ca_certificate of --zenoh-config, holds no certificate in PEM"
+        ) from None
+
+
+def _shown(pair: KeyPair, *, listens: bool) -> dict[str, Any]:
+    """The pair shown in a handshake in memory to a side that trusts just this certificate, whatever the date."""
+    server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    client.check_hostname = False
+    client.verify_mode = ssl.CERT_NONE
+    for context in (server, client):
+        context.load_cert_chain(pair.certificate, pair.key, password=plain_key_only)
+    judge = client if listens else server
+    judge.load_verify_locations(pair.certificate)
+    judge.verify_mode = ssl.CERT_REQUIRED
+    judge.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = (
+        client.wrap_bio(to_client, to_server, server_side=False),
+        server.wrap_bio(to_server, to_client, server_side=True),
+    )
+    for _ in range(2):  # hello and answer, then the client's own certificate
+        for end in ends:
+            with suppress(ssl.SSLWantReadError):
+                end.do_handshake()
+    return ends[0 if listens else 1].getpeercert() or {}
+
+
+def _unusable(pair: KeyPair, error: ssl.SSLError) -> str:
+    both = f"{pair.certificate} and {pair.key}"
+    if isinstance(error, _EncryptedKeyError):
+        return f"{pair.key}: this key is encrypted; a key without a password is needed"
+    if error.reason == "KEY_VALUES_MISMATCH":
+        return f"{both} do not belong together: copy the pair again"
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"{pair.certificate}: this certificate cannot be used here ({error.verify_message})"
+    return f"{both} are not a certificate and its key in PEM ({(error.reason or 'no PEM').lower().replace('_', ' ')})"

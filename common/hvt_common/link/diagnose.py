@@ -1,0 +1,204 @@
+"""Says in plain words why there is no link, and who is linked without the rights to be of use.
+
+Zenoh tells a program nothing of this: a connection that is refused is tried again for ever, a message without
+permission is dropped. So a thread looks now and then whether links stand and whose they are, and visits the endpoints
+(`probe`) where none does.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from hvt_common.errors import UserError
+from hvt_common.link.certificate import TlsFiles
+from hvt_common.link.keys import EdgeKeys, Row
+from hvt_common.link.probe import why_no_link
+from hvt_common.link.rights import Rights
+from hvt_common.link.zenoh_config import LinkSettings, configure
+
+__all__ = ["LinkWatch", "control_unanswered", "visit", "why_unlinked"]
+
+_log = logging.getLogger(__name__)
+
+_LOOK_S = 1.0
+_PATIENCE_S = 4.0
+"""A link that is merely slow to come needs no explanation."""
+_FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
+"""From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
+_SAY_AGAIN_S = 300.0
+_MAX_NAMES = 256
+"""Names that are remembered. Each takes a certificate of the CA, so a fleet of that size comes first."""
+
+
+def why_unlinked(settings: LinkSettings) -> list[str]:
+    """One sentence for each endpoint that we would connect to. Blocks for some seconds an endpoint."""
+    return visit(configure(settings)[0])
+
+
+def control_unanswered(edge: str) -> str:
+    """What to tell a user whose question on ``control`` came to nothing while the edge is there."""
+    return (
+        f"{edge} does not answer on control: this ground may lack the right to command it (hvt-ground keys list "
+        f"shows who has it; add-ground without --watch-only gives it, then copy {edge}.json5 to the edge), or the "
+        "link is full"
+    )
+
+
+class LinkWatch:
+    """A context manager with a thread of its own, which looks after one session until it closes.
+
+    Args:
+        session: the session that was opened with these settings.
+        settings: how it was opened.
+        served: whether a machine of that name has shown life to us, or we to it: an edge that has appeared, a ground
+            that subscribes. Called from the thread.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, settings: LinkSettings, *, served: Callable[[str], bool]
+    ) -> None:
+        self._session = session
+        self._config = configure(settings)[0]
+        self._file = settings.zenoh_config
+        self._edge = settings.name
+        self._served = served
+        self._rights = Rights.of(self._config)
+        self._trouble = ""
+        self._said_s = 0.0
+        self._first_seen_s: dict[str, float] = {}
+        self._named: set[str] = set()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hvt-link-watch", daemon=True)
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no link, in a sentence; empty while there is one, or nothing is known."""
+        return self._trouble
+
+    def may_command(self, edge: str) -> bool:
+        """Whether our own configuration lets questions on ``control`` of this edge out at all."""
+        return self._rights.allow_somebody(
+            flow="egress", message="query", key=EdgeKeys(edge).key(Row.CONTROL)
+        )
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        # A visit in progress ends by itself, within seconds: nobody waits for it.
+        self._thread.join(0.1)
+
+    # The thread
+
+    def _run(self) -> None:
+        linked_s = time.monotonic()
+        next_visit_s, pause_s = linked_s + _PATIENCE_S, _FIRST_PAUSE_S
+        while not self._stop.wait(_LOOK_S):
+            try:
+                names = self._linked()
+            except zenoh.ZError:  # closed under our hands
+                return
+            now_s = time.monotonic()
+            if names is not None:
+                self._trouble = ""
+                next_visit_s, pause_s = now_s + _PATIENCE_S, _FIRST_PAUSE_S
+                self._look_at(names, now_s)
+            elif now_s >= next_visit_s:
+                self._explain()
+                next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
+
+    def _linked(self) -> dict[str, bool] | None:
+        """Who is at the other end of the links, each with whether it is a router; None without any link."""
+        links = self._session.info.links()
+        if not links:
+            return None
+        routers = {str(zid) for zid in self._session.info.routers_zid()}
+        return {link.auth_identifier: str(link.zid) in routers for link in links if link.auth_identifier}
+
+    def _explain(self) -> None:
+        reasons = visit(self._config)
+        if self._stop.is_set() or not reasons:
+            return
+        trouble = "; ".join(reasons)
+        now_s = time.monotonic()
+        if trouble != self._trouble or now_s - self._said_s > _SAY_AGAIN_S:
+            self._said_s = now_s
+            _log.warning("no link: %s", trouble)
+        self._trouble = trouble
+
+    def _look_at(self, names: dict[str, bool], now_s: float) -> None:
+        if not self._rights.enabled:
+            return
+        for name, router in names.items():
+            if name in self._named or len(self._first_seen_s) >= _MAX_NAMES:
+                continue
+            since_s = self._first_seen_s.setdefault(name, now_s)
+            if not self._rights.knows(name):
+                self._say(name, self._stranger(name))
+            elif now_s - since_s > _PATIENCE_S and not router and self._is_hiding(name):
+                self._say(name, self._hidden(name))
+
+    def _is_hiding(self, name: str) -> bool:
+        if self._edge is None and not self._writes(name):
+            return False  # another ground, or a router
+        return not self._served(name)
+
+    def _writes(self, name: str) -> bool:
+        """Whether an edge of that name may send here under its own id."""
+        try:
+            key = EdgeKeys(name).key(Row.STATUS)
+        except UserError:
+            return False
+        return self._rights.allow(name, flow="ingress", message="put", key=key)
+
+    def _stranger(self, name: str) -> str:
+        kind = "add-ground" if self._edge else "add-edge or add-ground"
+        mend = f"hvt-ground keys {kind} {name}, then copy the file here again"
+        lost = "it gets no picture and no answer from here" if self._edge else "what it sends is dropped"
+        return f"{name!r} has a certificate of this CA, but {self._file} does not name it: {lost} ({mend})"
+
+    def _hidden(self, name: str) -> str:
+        if self._edge is not None:
+            return (
+                f"{name!r} is linked, but listens to nothing of {self._edge}: its Zenoh configuration does not name "
+                f"{self._edge} (hvt-ground keys add-edge {self._edge}, then copy {name}.json5 to it), or its --edges "
+                "leaves it out"
+            )
+        return (
+            f"{name!r} is linked, but nothing of edge {name} is seen here: its Zenoh configuration does not name "
+            f"this ground (hvt-ground keys add-ground, then copy {name}.json5 to it), or it runs under another id "
+            "than its certificate says, and all it sends is dropped"
+        )
+
+    def _say(self, name: str, sentence: str) -> None:
+        self._named.add(name)
+        _log.warning("%s", sentence)
+
+
+def visit(config: zenoh.Config) -> list[str]:
+    """One sentence for each endpoint that this configuration connects to. Blocks for some seconds an endpoint."""
+    endpoints = json.loads(config.get_json("connect/endpoints")) or []
+    if isinstance(endpoints, dict):
+        endpoints = [one for group in endpoints.values() for one in group]
+    try:
+        files = TlsFiles.of(config)
+        return [why_no_link(endpoint, files) for endpoint in dict.fromkeys(map(_bare, endpoints))]
+    except UserError as error:
+        return [str(error)]
+
+
+def _bare(endpoint: str) -> str:
+    """Two links to one place by priority are one place."""
+    return endpoint.partition("#")[0].partition("?")[0]

@@ -1,0 +1,90 @@
+"""What our own Zenoh configuration lets whom do: its access control, read as Zenoh reads it.
+
+Zenoh drops what is not allowed without a word. Who knows its own rules can at least say so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import zenoh
+
+__all__ = ["Rights"]
+
+
+@dataclass(frozen=True, slots=True)
+class Rights:
+    """The access control of one configuration; a subject is known by the common name of its certificate."""
+
+    enabled: bool = False
+    default_allow: bool = True
+    rules: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """By id."""
+    granted: tuple[tuple[frozenset[str] | None, tuple[str, ...]], ...] = ()
+    """Of each policy: the names that it is for (None: anybody), and the ids of its rules."""
+
+    @classmethod
+    def of(cls, config: zenoh.Config) -> Rights:
+        """From a configuration that Zenoh has accepted."""
+        said = json.loads(config.get_json("access_control")) or {}
+        subjects = {one["id"]: _names(one) for one in said.get("subjects") or ()}
+        granted = tuple(
+            (subjects.get(subject, frozenset()), tuple(policy["rules"]))
+            for policy in said.get("policies") or ()
+            for subject in policy["subjects"]
+        )
+        return cls(
+            enabled=said.get("enabled") is True,
+            default_allow=said.get("default_permission") == "allow",
+            rules={one["id"]: one for one in said.get("rules") or ()},
+            granted=granted,
+        )
+
+    def knows(self, name: str) -> bool:
+        """Whether any rule is for this name."""
+        return not self.enabled or self.default_allow or bool(self._rules_for(name))
+
+    def allow(self, name: str, *, flow: str, message: str, key: str) -> bool:
+        """Whether the rules let this pass between us and that name.
+
+        Args:
+            name: common name of the certificate at the other end.
+            flow: ``ingress`` from there, ``egress`` to there.
+            message: Zenoh's word: ``put``, ``query``, ``reply``, ``declare_subscriber`` and so on.
+            key: the full key of the message.
+        """
+        if not self.enabled:
+            return True
+        asked = zenoh.KeyExpr(key)
+        said = {
+            rule["permission"]
+            for rule in self._rules_for(name)
+            if flow in (rule.get("flows") or (flow,))
+            and message in rule["messages"]
+            and any(zenoh.KeyExpr(one).includes(asked) for one in rule["key_exprs"])
+        }
+        return "deny" not in said and ("allow" in said or self.default_allow)
+
+    def allow_somebody(self, *, flow: str, message: str, key: str) -> bool:
+        """Whether the rules let this pass between us and anybody at all."""
+        names = {name for group, _ in self.granted for name in group or {""}}
+        return not self.enabled or any(
+            self.allow(name, flow=flow, message=message, key=key) for name in names or {""}
+        )
+
+    def _rules_for(self, name: str) -> list[Mapping[str, Any]]:
+        return [
+            self.rules[rule]
+            for names, rules in self.granted
+            if names is None or name in names
+            for rule in rules
+            if rule in self.rules
+        ]
+
+
+def _names(subject: Mapping[str, Any]) -> frozenset[str] | None:
+    names = subject.get("cert_common_names")
+    return None if names is None else frozenset(names)

@@ -1,0 +1,343 @@
+"""The rate that the link carries, from receiver reports: a delay-based controller of the SCReAM and GCC family. Pure.
+
+The signal is queueing delay (RFC 8298, section 4.1.2; RFC 6817): one-way delay above the least seen lately, so the
+two clocks need not agree. From it is taken what the edge's own messages would have waited on a link of exactly the
+present rate (`Progress.own_ns`): a keyframe or a burst is no congestion, and what is left, the **excess**, grows
+exactly where the link is slower than the rate. It counts as overuse where it stays high and does not fall over
+several reports (as in CoDel, a burst empties, a standing queue does not). Then the rate becomes a share of what
+arrived meanwhile, which is what the link carries. Messages sent before that say nothing about the new rate and are
+not judged: the hold-off lasts a round trip and the emptying of the queue, however long these are.
+
+Growth follows a cubic curve (RFC 9438, section 4.2, in time): quickly back to where it broke down last, long near
+there, then faster and faster beyond. So a link of constant rate sees a rate close to its own, and one that has come
+back is found again in some seconds.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+__all__ = ["LeastDelay", "Progress", "RateController", "RateSettings", "Reopening", "ReopeningSettings"]
+
+_MS = 1_000_000
+_SECOND_NS = 1_000_000_000
+_ABSURD_NS = 60 * _SECOND_NS
+"""A delay that differs by so much is a clock that was set, not a queue."""
+_MTU_BITS = 12_000
+_SOME_LOSS = 0.02
+_GRAVE, _GRAVE_SPAN_NS = 2.5, 150 * _MS
+_LOSS_EVERY_NS = 3 * _SECOND_NS
+"""Loss is counted over some seconds: a lower rate shows as late."""
+
+
+@dataclass(frozen=True, slots=True)
+class RateSettings:
+    """Rates in line bits a second, times in nanoseconds."""
+
+    ceiling_bps: int
+    floor_bps: int
+    excess_ns: int = 80 * _MS
+    """Overuse begins here; on thin links at two large packets."""
+    verdict_ns: int = 300 * _MS
+    """Over so much time, and `verdict_reports`, the excess must stay high."""
+    verdict_reports: int = 3
+    backoff: float = 0.85
+    """Of the rate that arrived, after overuse."""
+    plateau_ns: int = 2_600 * _MS
+    """How long it takes back to where it broke down."""
+    beyond_per_s3: float = 0.008
+    """Growth beyond, as a share of that rate, by the third power of the seconds."""
+    resume_ns: int = 3 * _SECOND_NS
+    """How long it takes back to the former rate after the link was gone."""
+    most_loss: float = 0.12
+    """Of messages; less is taken for the link's nature, and only slows growth down."""
+    memory_ns: int = 15 * _SECOND_NS
+    """The least delay is that of so long: a route that became longer is no queue for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What one report says of the newest base message that has arrived, in the edge's own accounts."""
+
+    now_ns: int
+    """When the report came, the edge's clock."""
+    sent_ns: int
+    """When the message was sent, the edge's clock."""
+    arrived_ns: int
+    """The ground's clock."""
+    own_ns: int
+    """What it would have taken on a link of the rate of that time, behind the edge's own messages."""
+    arrived_bytes: int
+    """Line bytes sent up to and with it: they have all arrived, or are lost."""
+    messages: int = 0
+    """So many base messages were sent up to and with it."""
+    lost: int = 0
+    """So many of them never came, as the ground counts."""
+
+
+class LeastDelay:
+    """The least of the last ``memory_ns`` to twice that long, in constant memory."""
+
+    def __init__(self, memory_ns: int) -> None:
+        self._memory_ns = memory_ns
+        self._since_ns: int | None = None
+        self._former: int | None = None
+        self._least: int | None = None
+
+    def add(self, delay_ns: int, *, now_ns: int) -> int:
+        """Take in one delay; return the least."""
+        if self._since_ns is None or now_ns - self._since_ns >= self._memory_ns:
+            self._former, self._least, self._since_ns = self._least, None, now_ns
+        self._least = delay_ns if self._least is None else min(self._least, delay_ns)
+        return self._least if self._former is None else min(self._former, self._least)
+
+
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    progress: Progress
+    excess_ns: int
+
+
+class RateController:
+    """Between floor and ceiling. Deterministic, time is an argument; not thread-safe."""
+
+    def __init__(self, settings: RateSettings) -> None:
+        assert 0 < settings.floor_bps <= settings.ceiling_bps
+        self._settings = settings
+        self._rate = float(settings.ceiling_bps)
+        self._least = LeastDelay(settings.memory_ns)
+        self._base_ns: int | None = None
+        self._recent: deque[_Judged] = deque(maxlen=64)
+        self._judge_from_ns = -(2**63)
+        """Only messages sent from here on say something about the present rate."""
+        self._knee = self._low = float(settings.ceiling_bps)
+        self._plateau_ns = settings.plateau_ns
+        self._curve_ns = 2**62
+        """How far along the curve of growth: only time in which nothing speaks against it counts."""
+        self._last_ns: int | None = None
+        self._silent = False
+        self._losses: deque[tuple[int, int]] = deque(maxlen=64)
+        self._next_loss_ns = 0
+        self.backoffs = 0
+        """How often the rate was lowered."""
+
+    @property
+    def rate_bps(self) -> int:
+        """What may be sent now, line bits a second."""
+        settings = self._settings
+        return round(min(settings.ceiling_bps, max(settings.floor_bps, self._rate)))
+
+    @property
+    def steady_bps(self) -> int:
+        """What is likely to last, for what cannot follow each step: near where it broke down, a little below that."""
+        if self._rate >= self._settings.ceiling_bps or self._rate > 1.15 * self._knee:
+            return self.rate_bps
+        return min(self.rate_bps, max(self._settings.floor_bps, round(0.9 * self._knee)))
+
+    @property
+    def settled(self) -> bool:
+        """Whether the rate is the ceiling, and so will stay."""
+        return self._rate >= self._settings.ceiling_bps
+
+    @property
+    def excess_ns(self) -> int:
+        """Of the newest report; negative where the link has room."""
+        return self._recent[-1].excess_ns if self._recent else 0
+
+    def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:
+        """Another budget. A rate at the old ceiling goes on at the new one; a lower one grows as before."""
+        old = self._settings
+        at_ceiling = self._rate >= old.ceiling_bps
+        floor = min(ceiling_bps, old.floor_bps if floor_bps is None else floor_bps)
+        self._settings = replace(old, ceiling_bps=ceiling_bps, floor_bps=floor)
+        if at_ceiling or self._rate > ceiling_bps:
+            self._rate = self._knee = float(ceiling_bps)
+
+    def on_progress(self, progress: Progress) -> int:
+        """Take in one report that names a message that none before has named; return the rate."""
+        step_ns = self._elapsed(progress.now_ns)
+        excess_ns = self._excess(progress)
+        if progress.sent_ns < self._judge_from_ns:
+            return self.rate_bps
+        self._silent = False
+        self._recent.append(_Judged(progress, excess_ns))
+        self._losses.append((progress.messages, progress.lost))
+        limit_ns = self._limit_ns()
+        if self._overused(limit_ns):
+            self._back_off(progress, self._settings.backoff * min(self._rate, self._arriving_bps()))
+        elif (loss := self._loss()) > self._settings.most_loss:
+            if progress.now_ns >= self._next_loss_ns:
+                self._next_loss_ns = progress.now_ns + _LOSS_EVERY_NS
+                self._back_off(progress, self._rate * (1 - loss / 2))
+        elif excess_ns < limit_ns // 2:
+            self._grow(step_ns // 2 if loss > _SOME_LOSS else step_ns)
+        return self.rate_bps
+
+    def on_silence(self, now_ns: int) -> int:
+        """Reports have stopped: down to the floor. When they come again the former rate is approached quickly."""
+        if not self._silent:
+            self._silent = True
+            if self._curve_ns >= self._plateau_ns:  # else it is still on its way back
+                self._knee = self._rate
+            self._rate = self._low = float(self._settings.floor_bps)
+            self._curve_ns, self._plateau_ns = 0, self._settings.resume_ns
+            self.backoffs += 1
+            self._start_over(now_ns)
+        self._last_ns = now_ns
+        return self.rate_bps
+
+    def forget_silence(self) -> None:
+        """It was the receiver that left, not the link: the rate is what it was before."""
+        if self._silent:
+            self._silent = False
+            self._rate, self._curve_ns = max(self._rate, self._knee), self._plateau_ns
+
+    def forget_path(self) -> None:
+        """The receiver or the transport is another: delays of before say nothing."""
+        self._least = LeastDelay(self._settings.memory_ns)
+        self._recent.clear()
+        self._losses.clear()
+
+    def _elapsed(self, now_ns: int) -> int:
+        """Time since the last report, bounded: one after a long pause is no reason for a leap."""
+        step_ns = 0 if self._last_ns is None else min(max(0, now_ns - self._last_ns), 500 * _MS)
+        self._last_ns = now_ns
+        return step_ns
+
+    def _excess(self, progress: Progress) -> int:
+        delay_ns = progress.arrived_ns - progress.sent_ns
+        if self._base_ns is not None and abs(delay_ns - self._base_ns) > _ABSURD_NS:
+            self.forget_path()
+        self._base_ns = self._least.add(delay_ns, now_ns=progress.now_ns)
+        return delay_ns - self._base_ns - progress.own_ns
+
+    def _limit_ns(self) -> int:
+        return max(self._settings.excess_ns, round(2 * _MTU_BITS * _SECOND_NS / self._rate))
+
+    def _verdict(self) -> list[_Judged]:
+        """The newest judged reports, as few as suffice for a verdict; empty where there are too few."""
+        chosen: list[_Judged] = []
+        for one in reversed(self._recent):
+            chosen.append(one)
+            span_ns = chosen[0].progress.arrived_ns - one.progress.arrived_ns
+            if len(chosen) >= self._settings.verdict_reports and span_ns >= self._settings.verdict_ns:
+                return chosen[::-1]
+            # Where the link has fallen far, few messages arrive and each is later: two of them suffice.
+            if len(chosen) == 2 and span_ns >= _GRAVE_SPAN_NS and one.excess_ns > _GRAVE * self._limit_ns():
+                return chosen[::-1]
+        return []
+
+    def _overused(self, limit_ns: int) -> bool:
+        chosen = self._verdict()
+        if not chosen or min(one.excess_ns for one in chosen) <= limit_ns:
+            return False
+        return chosen[-1].excess_ns >= chosen[0].excess_ns - limit_ns // 4  # it empties: wait
+
+    def _arriving_bps(self) -> float:
+        """What arrived while the queue stood: what the link carries."""
+        chosen = self._verdict() or list(self._recent)
+        return _arrival_bps(chosen[0].progress, chosen[-1].progress) or self._rate
+
+    def _loss(self) -> float:
+        """The share of the last 100 messages or more that never came; 0 where there were fewer."""
+        last = self._losses[-1]
+        for messages, lost in reversed(self._losses):
+            if (sent := last[0] - messages) >= 100:
+                return min(1.0, max(0, last[1] - lost) / sent)
+        return 0.0
+
+    def _back_off(self, progress: Progress, rate: float) -> None:
+        broke_bps = min(self._rate, self._arriving_bps())
+        again = 0.85 * self._knee < broke_bps < 1.15 * self._knee
+        self._rate = max(rate, self._rate / 10, self._settings.floor_bps)
+        self._knee, self._low, self._curve_ns = max(self._rate, broke_bps), self._rate, 0
+        # A link that breaks down at the same rate time and again is tried more rarely.
+        least_ns = self._settings.plateau_ns
+        self._plateau_ns = min(2 * least_ns, self._plateau_ns * 13 // 10) if again else least_ns
+        self.backoffs += 1
+        self._start_over(progress.now_ns)
+
+    def _start_over(self, now_ns: int) -> None:
+        self._judge_from_ns = now_ns
+        self._recent.clear()
+
+    def _grow(self, step_ns: int) -> None:
+        settings = self._settings
+        if self._rate >= settings.ceiling_bps:
+            self._rate = float(settings.ceiling_bps)
+            return
+        curve_ns = self._curve_ns + step_ns
+        wanted = self._on_curve(curve_ns)
+        # What never arrived proves nothing: where little is sent, the rate does not run away from it.
+        proven = 2 * self._lately_bps()
+        if wanted <= proven:
+            self._curve_ns = curve_ns
+        self._rate = min(float(settings.ceiling_bps), max(self._rate, min(wanted, proven)))
+
+    def _on_curve(self, curve_ns: int) -> float:
+        if curve_ns < self._plateau_ns:
+            left = 1 - curve_ns / self._plateau_ns
+            return self._knee - (self._knee - self._low) * left**3
+        beyond_s = (curve_ns - self._plateau_ns) / _SECOND_NS
+        return self._knee * (1 + self._settings.beyond_per_s3 * beyond_s**3)
+
+    def _lately_bps(self) -> float:
+        """What arrived in about the last second; half the rate where that is not known yet."""
+        last = first = self._recent[-1].progress
+        for one in reversed(self._recent):
+            first = one.progress
+            if last.arrived_ns - first.arrived_ns >= _SECOND_NS:
+                break
+        if last.arrived_ns - first.arrived_ns < _SECOND_NS // 2:
+            return self._rate / 2
+        return _arrival_bps(first, last)
+
+
+def _arrival_bps(first: Progress, last: Progress) -> float:
+    """Line bits a second that arrived after the first and up to the last; 0 where no time passed."""
+    span_ns = last.arrived_ns - first.arrived_ns
+    return 0.0 if span_ns <= 0 else 8e9 * max(0, last.arrived_bytes - first.arrived_bytes) / span_ns
+
+
+@dataclass(frozen=True, slots=True)
+class ReopeningSettings:
+    """By how much the base's rate must be off, and for how long, before x265 is opened anew."""
+
+    much_less: float = 0.8
+    much_more: float = 1.25
+    some: float = 0.08
+    little: float = 0.02
+    """At the ceiling, where the rate will stay."""
+    rest_ns: int = 1_500 * _MS
+    some_ns: int = 3 * _SECOND_NS
+    """So long it must be off by `some`."""
+
+
+class Reopening:
+    """Whether it is worth a keyframe and some 35 ms to open x265 at another rate. Time is an argument.
+
+    Until then a base stream that is too fast takes from the stills, and then drops frames.
+    """
+
+    def __init__(self, settings: ReopeningSettings = ReopeningSettings()) -> None:
+        self._settings = settings
+        self._done_ns: int | None = None
+        self._off_ns: int | None = None
+
+    def wants(self, wanted_bps: float, base_bps: float, *, settled: bool, now_ns: int) -> bool:
+        """``base_bps`` is what x265 is opened for; ``settled``: the wanted rate is the one that will stay."""
+        settings = self._settings
+        ratio = wanted_bps / base_bps
+        if abs(ratio - 1) <= (settings.little if settled else settings.some):
+            self._off_ns = None
+            return False
+        self._off_ns = now_ns if self._off_ns is None else self._off_ns
+        if self._done_ns is not None and now_ns - self._done_ns < settings.rest_ns:
+            return False
+        much = ratio <= settings.much_less or ratio >= settings.much_more
+        return much or now_ns - self._off_ns >= settings.some_ns
+
+    def done(self, now_ns: int) -> None:
+        """x265 was opened anew."""
+        self._done_ns, self._off_ns = now_ns, None

@@ -1,0 +1,48 @@
+"""Edge and ground as real processes over a relay that is thinner than the budget."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from link.relay import Relay
+from link.script import LinkState, Piece, Script
+from processes import Link
+
+pytestmark = pytest.mark.integration
+
+THIN = Script(
+    pieces=(Piece(0.0, LinkState(rate_bps=250_000, delay_s=0.02)),), lasts_s=120.0, queue_bytes=64_000
+)
+EDGE = (
+    "--source", "demo", "--size", "640x360", "--budget", "800kbps", "--detector", "motion",
+    "--preset", "ultrafast", "--max-frames", "180", "--detect-every", "15",
+)  # fmt: skip
+
+
+def flown(folder: Path, *arguments: str) -> dict[str, Any]:
+    """The edge's summary of a run over the thin link."""
+    folder.mkdir()
+    with Link(folder) as link, Relay(THIN, target_port=link.port) as relay:
+        link.ground("--once", "--detector", "motion", "--classifier", "none")
+        where = ["--connect", f"tcp/127.0.0.1:{relay.port}"]
+        return link._start("hvt_edge.cli", [*where, *EDGE, *arguments], name="edge").finish(within_s=90)
+
+
+def test_the_base_follows_a_link_thinner_than_the_budget(tmp_path):
+    """The picture would be seconds late, and move in jerks."""
+    adapted, fixed = flown(tmp_path / "adapted", "--adapt"), flown(tmp_path / "fixed", "--no-adapt")
+    assert fixed["budget_base_bps"] == 650_000
+    assert fixed["total_bps"] > 1.3 * 250_000  # the rest stands in queues
+    assert adapted["budget_base_bps"] < 300_000  # x265 was opened anew
+    assert adapted["total_bps"] < 1.2 * 250_000
+    assert adapted["frames"] > fixed["frames"]  # more of them, and smaller ones
+
+
+def test_lockstep_never_adapts(tmp_path):
+    """The same input would not give the same bytes."""
+    summary = flown(tmp_path / "lockstep", "--pace", "lockstep", "--adapt", "--max-frames", "45")
+    assert (summary["frames"], summary["frames_dropped"], summary["keyframes"]) == (45, 0, 1)
+    assert summary["base_bps"] > 2 * 250_000  # media time: what the budget gives, whatever the link does

@@ -1,0 +1,172 @@
+"""Asking a flying edge for more, through the ground that watches it, from the command line and from Python."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_ground.ask import AskedStill, EdgeClient, EdgeTrack, RefusedError
+from processes import Link, eventually
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+PLACE = (300, 100, 200, 150)
+"""x, y, width, height in source pixels."""
+
+
+@dataclass
+class Flight:
+    """What was asked of one flight, and what the flight says of itself."""
+
+    names: list[str]
+    box: AskedStill
+    past: AskedStill
+    track: AskedStill
+    tracks: list[EdgeTrack]
+    refusals: list[str]
+    before_kbps: int
+    after_kbps: int
+    told: subprocess.CompletedProcess[str]
+    nobody: subprocess.CompletedProcess[str]
+    folder: Path
+    edge: dict[str, Any]
+    ground: dict[str, Any]
+
+
+def refusal(ask) -> str:
+    """The sentence with which the edge says no."""
+    with pytest.raises(RefusedError) as caught:
+        ask()
+    return str(caught.value)
+
+
+def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run ``hvt-ground`` with these words."""
+    line = [sys.executable, "-m", "hvt_ground.cli", *words]
+    return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=40, check=False)
+
+
+@pytest.fixture(scope="module")
+def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """An edge in real time, a ground that records, and somebody who asks through the ground."""
+    folder = tmp_path_factory.mktemp("asked")
+    with Link(folder) as link:
+        ground = link.ground(
+            "--record", "flight.rrd", "--once", "--detector", "motion", "--classifier", "none"
+        )
+        edge = link.edge(
+            *("--source", str(scene), "--source-fps", "10", "--fps", "10", "--size", "640x360"),
+            *("--preset", "ultrafast", "--budget", "500kbps", "--video-share", "0.6", "--edge-id", "uav-1"),
+            *("--detector", "motion", "--still-codec", "residual", "--cooldown", "0s"),
+        )
+        eventually(lambda: "stills" in ground.said, within_s=40, what="the ground sees stills")
+        with EdgeClient.connect(link.ground_endpoint) as edges:
+            one = edges["uav-1"]
+            eventually(one.tracks, within_s=20, what="the edge tracks something")
+            names = edges.names()
+            box = one.still(box=PLACE, quality_pct=90)
+            past = one.still(box=PLACE, at_s=-2, quality_pct=90)
+            tracks = one.tracks()
+            track = one.still(track=tracks[0].track_id)
+            refusals = [
+                refusal(lambda: one.still(track=99999)),
+                refusal(lambda: one.still(at_s=-600)),
+                refusal(lambda: one.still(box=(900, 500, 100, 100))),
+                refusal(lambda: one.set_budget(10_000)),
+                refusal(lambda: one.set_method("M99")),
+            ]
+            before = one.info().budget_bps
+            one.keyframe()
+            one.set_budget(300_000)
+            after = one.info().budget_bps
+        connect = ("--connect", link.ground_endpoint)
+        told = command(
+            "still", *connect, "--box", "300,100,200,150", "--at", "-1s", "--out", "a.png", folder=folder
+        )
+        nobody = command("keyframe", *connect, "--edge", "uav-2", folder=folder)
+        edge.stop()
+        return Flight(
+            names,
+            box,
+            past,
+            track,
+            tracks,
+            refusals,
+            before // 1000,
+            after // 1000,
+            told,
+            nobody,
+            folder,
+            edge=edge.finish(within_s=20),
+            ground=ground.finish(within_s=30),
+        )
+
+
+def source(scene: Path, index: int) -> np.ndarray:
+    """The source frame of that index, cut to the place."""
+    x, y, w, h = PLACE
+    return cv2.imread(str(scene / f"{index:06d}.jpg"))[y : y + h, x : x + w]
+
+
+def test_the_still_shows_the_source_frame_that_it_names(flight, scene):
+    """The operator would look closer at something else, or at what the video stream left of it."""
+    assert flight.names == ["uav-1"]
+    for still in (flight.box, flight.past):
+        assert still.header.crop_source_px == (300, 100, 500, 250)
+        assert cv2.PSNR(still.image_bgr, source(scene, still.header.frame_index)) > 27
+
+
+def test_two_seconds_ago_is_two_seconds_ago(flight):
+    """The moment that mattered would not be the one that is shown."""
+    delay_ns = flight.past.header.send_ns - flight.past.header.capture_ns
+    assert 2.0e9 - 1 <= delay_ns < 6e9
+
+
+def test_a_track_of_the_list_can_be_asked_for(flight):
+    """The list would be of no use."""
+    listed = flight.tracks[0]
+    header = flight.track.header
+    assert header.track_id == listed.track_id
+    x1, y1, x2, y2 = header.box_source_px
+    assert (x2 - x1) * (y2 - y1) > 100
+    assert header.codec == "h264-intra", "the video's decoder is at the ground, not with whoever asks"
+
+
+def test_what_cannot_be_had_is_refused_in_a_sentence(flight):
+    """The operator would wait, or see a traceback."""
+    said = ["no track 99999", "no longer held", "not inside the frame of 960x540", "takes at least", "M99"]
+    for text, reason in zip(said, flight.refusals, strict=True):
+        assert text in reason
+        assert reason.startswith("uav-1 refuses: ")
+
+
+def test_the_command_line_writes_the_picture(flight, scene):
+    """An operator without Python could not ask."""
+    assert flight.told.returncode == 0, flight.told.stderr
+    assert "200x150 pixels at 300,100" in flight.told.stdout
+    index = int(flight.told.stdout.split("frame ")[1].split(",")[0])
+    picture = cv2.imread(str(flight.folder / "a.png"))
+    assert cv2.PSNR(picture, source(scene, index)) > 24
+    assert flight.nobody.returncode == 2
+    assert "edge 'uav-2' does not answer" in flight.nobody.stderr
+
+
+def test_another_budget_holds(flight):
+    """What was said to the edge would have no effect."""
+    assert (flight.before_kbps, flight.after_kbps) == (500, 300)
+
+
+def test_both_ledgers_know_what_was_asked_for(flight):
+    """Stills on demand would be bits that nobody counted."""
+    assert flight.edge["stills"]["reasons"]["sent"]["asked"] == 4
+    assert flight.ground["stills"]["received"] == flight.edge["stills"]["sent"]
+    assert flight.edge["worst_window_bps"]["total"] <= 500_000
+    for name in ("roi_bytes", "base_bytes"):
+        assert flight.ground[name] == flight.edge[name], name

@@ -1,0 +1,373 @@
+"""Who gets in over real TLS, who may do what, and what each who may not is told."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_keys import EXPIRED, Fleet
+from hvt_common.link.diagnose import LinkWatch
+from hvt_common.link.keys import EdgeKeys, Row, selector
+from hvt_common.link.session import ask, declare_publisher, open_session, serve
+from hvt_common.link.zenoh_config import LinkSettings, configure
+from processes import Running, eventually, free_ports
+
+pytestmark = pytest.mark.integration
+
+UAV1, UAV2 = EdgeKeys("uav-1"), EdgeKeys("uav-2")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    """Two edges; a ground that commands, one that watches; and one that the edges have not been told of."""
+    fleet = Fleet(tmp_path_factory.mktemp("keys") / "own")
+    fleet.keys("add-edge", "uav-1", "--host", "127.0.0.1")
+    fleet.keys("add-edge", "uav-2")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    fleet.keys("add-ground", "guest", "--watch-only")
+    old = fleet.file("uav-1").read_text()
+    fleet.keys("add-ground", "stranger")
+    fleet.file("uav-1").write_text(old)
+    return fleet
+
+
+@pytest.fixture
+def started() -> Iterator[list[Running]]:
+    """Processes that a test appends, killed at its end."""
+    running: list[Running] = []
+    yield running
+    for one in running:
+        if one.alive:
+            one.kill()
+
+
+@contextmanager
+def _unchecked(settings: LinkSettings) -> Iterator[zenoh.Session]:
+    """A session of somebody who does not look at keys before the start."""
+    with zenoh.open(configure(settings)[0]) as session:
+        yield session
+
+
+# Who does not get in
+
+
+@dataclass(frozen=True)
+class _Refused:
+    links: int
+    trouble: str
+
+
+REFUSALS = {
+    "no certificate": r"the other side wants a certificate of this machine, and --zenoh-config names none",
+    "other CA of the same name": r"its certificate was not signed by the CA in \S+/other/ca.pem",
+    "certificate of another CA of the same name": (
+        r"refused our certificate \S+/other/uav-1.pem: it was signed by another CA than the one trusted there, though"
+    ),
+    "our certificate expired": r"refused our certificate \S+/old/uav-1.pem: it is expired, or not valid yet, by",
+    "its certificate expired": r"the other side's certificate of 'base' expired on \d{4}-\d\d-\d\d \d\d:\d\d UTC; it",
+    "wrong host": r"its certificate of 'base' is for base, 127.0.0.1, not for 'localhost': connect to one of these",
+    "plain to TLS": r"this is a TLS port, and plain tcp does not get in: connect to tls/… with the keys",
+    "TLS to plain": r"what listens there does not answer TLS within 3 s: it is a plain tcp/… port",
+}
+
+
+@pytest.fixture(scope="module")
+def refused(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> dict[str, _Refused]:
+    """All of them at once, each calling a ground that would let `uav-1` in; what became of each."""
+    folder = tmp_path_factory.mktemp("others")
+    other = Fleet(folder / "other")
+    other.keys("add-edge", "uav-1")
+    other.keys("add-ground", "base", "--host", "127.0.0.1")
+    old = fleet.copy(folder / "old")
+    old.reissue("uav-1", now=EXPIRED)
+    old.reissue("base", "127.0.0.1", now=EXPIRED)
+    good, expired, plain = free_ports(3)
+    tls = (f"tls/127.0.0.1:{good}",)
+    own = fleet.settings("uav-1", "edge", connect=tls)
+    foreign = {
+        "root_ca_certificate": str(fleet.folder / "ca.pem"),
+        "connect_certificate": str(other.folder / "uav-1.pem"),
+        "connect_private_key": str(other.folder / "uav-1.key"),
+    }
+    no_pair = fleet.changed("uav-1", connect_certificate=None, connect_private_key=None)
+    callers = {
+        "no certificate": replace(own, zenoh_config=no_pair),
+        "other CA of the same name": other.settings("uav-1", "edge", connect=tls),
+        "certificate of another CA of the same name": replace(
+            own, zenoh_config=fleet.changed("uav-1", **foreign)
+        ),
+        "our certificate expired": old.settings("uav-1", "edge", connect=tls),
+        "its certificate expired": replace(own, connect=(f"tls/127.0.0.1:{expired}",)),
+        "wrong host": replace(own, connect=(f"tls/localhost:{good}",)),
+        "plain to TLS": LinkSettings("edge", connect=(f"tcp/127.0.0.1:{good}",)),
+        "TLS to plain": replace(own, connect=(f"tls/127.0.0.1:{plain}",)),
+    }
+    with ExitStack() as stack:
+        grounds = [
+            stack.enter_context(_unchecked(settings))
+            for settings in (
+                fleet.settings("base", "ground", listen=tls),
+                old.settings("base", "ground", listen=(f"tls/127.0.0.1:{expired}",)),
+                LinkSettings("ground", listen=(f"tcp/127.0.0.1:{plain}",)),
+            )
+        ]
+        watches = {}
+        for name, settings in callers.items():
+            session = stack.enter_context(_unchecked(settings))
+            watches[name] = (
+                session,
+                stack.enter_context(LinkWatch(session, settings, served=lambda _: True)),
+            )
+        eventually(
+            lambda: all(watch.trouble for _, watch in watches.values()), within_s=40, what="all are explained"
+        )
+        assert [list(ground.info.peers_zid()) for ground in grounds] == [[], [], []]
+        return {
+            name: _Refused(len(list(session.info.links())), watch.trouble)
+            for name, (session, watch) in watches.items()
+        }
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_who_must_not_get_in_does_not_and_is_told_why(refused: dict[str, _Refused], case: str) -> None:
+    """Let in, a stranger watches; refused without a reason, the owner gives up and flies with --insecure."""
+    assert refused[case].links == 0
+    assert re.search(rf"^(tls|tcp)/(127.0.0.1|localhost):\d+: .*{REFUSALS[case]}", refused[case].trouble)
+
+
+# Who is in, and may not
+
+
+@contextmanager
+def _edge(fleet: Fleet, endpoint: str, *, name: str = "uav-1") -> Iterator[zenoh.Session]:
+    """A session of the edge uav-1 that listens, is present, and answers info and control."""
+    settings = fleet.settings(name, "edge", listen=(endpoint,))
+    with open_session(settings) as session:
+        serve(session, Row.INFO, keys=UAV1, answer=lambda _question: b"info")
+        serve(session, Row.CONTROL, keys=UAV1, answer=lambda _question: b"done")
+        token = session.liveliness().declare_token(UAV1.key(Row.ALIVE))
+        with LinkWatch(session, settings, served=lambda _ground: False):
+            yield session
+        token.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _linked(*sessions: zenoh.Session) -> Callable[[], bool]:
+    return lambda: all(list(session.info.links()) for session in sessions)
+
+
+def test_an_edge_cannot_write_as_another(
+    fleet: Fleet, free_port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One captured drone could show the operator pictures under another drone's name."""
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    ground_settings = fleet.settings("base", "ground", listen=(endpoint,))
+    came: list[str] = []
+    with ExitStack() as stack:
+        ground = stack.enter_context(open_session(ground_settings))
+        ground.declare_subscriber("hvt/**", lambda sample: came.append(str(sample.key_expr)))
+        ground.liveliness().declare_subscriber(
+            "hvt/**", lambda sample: came.append(str(sample.key_expr)), history=True
+        )
+        forger = stack.enter_context(
+            open_session(replace(fleet.settings("uav-1", "edge", connect=(endpoint,)), name=None))
+        )
+        stack.enter_context(
+            LinkWatch(ground, ground_settings, served=lambda name: f"hvt/{name}/alive" in came)
+        )
+        forger.liveliness().declare_token(UAV2.key(Row.ALIVE))
+        serve(forger, Row.INFO, keys=UAV2, answer=lambda _question: b"forged")
+        own = declare_publisher(forger, Row.STATUS, keys=UAV1)
+        eventually(lambda: own.matching_status.matching, within_s=20, what="the edge's own stream is wanted")
+        for row in (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS, Row.FEEDBACK):
+            forger.put(UAV2.key(row), b"forged")
+        own.put(b"own")
+        eventually(lambda: came, within_s=20, what="the edge's own message")
+        assert ask(ground, Row.INFO, keys=UAV2, question=b"", timeout_s=1) is None
+        eventually(lambda: "'uav-1' is linked" in caplog.text, within_s=20, what="the ground is told")
+        assert came == [UAV1.key(Row.STATUS)]
+    assert "or it runs under another id than its certificate says, and all it sends is dropped" in caplog.text
+
+
+def test_watching_commanding_and_being_a_stranger(
+    fleet: Fleet, free_port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Three keys of one CA, three rights: else every guest steers, or every operator only watches."""
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    with ExitStack() as stack:
+        edge = stack.enter_context(_edge(fleet, endpoint))
+        # A guest who has changed its own file to that of a ground that commands: the edge has to refuse it.
+        bold = fleet.changed(
+            "base",
+            connect_certificate=str(fleet.folder / "guest.pem"),
+            connect_private_key=str(fleet.folder / "guest.key"),
+        )
+        files = {"base": fleet.file("base"), "guest": bold, "stranger": fleet.file("stranger")}
+        grounds = {
+            name: stack.enter_context(
+                open_session(LinkSettings("ground", connect=(endpoint,), zenoh_config=file))
+            )
+            for name, file in files.items()
+        }
+        came: dict[str, list[bytes]] = {name: [] for name in grounds}
+        for name, ground in grounds.items():
+            ground.declare_subscriber(
+                selector(Row.STATUS), lambda sample, name=name: came[name].append(sample.payload.to_bytes())
+            )
+        publisher = declare_publisher(edge, Row.STATUS, keys=UAV1)
+        eventually(_linked(*grounds.values()), within_s=20, what="all three are linked")
+        info = {
+            name: ask(ground, Row.INFO, keys=UAV1, question=b"", timeout_s=2)
+            for name, ground in grounds.items()
+        }
+        assert info == {"base": b"info", "guest": b"info", "stranger": None}
+        control = {
+            name: ask(ground, Row.CONTROL, keys=UAV1, question=b"do", timeout_s=2)
+            for name, ground in grounds.items()
+        }
+        assert control == {"base": b"done", "guest": None, "stranger": None}
+        publisher.put(b"picture")
+        eventually(lambda: came["base"] and came["guest"], within_s=10, what="the two that may watch receive")
+        assert came["stranger"] == []
+        eventually(
+            lambda: "'stranger' has a certificate" in caplog.text, within_s=20, what="the edge is told"
+        )
+    assert (
+        f"{fleet.file('uav-1')} does not name it: it gets no picture and no answer from here" in caplog.text
+    )
+
+
+# Real processes
+
+
+def _hvt_edge(fleet: Fleet, folder: Path, *arguments: str, name: str = "edge") -> Running:
+    common = ["--source", "demo", "--profile", "thin", "--detector", "motion", "--edge-id", "uav-1"]
+    return Running("hvt_edge.cli", [*common, *arguments], folder=folder, name=name)
+
+
+def _hvt_ground(fleet: Fleet, who: str, folder: Path, *arguments: str) -> Running:
+    common = ["--zenoh-config", str(fleet.file(who)), "--detector", "motion", "--classifier", "none"]
+    return Running("hvt_ground.cli", [*common, *arguments], folder=folder, name=who)
+
+
+def test_a_flight_with_keys_keeps_the_account(
+    fleet: Fleet, tmp_path: Path, free_port: int, started: list[Running]
+) -> None:
+    """A rule too strict for one row of the key table would lose that row only, and nobody would know."""
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    ground = _hvt_ground(fleet, "base", tmp_path, "--listen", endpoint, "--once", "--record", "flight.rrd")
+    started.append(ground)
+    ground.until("listening on")
+    keys = ("--zenoh-config", str(fleet.file("uav-1")), "--send-tracks")
+    edge = _hvt_edge(
+        fleet, tmp_path, "--connect", endpoint, *keys, "--pace", "lockstep", "--max-frames", "45"
+    )
+    started.append(edge)
+    sent, received = edge.finish(), ground.finish()
+    for count in ("frames", "base_bytes", "roi_bytes", "meta_bytes", "overhead_bytes"):
+        assert sent[count] == received[count] > 0, count
+    assert sent["frames"] == 45
+    assert sent["stills"]["sent"] == received["stills"]["received"] > 0
+    assert sent["unusable_messages"] == received["unusable_messages"] == 0
+    for one in (edge, ground):
+        assert "is linked, but" not in one.said
+        assert "does not answer on control" not in one.said
+
+
+@pytest.mark.parametrize(
+    ("who", "says"),
+    [
+        ("guest", "guest.json5 lets it watch uav-1, not command it: no keyframes or stills on demand"),
+        ("stranger", "hvt-ground: 'uav-1' is linked, but nothing of edge uav-1 is seen here: its Zenoh"),
+    ],
+)
+def test_a_ground_is_told_what_it_may_not(
+    fleet: Fleet, tmp_path: Path, free_port: int, started: list[Running], who: str, says: str
+) -> None:
+    """The operator asks for a still, or waits for a picture, and nothing comes: the reason has to stand there."""
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    with _edge(fleet, endpoint):
+        ground = _hvt_ground(fleet, who, tmp_path, "--connect", endpoint, "--record", str(tmp_path))
+        started.append(ground)
+        ground.until(says)
+        ground.stop()
+
+
+def test_an_edge_that_does_not_get_in_says_why_and_goes_on(
+    fleet: Fleet, tmp_path: Path, free_port: int, started: list[Running]
+) -> None:
+    """The engineer beside the drone sees only the drone's own log."""
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    with open_session(fleet.settings("base", "ground", listen=(endpoint,))):
+        file = fleet.changed("uav-1", connect_certificate=None, connect_private_key=None)
+        edge = _hvt_edge(fleet, tmp_path, "--connect", endpoint, "--zenoh-config", str(file))
+        started.append(edge)
+        edge.until(f"hvt-edge: no link: {endpoint}: the other side wants a certificate of this machine, and")
+        assert edge.alive
+        edge.stop()
+
+
+@pytest.mark.parametrize(
+    ("case", "says"),
+    [
+        (
+            "another id",
+            "--edge-id uav-2: KEYS/uav-1.pem is the certificate of 'uav-1', which may write as 'uav-1' only",
+        ),
+        ("expired", "KEYS/uav-1.pem: this certificate expired on "),
+        (
+            "missing",
+            "/nowhere/uav-1.key, the connect_private_key of --zenoh-config, cannot be read (No such file",
+        ),
+    ],
+)
+def test_an_edge_with_unfit_keys_does_not_start(
+    fleet: Fleet, tmp_path: Path, started: list[Running], case: str, says: str
+) -> None:
+    """Exit code 2 and a sentence, so that systemd does not try for ever and the reason is the last line."""
+    own = fleet.copy(tmp_path / "keys")
+    file = own.file("uav-1")
+    if case == "expired":
+        own.reissue("uav-1", now=EXPIRED)
+    elif case == "missing":
+        file = own.changed("uav-1", connect_private_key="/nowhere/uav-1.key")
+    who = ("--edge-id", "uav-2") if case == "another id" else ()
+    edge = _hvt_edge(own, tmp_path, "--connect", "tls/127.0.0.1:9", "--zenoh-config", str(file), *who)
+    started.append(edge)
+    assert edge.wait(within_s=60) == 2
+    assert edge.said.count("\n") == 1, edge.said
+    assert edge.said.startswith(f"hvt-edge: {says.replace('KEYS', str(own.folder))}")
+
+
+def test_a_ground_that_gets_no_answer_on_control_is_told(
+    fleet: Fleet, free_port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its keyframe requests would go nowhere, and the picture would come back only by the clock."""
+    from hvt_ground.subscribe import GroundLink
+
+    caplog.set_level(logging.WARNING)
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    bold = fleet.changed(
+        "base",
+        connect_certificate=str(fleet.folder / "guest.pem"),
+        connect_private_key=str(fleet.folder / "guest.key"),
+    )
+    with (
+        _edge(fleet, endpoint),
+        open_session(LinkSettings("ground", connect=(endpoint,), zenoh_config=bold)) as session,
+        GroundLink(session, edges="*") as link,
+    ):
+        eventually(link.ports, within_s=20, what="the edge is seen")
+        (port,) = link.ports()
+        for _ in range(3):
+            port.request_keyframe()
+            time.sleep(0.1)
+        eventually(lambda: "uav-1 does not answer on control" in caplog.text, within_s=10, what="it is said")
+    assert "this ground may lack the right to command it (hvt-ground keys list" in caplog.text

@@ -1,0 +1,139 @@
+"""The short scenarios, with hvt-edge and hvt-ground as real processes: cheap settings, so no bar of speed is asked.
+
+`make link` measures; here it is only asked that both survive, keep their account, and show a picture again.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+from pathlib import Path
+
+import psutil
+import pytest
+
+from link.laboratory import Run, run
+from link.measures import Outcome, measures
+from link.netns import UnavailableError
+from link.script import load_scenario, scenario_names
+from pictures import write_scene
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(240)]
+
+EDGE = (
+    "--source-fps",
+    "10",
+    "--fps",
+    "10",
+    "--size",
+    "320x180",
+    "--preset",
+    "ultrafast",
+    "--detector",
+    "motion",
+)
+GROUND = ("--detector", "motion", "--classifier", "none")
+AT_ONCE = 5
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """Pictures for longer than any short script lasts."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_scene(folder, frames=400)
+    return folder
+
+
+def short(name: str, scene: Path, folder: Path, **more: str) -> Outcome:
+    """One short run at little cost."""
+    return run(
+        Run(
+            scenario=load_scenario(name),
+            source=str(scene),
+            folder=folder / name,
+            length="short",
+            edge_arguments=EDGE,
+            ground_arguments=GROUND,
+            **more,
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def outcomes(scene, tmp_path_factory) -> dict[str, Outcome | str]:
+    """All scenarios over the relay, a few at a time."""
+    folder = tmp_path_factory.mktemp("link")
+    with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
+        names = sorted(scenario_names(), key=lambda name: -load_scenario(name).script("short").lasts_s)
+        running = {name: pool.submit(short, name, scene, folder) for name in names}
+        # The relay's TCP is a model; where there are namespaces, the kernel's own is asked too.
+        running["kernel"] = pool.submit(short, "steady-300k", scene, folder / "kernel", carrier="netns")
+        return {name: _result(one) for name, one in running.items()}
+
+
+def _result(running: concurrent.futures.Future[Outcome]) -> Outcome | str:
+    try:
+        return running.result()
+    except UnavailableError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_both_sides_survive(outcomes, name):
+    """A bad link would end the flight's video for good."""
+    outcome = outcomes[name]
+    assert outcome.exit_codes == {"edge": 0, "ground": 0}, outcome.said
+    assert not [text for text in outcome.said.values() if "Traceback" in text]
+
+
+def _today(name: str):
+    """What is known not to hold yet on a busy machine; to be taken out with the recovery that mends it."""
+    late = pytest.mark.xfail(
+        reason="after an outage past the lease the link sometimes stays gone", strict=False
+    )
+    return pytest.param(name, marks=late) if name == "outage-60s" else name
+
+
+@pytest.mark.parametrize("name", [_today(name) for name in scenario_names()])
+def test_there_is_a_picture_at_the_end(outcomes, name):
+    """After a fade the operator would look at the last frame before it."""
+    outcome = outcomes[name]
+    assert outcome.edge["frames"] > 0
+    last = max(one.received_s for one in outcome.shown)
+    assert last > outcome.ended_s - 1.5, outcome.said
+    assert measures(outcome)["decodable frames, %"] > 0
+
+
+@pytest.mark.parametrize("name", ["steady-1M", "steady-300k", "satellite-600ms"])
+def test_a_steady_link_loses_nothing(outcomes, name):
+    """The two accounts would differ, and with them what the budget means."""
+    found = measures(outcomes[name])
+    assert found["ledger difference, bytes"] == 0
+    assert found["stills lost"] == 0
+    assert found["decodable frames, %"] == 100
+
+
+@pytest.mark.parametrize("name", ["outage-8s", "outage-60s", "flapping", "drone-fade"])
+def test_darkness_is_dark(outcomes, name):
+    """The lab would be testing nothing."""
+    assert measures(outcomes[name])["received in darkness, bytes"] == 0
+
+
+def test_a_satellite_is_far_away(outcomes):
+    """As above."""
+    assert measures(outcomes["satellite-600ms"])["frame delay p50, ms"] >= 300
+
+
+def test_no_process_is_left(outcomes):
+    """A night of runs would fill the machine."""
+    assert outcomes
+    assert not psutil.Process().children(recursive=True)
+
+
+def test_the_same_on_the_kernels_own_tcp(outcomes):
+    """The model would be kind where the real thing is not."""
+    outcome = outcomes["kernel"]
+    if isinstance(outcome, str):
+        pytest.skip(outcome)
+    assert outcome.exit_codes == {"edge": 0, "ground": 0}, outcome.said
+    assert measures(outcome)["ledger difference, bytes"] == 0
+    assert measures(outcome)["decodable frames, %"] == 100
