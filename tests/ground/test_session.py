@@ -335,7 +335,7 @@ def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
         rig.settle()
         wait_for(lambda: len(rig.reader.had_base) == 20)
         assert all(rig.reader.had_base)
-        assert rig.receiver.session.sight.refined == 1
+        assert rig.receiver.session.sight.refined >= 1  # a busy machine may lose the track between
 
 
 def test_a_still_before_its_frame_waits_for_its_track(flight):
