@@ -109,7 +109,7 @@ def edge_config(shop: Workshop, job: Job) -> EdgeConfig:
 
 
 def ground_config(shop: Workshop) -> GroundConfig:
-    """The ground of every flight: re-detection reads the stills, and what they say is weighed with the base's votes."""
+    """The ground of every flight: re-detection reads the stills, which are weighed with the votes of the base."""
     classifier = "none" if shop.detector == MOTION else "detector"
     return check_ground(
         replace(
