@@ -291,6 +291,8 @@ class Edge:
                 if self._now_ns >= next_status_ns:
                     next_status_ns = self._now_ns + SECOND_NS
                     self._report(flow, line)
+                    if flow.renewal.wants_keyframe(self._now_ns):
+                        self._keyframes.renew(self._now_ns)
 
     def _make_pace(self, flow: _Flow, source: Source) -> LockstepPace | RealtimePace:
         fps = self._config.tick_fps

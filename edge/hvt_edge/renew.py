@@ -96,6 +96,13 @@ class Renewal:
             with self._lock:
                 self._split.observe(candidates, step)
 
+    def wants_keyframe(self, now_ns: int) -> bool:
+        """Whether the split is so far off that it is worth a keyframe of its own; asked once a second."""
+        if self._split is None:
+            return False
+        with self._lock:
+            return self._split.wants_keyframe(now_ns)
+
     def __call__(self, every_n: int, now_ns: int) -> BaseEncoder | None:
         """Return the encoder to go on with from this keyframe, or None for the one there is."""
         changed = self._take_change()

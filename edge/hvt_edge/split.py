@@ -44,6 +44,10 @@ class SplitSettings:
     """Time constant with which the need is averaged."""
     least_change: float = 0.05
     """Of the budget; a smaller change is not worth the opening of an encoder."""
+    own_change: float = 0.1
+    """Of the budget; a share that is off by so much is worth a keyframe of its own."""
+    own_rest_s: float = 20.0
+    """The least time between two of these, and before the first: a keyframe on a thin link is seen for seconds."""
 
 
 class Split:
@@ -63,6 +67,8 @@ class Split:
         self._need_bytes = 0.0
         self._shown = 1.0
         self._observed_ns: int | None = None
+        self._settled_ns = 0
+        """Since when the share is what it is."""
 
     def observe(self, candidates: Sequence[Candidate], step: Step) -> None:
         """Take in all tracks of a decision step, those that rest included."""
@@ -70,7 +76,9 @@ class Split:
         doubts = [self._gain.doubt(one, from_source=step.from_source) for one in candidates]
         shown = 1 - sum(doubts) / len(doubts) if doubts else 1.0
         keep = 0.0
-        if self._observed_ns is not None:
+        if self._observed_ns is None:
+            self._settled_ns = step.now_ns
+        else:
             keep = math.exp(-max(0, step.now_ns - self._observed_ns) / 1e9 / self._settings.memory_s)
         self._need_bytes = keep * self._need_bytes + (1 - keep) * need_bytes
         self._shown = keep * self._shown + (1 - keep) * shown
@@ -85,11 +93,20 @@ class Split:
         """The base's share of the budget from the keyframe that is due now; None to leave it as it is."""
         if self._observed_ns is None:
             return None
-        share = round(1 - self._metadata_share() - self._still_share(), 2)
+        share = self._target()
         if abs(share - self.share) < self._settings.least_change - 1e-9:
             return None
-        self.share = share
+        self.share, self._settled_ns = share, self._observed_ns
         return share
+
+    def wants_keyframe(self, now_ns: int) -> bool:
+        """Whether the scene has changed so much that the split should not wait for the next keyframe that comes."""
+        if self._observed_ns is None or now_ns - self._settled_ns < self._settings.own_rest_s * 1e9:
+            return False
+        return abs(self._target() - self.share) >= self._settings.own_change - 1e-9
+
+    def _target(self) -> float:
+        return round(1 - self._metadata_share() - self._still_share(), 2)
 
     def _need(self, candidate: Candidate, step: Step) -> float:
         part = min(1.0, self._gain.gain(candidate, step) / self._settings.full_gain)

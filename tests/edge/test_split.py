@@ -156,3 +156,18 @@ def test_the_share_is_the_same_every_time_and_leaves_x265_what_it_needs(total, m
             assert share * total >= min(90_000, total - metadata) - 0.005 * total - 1
             assert share <= 1 - metadata / total + 0.005
             assert share == pytest.approx(round(share, 2))
+
+
+def test_a_scene_that_has_changed_is_worth_a_keyframe_of_its_own_now_and_then():
+    """On a thin link scheduled keyframes are a minute apart: the split would follow the scene of a minute ago."""
+    one = split(300_000)
+    assert not one.wants_keyframe(60 * SECOND), "nothing is known of the scene"
+    crowd = [car(number, lost=0.9, side=90) for number in range(1, 60)]
+    one.observe(crowd, moment(0, from_source=True))
+    assert not one.wants_keyframe(19 * SECOND), "not so soon"
+    assert one.wants_keyframe(20 * SECOND)
+    assert one.propose() == 0.65
+    assert not one.wants_keyframe(60 * SECOND), "it is as it should be"
+    for number in range(60):
+        one.observe([], moment(1 + number / 3, from_source=True))
+    assert one.wants_keyframe(40 * SECOND), "the crowd has gone"
