@@ -176,7 +176,10 @@ def _chosen(
     config: EdgeConfig, source_size: tuple[int, int], *, size: tuple[int, int] | None
 ) -> tuple[tuple[int, int], int]:
     rate_bps = payload_bps(
-        config.base_bps, size=size or source_size, fps=config.tick_fps, edge_id=config.edge_id
+        config.base_bps,
+        size=size or min(source_size, DEFAULT_SIZE),
+        fps=config.tick_fps,
+        edge_id=config.edge_id,
     )
     return choose_base(
         rate_bps,

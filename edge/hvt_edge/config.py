@@ -318,7 +318,7 @@ def _check_stills(config: EdgeConfig) -> None:
         raise UserError(
             f"--fallback-codec {config.fallback_codec} needs the base stream itself: give one that does not"
         )
-    if parse_tiles(config.tiles) not in ("off", "auto") and config.candidates != "source":
+    if parse_tiles(config.tiles) != "off" and config.candidates != "source":
         raise UserError(f"--tiles {config.tiles} cuts up the source: add --candidates source")
 
 

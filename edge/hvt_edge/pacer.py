@@ -182,10 +182,10 @@ class Pacer:
         """How often the rate was lowered."""
         return self._controller.backoffs
 
-    def set_ceiling(self, ceiling_bps: int) -> None:
-        """Another ``--budget``, while running."""
+    def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:
+        """Another ``--budget``, while running; ``floor_bps`` is the ``--min-budget`` that goes with it."""
         with self._lock:
-            self._controller.set_ceiling(ceiling_bps)
+            self._controller.set_ceiling(ceiling_bps, floor_bps=floor_bps)
 
     # What goes out
 

@@ -38,5 +38,9 @@ def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
     """The configuration with the profile's settings, except for fields that the user has ``given``."""
     if config.profile is None:
         return config
-    settings = PROFILES[config.profile]
+    settings = dict(PROFILES[config.profile])
+    if config.regime is not None:  # which says the share itself
+        del settings["video_share"]
+    if "candidates" in given and config.candidates != "source":
+        del settings["tiles"]
     return replace(config, **{name: value for name, value in settings.items() if name not in given})

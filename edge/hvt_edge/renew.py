@@ -98,10 +98,10 @@ class Renewal:
 
     def wants_keyframe(self, now_ns: int) -> bool:
         """Whether the split is so far off that it is worth a keyframe of its own; asked once a second."""
-        if self._split is None:
-            return False
         with self._lock:
-            return self._split.wants_keyframe(now_ns)
+            if self._wanted is not None:  # it came while a keyframe was being made
+                return True
+            return self._moving and self._split is not None and self._split.wants_keyframe(now_ns)
 
     def __call__(self, every_n: int, now_ns: int) -> BaseEncoder | None:
         """Return the encoder to go on with from this keyframe, or None for the one there is."""
@@ -123,7 +123,7 @@ class Renewal:
 
     def _at_links_rate(self, pacer: Pacer, every_n: int, now_ns: int, *, changed: bool) -> BaseEncoder | None:
         if changed:
-            pacer.set_ceiling(self._config.budget_bps)
+            pacer.set_ceiling(self._config.budget_bps, floor_bps=self._config.floor_bps)
         self._proposed_bps(changed=changed)  # which moves the share
         base_bps = self._base_of(pacer.steady_bps)
         near = abs(base_bps / self._base_bps - 1) <= _WORTH and not (pacer.settled or changed)
@@ -141,9 +141,14 @@ class Renewal:
     def _base_of(self, total_bps: int) -> int:
         """The base's part of so much in all; never less than x265 can follow at its lowest frame rate."""
         config = self._config
-        share = config.share if self._split is None else self._split.share
+        share = self._split.share if self._moving and self._split is not None else config.share
         least_bps = least_base_bps(self._size, LEAST_FPS, edge_id=config.edge_id)
         return max(least_bps, round(min(total_bps * share, total_bps - config.metadata_bps)))
+
+    @property
+    def _moving(self) -> bool:
+        """Whether the split follows the scene: another method may want none."""
+        return isinstance(self._config.video_share, str)
 
     def _take_change(self) -> bool:
         """Whether another total or share was asked for since the last keyframe; it is the one from now on."""
@@ -156,11 +161,12 @@ class Renewal:
 
     def _proposed_bps(self, *, changed: bool) -> int:
         config = self._config
-        if self._split is None:
+        if not self._moving or self._split is None:
             return config.base_bps if changed else self._base_bps
+        total_bps = config.budget_bps if self._pacer is None else self._pacer.steady_bps
         with self._lock:
-            if changed:
-                self._split.set_total(config.budget_bps)
+            if changed or self._pacer is not None:
+                self._split.set_total(total_bps)
             share = self._split.propose()
             share = self._split.share if share is None and changed else share
         return self._base_bps if share is None else round(config.budget_bps * share)

@@ -25,6 +25,8 @@ class TrackReportSettings:
 
     most_per_s: float = 3.0
     """Steps a second of capture time at most."""
+    most_bps: int = 8_000
+    """Payload bits a second at most: in a crowd steps come less often."""
     fresh_frames: int = 5
     """A track whose last detection is older than so many ticks is left out."""
     refresh_ns: int = _SECOND_NS
@@ -49,6 +51,7 @@ class TrackReporter:
         self._settings = settings
         self._encoder = TrackStepEncoder(session_id=session_id, refresh_ns=settings.refresh_ns)
         self._last_ns: int | None = None
+        self._last_bytes = 0
         self.steps = 0
         """Sent so far."""
         self.boxes = 0
@@ -64,6 +67,7 @@ class TrackReporter:
         self._last_ns = capture_ns
         tracks = _fresh(seen.tracks, most_frames=self._settings.fresh_frames)
         step = self._encoder.encode(tracks, capture_ns=capture_ns)
+        self._last_bytes = len(step.pack())
         self._sender.tracks(
             lambda at_ns: replace(step, send_delay_ns=at_ns - capture_ns).pack(), now_ns=now_ns
         )
@@ -74,7 +78,8 @@ class TrackReporter:
     def _due(self, capture_ns: int) -> bool:
         if self._last_ns is None:
             return True
-        return capture_ns - self._last_ns >= _SECOND_NS / self._settings.most_per_s * _EARLY
+        pause_s = max(1 / self._settings.most_per_s, 8 * self._last_bytes / self._settings.most_bps)
+        return capture_ns - self._last_ns >= _SECOND_NS * pause_s * _EARLY
 
 
 def _fresh(tracks: Tracks, *, most_frames: int) -> Tracks:

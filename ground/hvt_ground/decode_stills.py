@@ -64,6 +64,10 @@ def _coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
         raise StillError(f"crop {header.crop_source_px} is not of this source")
     if not (0 < width <= x2 - x1 and 0 < height <= y2 - y1):
         raise StillError(f"size {width}x{height} is larger than what it shows")
+    if abs(width * (y2 - y1) - height * (x2 - x1)) > max(x2 - x1, y2 - y1):
+        # Both sides are shrunk by one factor, each rounded to a pixel. A needle of a picture would cost the base
+        # crop the area of the whole frame for each of its pixels.
+        raise StillError(f"size {width}x{height} is not the shape of what it shows")
     if max(width, height) > MAX_SIDE_PX:
         raise StillError(
             f"size {width}x{height} is larger than any still, whose sides are up to {MAX_SIDE_PX}"

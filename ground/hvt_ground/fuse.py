@@ -334,6 +334,7 @@ class Fusion:
         kept.born, kept.last_frame = min(kept.born, gone.born), max(kept.last_frame, gone.last_frame)
         kept.still_frame = max(kept.still_frame, gone.still_frame)
         kept.own_id, kept.own_vote, kept.correction = ours.own_id, ours.own_vote, ours.correction
+        kept.own_then = ours.own_then
         kept.edge_id, kept.far_vote, kept.afar = theirs.edge_id, theirs.far_vote, theirs.afar
         kept.missed, kept.apart = theirs.missed, 0
         if kept.own_id is not None:

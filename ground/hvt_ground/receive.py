@@ -227,6 +227,9 @@ class EdgeReceiver:
         if answer is None:
             return None
         info, asked_ns, heard_ns = answer
+        if info.edge != self.port.edge:  # it names files and keys: another's name is nobody's
+            self._skip("info", WireError(f"the edge says that it is {info.edge!r:.40}"))
+            return None
         self.clock_offset.add(t0_ns=asked_ns, t1_ns=info.received_ns, t2_ns=info.answered_ns, t3_ns=heard_ns)
         if info.software != __version__:
             _log.info("%s runs version %s, this is %s", self.port.edge, info.software, __version__)

@@ -26,10 +26,19 @@ from hvt_ground.still_stage import Carried, Moment, StillStage
 __all__ = ["GroundSight", "Picture", "ReceivedStill", "SightParts"]
 
 _SECOND_NS = 1_000_000_000
-_FARTHEST_S = 60
+_FARTHEST_S = 5
 """A step further ahead of all that is known is not believed: nothing that comes after it could be shown."""
 _GAP_S = 1.0
 """For how long the base stream may leave out ticks and still tell where tracks were between."""
+
+
+_HISTORY_FRAMES = 45
+_MOST_HISTORY_BYTES = 256 * 2**20
+
+
+def _history_bytes(base_size: tuple[int, int]) -> int:
+    """For pictures that residual stills may build on: three seconds at 15 fps, as far as memory allows."""
+    return min(_MOST_HISTORY_BYTES, _HISTORY_FRAMES * 3 * base_size[0] * base_size[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +95,7 @@ class GroundSight:
         self._tick_ns = _SECOND_NS / fps
         self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
-        self._history = History()
+        self._history = History(max_bytes=_history_bytes(view.base_size))
         self._stills = StillStage(
             parts.reader,
             parts.refiner,

@@ -40,8 +40,8 @@ def still_picture(refinement: Refinement) -> Coded | None:
     The viewer shows neither WebP nor AVIF nor what only the ground can decode, and one media type for all pictures
     need not be written with each.
     """
-    pixels = refinement.still_bgr
-    if pixels is None or refinement.media_type == "image/jpeg":
+    pixels = refinement.still_bgr  # what the codec made of it: the bytes themselves are a stranger's
+    if pixels is None:
         pixels = _decoded(refinement.still)
     if pixels is None or pixels.size == 0:
         return None

@@ -11,7 +11,7 @@ import numpy as np
 from hvt_common.link.wire import RoiHeader, StillResult, fitted_text
 from hvt_common.values import Image, Posterior, View
 from hvt_common.vision.base_crop import base_crop
-from hvt_common.vision.still_codecs import BaseMissingError, StillError, psnr_y_db
+from hvt_common.vision.still_codecs import BaseMissingError, StillError, psnr_y_db, still_codec
 from hvt_ground.classify_stills import Box, Decoded, Reading, StillReader
 from hvt_ground.decode_stills import ReceivedStill, decode_still, needs_base
 from hvt_ground.events import Event, Notice, Refinement
@@ -243,7 +243,7 @@ class StillStage:
             edge_track_id=carried.track_id,
             box_base_px=carried.box_base_px,
             still=carried.received.data,
-            media_type=carried.received.media_type,
+            media_type=still_codec(header.codec).media_type,  # not what Zenoh said: that is nobody's word
             base_crop_bgr=carried.base_crop_bgr,
             class_before=before,
             class_after=after,

@@ -67,7 +67,7 @@ class ClockOffset:
         return remote_ns - (self.offset_ns or 0)
 
     def _best(self) -> _Sample | None:
-        return min(self._samples, key=lambda sample: sample.round_trip_ns, default=None)
+        return min(tuple(self._samples), key=lambda sample: sample.round_trip_ns, default=None)
 
 
 def _agree(one: _Sample, other: _Sample) -> bool:

@@ -204,7 +204,12 @@ class RemoteEdge:
             if item is not None and header is not None and _is_answer(header, answer):
                 return header, item
             if now_s >= ask_s:
-                self.command(Command.STILL_FATE, {"ask": answer.still_ask})
+                try:
+                    self.command(Command.STILL_FATE, {"ask": answer.still_ask})
+                except RefusedError:
+                    raise
+                except UserError:
+                    pass  # a late answer: the still itself may come all the same
                 ask_s = now_s + _FATE_S
         raise UserError(
             f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: "

@@ -46,8 +46,12 @@ def run(argv: Sequence[str]) -> int:
     if arguments.command == "list":
         _list(before, authority)
         return 0
-    after = _changed(before, arguments)
     name: str = arguments.name
+    if arguments.command == "renew":
+        authority.issue(name, hosts=arguments.host or _hosts_of(before, name))
+        say(f"{name}: copy {name}.pem and {name}.key from {folder} to the machine")
+        return 0
+    after = _changed(before, arguments)
     if arguments.command == "remove":
         authority.forget(name)
         (folder / f"{name}.json5").unlink(missing_ok=True)
@@ -66,12 +70,31 @@ def _changed(roster: Roster, arguments: argparse.Namespace) -> Roster:
     name: str = arguments.name
     if arguments.command == "add-edge":
         return roster.with_edge(name)
+    if arguments.command != "remove":
+        _refuse_known(roster, name, kind=arguments.command.removeprefix("add-"))
     if arguments.command == "add-router":
         return roster.with_router(Router(name, tuple(arguments.host)))
     if arguments.command == "add-ground":
         command = not arguments.watch_only
         return roster.with_ground(Ground(name, tuple(arguments.host), command=command, edges=arguments.edges))
     return roster.without(name)
+
+
+def _refuse_known(roster: Roster, name: str, *, kind: str) -> None:
+    """A key that is only to be renewed must not come with other rights, or without its host names."""
+    if roster.names.get(name) == kind:
+        raise UserError(
+            f"{name!r} is in this fleet already: hvt-ground keys renew {name} makes a new key with the same rights; "
+            "for other rights remove it first"
+        )
+
+
+def _hosts_of(roster: Roster, name: str) -> tuple[str, ...]:
+    """Where others connect to a machine of the roster."""
+    if name not in roster.names:
+        raise UserError(f"{name!r} is not in this fleet: hvt-ground keys list shows who is")
+    machines: list[Ground | Router] = [*roster.grounds, *roster.routers]
+    return next((one.hosts for one in machines if one.name == name), ())
 
 
 def _write_files(roster: Roster, folder: Path, *, keys_folder: str) -> list[str]:
@@ -110,16 +133,19 @@ def _parser() -> argparse.ArgumentParser:
     add_edge = commands.add_parser("add-edge", help="a key for an edge; NAME is its --edge-id")
     add_ground = commands.add_parser("add-ground", help="a key for a ground")
     add_router = commands.add_parser("add-router", help="a key for a router between them")
+    renew = commands.add_parser(
+        "renew", help="a new key for a machine of the fleet, with the rights that it has"
+    )
     remove = commands.add_parser("remove", help="take all rights from a machine, such as one that is lost")
     listing = commands.add_parser("list", help="who belongs to the fleet, and until when")
-    for one in (new_ca, add_edge, add_ground, add_router, remove, listing):
+    for one in (new_ca, add_edge, add_ground, add_router, renew, remove, listing):
         one.add_argument("--dir", type=Path, default=_DIR, help=f"folder of the fleet's keys [{_DIR}]")
-    for one in (add_edge, add_ground, add_router, remove):
+    for one in (add_edge, add_ground, add_router, renew, remove):
         one.add_argument("name", metavar="NAME")
         one.add_argument(
             "--keys-folder", default=KEYS_FOLDER, help=f"where the keys lie on the machines [{KEYS_FOLDER}]"
         )
-    for one in (add_edge, add_ground, add_router):
+    for one in (add_edge, add_ground, add_router, renew):
         one.add_argument(
             "--host",
             action="append",

@@ -63,7 +63,8 @@ def ground_file(ground: Ground, roster: Roster, *, folder: str = KEYS_FOLDER) ->
         shared = [edge for edge in edges if other.may_watch(edge)]
         if shared:
             command = ground.command and other.command
-            grants[other.name] = [*through, *_toward_ground(shared, command=command, label=other.name)]
+            theirs = [rule for edge in shared for rule in _toward_edge(edge, command=ground.command)]
+            grants[other.name] = [*theirs, *_toward_ground(shared, command=command, label=other.name)]
     head = f"hvt-ground --listen tls/0.0.0.0:7447 --zenoh-config {ground.name}.json5"
     return _text(head, {}, name=ground.name, grants=grants, folder=folder)
 

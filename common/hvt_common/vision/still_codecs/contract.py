@@ -17,7 +17,7 @@ from hvt_common.values import Image
 __all__ = ["NO_PARAMETERS", "BaseMissingError", "CodedCrop", "Parameters", "StillCodec", "StillError"]
 
 Parameters = Mapping[str, int | float | str]
-"""At most 6 of them, keys of at most 16 bytes: they cross the link in the still's header, and cost bytes there."""
+"""At most 5 of them, keys of at most 16 bytes: they cross the link in the still's header, and cost bytes there."""
 
 NO_PARAMETERS: Parameters = MappingProxyType({})
 """Nothing beside the bytes."""
