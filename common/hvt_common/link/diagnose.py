@@ -76,6 +76,8 @@ class LinkWatch:
         self._first_seen_s: dict[str, float] = {}
         self._named: set[str] = set()
         self._stop = threading.Event()
+        self._using = threading.Lock()
+        """Held while the session is asked: it must not be closed under our hands."""
         self._thread = threading.Thread(target=self._run, name="hvt-link-watch", daemon=True)
 
     @property
@@ -97,7 +99,9 @@ class LinkWatch:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stop.set()
-        # A visit in progress ends by itself, within seconds: nobody waits for it.
+        with self._using:
+            pass
+        # A visit in progress asks nothing of the session and ends by itself, within seconds: nobody waits for it.
         self._thread.join(0.1)
 
     # The thread
@@ -106,18 +110,26 @@ class LinkWatch:
         linked_s = time.monotonic()
         next_visit_s, pause_s = linked_s + _PATIENCE_S, _FIRST_PAUSE_S
         while not self._stop.wait(_LOOK_S):
-            try:
-                names = self._linked()
-            except zenoh.ZError:  # closed under our hands
-                return
             now_s = time.monotonic()
-            if names is not None:
+            if self._look(now_s):
                 self._trouble = ""
                 next_visit_s, pause_s = now_s + _PATIENCE_S, _FIRST_PAUSE_S
-                self._look_at(names, now_s)
             elif now_s >= next_visit_s:
                 self._explain()
                 next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
+
+    def _look(self, now_s: float) -> bool:
+        """Whether there is a link; what is wrong with those at its other end is said."""
+        with self._using:
+            if self._stop.is_set():
+                return True
+            try:
+                names = self._linked()
+                if names is not None:
+                    self._look_at(names, now_s)
+            except zenoh.ZError:  # somebody else closed it
+                return True
+            return names is not None
 
     def _linked(self) -> dict[str, bool] | None:
         """Who is at the other end of the links, each with whether it is a router; None without any link."""
