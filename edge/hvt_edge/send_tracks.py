@@ -25,7 +25,7 @@ class TrackReportSettings:
 
     most_per_s: float = 3.0
     """Steps a second of capture time at most."""
-    most_bps: int = 8_000
+    most_bps: int = 12_000
     """Payload bits a second at most: in a crowd steps come less often."""
     fresh_frames: int = 5
     """A track whose last detection is older than so many ticks is left out."""
