@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,12 @@ def command(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=40, check=False)
 
 
+def patiently(edge):
+    """Its tracks, asked for ten times a second: more than 32 questions a second are refused."""
+    time.sleep(0.1)
+    return edge.tracks()
+
+
 @pytest.fixture(scope="module")
 def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """An edge in real time, a ground that records, and somebody who asks through the ground."""
@@ -69,7 +76,7 @@ def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
         eventually(lambda: "stills" in ground.said, within_s=40, what="the ground sees stills")
         with EdgeClient.connect(link.ground_endpoint) as edges:
             one = edges["uav-1"]
-            eventually(one.tracks, within_s=20, what="the edge tracks something")
+            eventually(lambda: patiently(one), within_s=20, what="the edge tracks something")
             names = edges.names()
             box = one.still(box=PLACE, quality_pct=90)
             past = one.still(box=PLACE, at_s=-2, quality_pct=90)
