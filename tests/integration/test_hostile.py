@@ -167,6 +167,7 @@ def attack(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Attack:
             ears = Tap(to_edge, "hvt/uav-1/**")
             reports = Tap(to_ground, "hvt/uav-1/feedback")
             eventually(lambda: messages_of(ears.messages, "roi"), within_s=40, what="stills come")
+            eventually(lambda: messages_of(ears.messages, "base"), within_s=10, what="pictures come")
             bad_to_ground, replayed = attack_ground(to_ground, ears, rng)
             bad_to_edge = attack_edge(to_edge, reports, rng)
             refusals = [
