@@ -5,12 +5,11 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, cast
 
-from hvt_common.errors import UserError
 from hvt_common.link.diagnose import LinkWatch
 from hvt_common.link.keys import EdgeKeys
 from hvt_common.link.ledger import Ledger
@@ -18,10 +17,8 @@ from hvt_common.link.session import open_session
 from hvt_common.link.wire import Feedback, Status
 from hvt_common.link.zenoh_config import LinkSettings
 from hvt_common.report import StatusLine, check_writable
-from hvt_common.units import bitrate_text
 from hvt_common.values import Fit
 from hvt_common.vision.detect import Detector
-from hvt_edge.adapt import RateController, RateSettings
 from hvt_edge.base_stage import BaseStage
 from hvt_edge.build import (
     SECOND_NS,
@@ -34,6 +31,7 @@ from hvt_edge.build import (
     make_encoder,
     make_keyframes,
     make_on_demand,
+    make_pacer,
     make_regions,
     make_sight,
     make_split,
@@ -46,16 +44,15 @@ from hvt_edge.counts import FrameCounts
 from hvt_edge.feedback import FeedbackInbox
 from hvt_edge.pace_lockstep import LockstepPace
 from hvt_edge.pace_realtime import RealtimePace
-from hvt_edge.pacer import Pacer
 from hvt_edge.publish import EdgeLink
 from hvt_edge.record_base import BaseRecorder
 from hvt_edge.renew import HeldCadence, Renewal
-from hvt_edge.reports import make_info, make_status
-from hvt_edge.scene.truth import write_truth
+from hvt_edge.reports import make_info, make_status, status_text
 from hvt_edge.send import Sender
 from hvt_edge.send_tracks import TrackReporter
 from hvt_edge.source import Source, open_source
-from hvt_edge.sources.demo import DemoSource
+from hvt_edge.sources.closing import closing_on
+from hvt_edge.sources.demo import check_truth, write_truth_of
 from hvt_edge.still_stage import StillStage
 from hvt_edge.summary import EdgeRun, summary
 
@@ -65,21 +62,6 @@ _GOODBYE_S = 1.5
 _MILLION = 1_000_000
 _MOST_WAIT_NS = SECOND_NS // 10
 """A frame that would wait longer for the budget's window is dropped before it is encoded."""
-
-
-@contextmanager
-def _closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
-    """Close a live source as soon as ``stop`` is set: one whose signal is lost would keep its reader waiting."""
-
-    def wait() -> None:
-        stop.wait()
-        source.close()
-
-    threading.Thread(target=wait, name="hvt-stop", daemon=True).start()
-    try:
-        yield
-    finally:
-        stop.set()
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +91,7 @@ class Edge:
         self._ledger = Ledger(window_ns=round(config.window * SECOND_NS))
         self._keyframes = make_keyframes(config)
         self._inbox = FeedbackInbox()
-        self._pacer = self._make_pacer()
+        self._pacer = make_pacer(config)
         self._commands = Commands(
             config,
             session_id=self._session_id,
@@ -138,7 +120,7 @@ class Edge:
         detector = make_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(self._open_source())
-            self._check_truth(source)
+            check_truth(config.truth, source)
             check_rate(config, source.view.base_size)
             warm_up_for(config, detector, source.view)
             line = stack.enter_context(StatusLine(quiet=config.quiet))
@@ -161,7 +143,7 @@ class Edge:
         budget = make_budget(config, every_n=every_n)
         link = self._open_link(stack, source, detector.class_names)
         # Files come after all that may be refused: a failed start leaves nothing behind.
-        self._write_truth(source)
+        write_truth_of(source, config.truth, fps=config.tick_fps)
         recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
         sender = Sender(
             link,
@@ -228,16 +210,6 @@ class Edge:
             source_fps=config.source_fps,
         )
 
-    def _check_truth(self, source: Source) -> None:
-        if self._config.truth is not None and not isinstance(source, DemoSource):
-            raise UserError(
-                f"--truth {self._config.truth} is for --source demo: no other source knows its truth"
-            )
-
-    def _write_truth(self, source: Source) -> None:
-        if self._config.truth is not None and isinstance(source, DemoSource):
-            write_truth(source.scene, self._config.truth, fps=self._config.tick_fps, view=source.view)
-
     def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> EdgeLink:
         config = self._config
         settings = LinkSettings(
@@ -279,7 +251,7 @@ class Edge:
         next_status_ns = 0
         with ExitStack() as stack:
             if source.live:
-                stack.enter_context(_closing_on(self._stop, source))
+                stack.enter_context(closing_on(self._stop, source))
             pace = self._make_pace(flow, source)
             stack.enter_context(pace)
             for frame in source.frames(start_ns=self._started_ns):
@@ -321,17 +293,14 @@ class Edge:
 
     # The link's rate
 
-    def _make_pacer(self) -> Pacer | None:
-        config = self._config
-        if not config.adapts:
-            return None
-        return Pacer(RateController(RateSettings(ceiling_bps=config.budget_bps, floor_bps=config.floor_bps)))
-
     def _follow(self, flow: _Flow, now_ns: int) -> None:
         """Before each frame: what the link carries decides on budget, base rate and keyframe."""
         if self._pacer is None:
             return
-        back = self._pacer.link(flow.link.heard(), now_ns=now_ns)
+        linked = flow.link.heard()
+        back = self._pacer.link(linked, now_ns=now_ns)
+        if not linked:  # nothing is carried anywhere: what is recorded here keeps its quality
+            return
         if flow.renewal.follow(now_ns) or back:
             self._keyframes.renew(now_ns)
 
@@ -369,17 +338,22 @@ class Edge:
 
     def _report(self, flow: _Flow, line: StatusLine) -> None:
         self._send_status("running", flow)
-        config = self._commands.config
-        media_s = self._counts.duration_s(config.tick_fps)
-        rate_bps = self._ledger.window_bytes(None, self._now_ns) * 8 * SECOND_NS / self._ledger.window_ns
-        sent = sum(self._ledger.fates("sent").values())
-        allowed_bps = config.budget_bps if self._pacer is None else self._pacer.rate_bps
-        unlinked = self._watch is not None and self._watch.trouble  # which the log has said
-        heard = "a ground listens" if flow.link.heard() else "no link" if unlinked else "no ground listens"
+        pacer, watch = self._pacer, self._watch
+        unlinked = watch is not None and watch.trouble  # which the log has said
         line.show(
-            f"{self._config.edge_id} {media_s:6.1f} s  {bitrate_text(rate_bps)} of "
-            f"{bitrate_text(allowed_bps)}  {config.method}  stills {sent}, {flow.stills.waiting} "
-            f"waiting  tracks {flow.stills.tracks}  {heard}"
+            status_text(
+                self._commands.config,
+                counts=self._counts,
+                ledger=self._ledger,
+                stills=flow.stills,
+                now_ns=self._now_ns,
+                allowed_bps=self._commands.config.budget_bps if pacer is None else pacer.rate_bps,
+                link="a ground listens"
+                if flow.link.heard()
+                else "no link"
+                if unlinked
+                else "no ground listens",
+            )
         )
 
     def _send_status(self, state: str, flow: _Flow) -> None:

@@ -12,6 +12,7 @@ from hvt_common.vision.detect import Detector, open_detector, warm_up
 from hvt_common.vision.still_codecs import still_codec
 from hvt_common.vision.tiles import tiled, warm_up_source
 from hvt_common.vision.track import ByteTracker, TrackerSettings, weak_confidence
+from hvt_edge.adapt import RateController, RateSettings
 from hvt_edge.base_model import choose_base, most_every_n
 from hvt_edge.budget import BudgetSettings, RollingBudget
 from hvt_edge.cadence import Cadence, MeasuredCadence
@@ -24,6 +25,7 @@ from hvt_edge.keyframes import KeyframePlan, KeyframeSettings, keyframe_interval
 from hvt_edge.methods.base import Step
 from hvt_edge.methods.registry import method, tuning
 from hvt_edge.on_demand import OnDemand
+from hvt_edge.pacer import Pacer
 from hvt_edge.pulses import PulsePlan, RegionPlan, RollingPlan, TrackRegions, combined
 from hvt_edge.rate import encoder_settings, least_base_bps, payload_bps
 from hvt_edge.resample import BaseSize
@@ -44,6 +46,7 @@ __all__ = [
     "make_encoder",
     "make_keyframes",
     "make_on_demand",
+    "make_pacer",
     "make_regions",
     "make_sight",
     "make_split",
@@ -263,3 +266,10 @@ def make_keyframes(config: EdgeConfig) -> KeyframePlan:
     if isinstance(interval_s, str):
         interval_s = keyframe_interval_s(config.fixed_size or DEFAULT_SIZE, config.base_bps)
     return KeyframePlan(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
+
+
+def make_pacer(config: EdgeConfig) -> Pacer | None:
+    """What follows the link's rate; None where the budget is to stay as it is."""
+    if not config.adapts:
+        return None
+    return Pacer(RateController(RateSettings(ceiling_bps=config.budget_bps, floor_bps=config.floor_bps)))

@@ -290,7 +290,9 @@ class Pacer:
     def _follow(self, feedback: Feedback, now_ns: int) -> bool:
         """Whether this report is the newest of the receiver that counts."""
         if feedback.receiver_id != self._receiver_id:
-            if self._receiver_id is not None and now_ns - self._heard_ns < _OTHER_RECEIVER_NS:
+            # One that reports and never names anything new must not keep the edge from all the others.
+            quiet_ns = max(now_ns - self._heard_ns, now_ns - self._progress_ns)
+            if self._receiver_id is not None and quiet_ns < _OTHER_RECEIVER_NS:
                 return False
             self._leave()
             self._receiver_id = feedback.receiver_id

@@ -1,4 +1,4 @@
-"""What the edge says of itself on the link: `Info` when asked, `Status` once a second."""
+"""What the edge says of itself: `Info` when asked, `Status` once a second, and a line for whoever looks at it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 from hvt_common import __version__
 from hvt_common.link.ledger import Ledger
 from hvt_common.link.wire import Health, Info, Status, fitted_class_names
+from hvt_common.units import bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.counts import FrameCounts
@@ -14,7 +15,9 @@ from hvt_edge.keyframes import KeyframePlan
 from hvt_edge.send import Sender
 from hvt_edge.still_stage import StillStage
 
-__all__ = ["make_info", "make_status"]
+__all__ = ["make_info", "make_status", "status_text"]
+
+_SECOND_NS = 1_000_000_000
 
 
 def make_info(
@@ -103,4 +106,24 @@ def make_status(
             detect_ms=stills.sight_ms if measured else 0.0,
             feedback_age_ms=feedback_age_ms if measured else -1,
         ),
+    )
+
+
+def status_text(
+    config: EdgeConfig,
+    *,
+    counts: FrameCounts,
+    ledger: Ledger,
+    stills: StillStage,
+    now_ns: int,
+    allowed_bps: float,
+    link: str,
+) -> str:
+    """The status line; ``allowed_bps`` is what the budget or the link allows now."""
+    rate_bps = ledger.window_bytes(None, now_ns) * 8 * _SECOND_NS / ledger.window_ns
+    sent = sum(ledger.fates("sent").values())
+    return (
+        f"{config.edge_id} {counts.duration_s(config.tick_fps):6.1f} s  {bitrate_text(rate_bps)} of "
+        f"{bitrate_text(allowed_bps)}  {config.method}  stills {sent}, {stills.waiting} waiting  "
+        f"tracks {stills.tracks}  {link}"
     )

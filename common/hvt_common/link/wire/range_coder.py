@@ -8,6 +8,7 @@ decoder takes no notice of it and returns the one it reads. So a syntax is writt
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Final, Protocol
 
 from hvt_common.link.wire.fields import WireError
@@ -73,16 +74,16 @@ class Coder(Protocol):
         ...
 
 
-class _Syntax:
+class _Syntax(ABC):
     """Numbers as decisions; the same for both sides."""
 
     __slots__ = ()
 
-    def bit(self, context: Context, bit: int) -> int:
-        raise NotImplementedError
+    @abstractmethod
+    def bit(self, context: Context, bit: int) -> int: ...
 
-    def plain(self, value: int, bits: int) -> int:
-        raise NotImplementedError
+    @abstractmethod
+    def plain(self, value: int, bits: int) -> int: ...
 
     def unsigned(self, numbers: Numbers, value: int) -> int:
         """Elias gamma of ``value + 1``: its length in unary and its highest bits as decisions, the rest plain."""
