@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test check lint type format bench bench-stills bench-sight bench-peers link clean help
+.PHONY: setup demo test check lint type format bench bench-stills bench-sight bench-peers link soak kills fuzz clean help
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -25,8 +25,12 @@ endif
 demo: setup      ## edge and ground as two processes on the drawn scene: demo.rrd and a summary
 	@$(BIN)/python deploy/demo.py
 
+# A busy machine can stop a process for a second, and a flight in real time with it: what failed there flies once more,
+# alone. Nothing else has a second chance, and no run that ended otherwise than with failed tests (1) has one.
 test: setup      ## all tests, on real x265, Zenoh, ONNX models and recordings
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest -m 'not integration'
+	@$(BIN)/python -m pytest -m integration || { code=$$?; test $$code = 1 || exit $$code; \
+		echo 'The flights that failed fly once more:'; $(BIN)/python -m pytest -m integration --last-failed; }
 
 lint: setup
 	@$(BIN)/ruff check
@@ -54,6 +58,15 @@ bench-sight: setup ## what the ground sees at each bitrate, method by method, on
 link: setup      ## edge and ground over bad links; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns SEED=
 	@PYTHONPATH=tests $(BIN)/python -m link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
 		$(if $(LASTS),--lasts $(LASTS)) $(if $(CARRIER),--carrier $(CARRIER)) $(if $(SEED),--seed $(SEED))
+
+soak: setup      ## an hour of fading link: memory, descriptors, threads, account; LASTS=60min CLIP=
+	@PYTHONPATH=tests $(BIN)/python -m link drone-fade --name soak --lasts $(or $(LASTS),60min) $(if $(CLIP),--clip $(CLIP))
+
+kills: setup     ## kill -9 of edge or ground in the air: what is left is readable; COUNT=50 SEED=
+	@PYTHONPATH=tests $(BIN)/python -m link.kills $(if $(COUNT),--count $(COUNT)) $(if $(SEED),--seed $(SEED))
+
+fuzz: setup      ## coverage-guided fuzzing of all that comes from outside: RUNS=1000000 TARGET=NAME; needs atheris
+	@PYTHONPATH=tests $(BIN)/python -m fuzz $(if $(RUNS),--runs $(RUNS)) $(if $(TARGET),--target $(TARGET))
 
 bench-peers: setup ## the tracker beside roboflow trackers, which get an environment of their own (they are large)
 	@test -x build/peers/bin/python || $(PYTHON) -m venv build/peers

@@ -211,7 +211,9 @@ class Flight:
         step = self._steps.encode(tracks, capture_ns=self.units[index].capture_ns, send_delay_ns=25_000_000)
         return _received("tracks", replace(step, **changes).pack(), b"", MSGPACK_ENCODING)
 
-    def status(self, *, base: int, roi: int = 0, state: str = "running", meta: int = 0) -> Received:
+    def status(
+        self, *, base: int, roi: int = 0, past: int = 0, state: str = "running", meta: int = 0
+    ) -> Received:
         """The edge's report after so many messages."""
         self._statuses += 1
         report = Status(
@@ -224,10 +226,12 @@ class Flight:
             last_still_sequence=roi - 1,
             base_bytes=0,
             roi_bytes=0,
+            past_bytes=0,
             meta_bytes=0,
             overhead_bytes=0,
             base_messages=base,
             roi_messages=roi,
+            past_messages=past,
             meta_messages=meta,
             worst_window_bps=(0, 0, 0),
             sent={},
@@ -267,11 +271,13 @@ class Port:
         self.keyframe_requests = 0
         self.reports: list[Feedback] = []
 
-    def ask_info(self) -> tuple[Info, int, int] | None:
-        """The flight's facts."""
+    def ask_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
+        """The flight's facts, where it is the one that is asked for."""
         self.asked += 1
         now = time.time_ns()
-        return None if self.flight is None else (self.flight.info(), now, time.time_ns())
+        if self.flight is None or session_id not in (None, self.flight.session_id):
+            return None
+        return self.flight.info(), now, time.time_ns()
 
     def request_keyframe(self) -> None:
         """Counts."""

@@ -1,5 +1,11 @@
 """What both ends of an HVT link agree on: values, link (Zenoh, bytes) and vision (pixels)."""
 
+import os
+
 __all__ = ["__version__"]
 
 __version__ = "0.1.0"
+
+# Onnxruntime's wheels for Linux and macOS (from 1.29 on) report to their maker: an upload over the very link that HVT
+# counts the bits of, an identifier and a growing file in the home folder. It is decided when onnxruntime is imported.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -71,9 +71,11 @@ def _plain(text: str, *, name: str) -> str:
 
 def _path(text: str, *, name: str) -> Path:
     try:
-        return Path(_plain(text, name=name)).expanduser()
+        path = Path(_plain(text, name=name)).expanduser()
     except RuntimeError:
         raise UserError(f"{name} {text!r} begins with a user that this machine does not know") from None
+    _plain(str(path), name=name)  # a blank with a slash behind it is a blank
+    return path
 
 
 def _decimal(number: float) -> str:

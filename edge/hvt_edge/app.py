@@ -4,32 +4,35 @@ from __future__ import annotations
 
 import secrets
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, cast
 
+from hvt_common.clock import SteadyClock
 from hvt_common.link.diagnose import LinkWatch
 from hvt_common.link.keys import EdgeKeys
-from hvt_common.link.ledger import Ledger
+from hvt_common.link.ledger import Channel, Ledger
+from hvt_common.link.same_id import refuse_same_id
 from hvt_common.link.session import open_session
 from hvt_common.link.wire import Feedback, Status
-from hvt_common.link.zenoh_config import LinkSettings
-from hvt_common.report import StatusLine, check_writable
+from hvt_common.report import StatusLine
 from hvt_common.values import Fit
 from hvt_common.vision.detect import Detector
 from hvt_edge.base_stage import BaseStage
 from hvt_edge.build import (
     SECOND_NS,
     base_size,
+    check_files,
     first_every_n,
     make_budget,
     make_cadence,
     make_chooser,
     make_detector,
     make_encoder,
+    make_keep,
     make_keyframes,
+    make_link_settings,
     make_on_demand,
     make_pacer,
     make_regions,
@@ -37,11 +40,11 @@ from hvt_edge.build import (
     make_split,
     warm_up_for,
 )
-from hvt_edge.clock import SteadyClock
 from hvt_edge.commands import Commands, Served
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.counts import FrameCounts
 from hvt_edge.feedback import FeedbackInbox
+from hvt_edge.follow import LinkFollower, wait_for_ground
 from hvt_edge.pace_lockstep import LockstepPace
 from hvt_edge.pace_realtime import RealtimePace
 from hvt_edge.publish import EdgeLink
@@ -55,13 +58,12 @@ from hvt_edge.sources.closing import closing_on
 from hvt_edge.sources.demo import check_truth, write_truth_of
 from hvt_edge.still_stage import StillStage
 from hvt_edge.summary import EdgeRun, summary
+from hvt_edge.unacked import Unacknowledged
 
 __all__ = ["Edge"]
 
 _GOODBYE_S = 1.5
 _MILLION = 1_000_000
-_MOST_WAIT_NS = SECOND_NS // 10
-"""A frame that would wait longer for the budget's window is dropped before it is encoded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +93,8 @@ class Edge:
         self._ledger = Ledger(window_ns=round(config.window * SECOND_NS))
         self._keyframes = make_keyframes(config)
         self._inbox = FeedbackInbox()
-        self._pacer = make_pacer(config)
+        unacked = None if self._lockstep else Unacknowledged()
+        self._following = LinkFollower(make_pacer(config), unacked, keyframes=self._keyframes)
         self._commands = Commands(
             config,
             session_id=self._session_id,
@@ -111,12 +114,7 @@ class Edge:
             UserError: before anything is sent, where a setting, a file or a port cannot be used.
         """
         config = self._config
-        for path, name in (
-            (config.summary, "--summary"),
-            (config.truth, "--truth"),
-            (config.record_base, "--record-base"),
-        ):
-            check_writable(path, name=name)
+        check_files(config)
         detector = make_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(self._open_source())
@@ -126,7 +124,8 @@ class Edge:
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             flow = self._make_flow(stack, source, detector)
             self._on_started()
-            self._wait_for_ground(flow.link, source, line)
+            if not source.live:
+                wait_for_ground(flow.link.heard, config, stop=self._stop, note=line.note)
             self._started_ns = self._clock()
             try:
                 self._play(source, flow, line)
@@ -137,7 +136,7 @@ class Edge:
 
     def _make_flow(self, stack: ExitStack, source: Source, detector: Detector) -> _Flow:
         """Everything between the source and the link."""
-        config, view = self._config, source.view
+        config, view, following = self._config, source.view, self._following
         every_n = first_every_n(config, view.base_size)
         encoder = make_encoder(config, size=view.base_size, every_n=every_n, base_bps=config.base_bps)
         budget = make_budget(config, every_n=every_n)
@@ -153,7 +152,8 @@ class Edge:
             session_id=self._session_id,
             lockstep=self._lockstep,
             wait_until=self._wait_until,
-            pacer=self._pacer,
+            pacer=following.pacer,
+            unacked=following.unacked,
         )
         renewal = Renewal(
             config,
@@ -161,8 +161,20 @@ class Edge:
             every_n=every_n,
             sender=sender,
             split=make_split(config, view.base_size),
-            pacer=self._pacer,
+            pacer=following.pacer,
         )
+        keep = make_keep(
+            config,
+            session_id=self._session_id,
+            live=source.live,
+            link=link,
+            sender=sender,
+            keyframes=self._keyframes,
+            clock=self._clock,
+            info=lambda: self._info(source, detector.class_names, self._clock()),
+        )
+        if keep is not None:
+            stack.enter_context(keep)
         base = BaseStage(
             encoder,
             keyframes=self._keyframes,
@@ -172,7 +184,8 @@ class Edge:
             plan=make_regions(config, view.base_size),
             cadence=HeldCadence(make_cadence(config, every_n), renewal.least_every_n),
             renew=renewal,
-            admits=lambda now_ns: self._admits(sender, now_ns),
+            admits=following.admits,
+            keep=keep,
         )
         on_demand = make_on_demand(
             config, view=view, class_names=detector.class_names, most_bytes=sender.most_still_bytes
@@ -185,16 +198,19 @@ class Edge:
             on_fate=sender.fate,
             observe=renewal.observe,
             asked=on_demand,
+            overdue=following.overdue_stills,
         )
         renewal.on_change = lambda: chooser.set_most_bytes(sender.most_still_bytes())
-        self._commands.serve(Served(on_demand, renewal, chooser, base_size=view.base_size))
+        self._commands.serve(Served(on_demand, renewal, chooser, base_size=view.base_size, keep=keep))
         stills = StillStage(
             make_sight(config, detector=detector, view=view),
             chooser,
             sender=sender,
             keyframes=self._keyframes,
             reporter=TrackReporter(sender, session_id=self._session_id) if config.send_tracks else None,
+            keep=keep,
         )
+        following.attach(linked=link.heard, sender=sender, renewal=renewal, stills=stills, keep=keep)
         return _Flow(base, stills, sender, link, renewal)
 
     def _open_source(self) -> Source:
@@ -208,18 +224,13 @@ class Edge:
             seed=config.seed,
             max_frames=config.max_frames,
             source_fps=config.source_fps,
+            clock=self._clock,
         )
 
     def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> EdgeLink:
         config = self._config
-        settings = LinkSettings(
-            role="edge",
-            listen=config.listen,
-            connect=config.connect,
-            zenoh_config=config.zenoh_config,
-            insecure=config.insecure,
-            name=config.edge_id,
-        )
+        settings = make_link_settings(config)
+        refuse_same_id(settings, EdgeKeys(config.edge_id))
         session = stack.enter_context(open_session(settings))
         link = stack.enter_context(
             EdgeLink(
@@ -228,22 +239,11 @@ class Edge:
                 answer_info=lambda received_ns: self._info(source, class_names, received_ns),
                 answer_control=self._commands.answer,
                 hear=self._hear,
+                clock=self._clock,
             )
         )
         self._watch = stack.enter_context(LinkWatch(session, settings, served=lambda _ground: link.heard()))
         return link
-
-    def _wait_for_ground(self, link: EdgeLink, source: Source, line: StatusLine) -> None:
-        """A recorded source can wait for its audience; a camera cannot."""
-        if source.live or link.heard():
-            return
-        deadline_s = time.monotonic() + self._config.wait
-        line.note(f"{self._config.edge_id}: waiting up to {self._config.wait:g} s for a ground (--wait)")
-        while not link.heard() and not self._stop.is_set():
-            if time.monotonic() >= deadline_s:
-                line.note(f"{self._config.edge_id}: no ground yet; playing on, one may join at any time")
-                return
-            self._stop.wait(0.02)
 
     # The frame loop
 
@@ -265,6 +265,8 @@ class Edge:
                     self._report(flow, line)
                     if flow.renewal.wants_keyframe(self._now_ns):
                         self._keyframes.renew(self._now_ns)
+        if not source.live:
+            self._following.finish(stop=self._stop, note=line.note)
 
     def _make_pace(self, flow: _Flow, source: Source) -> LockstepPace | RealtimePace:
         fps = self._config.tick_fps
@@ -288,27 +290,8 @@ class Edge:
             live=source.live,
             counts=self._counts,
             stop=self._stop,
-            follow=lambda now_ns: self._follow(flow, now_ns),
+            follow=self._following.before_frame,
         )
-
-    # The link's rate
-
-    def _follow(self, flow: _Flow, now_ns: int) -> None:
-        """Before each frame: what the link carries decides on budget, base rate and keyframe."""
-        if self._pacer is None:
-            return
-        linked = flow.link.heard()
-        back = self._pacer.link(linked, now_ns=now_ns)
-        if not linked:  # nothing is carried anywhere: what is recorded here keeps its quality
-            return
-        if flow.renewal.follow(now_ns) or back:
-            self._keyframes.renew(now_ns)
-
-    def _admits(self, sender: Sender, now_ns: int) -> bool:
-        """Whether a frame may be coded now; what is held back would only wait and grow old."""
-        if self._pacer is None:
-            return True
-        return self._pacer.admits_base(now_ns) and sender.base_wait_ns(now_ns) <= _MOST_WAIT_NS
 
     def _wait_until(self, at_ns: int) -> None:
         """Let the budget's window make room; media time needs no waiting."""
@@ -320,9 +303,9 @@ class Edge:
     def _hear(self, feedback: Feedback) -> None:
         if feedback.session_id == self._session_id:
             now_ns = self._clock()
+            self._following.hear(feedback, now_ns=now_ns)
+            # Last: who waits there for the end goes on to keep what is not acknowledged.
             self._inbox.receive(feedback, now_ns=now_ns)
-            if self._pacer is not None:
-                self._pacer.hear(feedback, now_ns=now_ns)
 
     def _info(self, source: Source, class_names: tuple[str, ...], received_ns: int) -> bytes:
         info = make_info(
@@ -333,13 +316,15 @@ class Edge:
             class_names=class_names,
             window_ns=self._ledger.window_ns,
             received_ns=received_ns,
+            answered_ns=self._clock(),
         )
         return info.pack()
 
     def _report(self, flow: _Flow, line: StatusLine) -> None:
         self._send_status("running", flow)
-        pacer, watch = self._pacer, self._watch
+        pacer, watch = self._following.pacer, self._watch
         unlinked = watch is not None and watch.trouble  # which the log has said
+        heard = "a ground listens" if flow.link.heard() else "no link" if unlinked else "no ground listens"
         line.show(
             status_text(
                 self._commands.config,
@@ -348,11 +333,7 @@ class Edge:
                 stills=flow.stills,
                 now_ns=self._now_ns,
                 allowed_bps=self._commands.config.budget_bps if pacer is None else pacer.rate_bps,
-                link="a ground listens"
-                if flow.link.heard()
-                else "no link"
-                if unlinked
-                else "no ground listens",
+                link=f"{heard}  {self._following.text()}".rstrip(),
             )
         )
 
@@ -385,7 +366,7 @@ class Edge:
         self._send_status("ended", flow)
         if flow.link.heard():  # what is still in a queue would be lost with the session
             self._inbox.wait_for_end(
-                base=sender.base_sequence + 1,
+                base=self._ledger.messages(Channel.BASE),
                 roi=sender.still_sequence + 1,
                 frame_index=self._counts.last_index,
                 still_sequence=sender.still_sequence,
@@ -393,12 +374,14 @@ class Edge:
             )
 
     def _facts(self, flow: _Flow) -> EdgeRun:
-        counts, config = self._counts, self._config
+        counts, config, keep = self._counts, self._config, self._following.keep
+        kept = 0 if keep is None else keep.frames
         return EdgeRun(
             edge=config.edge_id,
             session=f"{self._session_id:016x}",
             method=self._commands.config.method,
-            frames=counts.encoded,
+            frames=counts.encoded - kept,
+            frames_kept=kept,
             frames_dropped=counts.dropped,
             duration_s=self._counts.duration_s(self._config.tick_fps),
             budget_bps=self._commands.highest_budget_bps,
@@ -409,4 +392,5 @@ class Edge:
             encode_ms=counts.encode_ms,
             sight_ms=flow.stills.sight_ms,
             unusable_messages=flow.link.unusable,
+            store=None if keep is None else keep.numbers,
         )

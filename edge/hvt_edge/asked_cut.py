@@ -56,7 +56,7 @@ def frame_for(ask: Ask, ring: FrameRing) -> KeptFrame:
         kept = ring.near_time(newest.capture_ns - ago_ms * 1_000_000)
         wanted = f"the frame of {ago_ms / 1000:g} s ago"
     if kept is None:
-        raise RefusedError(f"{wanted} is no longer held: frames go back {ring.reach_s():.1f} s")
+        raise RefusedError(f"{wanted} is not held: frames go back {ring.reach_s():.1f} s")
     return kept
 
 

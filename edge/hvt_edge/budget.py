@@ -125,6 +125,11 @@ class RollingBudget:
         self._tokens = min(self._cap, self._tokens)
 
     @property
+    def total_bps(self) -> int:
+        """B_tot as it is now."""
+        return self._settings.total_bps
+
+    @property
     def base_step_bytes(self) -> float:
         """What one base frame takes on average at B_v, in line bytes."""
         return self._settings.base_bps / 8 / self._settings.fps
@@ -136,13 +141,20 @@ class RollingBudget:
         lent = self._settings.base_bps * window_s / 8 if self._settings.lend else 0.0
         return int(min(self._cap + lent, self._settings.still_bps * window_s / 8))
 
-    def record_base(self, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
-        """Count one base message; ``now_ns`` is when `earliest_ns` lets it go."""
+    def record_base(
+        self, line_bytes: int, *, now_ns: int, keyframe: bool = False, kept: bool = False
+    ) -> None:
+        """Count one base message; ``now_ns`` is when `earliest_ns` lets it go.
+
+        One that is ``kept`` for later uses up the base's share, so that nobody takes it for left over, and nothing of
+        the line.
+        """
         self._base_events.append((now_ns, line_bytes))
         while self._base_events[0][0] <= now_ns - 2 * self._settings.window_ns:
             self._base_events.popleft()
-        self._record(line_bytes, now_ns)
-        self._last_ns = max(self._last_ns, now_ns)
+        if not kept:
+            self._record(line_bytes, now_ns)
+            self._last_ns = max(self._last_ns, now_ns)
         self._last_base_ns = max(self._last_base_ns or now_ns, now_ns)
         self._base_steps.append(round(self.base_step_bytes) if keyframe else line_bytes)
         self._burst = self._recent_bursts()
@@ -151,6 +163,10 @@ class RollingBudget:
         """Count a message that belongs to neither stream, such as ``status``; it waits as the base does."""
         self._record(line_bytes, now_ns)
         self._last_ns = max(self._last_ns, now_ns)
+
+    def record_past(self, line_bytes: int, *, now_ns: int) -> None:
+        """Count a piece of what was kept, that `past_room` admitted at this very time."""
+        self._record(line_bytes, now_ns)
 
     def record_still(self, line_bytes: int, *, now_ns: int) -> None:
         """Count one still; it was admitted by `still_room` at this very time."""
@@ -161,6 +177,14 @@ class RollingBudget:
             self._lent.append((now_ns, lent))
         self._tokens -= line_bytes - lent
         self._record(line_bytes, now_ns)
+
+    def has_room(self, line_bytes: int, *, now_ns: int) -> bool:
+        """Tell whether a message of so many line bytes, sent now, leaves every window within the total.
+
+        What another thread has sent since a still or a piece was admitted may have taken its room.
+        """
+        after_ns = now_ns - self._settings.window_ns
+        return line_bytes + sum(size for at_ns, size in self._events if at_ns > after_ns) <= self._total
 
     def earliest_ns(self, line_bytes: int, *, now_ns: int, base: bool = False) -> int:
         """Return when a message of so many line bytes may go: now, or as soon as its window has room.
@@ -194,6 +218,21 @@ class RollingBudget:
         """Return how many line bytes a still may take now; 0 where it has to wait."""
         self._refill(now_ns)
         return max(0, int(min(self._tokens + self._lendable(now_ns), self._window_room(now_ns))))
+
+    def past_room(self, now_ns: int, *, reserve: float) -> int:
+        """Return how many line bytes of what was kept may go now: what neither base nor stills will want.
+
+        It takes no share of anybody's. ``reserve`` is left free of a window, as a share of what stills have of one.
+        Where no base frame has gone out for a window, none is expected.
+        """
+        settings = self._settings
+        if self._last_base_ns is None or now_ns - self._last_base_ns > settings.window_ns:
+            after_ns = now_ns - settings.window_ns
+            free = self._total - sum(size for at_ns, size in self._events if at_ns > after_ns)
+        else:
+            free = self._window_room(now_ns)
+        kept_free = reserve * settings.still_bps * settings.window_ns / 8 / _SECOND_NS
+        return max(0, int(free - kept_free))
 
     def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a keyframe of this many line bytes, sent now, leaves every window within the total."""

@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal, cast
 
-from hvt_common.values import View
+from hvt_common.link.zenoh_config import LinkSettings
+from hvt_common.report import check_writable
+from hvt_common.values import Still, View
 from hvt_common.vision.detect import Detector, open_detector, warm_up
 from hvt_common.vision.still_codecs import still_codec
 from hvt_common.vision.tiles import tiled, warm_up_source
@@ -29,22 +31,28 @@ from hvt_edge.pacer import Pacer
 from hvt_edge.pulses import PulsePlan, RegionPlan, RollingPlan, TrackRegions, combined
 from hvt_edge.rate import encoder_settings, least_base_bps, payload_bps
 from hvt_edge.resample import BaseSize
+from hvt_edge.send import Sender
 from hvt_edge.sight import Sight, SightSettings
 from hvt_edge.split import Split, SplitSettings
 from hvt_edge.still import StillMaker
 from hvt_edge.still_gate import Gate
+from hvt_edge.store.folder import Folder, check_folder, default_folder
+from hvt_edge.store.keep import Keep, Link
 from hvt_edge.suppress import Suppression
 
 __all__ = [
     "SECOND_NS",
     "base_size",
+    "check_files",
     "first_every_n",
     "make_budget",
     "make_cadence",
     "make_chooser",
     "make_detector",
     "make_encoder",
+    "make_keep",
     "make_keyframes",
+    "make_link_settings",
     "make_on_demand",
     "make_pacer",
     "make_regions",
@@ -58,6 +66,34 @@ SECOND_NS = 1_000_000_000
 _MOST_ENCODER_THREADS = 4  # a 720p picture has twelve rows of blocks, each some steps behind the one above
 _REST_S = 10.0
 """How often ``--fps auto`` may think again."""
+
+
+# What is written, and who is talked to
+
+
+def check_files(config: EdgeConfig) -> None:
+    """Raise `UserError` for a file or folder that could not be written."""
+    for path, name in (
+        (config.summary, "--summary"),
+        (config.truth, "--truth"),
+        (config.record_base, "--record-base"),
+    ):
+        check_writable(path, name=name)
+    if config.store and config.pace != "lockstep":
+        check_folder(config.store_folder or default_folder(config.edge_id))
+
+
+def make_link_settings(config: EdgeConfig) -> LinkSettings:
+    """How the edge takes part in Zenoh."""
+    return LinkSettings(
+        role="edge",
+        listen=config.listen,
+        connect=config.connect,
+        zenoh_config=config.zenoh_config,
+        insecure=config.insecure,
+        name=config.edge_id,
+        links=2 if config.links == 2 else 1,
+    )
 
 
 # Seeing
@@ -117,6 +153,7 @@ def make_chooser(
     on_fate: Callable[[str, str], None],
     observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
     asked: Asked | None = None,
+    overdue: Callable[[int], Sequence[tuple[Still, float]]] = lambda _now_ns: (),
 ) -> Chooser:
     """Method, suppression, queue and still stage; ``most_bytes`` is the largest payload the budget ever admits."""
     return Chooser(
@@ -136,6 +173,7 @@ def make_chooser(
         on_fate=on_fate,
         observe=observe,
         asked=asked,
+        overdue=overdue,
     )
 
 
@@ -273,3 +311,34 @@ def make_pacer(config: EdgeConfig) -> Pacer | None:
     if not config.adapts:
         return None
     return Pacer(RateController(RateSettings(ceiling_bps=config.budget_bps, floor_bps=config.floor_bps)))
+
+
+# Keeping
+
+
+def make_keep(
+    config: EdgeConfig,
+    *,
+    session_id: int,
+    live: bool,
+    link: Link,
+    sender: Sender,
+    keyframes: KeyframePlan,
+    clock: Callable[[], int],
+    info: Callable[[], bytes],
+) -> Keep | None:
+    """Who keeps what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
+    if not config.store or config.pace == "lockstep":
+        return None
+    path = config.store_folder or default_folder(config.edge_id)
+    oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
+    return Keep(
+        lambda: Folder(path, max_bytes=config.store, session_id=session_id, info=info, oldest_ns=oldest_ns),
+        session_id=session_id,
+        live=live,
+        link=link,
+        sender=sender,
+        keyframes=keyframes,
+        clock=clock,
+        on_fate=sender.fate,
+    )

@@ -6,12 +6,14 @@ that rides along in the still of a neighbour shares that one's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from hvt_common.values import Still, View
 from hvt_edge.candidates import Candidate, TrackMemory
+from hvt_edge.measured import without_frame
 from hvt_edge.methods.base import STILL_OVERHEAD_BYTES, Method, Request, Step
 from hvt_edge.methods.cost import CostModel
 from hvt_edge.neighbours import expected_bytes, group
@@ -20,6 +22,7 @@ from hvt_edge.sight import Seen
 from hvt_edge.still import NoStill, Room, StillMaker
 from hvt_edge.still_gate import Gate
 from hvt_edge.still_queue import QueueSettings, StillQueue, Waiting
+from hvt_edge.store.entry import FIRST_KEPT
 from hvt_edge.suppress import Suppression
 
 __all__ = ["Asked", "Chooser", "ChooserSettings"]
@@ -76,7 +79,11 @@ class Chooser:
 
     ``on_fate(fate, reason)`` is called with ``sent``, ``deferred`` or ``dropped`` for every candidate that a step
     did not simply pass over; ``observe(candidates, step)`` with all tracks of each step, those that rest included.
-    ``asked`` are the stills that grounds ask for: they go before all others.
+    ``asked`` are the stills that grounds ask for: they go before all others. ``overdue(now_ns)`` returns stills that
+    were sent and seem to be lost, each with its utility, most useful first.
+
+    One that is overdue is yielded again, as it was, before wishes that are less useful, and only where there is room
+    for it: it holds up nobody, because what it shows grows old.
     """
 
     def __init__(
@@ -92,9 +99,13 @@ class Chooser:
         on_fate: Callable[[str, str], None],
         observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
         asked: Asked | None = None,
+        overdue: Callable[[int], Sequence[tuple[Still, float]]] = lambda _now_ns: (),
     ) -> None:
         self._method = method
         self._asked = asked
+        self._overdue = overdue
+        self.utility = 0.0
+        """Of the still that was yielded last, as the method scored it; infinite where a ground asked for it."""
         self._suppression = suppression
         self._maker = maker
         self._memory = memory
@@ -110,12 +121,19 @@ class Chooser:
         self._put_off = False
         self._held_up: dict[int, int] = {}
         """Track id → since when it has been the most useful and without room (ns)."""
-        self._sequence = 0
+        self._sequences = {False: 0, True: FIRST_KEPT}
+        """Of the next still: for the link, and to be kept."""
+        self._keeps = False
 
     @property
     def waiting(self) -> int:
         """How many stills wait for room."""
         return len(self._queue)
+
+    @property
+    def live_waits(self) -> bool:
+        """Whether any still waits for room, one that was asked for included."""
+        return bool(self._queue) or (self._asked is not None and self._asked.waiting > 0)
 
     def consider(self, seen: Seen, *, now_ns: int, room_bytes: int) -> None:
         """Take in one frame's tracks; at a decision step let the method say which it wants.
@@ -147,8 +165,12 @@ class Chooser:
         for request in self._requests(self._wanted(candidates, now_ns=now_ns), step):
             self._wish(request, seen, now_ns=now_ns)
 
-    def stills(self, *, now_ns: int, room: Room) -> Iterator[Still]:
-        """Yield stills that fit ``room`` of each; the caller sends each before it asks for the next."""
+    def stills(self, *, now_ns: int, room: Room, keeps: bool = False) -> Iterator[Still]:
+        """Yield stills that fit ``room`` of each; the caller sends each before it asks for the next.
+
+        ``keeps``: they are kept for later. Then none builds on the base, which may come later still, or never.
+        """
+        self._keeps = keeps
         self._wish_again(now_ns)
         for _, reason in self._queue.expire(now_ns):
             self._on_fate("dropped", reason)
@@ -156,12 +178,32 @@ class Chooser:
         if self._asked is not None and self._asked.waiting:
             return  # it waits for its room; none of the others takes that away
         while (waiting := self._queue.best()) is not None:
+            yield from self._lost(over=waiting.request.score, now_ns=now_ns, room=room)
+            if keeps:
+                recoded = waiting.cut.recoded(self._maker.without_base, reason=waiting.cut.draft.reason)
+                waiting = replace(waiting, cut=recoded)
             if not self._may_go(waiting, room(self._draft(waiting)), now_ns=now_ns):
                 break  # the most useful waits for its room; a lesser one does not slip in before it
             still = self._make(waiting, room, now_ns=now_ns)
             if still is not None:
+                self.utility = waiting.request.score
                 yield still
+        else:
+            yield from self._lost(over=-math.inf, now_ns=now_ns, room=room)
         self._forget()
+
+    def without_base(self, still: Still, *, now_ns: int) -> Still:
+        """A still that was sent lately, as it is without the base; itself where it is so, or its crop is gone."""
+        if still.codec == self._maker.without_base.name:
+            return still
+        self._wish_again(now_ns)
+        self._sent.ask(still.sequence)
+        for _, waiting in self._sent.take(now_ns):
+            cut = replace(waiting.cut, draft=replace(waiting.cut.draft, reason=still.reason))
+            made = self._maker.code(cut, sequence=still.sequence, room=lambda _: self._most_bytes)
+            if not isinstance(made, NoStill):
+                return made
+        return still
 
     def record_feedback(
         self, track_id: int, *, class_name: str, confidence: float, entropy_nats: float
@@ -242,7 +284,7 @@ class Chooser:
                 self._memory.record_refused(one.track_id, now_ns=now_ns)
             self._on_fate("dropped", cut.reason)
             return
-        self._offer(Waiting(_without_frame(request), cut, now_ns))
+        self._offer(Waiting(without_frame(request), cut, now_ns))
 
     def _wish_again(self, now_ns: int) -> None:
         """Let those that the ground asked for once more wait for room, unless something newer of the track does."""
@@ -264,9 +306,29 @@ class Chooser:
         if self._asked is None:
             return
         for still in self._asked.stills(now_ns=now_ns, room=room, next_sequence=lambda: self._sequence):
-            self._sequence += 1
-            self._on_fate("sent", still.reason)
+            self._made(still)
+            self.utility = math.inf
             yield still
+
+    def _lost(self, *, over: float, now_ns: int, room: Room) -> Iterator[Still]:
+        """Those to be sent again that are more useful than ``over``, and fit."""
+        for still, utility in self._overdue(now_ns):
+            if utility <= over:
+                return
+            # Something newer of its track says more.
+            if still.track_id not in self._queue and len(still.data) <= room(still):
+                self._on_fate("sent", _AGAIN)
+                self.utility = utility
+                yield still
+
+    @property
+    def _sequence(self) -> int:
+        return self._sequences[self._keeps]
+
+    def _made(self, still: Still) -> None:
+        """It goes out, or into the store."""
+        self._sequences[self._keeps] += 1
+        self._on_fate(*(("deferred", "stored") if self._keeps else ("sent", still.reason)))
 
     def _draft(self, waiting: Waiting) -> Still:
         return replace(waiting.cut.draft, sequence=self._sequence)
@@ -292,14 +354,13 @@ class Chooser:
         if isinstance(made, NoStill):
             self._refuse(waiting.request.candidate, made.reason, now_ns=now_ns)
             return None
-        self._sequence += 1
+        self._made(made)
         self._record(waiting, made, now_ns=now_ns)
         return made
 
     def _record(self, waiting: Waiting, still: Still, *, now_ns: int) -> None:
         height, width = waiting.cut.crop_bgr.shape[:2]
         self._cost_of(still.codec).observe(area_px=width * height, size_bytes=len(still.data))
-        self._on_fate("sent", still.reason)
         if waiting.again:
             return  # its tracks have rested since it was sent first
         for one in (waiting.request.candidate, *waiting.request.also):
@@ -329,19 +390,3 @@ class Chooser:
         self._held_up = {
             track_id: since_ns for track_id, since_ns in self._held_up.items() if track_id in tracks
         }
-
-
-def _without_frame(request: Request) -> Request:
-    """The same, with what is measured on the frame measured now: a wish that waits must not keep frames."""
-    return replace(
-        request,
-        candidate=_measured(request.candidate),
-        also=tuple(_measured(one) for one in request.also),
-    )
-
-
-def _measured(candidate: Candidate) -> Candidate:
-    if candidate.sharpness is None:
-        return replace(candidate, loss=None)
-    value = candidate.sharpness()
-    return replace(candidate, sharpness=lambda: value, loss=None)

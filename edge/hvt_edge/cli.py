@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
 from hvt_common.report import print_table, start_log, write_json
+from hvt_common.stopping import stop_on_signals
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.profiles import with_profile
@@ -36,9 +35,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = check(config)
     release_log = start_log("hvt-edge", quiet=config.quiet)
-    stop = threading.Event()
-    for one in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(one, lambda *_: stop.set())
+    stop = stop_on_signals()
     content = Edge(config, stop=stop, on_started=release_log).run()
     if config.summary is not None:
         write_json(config.summary, content)

@@ -24,6 +24,7 @@ from hvt_edge.methods.registry import method
 from hvt_edge.on_demand import OnDemand
 from hvt_edge.rate import least_base_bps
 from hvt_edge.renew import Renewal
+from hvt_edge.store.keep import Keep
 
 __all__ = ["Commands", "Served"]
 
@@ -50,6 +51,7 @@ class Served:
     renewal: Renewal
     chooser: Chooser
     base_size: tuple[int, int]
+    keep: Keep | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,7 @@ class Commands:
             Command.TRACKS: self._tracks,
             Command.SET_BUDGET: self._set_budget,
             Command.SET_METHOD: self._set_method,
+            Command.SEND_PAST: self._send_past,
         }
 
     @property
@@ -149,7 +152,9 @@ class Commands:
 
     def _keyframe(self, arguments: Arguments) -> _Said:
         _Reader("keyframe", arguments).end()
-        self._keyframes.request(self._window_ns())
+        refusal = self._keyframes.request(self._window_ns())
+        if refusal is not None:
+            raise RefusedError(refusal)
         return _Said()
 
     def _still(self, arguments: Arguments) -> _Said:
@@ -191,6 +196,15 @@ class Commands:
             replace(self._config, method=policy.name, tune=(), video_share=self._share_for(policy.video_only))
         )
         chooser.set_method(policy)
+        return _Said()
+
+    def _send_past(self, arguments: Arguments) -> _Said:
+        _Reader("send-past", arguments).end()
+        keep = self._parts().keep
+        if keep is None:
+            raise RefusedError("this edge keeps nothing while its link is away (--store 0)")
+        if not keep.send_video():
+            raise RefusedError("nothing is kept that was not sent")
         return _Said()
 
     # Changes of the rates

@@ -54,6 +54,7 @@ DEFAULT_SIZE = (1280, 720)
 _LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, 60.0
 _R0_DEPTH = 0.1
 _MIN_BUDGET_BPS = 100_000
+_LEAST_STORE_BYTES = 10_000_000
 _MOST_CELLS = 64
 LEAST_FPS = 2.0
 """To this ``--fps auto`` may fall: two frames in a window of a second."""
@@ -151,6 +152,18 @@ class EdgeConfig:
     ring_time: float = option(
         DURATION, 5.0, "how far back those go; where memory is short, with frames left out"
     )
+    store: int = option(
+        BYTES, 200_000_000, "disk for what is seen while the link is away, and sent afterwards; 0 for none"
+    )
+    store_folder: Path | None = option(
+        PATH,
+        None,
+        "where that is kept; made when the link first goes",
+        shown_default="~/.local/state/hvt/EDGE_ID",
+    )
+    store_age: float = option(
+        DURATION, 3600.0, "what an earlier run kept longer ago than this is dropped at the start"
+    )
 
     detector: str = option(
         TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
@@ -203,6 +216,9 @@ class EdgeConfig:
     )
     listen: tuple[str, ...] = option(TEXT, (), "Zenoh endpoint to listen on", many=True)
     zenoh_config: Path | None = option(PATH, None, "Zenoh configuration, JSON5, that all this goes on top of")
+    links: int = option(
+        integer(1, 2), 1, "2: one Zenoh link for what is urgent and one for the rest (docs/adaptation.md)"
+    )
     insecure: bool = switch("allow listening beyond this machine without keys")
     wait: float = option(
         DURATION, 15.0, "how long a file, a folder or the demo waits for the first ground before it plays"
@@ -280,6 +296,11 @@ def check(config: EdgeConfig) -> EdgeConfig:
         raise UserError(
             f"--min-budget {bitrate_text(config.min_budget)} is more than --budget "
             f"{bitrate_text(config.budget_bps)}: give less, or the same for a rate that does not change"
+        )
+    if 0 < config.store < _LEAST_STORE_BYTES:
+        raise UserError(
+            f"--store {config.store / 1e6:g}MB does not hold half a minute of video: give "
+            f"{_LEAST_STORE_BYTES // 10**6}MB or more, or 0 to keep nothing"
         )
     _check_stills(config)
     _check_regions(config)

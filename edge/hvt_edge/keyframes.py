@@ -3,6 +3,10 @@
 A keyframe is the largest message there is, so it is announced: while one is due, stills are held, and it is sent
 as soon as it fits the budget's window. A scheduled one can wait until it does; one that a ground asked for waits
 ``patience_ns`` at the most, so that a ground that joins late sees a picture within a second.
+
+Requests are paid for out of a purse, so that whoever may command cannot make the stream all keyframes: one costs
+the time in which its bytes are ``asked_share`` of the budget. Where reports tell of losses none is needed: on a lossy
+link a refused keyframe is a dark screen.
 """
 
 from __future__ import annotations
@@ -15,6 +19,8 @@ __all__ = ["KeyframePlan", "KeyframeSettings", "keyframe_interval_s"]
 
 _SECOND_NS = 1_000_000_000
 _KEYFRAME_SHARE = 0.005
+_MOST_RECEIVERS = 16
+"""Whose losses are remembered: ids cost a sender nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +33,13 @@ class KeyframeSettings:
     rest_ns: int = 3 * _SECOND_NS // 10
     """After a keyframe, requests are taken as answered by it for so long: they crossed it on the way. With the
     second request of a ground (0.3 s after the first) and the patience it stays under a second."""
+    burst: int = 6
+    """So many may be asked for in a row: losses come in bursts."""
+    refill_ns: int = 7 * _SECOND_NS // 10
+    """After that one in so long at the most, where losses were reported too; 0 for no limit. On a link that loses one
+    frame in twenty, two seconds would show half of what 0.7 s shows."""
+    asked_share: float = 0.35
+    """Of the budget, for keyframes that nobody needs as far as the edge can tell."""
 
 
 def keyframe_interval_s(size: tuple[int, int], base_bps: int) -> float:
@@ -48,19 +61,43 @@ class KeyframePlan:
         self._last_ns: int | None = None
         self._due_ns: int | None = None
         self._asked_ns: int | None = None
+        self._spent_ns = -(2**63)
+        """Asked keyframes are paid for up to this time: `_price_ns` each."""
+        self._takes_ns = 0
+        """What a keyframe takes of the budget, as time."""
+        self._losses: dict[int, int] = {}
+        """By receiver, as its last report counted them."""
+        self._lossy = False
+        """Whether somebody has lost more since the last keyframe."""
         self.requests = 0
+        """Those that were served, by a keyframe of their own or one that was due or fresh."""
         self.sent = 0
 
-    def request(self, now_ns: int) -> bool:
-        """A ground wants a keyframe; False where the newest one is so fresh that it serves."""
+    def request(self, now_ns: int) -> str | None:
+        """A ground wants a keyframe; return why it gets none now, in a sentence, or None where it is served.
+
+        What costs no keyframe of its own is always served: one is due already, or the newest one is so fresh that it
+        crossed the request on the way.
+        """
+        fresh = self._last_ns is not None and now_ns - self._last_ns < self._settings.rest_ns
+        if not fresh and self._due_ns is None and self._last_ns is not None:
+            refusal = self._pay(now_ns, last_ns=self._last_ns)
+            if refusal is not None:
+                return refusal
         self.requests += 1
-        if self._last_ns is not None and now_ns - self._last_ns < self._settings.rest_ns:
-            return False
-        if self._due_ns is None:
-            self._due_ns = now_ns
-        if self._asked_ns is None:
-            self._asked_ns = now_ns
-        return True
+        if not fresh:
+            self.renew(now_ns)
+        return None
+
+    def note_losses(self, receiver_id: int, count: int) -> None:
+        """A receiver reports so many lost or damaged messages in all; it may ask for a keyframe without paying."""
+        before = self._losses.get(receiver_id, 0)
+        if count <= before:
+            return
+        if receiver_id not in self._losses and len(self._losses) >= _MOST_RECEIVERS:
+            del self._losses[next(iter(self._losses))]
+        self._losses[receiver_id] = count
+        self._lossy = True
 
     def renew(self, now_ns: int) -> None:
         """The edge itself wants one, because something is to change with it."""
@@ -85,7 +122,30 @@ class KeyframePlan:
     def done(self, now_ns: int) -> None:
         """A keyframe has just been encoded."""
         self._last_ns, self._due_ns, self._asked_ns = now_ns, None, None
+        self._lossy = False
         self.sent += 1
+
+    def note_cost(self, takes_ns: int) -> None:
+        """A keyframe has been sent that takes the whole budget for so long."""
+        self._takes_ns = takes_ns
+
+    @property
+    def _price_ns(self) -> int:
+        return max(self._settings.refill_ns, round(self._takes_ns / self._settings.asked_share))
+
+    def _pay(self, now_ns: int, *, last_ns: int) -> str | None:
+        """Take the price out of the purse; why not, where it is empty. After a loss nobody pays."""
+        settings, price_ns = self._settings, self._price_ns
+        if settings.refill_ns == 0 or (self._lossy and now_ns - last_ns >= settings.refill_ns):
+            return None
+        spent_ns = max(self._spent_ns, now_ns - settings.burst * price_ns) + price_ns
+        if spent_ns > now_ns:
+            return (
+                f"the last keyframe came {(now_ns - last_ns) / _SECOND_NS:.1f} s ago, after many others: ask again "
+                f"in {(spent_ns - now_ns) / _SECOND_NS:.1f} s"
+            )
+        self._spent_ns = spent_ns
+        return None
 
     def _patient(self, now_ns: int) -> bool:
         settings = self._settings

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from hvt_common.clock import SteadyClock
 from hvt_common.values import Frame
 from hvt_edge.base_stage import BaseStage
-from hvt_edge.clock import SteadyClock, realtime_admits
+from hvt_edge.clock import realtime_admits
 from hvt_edge.counts import FrameCounts
 from hvt_edge.feedback import FeedbackInbox
 from hvt_edge.still_stage import StillStage, StillWorker

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from hvt_common.link.wire import Feedback
 from hvt_edge.adapt import LeastDelay, Progress, RateController
+from hvt_edge.followed import Followed
 
 __all__ = ["Flight", "Pacer"]
 
@@ -29,7 +30,6 @@ _GIVEN_UP_NS = _SECOND_NS
 _SILENCE_NS = 2 * _SECOND_NS
 _PROBE_NS = _SECOND_NS
 """In silence one frame goes out in so long: a ground that has forgotten the session hears nothing else."""
-_OTHER_RECEIVER_NS = _SECOND_NS
 _START_NS, _START_HOLD_NS = _SECOND_NS // 2, 2 * _SECOND_NS
 """So much goes out from a keyframe on before the first report; then it is waited for, so long. A thin link that is
 overrun at once does not let the ground ask what the session is. Who never reports gets everything after that."""
@@ -140,18 +140,15 @@ class Flight:
 class Pacer:
     """Hears reports, keeps the rate, and says what may go. Thread-safe; time is an argument.
 
-    It follows one receiver, the first that reports, until that is silent for a second: several grounds see the same
-    thin link, and the pace of one that is itself badly connected must not be everybody's.
+    It follows one receiver (`hvt_edge.followed`): the pace of one that is itself badly connected must not be
+    everybody's.
     """
 
     def __init__(self, controller: RateController) -> None:
         self._controller = controller
         self._flight = Flight()
         self._lock = threading.Lock()
-        self._receiver_id: int | None = None
-        self._report_sequence = -1
-        self._heard_ns = 0
-        self._progress_ns = 0
+        self._followed = Followed()
         self._held_ns = _FIRST_HELD_NS
         self._round_trip = LeastDelay(15 * _SECOND_NS)
         self._round_trip_ns = _SECOND_NS // 2
@@ -171,6 +168,11 @@ class Pacer:
     def steady_bps(self) -> int:
         """The rate that x265 should be opened for a share of."""
         return self._controller.steady_bps
+
+    @property
+    def round_trip_ns(self) -> int:
+        """From sending to hearing of it, at its shortest; half a second until one was measured."""
+        return self._round_trip_ns
 
     @property
     def settled(self) -> bool:
@@ -203,7 +205,7 @@ class Pacer:
             self._flight.sent_still(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
     def sent_other(self, line_bytes: int, *, now_ns: int) -> None:
-        """Status or tracks go out."""
+        """Status, tracks or a still that was sent before go out: no report tells of it."""
         with self._lock:
             self._flight.sent_other(line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
 
@@ -242,7 +244,7 @@ class Pacer:
                 self._started_ns = None
             if before and not there:
                 self._flight.clear()
-                if self._receiver_id is not None:
+                if self._followed.receiver_id is not None:
                     self._controller.on_silence(now_ns)
                 self._leave()
             return before is False and there and self.backoffs > 0
@@ -252,16 +254,16 @@ class Pacer:
     def admits_base(self, now_ns: int) -> bool:
         """Whether a frame may be encoded and sent now."""
         with self._lock:
-            if self._receiver_id is None:
+            if self._followed.receiver_id is None:
                 return self._may_start(now_ns)
-            if now_ns - self._heard_ns > _FORGET_NS and self._linked:
+            if now_ns - self._followed.heard_ns > _FORGET_NS and self._linked:
                 self._leave()
                 self._controller.forget_silence()
                 return True
-            if now_ns - self._heard_ns > _SILENCE_NS:
+            if now_ns - self._followed.heard_ns > _SILENCE_NS:
                 self._controller.on_silence(now_ns)
                 return now_ns - self._last_sent_ns >= _PROBE_NS
-            if min(self._overdue_ns(now_ns), now_ns - self._progress_ns) > _GIVEN_UP_NS:
+            if min(self._overdue_ns(now_ns), now_ns - self._followed.progress_ns) > _GIVEN_UP_NS:
                 self._controller.on_silence(now_ns)
                 self._flight.clear()
             return self._is_open(now_ns, _MOST_BACKLOG_NS)
@@ -269,9 +271,11 @@ class Pacer:
     def admits_still(self, now_ns: int) -> bool:
         """Whether a still may go now."""
         with self._lock:
-            if self._receiver_id is None:
+            if self._followed.receiver_id is None:
                 return self._may_start(now_ns)
-            return now_ns - self._heard_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
+            return now_ns - self._followed.heard_ns <= _SILENCE_NS and self._is_open(
+                now_ns, _STILL_BACKLOG_NS
+            )
 
     def _may_start(self, now_ns: int) -> bool:
         if not self._linked or self._started_ns is None:
@@ -289,23 +293,16 @@ class Pacer:
 
     def _follow(self, feedback: Feedback, now_ns: int) -> bool:
         """Whether this report is the newest of the receiver that counts."""
-        if feedback.receiver_id != self._receiver_id:
-            # One that reports and never names anything new must not keep the edge from all the others.
-            quiet_ns = max(now_ns - self._heard_ns, now_ns - self._progress_ns)
-            if self._receiver_id is not None and quiet_ns < _OTHER_RECEIVER_NS:
-                return False
-            self._leave()
-            self._receiver_id = feedback.receiver_id
-            self._progress_ns = now_ns
-        elif feedback.sequence <= self._report_sequence:
-            return False
-        self._report_sequence = feedback.sequence
-        self._heard_ns = now_ns
-        return True
+        kind = self._followed.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns)
+        if kind == "first":
+            self._forget_path()
+        return kind is not None
 
     def _leave(self) -> None:
-        self._receiver_id = None
-        self._report_sequence = -1
+        self._followed.forget()
+        self._forget_path()
+
+    def _forget_path(self) -> None:
         self._held_ns = _FIRST_HELD_NS
         self._round_trip = LeastDelay(15 * _SECOND_NS)
         self._round_trip_ns = _SECOND_NS // 2
@@ -315,5 +312,5 @@ class Pacer:
         # Quickly up, slowly down: what is expected is the longest of the usual.
         held_ns = min(max(held_ns, _LEAST_HELD_NS), _MOST_HELD_NS)
         self._held_ns = max((9 * self._held_ns + held_ns) // 10, min(held_ns, 2 * self._held_ns))
-        self._progress_ns = now_ns
+        self._followed.note_progress(now_ns)
         self._round_trip_ns = self._round_trip.add(max(0, now_ns - sent.sent_ns), now_ns=now_ns)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
 import zenoh
 
+from hvt_common.link.flood import FloodWatch
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.session import declare_publisher, serve
 from hvt_common.link.wire import ControlAnswer, ControlRequest, Feedback, WireError
@@ -18,16 +18,18 @@ __all__ = ["EdgeLink"]
 
 _log = logging.getLogger(__name__)
 
-_PUBLISHED = (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS)
+_PUBLISHED = (Row.BASE, Row.ROI, Row.TRACKS, Row.PAST, Row.STATUS)
+_MOST_PER_S = 1000
+"""Questions, or reports: a ground sends some ten a second."""
 _NEEDED = (Row.BASE, Row.ROI, Row.STATUS)
-"""Rows that a ground subscribes to in any case; one that only shows the video may leave out the tracks."""
+"""Rows that a ground subscribes to in any case; one that only shows the video may leave out tracks and past."""
 
 
 class EdgeLink:
-    """Publishers of base, roi, tracks, status; queryables info, control; a subscriber of feedback; the alive token.
+    """Publishers of all rows; queryables info and control; a subscriber of feedback; the alive token.
 
     ``answer_info(received_ns)``, ``answer_control(request)`` and ``hear(feedback)`` run in Zenoh's callbacks and
-    must be quick.
+    must be quick; ``clock`` is that of the headers.
     """
 
     def __init__(
@@ -38,11 +40,14 @@ class EdgeLink:
         answer_info: Callable[[int], bytes],
         answer_control: Callable[[ControlRequest], ControlAnswer],
         hear: Callable[[Feedback], None],
+        clock: Callable[[], int],
     ) -> None:
         self._keys = keys
         self._answer_info = answer_info
         self._answer_control = answer_control
         self._hear = hear
+        self._clock = clock
+        self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
         self._publishers = {row: declare_publisher(session, row, keys=keys) for row in _PUBLISHED}
@@ -54,8 +59,12 @@ class EdgeLink:
 
     def heard(self) -> bool:
         """Whether a ground subscribes to base, stills and status."""
+        return all(self.listens(row) for row in _NEEDED)
+
+    def listens(self, row: Row) -> bool:
+        """Whether somebody subscribes to this row."""
         # Zenoh's own stub calls the status a bool.
-        return all(self._publishers[row].matching_status.matching for row in _NEEDED)  # type: ignore[attr-defined]
+        return bool(self._publishers[row].matching_status.matching)  # type: ignore[attr-defined]
 
     def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
         """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
@@ -77,9 +86,10 @@ class EdgeLink:
         self.close()
 
     def _info(self, _question: bytes) -> bytes:
-        return self._answer_info(time.time_ns())
+        return self._answer_info(self._clock())
 
     def _control(self, question: bytes) -> bytes | None:
+        self._watch(Row.CONTROL)
         try:
             request = ControlRequest.parse(question)
         except WireError as error:
@@ -88,12 +98,22 @@ class EdgeLink:
         return self._answer_control(request).pack()
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
+        self._watch(Row.FEEDBACK)
         try:
             feedback = Feedback.parse(sample.payload.to_bytes())
         except WireError as error:
             self._skip("feedback", error)
             return
         self._hear(feedback)
+
+    def _watch(self, row: Row) -> None:
+        if self._flood.note(row, now_ns=self._clock()) is not None:
+            _log.warning(
+                "more than %d messages a second on %s, far more than any ground sends: somebody floods this edge "
+                "(docs/security.md has keys against that)",
+                _MOST_PER_S,
+                row,
+            )
 
     def _skip(self, row: str, error: WireError) -> None:
         self.unusable += 1

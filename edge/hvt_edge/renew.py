@@ -79,6 +79,19 @@ class Renewal:
         wanted_bps = self._base_of(self._pacer.steady_bps)
         return self._reopening.wants(wanted_bps, self._base_bps, settled=self._pacer.settled, now_ns=now_ns)
 
+    def hold(self, now_ns: int) -> None:
+        """While the link is away: what is kept has the budget that the base stream was opened for.
+
+        The pacer takes the silence for a link that carries next to nothing; stills to be kept would find no room.
+        """
+        if self._pacer is None:
+            return
+        total_bps = min(self._config.budget_bps, round(self._base_bps / self._share))
+        if total_bps != self._total_bps:
+            self._total_bps = total_bps
+            fps = self._config.tick_fps / self._every_n
+            self._sender.set_total(total_bps, self._base_bps, fps, now_ns=now_ns)
+
     def least_every_n(self) -> int:
         """At the link's rate, each n-th tick at the most can be coded: x265 has a least for each frame."""
         if self._pacer is None:
@@ -140,10 +153,14 @@ class Renewal:
 
     def _base_of(self, total_bps: int) -> int:
         """The base's part of so much in all; never less than x265 can follow at its lowest frame rate."""
-        config = self._config
-        share = self._split.share if self._moving and self._split is not None else config.share
+        config, share = self._config, self._share
         least_bps = least_base_bps(self._size, LEAST_FPS, edge_id=config.edge_id)
         return max(least_bps, round(min(total_bps * share, total_bps - config.metadata_bps)))
+
+    @property
+    def _share(self) -> float:
+        """The base's, as it is now."""
+        return self._split.share if self._moving and self._split is not None else self._config.share
 
     @property
     def _moving(self) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from hvt_common import __version__
 from hvt_common.link.ledger import Ledger
 from hvt_common.link.wire import Health, Info, Status, fitted_class_names
@@ -29,8 +27,9 @@ def make_info(
     class_names: tuple[str, ...],
     window_ns: int,
     received_ns: int,
+    answered_ns: int,
 ) -> Info:
-    """What does not change while the session runs; ``received_ns`` is when the question came."""
+    """What does not change while the session runs; both times are of the clock that the headers go by."""
     return Info(
         session_id=session_id,
         edge=config.edge_id,
@@ -49,7 +48,7 @@ def make_info(
         window_ns=window_ns,
         class_names=fitted_class_names(class_names),
         received_ns=received_ns,
-        answered_ns=time.time_ns(),
+        answered_ns=answered_ns,
     )
 
 
@@ -85,10 +84,12 @@ def make_status(
         last_still_sequence=sender.still_sequence,
         base_bytes=account.base_bytes,
         roi_bytes=account.roi_bytes,
+        past_bytes=account.past_bytes,
         meta_bytes=account.meta_bytes,
         overhead_bytes=account.overhead_bytes,
         base_messages=account.messages["base"],
         roi_messages=account.messages["roi"],
+        past_messages=account.messages["past"],
         meta_messages=account.messages["meta"],
         worst_window_bps=(worst.base, worst.roi, worst.total),
         sent=account.fates["sent"],

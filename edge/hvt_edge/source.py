@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -31,6 +32,7 @@ def open_source(
     seed: int = 0,
     max_frames: int | None = None,
     source_fps: float | None = None,
+    clock: Callable[[], int] | None = None,
 ) -> Source:
     """Open a source of base frames.
 
@@ -43,6 +45,7 @@ def open_source(
         max_frames: end after so many base frames.
         source_fps: the rate at which the images of a folder were taken (default: the base rate), or a rate that
             overrides a video file's own time stamps. Live sources and the demo ignore it.
+        clock: of a live source's capture times, Unix nanoseconds without steps; None for one of its own.
 
     Raises:
         UserError: if nothing usable is there, or size or rate are impossible.
@@ -55,12 +58,13 @@ def open_source(
         stream = StreamGrabber(spec)
         stream.open()
         if not stream.holds_a_clip:
-            return LiveSource(stream, size=size, fps=fps, fit=fit, max_frames=max_frames)
+            return LiveSource(stream, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock)
         stream.close()
     elif scheme:
         raise UserError(f"source {spec!r} has the unknown scheme {scheme!r}; accepted is {_ACCEPTED}")
     if spec.startswith("/dev/"):
-        return LiveSource(CameraGrabber(spec, fps=fps), size=size, fps=fps, fit=fit, max_frames=max_frames)
+        camera = CameraGrabber(spec, fps=fps)
+        return LiveSource(camera, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock)
     if not scheme and not Path(spec).exists():
         raise UserError(f"source {spec!r} does not exist; accepted is {_ACCEPTED}")
     kind = FolderSource if not scheme and Path(spec).is_dir() else VideoSource

@@ -13,11 +13,12 @@ from typing import Protocol, Self
 from hvt_common.distinct import DistinctIds
 from hvt_common.link.wire import StillResult
 from hvt_common.priority import give_way
-from hvt_common.values import AccessUnit, Frame, Tracks
+from hvt_common.values import AccessUnit, Frame, Still, Tracks
 from hvt_edge.choose import Chooser
 from hvt_edge.keyframes import KeyframePlan
 from hvt_edge.send import Sender
 from hvt_edge.sight import Seen, Sight
+from hvt_edge.store.keep import Keep
 
 __all__ = ["MAX_QUEUE_BYTES", "Reporter", "StillStage", "StillWorker"]
 
@@ -27,6 +28,7 @@ _LEAST_FRAMES = 2
 MAX_QUEUE_BYTES = 160 * 2**20
 """Of frames that wait to be seen: 16 of 1280x720 and 1920x1080, 5 of 3840x2160."""
 _FINISH_S = 1.0
+_AGAIN_S = 0.025
 
 
 class Reporter(Protocol):
@@ -40,7 +42,8 @@ class Reporter(Protocol):
 class StillStage:
     """Takes each frame with its access unit, if it has one, after the unit was sent.
 
-    With a ``reporter`` the edge's own tracks go out at each decision step, before the stills of it.
+    With a ``reporter`` the edge's own tracks go out at each decision step, before the stills of it. While the link is
+    away ``keep`` takes the stills, as many as would have been sent.
     """
 
     def __init__(
@@ -51,12 +54,14 @@ class StillStage:
         sender: Sender,
         keyframes: KeyframePlan,
         reporter: Reporter | None = None,
+        keep: Keep | None = None,
     ) -> None:
         self._sight = sight
         self._chooser = chooser
         self._sender = sender
         self._keyframes = keyframes
         self._reporter = reporter
+        self._keep = keep
         self._latest_tracks: Tracks | None = None
         self._track_ids = DistinctIds()
         self._sight_ns = 0
@@ -81,6 +86,11 @@ class StillStage:
         return self._chooser.waiting
 
     @property
+    def live_waits(self) -> bool:
+        """Whether a still waits for room, one that a ground asked for included."""
+        return self._chooser.live_waits
+
+    @property
     def sight_ms(self) -> float:
         """Mean time to decode, detect and track, over all frames."""
         return self._sight_ns / max(1, self._steps) / 1e6
@@ -103,16 +113,38 @@ class StillStage:
         self._latest_tracks = seen.tracks
         if self._reporter is not None and seen.detected:
             self._reporter.report(seen, now_ns=now_ns)
-        self._chooser.consider(seen, now_ns=now_ns, room_bytes=self._sender.still_room_bytes(now_ns))
+        # What is wished for waits until the link is free, which right behind a base frame it never is.
+        room_bytes = self._sender.still_room_bytes(now_ns, paced=False)
+        self._chooser.consider(seen, now_ns=now_ns, room_bytes=room_bytes)
+        return self.send_waiting(now_ns=now_ns, held=held)
+
+    def send_waiting(self, *, now_ns: int, held: bool | None = None) -> set[int]:
+        """Send those that wait and fit now, without another frame; the rest as of `send`."""
         sent: set[int] = set()
+        if self._keep is not None:
+            self._keep.keep_lost(now_ns)
+            if self._keep.away:
+                self._keep_stills(self._keep, now_ns)
+                return sent
         if self._keyframes.due(now_ns) if held is None else held:
             return sent
         for still in self._chooser.stills(
             now_ns=now_ns, room=lambda one: self._sender.still_room_bytes(now_ns, still=one)
         ):
-            self._sender.still(still, now_ns=now_ns)
+            self._sender.still(still, now_ns=now_ns, utility=self._chooser.utility)
+            if self._keep is not None:
+                self._keep.note_utility(still, self._chooser.utility)
             sent.add(still.sequence)
         return sent
+
+    def _keep_stills(self, keep: Keep, now_ns: int) -> None:
+        """Those that would have gone out now."""
+        for still in self._chooser.stills(
+            now_ns=now_ns,
+            room=lambda one: self._sender.still_room_bytes(now_ns, still=one, paced=False),
+            keeps=True,
+        ):
+            keep.still(still, utility=self._chooser.utility, now_ns=now_ns)
 
     def hear(self, results: Sequence[StillResult]) -> None:
         """What a ground made of stills counts for the next decision; one without a name is no opinion.
@@ -130,6 +162,10 @@ class StillStage:
                 confidence=result.confidence,
                 entropy_nats=result.entropy_nats,
             )
+
+    def without_base(self, still: Still, *, now_ns: int) -> Still:
+        """A still that was sent lately, as it is without the base; in the thread of `send`, or after its end."""
+        return self._chooser.without_base(still, now_ns=now_ns)
 
     def close(self) -> None:
         """Give up what still waits."""
@@ -199,13 +235,25 @@ class StillWorker:
     def _run(self) -> None:
         give_way()
         try:
-            while (item := self._frames.get()) is not None and not self._given_up.is_set():
+            while (item := self._next()) is not None and not self._given_up.is_set():
                 behind = self._frames.qsize() >= _BEHIND_FRAMES
                 self._stage.hear(self._hear())
                 seen = self._stage.see(*item, hurry=behind)
                 self._stage.send(seen, now_ns=self._clock())
         except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
             self._error = error
+
+    def _next(self) -> tuple[Frame, AccessUnit | None] | None:
+        """Return the next frame; until it comes what waits is tried again.
+
+        Right behind a base frame the link is busy: with few frames a second there would be no other moment.
+        """
+        while True:
+            try:
+                return self._frames.get(timeout=_AGAIN_S)
+            except queue.Empty:
+                if self._stage.live_waits:
+                    self._stage.send_waiting(now_ns=self._clock())
 
     def _raise_error(self) -> None:
         if self._error is not None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from hvt_common.link.ledger import Ledger
 from hvt_common.units import bitrate_text
+from hvt_edge.store.worker import StoreNumbers
 
 __all__ = ["EdgeRun", "summary", "table"]
 
@@ -35,6 +36,10 @@ class EdgeRun:
     sight_ms: float
     """Mean of decoding, detection and tracking over all frames."""
     unusable_messages: int
+    frames_kept: int = 0
+    """Encoded while the link was away, and not sent at once."""
+    store: StoreNumbers | None = None
+    """What was kept while the link was away; None where nothing ever is."""
 
 
 def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
@@ -44,17 +49,20 @@ def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
         fate: sum(account.fates[fate].values()) for fate in ("sent", "deferred", "dropped")
     }
     stills["reasons"] = {fate: account.fates[fate] for fate in ("sent", "deferred", "dropped")}
-    stills["mean_bytes"] = round(account.roi_bytes / stills["sent"]) if stills["sent"] else 0
+    on_roi = stills["sent"] - account.fates["sent"].get("stored", 0)
+    stills["mean_bytes"] = round(account.roi_bytes / on_roi) if on_roi else 0
     stills["per_minute"] = round(60 * stills["sent"] / run.duration_s, 2) if run.duration_s else 0.0
     return {
         "edge": run.edge,
         "session": run.session,
         "method": run.method,
         "frames": run.frames,
+        "frames_kept": run.frames_kept,
         "frames_dropped": run.frames_dropped,
         "duration_s": round(run.duration_s, 3),
         "base_bytes": account.base_bytes,
         "roi_bytes": account.roi_bytes,
+        "past_bytes": account.past_bytes,
         "meta_bytes": account.meta_bytes,
         "overhead_bytes": account.overhead_bytes,
         "total_bps": account.total_bps,
@@ -74,6 +82,7 @@ def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
         "encode_ms": round(run.encode_ms, 2),
         "sight_ms": round(run.sight_ms, 2),
         "unusable_messages": run.unusable_messages,
+        "store": None if run.store is None else asdict(run.store),
     }
 
 
@@ -84,7 +93,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     share = f"{total / content['budget_bps']:.0%} of {bitrate_text(content['budget_bps'])}"
     dropped = f", {content['frames_dropped']} dropped before encoding" if content["frames_dropped"] else ""
     sent = f"{stills['sent']}, {stills['per_minute']:.0f} a minute, {stills['mean_bytes']} bytes in the mean"
-    return [
+    rows = [
         ("method", content["method"]),
         ("frames", f"{content['frames']} in {content['duration_s']:.1f} s{dropped}"),
         ("total", f"{bitrate_text(total)}, {share}; fullest window {bitrate_text(worst['total'])}"),
@@ -96,6 +105,16 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         ("tracks", str(content["tracks"])),
         ("keyframes", f"{content['keyframes']}, {content['keyframe_requests']} asked for by a ground"),
     ]
+    return rows + _store_rows(content["store"])
+
+
+def _store_rows(store: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """What the store did, where it did anything."""
+    if store is None or not any(store.values()):
+        return []
+    sent = f"{store['sent_stills']} stills and {store['sent_video_s']:.0f} s of video sent afterwards"
+    left = f"{store['stills']} stills and {store['video_s']:.0f} s are still kept"
+    return [("store", f"{sent}; {left}")]
 
 
 def _reasons(counts: dict[str, int]) -> str:

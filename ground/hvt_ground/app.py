@@ -5,10 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from hvt_common.clock import SteadyClock
 from hvt_common.errors import UserError
 from hvt_common.link.diagnose import LinkWatch
 from hvt_common.link.keys import check_edge_pattern
@@ -17,15 +20,17 @@ from hvt_common.link.wire import Info
 from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_common.report import StatusLine, check_writable
 from hvt_common.units import bitrate_text
-from hvt_ground.build import Models, make_sight, output_path
+from hvt_ground.build import Models, make_past_look, make_sight, output_path, past_path
 from hvt_ground.config import GroundConfig
 from hvt_ground.export_tracks import TrackTable
 from hvt_ground.live_view import LiveView
+from hvt_ground.past.recordings import PastRecording
 from hvt_ground.receive import EdgeReceiver
 from hvt_ground.record import Recorder, RecorderSettings
 from hvt_ground.session import GroundSession
-from hvt_ground.subscribe import GroundLink
+from hvt_ground.subscribe import EdgePort, GroundLink
 from hvt_ground.summary import summary
+from hvt_ground.timing import SessionTiming, TimingTable
 
 __all__ = ["Ground"]
 
@@ -42,8 +47,10 @@ class Ground:
         self._config = config
         self._stop = stop
         self._on_started = on_started
+        self._clock = SteadyClock()
         self._receivers: dict[str, EdgeReceiver] = {}
         self._view: LiveView | None = None
+        self._timing: TimingTable | None = None
         self._paths: set[Path] = set()
         self._models: Models | None = None
         self._began_s = time.monotonic()
@@ -57,6 +64,7 @@ class Ground:
         config = self._config
         check_edge_pattern(config.edges)
         check_writable(config.summary, name="--summary")
+        check_writable(config.timing, name="--timing")
         self._check_record()
         self._models = Models(config)
         with ExitStack() as stack:
@@ -68,11 +76,14 @@ class Ground:
                 connect=config.connect,
                 zenoh_config=config.zenoh_config,
                 insecure=config.insecure,
+                links=2 if config.links == 2 else 1,
             )
             session = stack.enter_context(open_session(settings))
             self._make_record_folder()
+            if config.timing is not None:
+                self._timing = stack.enter_context(closing(TimingTable(config.timing)))
             line = stack.enter_context(StatusLine(quiet=config.quiet))
-            link = stack.enter_context(GroundLink(session, edges=config.edges))
+            link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.sees))
             self._on_started()
             self._say_where(line)
@@ -119,14 +130,7 @@ class Ground:
     def _serve(self, link: GroundLink, line: StatusLine, watch: LinkWatch) -> None:
         ticks = 0
         while not self._stop.wait(_TICK_S):
-            for port in link.ports():
-                if port.edge not in self._receivers:
-                    self._receivers[port.edge] = EdgeReceiver(port, open_session=self._open_session)
-                    if not watch.may_command(port.edge):
-                        line.note(
-                            f"hvt-ground: {self._config.zenoh_config} lets it watch {port.edge}, not command it: no "
-                            "keyframes or stills on demand, and no changes of its settings"
-                        )
+            self._attend(link.ports(), line, watch)
             for receiver in self._receivers.values():
                 if receiver.error is not None:
                     raise receiver.error
@@ -137,6 +141,28 @@ class Ground:
                 self._refresh_clocks()
             if self._config.once and self._all_ended():
                 return
+
+    def _attend(self, ports: list[EdgePort], line: StatusLine, watch: LinkWatch) -> None:
+        """A receiver for each edge of the link; none for one that has left it."""
+        for receiver in [one for one in self._receivers.values() if one.port not in ports]:
+            del self._receivers[receiver.port.edge]
+            receiver.close()
+        for port in ports:
+            if port.edge in self._receivers:
+                continue
+            receiver = self._receivers[port.edge] = EdgeReceiver(
+                port,
+                open_session=self._open_session,
+                clock=self._clock,
+                open_past=self._open_past,
+                patience_s=self._config.patience_s,
+            )
+            port.in_use = partial(_is_in_use, receiver)
+            if not watch.may_command(port.edge):
+                line.note(
+                    f"hvt-ground: {self._config.zenoh_config} lets it watch {port.edge}, not command it: no "
+                    "keyframes or stills on demand, and no changes of its settings"
+                )
 
     def _all_ended(self) -> bool:
         receivers = list(self._receivers.values())
@@ -164,35 +190,48 @@ class Ground:
         assert models is not None, "run() opens them"
         stamp = time.strftime("%Y%m%d-%H%M%S")
         path = output_path(config.record, suffix=".rrd", edge=info.edge, stamp=stamp, taken=self._paths)
-        recorder = Recorder(
-            RecorderSettings(
-                path=path,
-                edge_id=info.edge,
-                session=f"{info.session_id:016x}",
-                base_size=info.base_size,
-                fps=info.fps,
-                budget_bps=info.budget_bps,
-                facts={
-                    "method": info.method,
-                    "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
-                    "source": f"{info.source_size[0]}x{info.source_size[1]}",
-                    "base": f"{info.base_size[0]}x{info.base_size[1]} at {info.fps:g} fps, {info.codec}",
-                    "detector": Path(config.detector).name,
-                    "classifier": Path(config.classifier or "none").name,
-                },
-                clocked=info.pace == "realtime",
-                live_url=self._view.url if self._view is not None else None,
-            )
-        )
         return GroundSession(
             info,
-            recorder=recorder,
+            recorder=Recorder(self._recorder_settings(info, path)),
             recording=path,
             tables=self._open_tables(info, stamp),
+            timing=self._session_timing(info, receiver),
             sight_of=lambda emit: make_sight(config, models, info=info, emit=emit),
             to_local_ns=receiver.clock_offset.to_local_ns,
-            clock=time.time_ns,
+            clock=self._clock,
             report=receiver.report_now,
+            past_look=make_past_look(config, models, info=info),
+        )
+
+    def _open_past(self, info: Info) -> PastRecording:
+        """What was kept of a session that is over; not shown live, for the viewer shows what is now."""
+        config, models = self._config, self._models
+        assert models is not None, "run() opens them"
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        path = past_path(config.record, edge=info.edge, stamp=stamp, taken=self._paths)
+        settings = replace(self._recorder_settings(info, path), clocked=False, live_url=None)
+        look = make_past_look(config, models, info=info)
+        return PastRecording(info, path=path, recorder=Recorder(settings), look=look)
+
+    def _recorder_settings(self, info: Info, path: Path) -> RecorderSettings:
+        config = self._config
+        return RecorderSettings(
+            path=path,
+            edge_id=info.edge,
+            session=f"{info.session_id:016x}",
+            base_size=info.base_size,
+            fps=info.fps,
+            budget_bps=info.budget_bps,
+            facts={
+                "method": info.method,
+                "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
+                "source": f"{info.source_size[0]}x{info.source_size[1]}",
+                "base": f"{info.base_size[0]}x{info.base_size[1]} at {info.fps:g} fps, {info.codec}",
+                "detector": Path(config.detector).name,
+                "classifier": Path(config.classifier or "none").name,
+            },
+            clocked=info.pace == "realtime",
+            live_url=self._view.url if self._view is not None else None,
         )
 
     def _open_tables(self, info: Info, stamp: str) -> list[TrackTable]:
@@ -200,6 +239,17 @@ class Ground:
         if wish is None:
             return []
         return [TrackTable(output_path(wish, suffix=".csv", edge=info.edge, stamp=stamp, taken=self._paths))]
+
+    def _session_timing(self, info: Info, receiver: EdgeReceiver) -> SessionTiming | None:
+        if self._timing is None:
+            return None
+        return SessionTiming(
+            self._timing,
+            edge=info.edge,
+            session_id=info.session_id,
+            clock=self._clock,
+            offset_ns=lambda: receiver.clock_offset.offset_ns or 0,
+        )
 
     # Saying
 
@@ -222,7 +272,12 @@ class Ground:
 
     def _summaries(self) -> list[dict[str, Any]]:
         return [
-            summary(session, unusable=receiver.unusable)
+            summary(session, unusable=receiver.unusable, past_recordings=receiver.past.paths)
             for _, receiver in sorted(self._receivers.items())
             for session in receiver.done
         ]
+
+
+def _is_in_use(receiver: EdgeReceiver) -> bool:
+    """Whether there is or was more of this edge than messages under its name."""
+    return not receiver.idle or bool(receiver.done) or bool(receiver.past.paths)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.report import print_table, say, start_log, write_json
+from hvt_common.stopping import stop_on_signals
 from hvt_ground.config import GroundConfig, check
 
 __all__ = ["main"]
@@ -49,9 +48,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = check(config)
     release_log = start_log("hvt-ground", quiet=config.quiet)
-    stop = threading.Event()
-    for one in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(one, lambda *_: stop.set())
+    stop = stop_on_signals()
     sessions = Ground(config, stop=stop, on_started=release_log).run()
     if config.summary is not None:
         edges = {content["edge"] for content in sessions}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from hvt_common.vision.embedded import CLASSIFIER as EMBEDDED_CLASSIFIER
 from hvt_common.vision.embedded import DETECTOR as EMBEDDED_DETECTOR
 from hvt_common.vision.providers import PROVIDERS
 
-__all__ = ["DETECTOR", "NONE", "GroundConfig", "check"]
+__all__ = ["DETECTOR", "MOTION", "NONE", "GroundConfig", "check"]
 
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
 
@@ -28,6 +29,9 @@ class GroundConfig:
         TEXT, (), "Zenoh endpoint to connect to, for example tcp/HOST:7447", many=True
     )
     zenoh_config: Path | None = option(PATH, None, "Zenoh configuration, JSON5, that all this goes on top of")
+    links: int = option(
+        integer(1, 2), 1, "2: where it connects, one Zenoh link for what is urgent and one for the rest"
+    )
     insecure: bool = switch("allow listening beyond this machine without keys")
     edges: str = option(TEXT, "*", "which edges to serve, for example 'uav-*'")
 
@@ -66,18 +70,35 @@ class GroundConfig:
     tracks: Path | None = option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
+    timing: Path | None = option(
+        PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
+    )
     view: bool = switch("also open the Rerun viewer")
     serve: bool = switch("also serve the Rerun web viewer on this machine")
     once: bool = switch("end when the edges have ended")
     wait: float = option(
         DURATION, 0.0, "with --once: give up when no edge came for so long; 0 waits for ever"
     )
+    patience: float | None = option(
+        DURATION,
+        None,
+        "how long an edge that went without a word may stay away before its session is closed",
+        shown_default="10min; 5s with --once",
+    )
     summary: Path | None = option(PATH, None, "write the summary as JSON")
     quiet: bool = switch("no status line")
+
+    @property
+    def patience_s(self) -> float:
+        """After so long an edge that is away has ended."""
+        if self.patience is not None:
+            return self.patience
+        return 5.0 if self.once else 600.0
 
 
 def check(config: GroundConfig) -> GroundConfig:
     """Return the configuration; `UserError` where settings contradict."""
+    _check_files(config)
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):
@@ -92,3 +113,21 @@ def check(config: GroundConfig) -> GroundConfig:
         classifier = EMBEDDED_CLASSIFIER if config.detector in (MOTION, EMBEDDED_DETECTOR) else DETECTOR
         return replace(config, classifier=classifier)
     return config
+
+
+def _check_files(config: GroundConfig) -> None:
+    """Two files must not be one. What is written into a folder has names of its own, and a device takes anything."""
+    files: dict[str, str] = {}
+    for name, path, suffix in (
+        ("--record", config.record, ".rrd"),
+        ("--tracks", config.tracks, ".csv"),
+        ("--timing", config.timing, None),
+        ("--summary", config.summary, None),
+    ):
+        if path is None or (suffix is not None and path.suffix != suffix):
+            continue
+        if path.exists() and not path.is_file():
+            continue
+        other = files.setdefault(os.path.realpath(path), name)
+        if other != name:
+            raise UserError(f"{other} and {name} both name {path}: give each a file of its own")

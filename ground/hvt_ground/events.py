@@ -29,6 +29,8 @@ class VideoSample:
     capture_ns: int
     data: bytes
     keyframe: bool
+    stored: bool = False
+    """It was kept at the edge while the link was away: it lies before others that are logged already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,8 @@ class Overlay:
     """(N,) True once a still has spoken on the track's class."""
     origins: tuple[Origin, ...] = ()
     """N words; empty says ``base`` for all."""
+    stored: bool = False
+    """Of a `VideoSample` that was."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +91,8 @@ class Refinement:
     crop_base_px: tuple[float, float, float, float] | None = None
     """x1 y1 x2 y2, where the whole still lies in the base picture of its own frame (that of ``box_base_px``), not
     clipped; None leaves it out of the enhanced picture."""
+    stored: bool = False
+    """It was kept at the edge while the link was away: its frame is the one that it shows, long ago."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
@@ -24,8 +25,15 @@ _WAITING_PICTURES = 24
 _BEHIND_PICTURES = 1
 _STILLS_AT_ONCE = 16
 _WAITING_STILLS = 256
+_WAITING_STILL_BYTES = 32 * 2**20
 _WAITING_STEPS = 8
 """Reports of the edge's tracks: the newest count, each says all."""
+_LATER = 4096
+"""Pieces of work that can wait."""
+_AT_LEISURE = 8
+"""Those that come after them: each holds a stretch of video."""
+_LATER_S = 0.25
+"""On a machine that never comes to rest it still gets one step in so long."""
 _STEP_LAG = 2
 """In lockstep a step counts from so many ticks on. It is sent right before the next access unit, which may overtake
 it by microseconds: this is what makes the order the same in every run."""
@@ -38,6 +46,8 @@ See = Callable[[Picture, bool], None]
 Step = Callable[[Tracks, int], None]
 """Called with what the edge tracked at one tick, and that tick's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
+Work = Generator[None, None, object]
+"""Done step by step."""
 
 
 class Eyes(Protocol):
@@ -65,6 +75,19 @@ class Eyes(Protocol):
         """Hand over a still."""
         ...
 
+    def later(self, work: Work) -> bool:
+        """Hand over work that can wait, done step by step while nothing else is to be seen; False: no room."""
+        ...
+
+    def at_leisure(self, work: Work) -> bool:
+        """Hand over work that gives way even to what is done `later`, between any two steps; False: no room."""
+        ...
+
+    @property
+    def has_room(self) -> bool:
+        """Whether `later` takes another."""
+        ...
+
     def close(self) -> bool:
         """Finish what waits, for a second or two; False where the thread did not come back."""
         ...
@@ -86,6 +109,10 @@ class RealtimeEyes:
         self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
         self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
         self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
+        self._later: deque[Work] = deque()
+        self._leisure: deque[Work] = deque()
+        self._later_s = 0.0
+        """When some of it was done last."""
         self._wake = threading.Event()
         self._ending = threading.Event()
         self._given_up = threading.Event()
@@ -96,7 +123,15 @@ class RealtimeEyes:
     @property
     def idle(self) -> bool:
         """Nothing waits."""
-        return self._pictures.empty() and self._stills.empty() and not self._steps
+        return not (self._has_news() or self._later or self._leisure)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether `later` takes another."""
+        return len(self._later) < _LATER
+
+    def _has_news(self) -> bool:
+        return bool(self._steps) or not (self._pictures.empty() and self._stills.empty())
 
     def picture(self, picture: Picture) -> None:
         """Queue a frame; where the queue is full the oldest goes untracked."""
@@ -119,11 +154,31 @@ class RealtimeEyes:
 
     def still(self, still: ReceivedStill) -> None:
         """Queue a still; where the queue is full it is dropped."""
+        waiting_bytes = sum(len(one.data) for one in tuple(self._stills.queue))
         try:
-            self._stills.put_nowait(still)
+            if waiting_bytes + len(still.data) <= _WAITING_STILL_BYTES:
+                self._stills.put_nowait(still)
+            else:
+                self.dropped["overflow"] += 1
         except queue.Full:
             self.dropped["overflow"] += 1
         self._wake.set()
+
+    def later(self, work: Work) -> bool:
+        """Queue work that can wait."""
+        if not self.has_room:
+            return False
+        self._later.append(work)
+        self._wake.set()
+        return True
+
+    def at_leisure(self, work: Work) -> bool:
+        """Queue work that can wait for long."""
+        if len(self._leisure) >= _AT_LEISURE:
+            return False
+        self._leisure.append(work)
+        self._wake.set()
+        return True
 
     def close(self) -> bool:
         """Finish what waits, for a second or two."""
@@ -153,13 +208,20 @@ class RealtimeEyes:
                     return
         except BaseException as error:  # noqa: BLE001 - handed to the receiving thread, which ends the process
             self._error = error
+        finally:
+            for waiting in (self._later, self._leisure):
+                while waiting:  # whatever one in the middle holds is let go of here
+                    waiting.popleft().close()
 
     def _work_off(self) -> None:
         """See all pictures that came before the stills taken here, then the edge's tracks, then read the stills."""
         stills: list[ReceivedStill] = []
         while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
             stills.append(self._stills.get_nowait())
-        while not self._given_up.is_set():
+        # Those that come meanwhile are not among them, or on a slow machine stills would wait for ever.
+        for _ in range(self._pictures.qsize()):
+            if self._given_up.is_set():
+                break
             try:
                 picture = self._pictures.get_nowait()
             except queue.Empty:
@@ -169,7 +231,20 @@ class RealtimeEyes:
             self._step(*self._steps.popleft())
         if stills:
             self._read(stills)
+        self._work_later()
+        if self._has_news():
             self._wake.set()
+
+    def _work_later(self) -> None:
+        """Do what can wait, until something comes that cannot."""
+        while (waiting := self._later or self._leisure) and not self._given_up.is_set():
+            if self._has_news() and time.monotonic() - self._later_s < _LATER_S:
+                return
+            try:
+                next(waiting[0])
+            except StopIteration:
+                waiting.popleft()
+            self._later_s = time.monotonic()
 
 
 class LockstepEyes:
@@ -216,6 +291,20 @@ class LockstepEyes:
             self._early.pop(0)
             self.dropped["overflow"] += 1
 
+    @property
+    def has_room(self) -> bool:
+        """Always: it is done before the next is seen."""
+        return True
+
+    def later(self, work: Work) -> bool:
+        """Do it after what was handed over before."""
+        self._submit(self._worker.submit(_exhaust, work))
+        return True
+
+    def at_leisure(self, work: Work) -> bool:
+        """Likewise: here nothing gives way to anything."""
+        return self.later(work)
+
     def close(self) -> bool:
         """Finish what waits."""
         try:
@@ -238,3 +327,8 @@ class LockstepEyes:
         self._pending.append(future)
         while len(self._pending) > _AHEAD:
             self._pending.popleft().result()
+
+
+def _exhaust(work: Work) -> None:
+    for _ in work:
+        pass

@@ -131,6 +131,11 @@ class Fusion:
         """Whether there is anything to be moved along with the camera."""
         return any(entity.afar is not None for entity in self._entities)
 
+    def known_as(self, edge_track_id: int) -> int | None:
+        """The id that a track of the edge is listed under; None while it is not."""
+        entity = self._by_edge.get(edge_track_id)
+        return None if entity is None else entity.id or None
+
     def own_at(self, frame_index: int) -> Tracks | None:
         """Our own tracks at that frame, or the newest before it that are remembered."""
         exact = self._own.get(frame_index)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["CANVAS", "SLOTS", "Gallery", "Placement", "frame_of", "placed"]
+__all__ = ["CANVAS", "HOLD_S", "SLOTS", "Gallery", "Placement", "frame_of", "placed"]
 
 COLUMNS, ROWS = 2, 4
 SLOTS = COLUMNS * ROWS
+HOLD_S = 1.5
 _CELL = (150.0, 92.0)
 """Width and height of one picture."""
 _GAP = 6.0
@@ -58,7 +59,7 @@ class Gallery:
         hold_s: How long a pair keeps its slot at least, in seconds of capture time.
     """
 
-    def __init__(self, *, hold_s: float = 1.5) -> None:
+    def __init__(self, *, hold_s: float = HOLD_S) -> None:
         self._hold_ns = round(hold_s * 1e9)
         self._since_ns: dict[int, int] = {}
         self._changed: dict[int, bool] = {}

@@ -21,6 +21,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
+from hvt_ground.rrd_release import send_blueprint
 
 __all__ = ["LiveSink", "LiveView", "free_port", "listening", "viewer_environment", "viewer_program"]
 
@@ -114,6 +115,7 @@ class LiveSink:
         self._url = url
         self._port = int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
         self._next_look = 0.0
+        self._application_id = application_id
         self._recording: rr.RecordingStream | None = rr.RecordingStream(
             application_id, recording_id=recording_id, send_properties=False
         )
@@ -125,7 +127,7 @@ class LiveSink:
     def blueprint(self, blueprint: rrb.Blueprint) -> bytes:
         """Show the recording on this screen."""
         if self._recording is not None:
-            self._recording.send_blueprint(blueprint)
+            send_blueprint(self._recording, blueprint, application_id=self._application_id)
         return b""
 
     def chunks(self, chunks: Sequence[Chunk]) -> bytes:

@@ -99,6 +99,11 @@ class Matcher:
             known = np.union1d(known, after.ids)
         return {want.key: found[group[0].key] for group in groups for want in group}
 
+    def known_as(self, edge_track_id: int) -> int | None:
+        """The ground track that the newest still of this edge track went to; None for none."""
+        known = self._ground_of.get(edge_track_id)
+        return None if known is None else known[0]
+
     def merge(self, kept_id: int, gone_id: int) -> None:
         """Two ground tracks have turned out to be one, which goes on under the first id."""
         for edge_id, (ground_id, frame_index) in self._ground_of.items():

@@ -1,9 +1,9 @@
 """What of an overlay is worth writing: only what a viewer would see change.
 
 A recording answers "what was here at frame N" with the latest value of every component, so a value that did not
-change need not be written aga two layers, those whose class rests on the base stream
-alone and those that a still has spoken on. Each layer has *geometry* (centres and half sizes), *identity* (ids and
-classes), *labels* and *confidences*; each is written when it changed.
+change need not be written again. Tracks are in three layers: those that the base stream shows and whose class rests
+on it alone, those that the ground was only told of, and those that a still has spoken on. Each layer has *geometry*
+(centres and half sizes), *identity* (ids and classes), *labels* and *confidences*; each is written when it changed.
 
 Geometry is held against jitter: a box keeps the place that is on screen until it has moved more than
 `CENTRE_STEP_PX` or grown more than `HALF_SIZE_STEP_PX`, and is then put on the nearest half pixel. Equal numbers in
@@ -110,14 +110,27 @@ class OverlayEncoder:
 
     Movement is written at the overlay's own rate while it costs less than ``share`` of the bytes received, and less
     often beyond that; a change of the set of tracks, of a class or of a label is always written.
+
+    Args:
+        share: of the bytes received, for movement.
+        credit_bytes: for movement, before anything was received.
+        afresh: nothing is known of what is on the screen, so the first overlay is written whole.
+        with_origins: write origins from the first overlay on, not only once one is not of the base stream.
     """
 
-    def __init__(self, *, share: float = 0.125, credit_bytes: int = 16_384) -> None:
+    def __init__(
+        self,
+        *,
+        share: float = 0.125,
+        credit_bytes: int = 16_384,
+        afresh: bool = False,
+        with_origins: bool = False,
+    ) -> None:
         self._share = share
         self._limit = float(credit_bytes)
         self._credit = float(credit_bytes)
         self._newest_frame = -1
-        self._told_of = False
+        self._told_of = with_origins
         self._shown = _Shown(
             np.empty(0, np.int64),
             np.empty((0, 2), np.float32),
@@ -127,6 +140,18 @@ class OverlayEncoder:
         self._written: dict[Layer, LayerUpdate] = {
             layer: LayerUpdate(layer, None, Identity((), (), ()), (), (), ()) for layer in LAYERS
         }
+        if afresh:
+            self._written = {layer: _unknown(layer, with_origins=with_origins) for layer in LAYERS}
+
+    @property
+    def told_of(self) -> bool:
+        """Whether origins are written: a track was not of the base stream."""
+        return self._told_of
+
+    @property
+    def screen(self) -> tuple[LayerUpdate, ...]:
+        """All that is on the screen, whole."""
+        return tuple(self._written.values())
 
     def earn(self, received_bytes: int) -> None:
         """Credit the share of what was received on the link."""
@@ -168,6 +193,19 @@ class OverlayEncoder:
         centres = int((old.centres_px != update.geometry.centres_px).any(axis=1).sum())
         sizes = int((old.half_sizes_px != update.geometry.half_sizes_px).any(axis=1).sum())
         return _ROW_BYTES + _BOX_BYTES // 2 * (centres + sizes)
+
+
+def _unknown(layer: Layer, *, with_origins: bool) -> LayerUpdate:
+    """What no overlay is equal to; labels only where the layer has some."""
+    nobody = (-1,)
+    return LayerUpdate(
+        layer,
+        None,
+        Identity(nobody, ("",), ("",)),
+        ("",) if layer == "refined" else (),
+        nobody,
+        nobody if with_origins else (),
+    )
 
 
 def _held(shown: _Shown, overlay: Overlay) -> _Shown:

@@ -11,13 +11,17 @@ is given `REORDER_WAIT_NS`, and at most `REORDER_UNITS` units wait behind it, be
 keyframe never waits: what is missing before it no longer matters.
 
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
-the present session has been silent for `SILENCE_NS`, and not more than once in `ADOPTION_INTERVAL_NS`: late
-units of the old session, a second edge of the same name or a flood of invented ids cannot make the picture
-jump to and fro. A session that was left may come back, but only beyond where it had been.
+the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
+`ADOPTION_INTERVAL_NS`: late units of the old session or a flood of invented ids cannot make the picture jump to
+and fro. Where the present session still goes on `RIVAL_AFTER_NS` after another was first heard, that is no restart
+but a second edge of the same name: a *rival*, which is shown only when the first has been silent for
+`RIVAL_SILENCE_NS`. A session that was left may come back, but only beyond where it had been. One that the edge
+does not know (`Reassembler.disown`) is nobody's, and the one before it goes on.
 
 *Plausibility.* A sequence number or frame index that is further ahead than `MAX_RATE_HZ` allows since the last
 progress (plus some slack) is not believed, so that one flipped bit cannot make all that follows look old. If
-nothing else comes for `RESTART_SILENCE_NS` it was we who were wrong, and the next keyframe starts afresh.
+nothing else comes for `RESTART_SILENCE_NS` it was we who were wrong, and the next keyframe starts afresh. So it is
+where nothing comes but old numbers that have not been here: somebody else has counted on in the edge's name.
 """
 
 from __future__ import annotations
@@ -50,6 +54,8 @@ REORDER_UNITS = 2
 REORDER_WAIT_NS = 100_000_000
 SILENCE_NS = 500_000_000
 ADOPTION_INTERVAL_NS = 1_000_000_000
+RIVAL_AFTER_NS = 1_000_000_000
+RIVAL_SILENCE_NS = 5_000_000_000
 RESTART_SILENCE_NS = 2_000_000_000
 MAX_RATE_HZ = 240
 SEQUENCE_SLACK = 64
@@ -107,6 +113,8 @@ class Arrival(Generic[H]):
     """The first unit of another session, or of one whose count was lost: reset whatever counts frames."""
     lost_before: int = 0
     """How many units were given up just before this one; above 0 it is the end of a gap."""
+    rival: bool = False
+    """Foreign, and the present session goes on beside it: two edges of one name."""
 
 
 @dataclass(slots=True)
@@ -149,6 +157,8 @@ class Reassembler(Generic[H]):
         self._session: Hashable = None
         self._adopted_ns: int | None = None
         self._left: OrderedDict[Hashable, int] = OrderedDict()  # session id → the sequence it had reached
+        self._outsiders: OrderedDict[Hashable, int] = OrderedDict()  # session id → when it was first heard
+        self._disowned: OrderedDict[Hashable, None] = OrderedDict()
         self._first = 0
         self._next = 0
         self._last_frame = -1
@@ -156,6 +166,7 @@ class Reassembler(Generic[H]):
         self._held: dict[int, Arrival[H]] = {}
         self._synced = False
         self._progress_ns = 0
+        self._interval_ns = 0  # about the time between two units of the present session
         self._unshown = False  # something came since the last progress that could not be used
         self._requested_ns: int | None = None
         self._requests_in_gap = 0
@@ -169,10 +180,21 @@ class Reassembler(Generic[H]):
         """Take one access unit whose CRC is right; return all that is now settled, in order."""
         self.counters.received += 1
         unit = Arrival("decode", header, payload, now_ns)
+        if header.session_id in self._disowned:
+            return [self._judged(unit, "foreign")]
         if self._adopted_ns is None or header.session_id != self._session:
-            return self._accept_outsider(unit, "foreign", patience_ns=SILENCE_NS)
+            rival = self._is_rival(header.session_id, now_ns)
+            patience_ns = max(SILENCE_NS, 3 * self._interval_ns)
+            return self._accept_outsider(
+                unit,
+                "foreign",
+                patience_ns=RIVAL_SILENCE_NS if rival else min(patience_ns, RIVAL_SILENCE_NS),
+                rival=rival,
+            )
         if self._first <= header.sequence < self._next or header.sequence in self._held:
-            return [self._settle_old(unit)]
+            if now_ns - self._progress_ns < RESTART_SILENCE_NS or self._has_been(header.sequence):
+                return [self._settle_old(unit)]
+            return self._accept_outsider(unit, "stale", patience_ns=RESTART_SILENCE_NS)
         if not self._plausible(header, now_ns):
             return self._accept_outsider(unit, "implausible", patience_ns=RESTART_SILENCE_NS)
         self._held[header.sequence] = unit
@@ -186,6 +208,15 @@ class Reassembler(Generic[H]):
     def decoder_failed(self) -> None:
         """The decoder showed nothing for a unit it was given: skip to the next keyframe."""
         self._synced = False
+
+    def disown(self) -> None:
+        """The session that was adopted last is nobody's: skip it, and go on with the next keyframe of any other."""
+        self._disowned[self._session] = None
+        if len(self._disowned) > _REMEMBERED_SESSIONS:
+            self._disowned.popitem(last=False)
+        self._held.clear()
+        self._outsiders.clear()
+        self._adopted_ns, self._synced, self._unshown = None, False, True
 
     def wants_keyframe(self, now_ns: int) -> bool:
         """Whether to ask the edge for a keyframe now: something comes, and nothing can be shown of it.
@@ -250,6 +281,7 @@ class Reassembler(Generic[H]):
             self._synced = False
             return "implausible"
         self._last_frame = header.frame_index
+        self._interval_ns = (3 * self._interval_ns + now_ns - self._progress_ns) // 4
         self._progress_ns = now_ns
         self._unshown = False
         if not self._synced and not header.keyframe:
@@ -257,9 +289,12 @@ class Reassembler(Generic[H]):
         return "decode"
 
     def _settle_old(self, unit: Arrival[H]) -> Arrival[H]:
-        age = self._next - 1 - unit.header.sequence  # negative: waiting behind a hole, so it is here already
-        seen = age < 0 or (age < SEQUENCE_SLACK and self._recent >> age & 1)
-        return self._judged(unit, "duplicate" if seen else "stale")
+        return self._judged(unit, "duplicate" if self._has_been(unit.header.sequence) else "stale")
+
+    def _has_been(self, sequence: int) -> bool:
+        """Whether this old number is known to have come; of those long ago nothing is known."""
+        age = self._next - 1 - sequence  # negative: waiting behind a hole, so it is here already
+        return age < 0 or (age < SEQUENCE_SLACK and bool(self._recent >> age & 1))
 
     def _plausible(self, header: H, now_ns: int) -> bool:
         ahead = (now_ns - self._progress_ns) * MAX_RATE_HZ // 1_000_000_000
@@ -271,19 +306,32 @@ class Reassembler(Generic[H]):
 
     # Between sessions.
 
-    def _accept_outsider(self, unit: Arrival[H], refusal: Verdict, *, patience_ns: int) -> list[Arrival[H]]:
+    def _is_rival(self, session_id: Hashable, now_ns: int) -> bool:
+        """Whether the present session has gone on for a while since that one was first heard."""
+        if self._adopted_ns is None:
+            return False
+        since_ns = self._outsiders.setdefault(session_id, now_ns)
+        self._outsiders.move_to_end(session_id)
+        if len(self._outsiders) > _REMEMBERED_SESSIONS:
+            self._outsiders.popitem(last=False)
+        return self._progress_ns - since_ns > RIVAL_AFTER_NS
+
+    def _accept_outsider(
+        self, unit: Arrival[H], refusal: Verdict, *, patience_ns: int, rival: bool = False
+    ) -> list[Arrival[H]]:
         """A unit that does not continue the session: adopted with a keyframe when the session is silent."""
         header, now_ns = unit.header, unit.received_ns
         if header.sequence < self._left.get(header.session_id, 0):
             return [self._judged(unit, "stale")]
-        self._unshown = True
         if self._adopted_ns is None:
             too_soon, refusal = False, "skip"
         else:
             silent_ns, adopted_ns = now_ns - self._progress_ns, now_ns - self._adopted_ns
             too_soon = silent_ns < patience_ns or adopted_ns < ADOPTION_INTERVAL_NS
+        if not (too_soon and rival):  # while the first edge goes on, nothing of the second is missed
+            self._unshown = True
         if too_soon or not header.keyframe:
-            return [self._judged(unit, refusal)]
+            return [self._judged(unit, refusal, rival=rival and too_soon)]
         settled = self._leave()
         self._adopt(header, now_ns)
         verdict = self._take(unit, now_ns)
@@ -304,12 +352,20 @@ class Reassembler(Generic[H]):
                 self._left.popitem(last=False)
         self._left.pop(header.session_id, None)
         self._session, self._adopted_ns = header.session_id, now_ns
+        self._outsiders.clear()
+        self._interval_ns, self._progress_ns = 0, now_ns
         self._first = self._next = header.sequence
         self._last_frame, self._recent = header.frame_index - 1, 0
         self.counters.sessions += 1
 
     def _judged(
-        self, unit: Arrival[H], verdict: Verdict, *, lost_before: int = 0, starts_session: bool = False
+        self,
+        unit: Arrival[H],
+        verdict: Verdict,
+        *,
+        lost_before: int = 0,
+        starts_session: bool = False,
+        rival: bool = False,
     ) -> Arrival[H]:
         """The unit with its verdict, counted."""
         name = _COUNTER_OF[verdict]
@@ -324,4 +380,5 @@ class Reassembler(Generic[H]):
             starts_run=starts_run,
             starts_session=starts_session,
             lost_before=lost_before,
+            rival=rival,
         )

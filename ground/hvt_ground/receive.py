@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import logging
-import secrets
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
 
 from hvt_common import __version__
+from hvt_common.clock import SteadyClock
 from hvt_common.link.clock import ClockOffset
 from hvt_common.link.inbox import Received
 from hvt_common.link.keys import DELIVERIES, Row, parse_key
 from hvt_common.link.ledger import Channel
 from hvt_common.link.wire import (
-    MAX_STILL_RESULTS,
     BaseHeader,
-    Feedback,
     Info,
+    PastHeader,
+    PastKind,
     RoiHeader,
     Status,
     TrackStep,
     UnknownVersionError,
     WireError,
 )
+from hvt_ground.early import Early
+from hvt_ground.lived_time import LivedTime
+from hvt_ground.past.delivery import PastDelivery
+from hvt_ground.past.recordings import PastRecording, PastRecordings
 from hvt_ground.reassemble import Arrival, Counters, Reassembler
-from hvt_ground.reception import Reception, StepFree
+from hvt_ground.report_back import Reports
+from hvt_ground.rival import Rivals
 from hvt_ground.session import GroundSession
 from hvt_ground.subscribe import EdgePort
 
@@ -37,22 +42,37 @@ _log = logging.getLogger(__name__)
 _SECOND_NS = 1_000_000_000
 _ENDED_PATIENCE_NS = 2 * _SECOND_NS
 """How long the rest of a session may take to arrive after its edge has said that it ended."""
-_GONE_NS = 5 * _SECOND_NS
-"""An edge whose token is gone and that sends nothing for so long has ended without saying so."""
 _INFO_TRIES = 3
 _HEARD_NS = 2 * _SECOND_NS
 """A keyframe is asked for only while the edge is heard."""
+_TELL_NS = 3 * _SECOND_NS
+"""After so long without another piece the log says how much came of what was kept."""
 _DRAIN_NS = _SECOND_NS
 """How long what has already arrived is still taken in when the ground stops."""
 
 
 class EdgeReceiver:
-    """Parses, counts, reassembles, and hands on to the session; asks for keyframes; reports back."""
+    """Parses, counts, reassembles, and hands on to the session; asks for keyframes; reports back.
+
+    Args:
+        port: of the edge.
+        open_session: makes what the messages of a session go to.
+        clock: the port's, Unix nanoseconds without steps; one of its own by default.
+        open_past: makes what goes to a session that is over; without it nothing of one is taken.
+        patience_s: an edge whose token is gone and that sends nothing for so long has ended without saying so.
+    """
 
     def __init__(
-        self, port: EdgePort, *, open_session: Callable[[Info, EdgeReceiver], GroundSession]
+        self,
+        port: EdgePort,
+        *,
+        open_session: Callable[[Info, EdgeReceiver], GroundSession],
+        clock: Callable[[], int] | None = None,
+        open_past: Callable[[Info], PastRecording] | None = None,
+        patience_s: float = 5.0,
     ) -> None:
         self.port = port
+        self._clock = clock or SteadyClock()
         self.clock_offset = ClockOffset()
         self.session: GroundSession | None = None
         self.done: list[GroundSession] = []
@@ -62,19 +82,25 @@ class EdgeReceiver:
         """Messages that were skipped: damaged, foreign, or of another version."""
         self.error: BaseException | None = None
         self._open_session = open_session
-        self._receiver_id = secrets.randbits(64)
-        self._report_sequence = 0
-        self._report_lock = threading.Lock()
-        self._reception = Reception()
-        self._step_free = StepFree(wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
+        self._patience_ns = round(patience_s * _SECOND_NS)
         self._ended_ns: int | None = None
         self._ended_id: int | None = None
-        self._first_status: tuple[Status, Received] | None = None
-        """The first report of a session may overtake the keyframe that begins it; it counts all the same."""
+        self._early = Early()
+        self._rivals = Rivals(port.edge)
+        self.past = PastDelivery(
+            port.edge, recordings=None if open_past is None else PastRecordings(open_past)
+        )
+        """What was kept while the link was away."""
+        self._reports = Reports(port, clock=self._clock, clock_offset=self.clock_offset, past=self.past)
+        self._past_ns: int | None = None
+        """When the last piece of it came, of which nothing has been told yet."""
+        self._worked_ns = 0
         self._stop_ns = 0
         self._counted = Counters()
         """The counters when the session before ended."""
         self._heard_ns = time.monotonic_ns()
+        self._time = LivedTime()
+        """That the reassembly goes by."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"hvt-receive-{port.edge}", daemon=True)
         self._thread.start()
@@ -101,13 +127,24 @@ class EdgeReceiver:
     def _run(self) -> None:
         try:
             while not self._finished():
-                item = self.port.inbox.get(timeout_s=0.05)
+                item = self.port.inbox.get(timeout_s=0.0 if self.past.has_work else 0.05)
                 if item is not None:
                     self._handle(item)
+                self._work_on_past(came=item is not None)
                 self._keep_house()
             self._end_session()
+            self.past.close()
         except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
             self.error = error
+
+    def _work_on_past(self, *, came: bool) -> None:
+        """A frame of it when nothing came, and where something always does ten a second."""
+        if not self.past.has_work:
+            return
+        now_ns = time.monotonic_ns()
+        if not came or now_ns - self._worked_ns > _SECOND_NS // 10:
+            self._worked_ns = now_ns
+            self.past.work()
 
     def _finished(self) -> bool:
         if not self._stop.is_set():
@@ -116,15 +153,18 @@ class EdgeReceiver:
 
     def _handle(self, item: Received) -> None:
         self._heard_ns = time.monotonic_ns()
+        at_ns = self._time.handle(arrived_ns=item.received_ns, now_ns=self._clock())
         parsed = parse_key(item.key)
         row = parsed[1] if parsed else None
         try:
             if row is Row.BASE:
-                self._base(BaseHeader.parse(item.attachment, item.payload), item)
+                self._base(BaseHeader.parse(item.attachment, item.payload), item, at_ns=at_ns)
             elif row is Row.ROI:
                 self._still(RoiHeader.parse(item.attachment, item.payload), item)
             elif row is Row.TRACKS:
                 self._tracks(TrackStep.parse(item.payload), item)
+            elif row is Row.PAST:
+                self._past(PastHeader.parse(item.attachment, item.payload), item)
             elif row is Row.STATUS:
                 self._status(Status.parse(item.payload), item)
         except WireError as error:
@@ -132,9 +172,13 @@ class EdgeReceiver:
                 self.reassembler.corrupt()
             self._skip(str(row), error)
 
-    def _base(self, header: BaseHeader, item: Received) -> None:
-        for arrival in self.reassembler.accept(header, item.payload, now_ns=time.monotonic_ns()):
-            if arrival.starts_session or (arrival.starts_run and self._may_resume(arrival.header.session_id)):
+    def _base(self, header: BaseHeader, item: Received, *, at_ns: int) -> None:
+        for arrival in self.reassembler.accept(header, item.payload, now_ns=at_ns):
+            if arrival.rival:
+                self._note_rival(arrival.header.session_id)
+            if (arrival.starts_session and not self._goes_on(arrival.header)) or (
+                arrival.starts_run and self._may_resume(arrival.header.session_id)
+            ):
                 self._begin_session(arrival.header.session_id)
                 if self.session is None:
                     self.reassembler.decoder_failed()  # the next keyframe is the next try
@@ -154,11 +198,11 @@ class EdgeReceiver:
             own = replace(item, payload=arrival.payload, attachment=arrival.header.pack(arrival.payload))
         # Of one that waited behind a hole only the number counts: the time is that of the message that freed it.
         if own is item:
-            self._reception.base(
+            self._reports.reception.base(
                 arrival.header,
                 size_bytes=own.size_bytes,
-                arrived_ns=self._without_steps_ns(item.received_ns),
-                delay_ms=None if session.lockstep else self._delay_ms(arrival.header, item),
+                arrived_ns=item.received_ns,
+                delay_ms=None if session.lockstep else self._reports.delay_ms(arrival.header, item),
             )
         decodable = arrival.verdict == "decode"
         if not session.base(arrival.header, own, decode=decodable, starts_run=arrival.starts_run):
@@ -166,27 +210,44 @@ class EdgeReceiver:
 
     def _still(self, header: RoiHeader, item: Received) -> None:
         session = self.session
-        if session is None or header.session_id != session.info.session_id:
-            self._skip("roi", WireError("a still of another session"))
+        if session is None:
+            self._early.still(header, item)
+            return
+        if header.session_id != session.info.session_id:
+            self._skip_stranger("roi", header.session_id)
             return
         media_type = item.encoding.partition(";")[0] or DELIVERIES[Row.ROI].encoding
-        self._reception.still(
-            header.sequence, size_bytes=item.size_bytes, arrived_ns=self._without_steps_ns(item.received_ns)
+        self._reports.reception.still(
+            header.sequence, size_bytes=item.size_bytes, arrived_ns=item.received_ns
         )
         session.still(header, item, media_type=media_type)
 
     def _tracks(self, step: TrackStep, item: Received) -> None:
         session = self.session
         if session is None or step.session_id != session.info.session_id:
-            self._skip("tracks", WireError("tracks of another session"))
+            self._skip_stranger("tracks", step.session_id)
             return
         session.tracks(step, item)
+
+    def _past(self, header: PastHeader, item: Received) -> None:
+        session = self.session
+        if session is None:
+            self._skip("past", WireError("it was kept, and no session is open to take it"))
+            return
+        self._reports.reception.past(size_bytes=item.size_bytes, arrived_ns=item.received_ns)
+        self._past_ns = time.monotonic_ns()
+        delivered = False
+        try:
+            delivered = self.past.piece(header, item.payload, session=session)
+        finally:
+            session.past_piece(header, item, delivered=delivered)
+        if delivered and header.kind == PastKind.STILL and header.session_id == session.info.session_id:
+            self._reports.reception.stored_still(header.number)
 
     def _status(self, status: Status, item: Received) -> None:
         session = self.session
         if session is None or status.session_id != session.info.session_id:
-            if status.sequence == 0:
-                self._first_status = (status, item)
+            self._early.status(status, item)
             return
         session.status(status, item)
         if status.state == "ended":
@@ -198,32 +259,48 @@ class EdgeReceiver:
         """Whether a session that is not open here goes on at the edge: after an outage, or a lost answer to info."""
         return self.session is None and session_id != self._ended_id
 
+    def _goes_on(self, header: BaseHeader) -> bool:
+        """Whether the open session comes back from an interruption that was none of its own."""
+        session = self.session
+        if session is None or header.session_id != session.info.session_id:
+            return False
+        return header.frame_index > session.newest_index
+
     def _begin_session(self, session_id: int) -> None:
-        self._end_session()
         info = self._ask_info(session_id)
+        if info is None and self.session is not None and self.refresh_clock() is not None:
+            self.reassembler.disown()
+            self._skip("base", WireError(f"the edge does not know of a session {session_id:016x}"))
+            return
+        self._end_session()
         if info is None:
             self._skip("info", WireError("the edge does not say what its session is"))
             return
         self._ended_ns = None
-        with self._report_lock:
-            self._reception = Reception(lockstep=info.pace == "lockstep")
+        self._reports.begin(lockstep=info.pace == "lockstep")
         self.session = self._open_session(info, self)
-        first, self._first_status = self._first_status, None
-        if first is not None:
+        if (first := self._early.take_status()) is not None:
             self._status(*first)
+        for still in self._early.take_stills():
+            self._still(*still)
 
     def _ask_info(self, session_id: int) -> Info | None:
         for _ in range(_INFO_TRIES):
-            info = self.refresh_clock()
-            if info is not None and info.session_id == session_id:
+            if (info := self.refresh_clock(session_id)) is not None:
                 return info
             if self._stop.is_set():
                 break
         return None
 
-    def refresh_clock(self) -> Info | None:
-        """Ask the edge what it is and what time it has."""
-        answer = self.port.ask_info()
+    def refresh_clock(self, session_id: int | None = None) -> Info | None:
+        """Ask the edge what it is and what time it has; by default the one that is shown.
+
+        Another edge of the same id may run on a machine with another clock.
+        """
+        session = self.session
+        if session_id is None and session is not None:
+            session_id = session.info.session_id
+        answer = self.port.ask_info(session_id)
         if answer is None:
             return None
         info, asked_ns, heard_ns = answer
@@ -245,8 +322,12 @@ class EdgeReceiver:
         session.counters = self.reassembler.counters.since(self._counted)
         self.done.append(session)
         try:
+            self.past.finish()
             session.close()
             self._report(session)
+            while self.past.unsaid:  # one report names a few
+                self._report(session)
+            self.past.session_ended(session.info)
         finally:
             self._counted = replace(self.reassembler.counters)
 
@@ -259,8 +340,9 @@ class EdgeReceiver:
 
     def _keep_house(self) -> None:
         now_ns = time.monotonic_ns()
-        if now_ns - self._heard_ns < _HEARD_NS and self.reassembler.wants_keyframe(now_ns):
-            self.reassembler.keyframe_requested(now_ns)
+        at_ns = self._time.at(self._clock(), waiting=len(self.port.inbox) > 0)
+        if now_ns - self._heard_ns < _HEARD_NS and self.reassembler.wants_keyframe(at_ns):
+            self.reassembler.keyframe_requested(at_ns)
             self.port.request_keyframe()
             if self.session is not None:
                 self.session.note("warning", "keyframe requested")
@@ -268,7 +350,10 @@ class EdgeReceiver:
         if session is None:
             return
         session.raise_error()
-        if self._reception.due(now_ns=self._without_steps_ns(time.time_ns())):
+        if self._past_ns is not None and now_ns - self._past_ns > _TELL_NS and self.past.idle:
+            self._past_ns = None
+            session.tell_past()
+        if self._reports.reception.due(now_ns=self._clock()):
             self._report(session)
         if self._is_over(session, now_ns):
             gone = self._ended_ns is None
@@ -278,49 +363,35 @@ class EdgeReceiver:
 
     def _is_over(self, session: GroundSession, now_ns: int) -> bool:
         if self._ended_ns is not None and session.last_status is not None:
-            wanted = session.last_status.base_messages, session.last_status.roi_messages
-            have = session.frames_received, session.stills_received
+            last, messages = session.last_status, session.ledger.messages
+            wanted = last.base_messages, last.roi_messages, last.past_messages
+            have = session.frames_received, messages(Channel.ROI), messages(Channel.PAST)
             # A report does not count itself. Track steps have no number of their own there: they are metadata.
-            metadata = session.ledger.messages(Channel.META) > session.last_status.meta_messages
-            complete = have[0] >= wanted[0] and have[1] >= wanted[1] and metadata
-            return complete or now_ns - self._ended_ns > _ENDED_PATIENCE_NS
-        return not self.port.present.is_set() and now_ns - self._heard_ns > _GONE_NS
+            metadata = messages(Channel.META) > last.meta_messages
+            whole = metadata and all(one >= other for one, other in zip(have, wanted, strict=True))
+            return (whole and self.past.idle) or now_ns - self._ended_ns > _ENDED_PATIENCE_NS
+        return not self.port.present.is_set() and now_ns - self._heard_ns > self._patience_ns
 
     def _report(self, session: GroundSession) -> None:
         counters = self.reassembler.counters.since(self._counted)
-        with self._report_lock:
-            send_ns = self._without_steps_ns(time.time_ns())
-            measured = self._reception.take(send_ns)
-            delay_ms = measured.delay_p50_ms
-            error_ns = self.clock_offset.error_ns
-            feedback = Feedback(
-                session_id=session.info.session_id,
-                receiver_id=self._receiver_id,
-                sequence=self._report_sequence,
-                send_ns=send_ns,
-                last_frame_index=session.last_frame_index,
-                base_messages=session.frames_received,
-                base_bytes=session.ledger.base_bytes,
-                roi_messages=session.stills_received,
-                roi_bytes=session.ledger.roi_bytes,
-                lost=counters.lost,
-                corrupt=counters.corrupt,
-                base_sequence=measured.base_sequence,
-                base_held_us=measured.base_held_us,
-                still_sequence=measured.still_sequence,
-                delay_p50_ms=-1.0 if delay_ms is None else min(delay_ms, 3_600_000.0),
-                clock_offset_ns=self.clock_offset.offset_ns or 0,
-                clock_error_ns=-1 if error_ns is None else error_ns,
-                stills=session.take_results(MAX_STILL_RESULTS),
-            )
-            self._report_sequence += 1
-            self.port.report(feedback)
+        self._reports.send(session, lost=counters.lost, corrupt=counters.corrupt)
 
-    def _without_steps_ns(self, noted_ns: int) -> int:
-        return self._step_free.time_ns(noted_ns, wall_ns=time.time_ns(), monotonic_ns=time.monotonic_ns())
+    def _note_rival(self, session_id: int) -> None:
+        """A second edge of this id is there, and not shown."""
+        if self.session is None:
+            return
+        shown, now_ns = self.session.info.session_id, time.monotonic_ns()
+        text = self._rivals.note(session_id, shown=shown, now_ns=now_ns)
+        if text is not None:
+            _log.warning("%s", text)
+            self.session.note("warning", text)
 
-    def _delay_ms(self, header: BaseHeader, item: Received) -> float:
-        return max(0.0, (item.received_ns - self.clock_offset.to_local_ns(header.capture_ns)) / 1e6)
+    def _skip_stranger(self, row: str, session_id: int) -> None:
+        """What is of neither this session nor the one that follows."""
+        if self._rivals.knows(session_id):
+            self.unusable += 1
+        else:
+            self._skip(row, WireError(f"it belongs to the session {session_id:016x}, which is not shown"))
 
     def _skip(self, row: str, error: WireError) -> None:
         self.unusable += 1

@@ -1,4 +1,4 @@
-"""What the receiver measures for the edge's rate: the newest message of each stream, when it came, and how old. Pure.
+"""What the receiver tells the edge: the newest message of each stream, when it came, how old; stills missing.
 
 Reports cost the way back: they come so often that together they take `_SHARE` of what arrives, within bounds, and
 only when something new has arrived; in a pause the usual ones, twice a second, go on.
@@ -7,12 +7,13 @@ only when something new has arrived; in a pause the usual ones, twice a second, 
 from __future__ import annotations
 
 import statistics
+import threading
 from collections import deque
 from dataclasses import dataclass
 
-from hvt_common.link.wire import BaseHeader
+from hvt_common.link.wire import MAX_MISSING_STILLS, BaseHeader
 
-__all__ = ["REPORT_LINE_BYTES", "Measured", "Reception", "StepFree"]
+__all__ = ["REPORT_LINE_BYTES", "Measured", "Reception"]
 
 _MS = 1_000_000
 _SECOND_NS = 1_000_000_000
@@ -23,17 +24,8 @@ _LEAST_NS, _MOST_NS = 100 * _MS, 500 * _MS
 _RATE_OVER_NS = 2 * _SECOND_NS
 _MOST_DELAYS = 256
 _HELD_US = 2**32 - 1
-
-
-class StepFree:
-    """Takes the steps out of a wall clock: its times as it would show them, had nobody set it since the start."""
-
-    def __init__(self, *, wall_ns: int, monotonic_ns: int) -> None:
-        self._ahead_ns = wall_ns - monotonic_ns
-
-    def time_ns(self, noted_ns: int, *, wall_ns: int, monotonic_ns: int) -> int:
-        """``noted_ns`` was read off the wall clock a short while ago; the others are read now."""
-        return noted_ns - (wall_ns - monotonic_ns - self._ahead_ns)
+_MISSED_NS = 6 * _SECOND_NS
+"""A still that has not come for so long does not come any more: reports need not name it for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,16 +35,25 @@ class Measured:
     base_sequence: int
     base_held_us: int
     still_sequence: int
+    missing_stills: tuple[int, ...]
+    """Below it, in their order."""
     delay_p50_ms: float | None
     """Of the base messages since the last report."""
 
 
 class Reception:
-    """Of one session. ``now_ns`` is one clock without steps in all calls."""
+    """Of one session. ``now_ns`` is one clock without steps in all calls.
+
+    Safe for threads: messages come in one, and a still that was read in another is reported at once.
+    """
 
     def __init__(self, *, lockstep: bool = False) -> None:
+        self._lock = threading.Lock()
         self._lockstep = lockstep
         self._base_sequence = self._still_sequence = -1
+        self._from_start = False
+        self._missing: dict[int, int] = {}
+        """Sequence → when it was first missed."""
         self._arrived_ns = 0
         self._sizes: deque[tuple[int, int]] = deque()
         self._size_bytes = 0
@@ -64,26 +65,47 @@ class Reception:
         self, header: BaseHeader, *, size_bytes: int, arrived_ns: int, delay_ms: float | None = None
     ) -> None:
         """An access unit of this session has arrived; ``delay_ms`` from capture, where clocks allow to say."""
-        if header.sequence > self._base_sequence:
-            self._base_sequence, self._arrived_ns = header.sequence, arrived_ns
-        if delay_ms is not None:
-            self._delays_ms.append(delay_ms)
-        self._note(size_bytes, arrived_ns)
+        with self._lock:
+            if header.sequence > self._base_sequence:
+                self._base_sequence, self._arrived_ns = header.sequence, arrived_ns
+            self._from_start |= header.sequence == 0
+            if delay_ms is not None:
+                self._delays_ms.append(delay_ms)
+            self._note(size_bytes, arrived_ns)
 
     def still(self, sequence: int, *, size_bytes: int, arrived_ns: int) -> None:
         """A still of this session has arrived."""
-        self._still_sequence = max(self._still_sequence, sequence)
-        self._note(size_bytes, arrived_ns)
+        with self._lock:
+            self._missing.pop(sequence, None)
+            if sequence > self._still_sequence:
+                self._miss(self._still_sequence + 1, sequence, at_ns=arrived_ns)
+                self._still_sequence = sequence
+            self._note(size_bytes, arrived_ns)
+
+    def past(self, *, size_bytes: int, arrived_ns: int) -> None:
+        """A piece of what was kept while the link was away has arrived."""
+        with self._lock:
+            self._note(size_bytes, arrived_ns)
+
+    def stored_still(self, sequence: int) -> None:
+        """A still that never came on ``roi`` came afterwards, with what was kept."""
+        with self._lock:
+            self._missing.pop(sequence, None)
 
     def due(self, now_ns: int) -> bool:
         """Whether a report should go out."""
-        if self._reported_ns is None:
-            return True
-        since_ns = now_ns - self._reported_ns
-        return since_ns >= _MOST_NS or (self._news and since_ns >= self.interval_ns(now_ns))
+        with self._lock:
+            if self._reported_ns is None:
+                return True
+            since_ns = now_ns - self._reported_ns
+            return since_ns >= _MOST_NS or (self._news and since_ns >= self._interval_ns(now_ns))
 
     def interval_ns(self, now_ns: int) -> int:
         """Between two reports while messages arrive."""
+        with self._lock:
+            return self._interval_ns(now_ns)
+
+    def _interval_ns(self, now_ns: int) -> int:
         if self._lockstep:
             return _MOST_NS
         self._forget(now_ns)
@@ -94,17 +116,34 @@ class Reception:
 
     def take(self, now_ns: int) -> Measured:
         """What to report now; delays begin anew."""
-        delays = list(self._delays_ms)
-        self._delays_ms.clear()
-        self._news = False
-        self._reported_ns = now_ns
-        held_us = max(0, now_ns - self._arrived_ns) // 1000 if self._base_sequence >= 0 else 0
-        return Measured(
-            base_sequence=self._base_sequence,
-            base_held_us=min(held_us, _HELD_US),
-            still_sequence=self._still_sequence,
-            delay_p50_ms=statistics.median(delays) if delays else None,
-        )
+        with self._lock:
+            delays = list(self._delays_ms)
+            self._delays_ms.clear()
+            self._news = False
+            self._reported_ns = now_ns
+            held_us = max(0, now_ns - self._arrived_ns) // 1000 if self._base_sequence >= 0 else 0
+            return Measured(
+                base_sequence=self._base_sequence,
+                base_held_us=min(held_us, _HELD_US),
+                still_sequence=self._still_sequence,
+                missing_stills=self._missing_now(now_ns),
+                delay_p50_ms=statistics.median(delays) if delays else None,
+            )
+
+    def _miss(self, first: int, end: int, *, at_ns: int) -> None:
+        """Those from ``first`` up to ``end`` have not come; of many, the newest count.
+
+        What was sent before this ground was there is not missed.
+        """
+        if self._still_sequence < 0 and not self._from_start:
+            return
+        self._missing |= dict.fromkeys(range(max(first, end - MAX_MISSING_STILLS), end), at_ns)
+        while len(self._missing) > MAX_MISSING_STILLS:
+            del self._missing[next(iter(self._missing))]
+
+    def _missing_now(self, now_ns: int) -> tuple[int, ...]:
+        self._missing = {one: at_ns for one, at_ns in self._missing.items() if now_ns - at_ns <= _MISSED_NS}
+        return tuple(self._missing)
 
     def _note(self, size_bytes: int, arrived_ns: int) -> None:
         self._sizes.append((arrived_ns, size_bytes))

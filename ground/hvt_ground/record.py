@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -24,7 +24,8 @@ from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, Video
 from hvt_ground.live_view import LiveSink
 from hvt_ground.overlay_encoding import LAYERS, Identity, Layer, LayerUpdate, OverlayEncoder
 from hvt_ground.palette import AMBER, GREY, VERMILLION, Rgb
-from hvt_ground.record_stills import Row, StillRows
+from hvt_ground.record_past_overlays import PastOverlays
+from hvt_ground.record_stills import At, Row, StillRows
 from hvt_ground.recording_room import TABLE_BYTES, Room
 from hvt_ground.rrd_file import RrdEncoder, RrdFile
 from hvt_ground.rrd_footer import add_footer
@@ -100,6 +101,7 @@ class Recorder:
         self._settings = settings
         self._lock = threading.Lock()
         self._overlays = OverlayEncoder()
+        self._past_overlays = PastOverlays(fps=settings.fps)
         self._room = Room()
         self._stills = StillRows(self._room)
         self._class_ids: dict[str, int] = {}
@@ -128,7 +130,10 @@ class Recorder:
         return self._file.path.stat().st_size if self._closed else self._file.size_bytes
 
     def log(self, event: Event) -> None:
-        """Record an event. An access unit that no decoder could use at its place is left out."""
+        """Record an event. An access unit that no decoder could use at its place is left out.
+
+        What was ``stored`` may lie before what was logged already: whoever logs it vouches for its place.
+        """
         with self._lock:
             if self._closed:
                 return
@@ -145,8 +150,11 @@ class Recorder:
                     chunks = self._notice(event)
             self._write(chunks)
 
-    def close(self) -> None:
-        """Fold what is left and close the file and the viewer's connection; a second call does nothing."""
+    def close(self, *, footer: bool = True) -> None:
+        """Fold what is left and close the file and the viewer's connection; a second call does nothing.
+
+        Without ``footer`` none is added, which may take seconds.
+        """
         with self._lock:
             if self._closed:
                 return
@@ -156,7 +164,8 @@ class Recorder:
             finally:
                 if self._file is not None:
                     self._file.close()
-                    add_footer(self._file.path)
+                    if footer:
+                        add_footer(self._file.path)
                 self._encoder.close()
                 if self._live is not None:
                     self._live.close()
@@ -208,7 +217,7 @@ class Recorder:
         if chunks and self._file is not None:
             self._file.fold(self._encoder.chunks(chunks))
 
-    def _row(self, path: str, columns: Any, event: Event, value: Any, *, size_bytes: int = 64) -> Chunk:
+    def _row(self, path: str, columns: Any, event: Event | At, value: Any, *, size_bytes: int = 64) -> Chunk:
         """Add a row to the table of this entity and these columns; ``size_bytes``: its cost once folded, about."""
         key = (path, columns.__name__)
         table = self._tables.get(key)
@@ -221,18 +230,24 @@ class Recorder:
         return table.add(event.frame_index, event.capture_ns, value)
 
     def _rows(self, rows: Sequence[Row], event: Event) -> list[Chunk]:
-        return [self._row(row.path, row.columns, event, row.value, size_bytes=row.size_bytes) for row in rows]
+        return [
+            self._row(row.path, row.columns, row.at or event, row.value, size_bytes=row.size_bytes)
+            for row in rows
+        ]
 
     # -- the events -------------------------------------------------------------------------------------------
 
     def _sample(self, sample: VideoSample) -> list[Chunk]:
-        if not self._decodable(sample):
+        if not sample.stored and not self._decodable(sample):
             log.debug("frame %d left out of the recording: not decodable there", sample.frame_index)
             return []
-        self._last_sample = sample.frame_index
         size = len(sample.data)
         self._room.received_bytes += size
-        self._overlays.earn(size)
+        if sample.stored:
+            self._past_overlays.earn(size)
+        else:
+            self._last_sample = sample.frame_index
+            self._overlays.earn(size)
         return [self._row(names.VIDEO, video_columns, sample, sample.data, size_bytes=size)]
 
     def _decodable(self, sample: VideoSample) -> bool:
@@ -242,9 +257,20 @@ class Recorder:
         return sample.frame_index > self._last_sample and bool(sample.data)
 
     def _overlay(self, overlay: Overlay) -> list[Chunk]:
+        if overlay.stored:
+            return self._past_overlay(overlay)
         chunks = self._rows(self._stills.overlay(overlay), overlay)
         for update in self._overlays.encode(overlay):
             chunks += self._layer(overlay, update)
+        self._past_overlays.note(overlay, self._overlays)
+        return chunks
+
+    def _past_overlay(self, overlay: Overlay) -> list[Chunk]:
+        """Patches stay away: they ride on tracks of now."""
+        chunks = []
+        timed = self._past_overlays.encode(overlay, with_origins=self._overlays.told_of)
+        for frame_index, capture_ns, update in timed:
+            chunks += self._layer(replace(overlay, frame_index=frame_index, capture_ns=capture_ns), update)
         return chunks
 
     def _layer(self, overlay: Overlay, update: LayerUpdate) -> list[Chunk]:

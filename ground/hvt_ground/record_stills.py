@@ -11,9 +11,10 @@ import rerun as rr
 
 from hvt_ground import blueprint as names
 from hvt_ground.events import Overlay, Refinement
-from hvt_ground.gallery import SLOTS, Gallery, placed
-from hvt_ground.palette import GREY, class_colour
+from hvt_ground.gallery import HOLD_S, SLOTS, Gallery, placed
+from hvt_ground.palette import GREY, Rgb, class_colour
 from hvt_ground.patches import Patches
+from hvt_ground.record_past_stills import PastGallery, Put, Shown
 from hvt_ground.recording_room import Room
 from hvt_ground.rrd_tables import (
     Captions,
@@ -28,7 +29,7 @@ from hvt_ground.rrd_tables import (
 )
 from hvt_ground.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
 
-__all__ = ["Row", "StillRows"]
+__all__ = ["At", "Row", "StillRows"]
 
 HIDDEN_CROP_RATIO = 1.15
 """A still that is not shown keeps its base crop while the recording is smaller than this times the bytes received."""
@@ -45,6 +46,14 @@ _PATCH_BYTES = 100
 
 
 @dataclass(frozen=True, slots=True)
+class At:
+    """A moment of a recording."""
+
+    frame_index: int
+    capture_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class Row:
     """A row for the table of an entity with these columns."""
 
@@ -53,6 +62,8 @@ class Row:
     value: Any
     size_bytes: int = 64
     """What it costs once folded, about."""
+    at: At | None = None
+    """Where that is not the event's."""
 
 
 class StillRows:
@@ -62,6 +73,7 @@ class StillRows:
         self._room = room
         self._gallery = Gallery()
         self._captions: Captions = (("", GREY),) * SLOTS
+        self._past = PastGallery(self._captions, hold_ns=round(HOLD_S * 1e9))
         self._patches = Patches()
         self._pictured: OrderedDict[int, None] = OrderedDict()
 
@@ -78,7 +90,10 @@ class StillRows:
         base = base_picture(refinement, still_size=still[1], limit_bytes=round(0.8 * len(still[0])))
         shown = self._pair(refinement, base, still, changed=changed)
         spent = sum(row.size_bytes for row in shown)
-        # A still that found no slot in the gallery can be seen on the enhanced picture only.
+        # A still that found no slot in the gallery can be seen on the enhanced picture only. Patches ride on the
+        # tracks of now: one of long ago has no place there.
+        if refinement.stored:
+            return rows + (shown or self._hidden(refinement, base, still))
         if self._room.has(spent + len(still[0]) + _PATCH_BYTES, ratio=PATCH_RATIO) or not (
             shown or still[0] is not refinement.still
         ):
@@ -111,17 +126,34 @@ class StillRows:
         cost = sum(len(data) for _, (data, _) in pictures)
         if still[0] is not refinement.still and not self._room.has(cost, ratio=PAIR_RATIO):
             return []
-        slot = self._gallery.take(refinement.capture_ns, changed=changed)
-        if slot is None:
+        put = self._slot(refinement, changed=changed)
+        if put is None:
             return []
-        captions = list(self._captions)
-        captions[slot] = (caption(refinement), class_colour(refinement.class_after))
-        self._captions = tuple(captions)
         rows = []
         for name, (data, size) in pictures:
-            picture = Picture(data, placed(slot, size, right=name == "still"))
-            rows.append(Row(f"{names.STILLS}/{slot}/{name}", picture_columns, picture, len(data)))
-        return [*rows, Row(names.CAPTIONS, caption_columns, self._captions, 160)]
+            picture = Picture(data, placed(put.slot, size, right=name == "still"))
+            rows.append(Row(f"{names.STILLS}/{put.slot}/{name}", picture_columns, picture, len(data)))
+        for shown in put.rows:
+            at = At(shown.frame_index, shown.capture_ns)
+            rows.append(Row(names.CAPTIONS, caption_columns, shown.captions, 160, at))
+        return rows
+
+    def _slot(self, refinement: Refinement, *, changed: bool) -> Put[tuple[str, Rgb]] | None:
+        """A slot of the gallery and the captions to write; None where all are held."""
+        words = (caption(refinement), class_colour(refinement.class_after))
+        at = refinement.frame_index, refinement.capture_ns
+        if refinement.stored:
+            put = self._past.put(*at, words)
+            if put is not None and put.stays:
+                self._captions = _with(self._captions, put.slot, words)
+            return put
+        slot = self._gallery.take(refinement.capture_ns, changed=changed)
+        if slot is None:
+            return None
+        self._captions = _with(self._captions, slot, words)
+        row = Shown(*at, self._captions)
+        self._past.note(slot, row)
+        return Put(slot, (row,), stays=True)
 
     def _patch(self, refinement: Refinement, still: Coded) -> list[Row]:
         """The still on the enhanced picture; nothing where its object is not on the screen."""
@@ -142,3 +174,7 @@ class StillRows:
             if data is refinement.still or self._room.has(len(data), ratio=HIDDEN_CROP_RATIO):
                 rows.append(Row(f"{path}/{name}", hidden_picture_columns, data, len(data)))
         return rows
+
+
+def _with(captions: Captions, slot: int, words: tuple[str, Rgb]) -> Captions:
+    return (*captions[:slot], words, *captions[slot + 1 :])

@@ -12,41 +12,20 @@ stills of the track say (see `Belief`). Frames are the only clock here; `History
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from typing import Generic, Literal, Protocol, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
-from hvt_common.values import Posterior, Tracks
+from hvt_common.values import Tracks
 from hvt_ground.belief import Belief, Labels, Reading
 from hvt_ground.match import Candidate, Matcher, Wanted
+from hvt_ground.settled import Outcome, Settled, Shown, StillSeen
 
 __all__ = ["Counters", "Mode", "Outcome", "Refiner", "Settled", "Shown", "StillSeen", "TrackLog"]
 
 Mode = Literal["replace", "fuse"]
-
-Outcome = Literal["matched", "superseded", "no track", "ambiguous", "frame lost", "late", "overflow", "ended"]
-"""What became of a still:
-
-matched
-    it spoke on the class of ``track_id``.
-superseded
-    it belongs to ``track_id``, but a still of a later frame has already replaced the class.
-no track
-    no track of the ground overlaps its box enough at its frame.
-ambiguous
-    two tracks of the ground fit its box about equally well.
-frame lost
-    the ground never decoded its frame.
-late
-    its frame is older than the history, or was not reached within the hold time.
-overflow
-    more stills wait than are held; the oldest goes.
-ended
-    it still waited when the stream or its session ended.
-"""
 
 MAX_HELD = 256
 MAX_BELIEFS = 1024
@@ -70,64 +49,6 @@ class TrackLog(Protocol):
         """The tracks of that frame; None if it is lost, gone, or not tracked yet."""
 
 
-@dataclass(frozen=True, slots=True)
-class StillSeen(Generic[P]):
-    """A still that was decoded and classified."""
-
-    sequence: int
-    frame_index: int
-    capture_ns: int
-    edge_track_id: int
-    """The edge's own track; negative when the still was asked for by box."""
-    box_base_px: tuple[float, float, float, float]
-    """x1 y1 x2 y2, base pixels, without padding."""
-    class_name: str
-    """What the edge's detector called it."""
-    posterior: Posterior
-    """Of the classifier, over the `Refiner`'s ``classifier_classes``."""
-    carried: P
-    """Whatever the caller wants back with it (the coded still, its header)."""
-    news: float = 1.0
-    """How much the still shows that the base did not, 0…1; see `news`."""
-    part: int = 0
-    """Which of the objects that the still shows: each is offered by itself, under the still's sequence number."""
-
-    @property
-    def key(self) -> tuple[int, int]:
-        """Sequence and part."""
-        return self.sequence, self.part
-
-
-@dataclass(frozen=True, slots=True)
-class Settled(Generic[P]):
-    """A still and what it did."""
-
-    still: StillSeen[P]
-    outcome: Outcome
-    track_id: int | None
-    """The ground's track; None unless the outcome is matched or superseded."""
-    class_before: str
-    """The class that was shown for the track; without a track what the edge's detector said."""
-    class_after: str
-    """The class that is shown from now on; without a track what the still alone says."""
-    confidence: float
-    """Of ``class_after``, 0…1."""
-    entropy_nats: float
-    """Of the distribution that ``class_after`` was taken from."""
-
-
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """Classes of N tracks, parallel to the `Tracks` they were asked for; fields of `events.Overlay`."""
-
-    base_classes: tuple[str, ...]
-    classes: tuple[str, ...]
-    confidences: npt.NDArray[np.float32]
-    """(N,) of ``classes``, 0…1."""
-    refined: npt.NDArray[np.bool_]
-    """(N,) True once a still has spoken."""
-
-
 @dataclass(slots=True)
 class Counters:
     """Totals of one session."""
@@ -144,6 +65,10 @@ class Counters:
     """Distinct tracks of the ground on whose class a still has spoken."""
     class_changes: int = 0
     """Stills after which the class shown was another than before."""
+
+
+def _unknown(_edge_track_id: int) -> None:
+    """Where the edge tells nothing of its tracks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,17 +135,20 @@ class Refiner(Generic[P]):
         oldest = next(iter(self._held))
         return [self._unmatched(self._held.pop(oldest).still, "overflow")]
 
-    def settle(self, log: TrackLog, *, now_frame: int) -> list[Settled[P]]:
+    def settle(
+        self, log: TrackLog, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
+    ) -> list[Settled[P]]:
         """Match what can be matched and give up what never will be, oldest frame first.
 
-        Call it after each frame was tracked, with the newest frame that was decoded.
+        Call it after each frame was tracked, with the newest frame that was decoded. ``known_as`` gives the ground's
+        track for one of the edge, where the edge itself has told.
         """
         by_frame: dict[int, list[_Held[P]]] = {}
         for held in self._held.values():
             by_frame.setdefault(held.still.frame_index, []).append(held)
         settled: list[Settled[P]] = []
         for frame_index in sorted(by_frame):
-            settled += self._settle_frame(by_frame[frame_index], log, now_frame)
+            settled += self._settle_frame(by_frame[frame_index], log, now_frame, known_as)
         for done in settled:
             del self._held[done.still.key]
         return settled
@@ -266,11 +194,13 @@ class Refiner(Generic[P]):
 
     # One frame's stills.
 
-    def _settle_frame(self, held: list[_Held[P]], log: TrackLog, now_frame: int) -> list[Settled[P]]:
+    def _settle_frame(
+        self, held: list[_Held[P]], log: TrackLog, now_frame: int, known_as: Callable[[int], int | None]
+    ) -> list[Settled[P]]:
         frame_index = held[0].still.frame_index
         tracks = log.tracks(frame_index)
         if tracks is None:
-            return self._settle_untracked(held, log, now_frame)
+            return self._settle_untracked(held, log, now_frame, known_as)
         found = self._match(held, tracks, log)
         newest = log.newest_tracked
         settled: list[Settled[P]] = []
@@ -285,18 +215,42 @@ class Refiner(Generic[P]):
                 settled.append(self._unmatched(waiting.still, outcome))
         return settled
 
-    def _settle_untracked(self, held: Iterable[_Held[P]], log: TrackLog, now_frame: int) -> list[Settled[P]]:
+    def _settle_untracked(
+        self,
+        held: Iterable[_Held[P]],
+        log: TrackLog,
+        now_frame: int,
+        known_as: Callable[[int], int | None],
+    ) -> list[Settled[P]]:
         """Tracks come in the order of frames: once a later frame is there, an absent one never will be."""
         settled: list[Settled[P]] = []
         for waiting in held:
             oldest, newest, frame_index = log.oldest_tracked, log.newest_tracked, waiting.still.frame_index
+            outcome: Outcome | None = None
             if oldest is not None and frame_index < oldest:
-                settled.append(self._unmatched(waiting.still, "late"))
+                outcome = "late"
             elif newest is not None and frame_index < newest:
-                settled.append(self._unmatched(waiting.still, "frame lost"))
+                outcome = "frame lost"
             elif now_frame > waiting.last_frame:
-                settled.append(self._unmatched(waiting.still, "late"))
+                outcome = "late"
+            if outcome is not None:
+                named = self._by_name(waiting.still, log, known_as) if waiting.still.stored else None
+                settled.append(named or self._unmatched(waiting.still, outcome))
         return settled
+
+    def _by_name(
+        self, still: StillSeen[P], log: TrackLog, known_as: Callable[[int], int | None]
+    ) -> Settled[P] | None:
+        """Let a still of long ago speak on the track that its edge track is known as now; None where it is not."""
+        edge_id = still.edge_track_id
+        if edge_id < 0 or log.newest_tracked is None:
+            return None
+        track_id, tracks = known_as(edge_id), log.tracks(log.newest_tracked)
+        if track_id is None:
+            track_id = self._matcher.known_as(edge_id)
+        if track_id is None or tracks is None or track_id not in tracks.ids:
+            return None
+        return self._speak(still, tracks, int(np.flatnonzero(tracks.ids == track_id)[0]))
 
     def _match(self, held: list[_Held[P]], tracks: Tracks, log: TrackLog) -> dict[Hashable, Candidate]:
         wanted = [

@@ -24,6 +24,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
+from hvt_ground.rrd_release import release_recordings, send_blueprint
 
 __all__ = ["RrdEncoder", "RrdFile"]
 
@@ -36,6 +37,7 @@ class RrdEncoder:
     """Turns chunks into the messages of an RRD stream of one recording, LZ4-compressed by the SDK."""
 
     def __init__(self, *, application_id: str, recording_id: str, name: str) -> None:
+        self._application_id = application_id
         self._recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
         # Rows are timed by frame and capture time; the SDK's own two timelines would cost bytes and mean nothing.
         self._recording.set_log_time_enabled(False)
@@ -47,7 +49,7 @@ class RrdEncoder:
 
     def blueprint(self, blueprint: rrb.Blueprint) -> bytes:
         """The blueprint, made active when the recording is opened."""
-        self._recording.send_blueprint(blueprint)
+        send_blueprint(self._recording, blueprint, application_id=self._application_id)
         return self._messages()
 
     def chunks(self, chunks: Sequence[Chunk]) -> bytes:
@@ -59,6 +61,8 @@ class RrdEncoder:
         """Release the SDK's stream; nothing is lost, since every call returned its bytes."""
         self._recording.disconnect()
         self._stream.read()  # its own farewell, or the SDK warns that it was dropped
+        del self._stream, self._recording
+        release_recordings()
 
     def _messages(self) -> bytes:
         """What the SDK encoded since the last call, without the stream's header and footer."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -40,6 +41,8 @@ __all__ = [
     "told_identity_columns",
     "video_columns",
 ]
+
+_LATEST_NS = 2**63 - 1
 
 T = TypeVar("T")
 Columns = Iterable[rr.ComponentColumn]
@@ -89,9 +92,12 @@ class Table(Generic[T]):
     _values: list[T] = field(default_factory=list)
 
     def add(self, frame: int, capture_ns: int, value: T) -> Chunk:
-        """Keep a row; returns it as a chunk of its own, for the journal."""
+        """Keep a row; returns it as a chunk of its own, for the journal.
+
+        Times come from the wire and are reckoned on from there: what no timestamp can hold is held at its end.
+        """
         self._frames.append(frame)
-        self._capture_ns.append(capture_ns)
+        self._capture_ns.append(min(max(capture_ns, 0), _LATEST_NS))
         self._values.append(value)
         return self._chunk(slice(-1, None))
 
@@ -103,9 +109,19 @@ class Table(Generic[T]):
         """All rows since the last call as one chunk; None where there are none."""
         if not self._values:
             return None
+        self._sort()
         chunk = self._chunk(slice(None))
         self._frames, self._capture_ns, self._values = [], [], []
         return chunk
+
+    def _sort(self) -> None:
+        """Rows that were kept while the link was away come late; of those of one frame the last counts."""
+        if all(one <= other for one, other in pairwise(self._frames)):
+            return
+        order = sorted(range(len(self._frames)), key=self._frames.__getitem__)
+        self._frames = [self._frames[place] for place in order]
+        self._capture_ns = [self._capture_ns[place] for place in order]
+        self._values = [self._values[place] for place in order]
 
     def _chunk(self, rows: slice) -> Chunk:
         times = np.array(self._capture_ns[rows], "datetime64[ns]")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hvt_common.distinct import DistinctIds
 from hvt_common.latency import LatencyStats
 from hvt_common.link.inbox import Received
 from hvt_common.link.keys import EdgeKeys, Row
@@ -16,6 +15,8 @@ from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
 from hvt_common.link.wire import (
     BaseHeader,
     Info,
+    PastHeader,
+    PastUnit,
     RoiHeader,
     Status,
     StillResult,
@@ -27,16 +28,22 @@ from hvt_common.vision.hevc import BaseDecoder
 from hvt_ground.events import Event, Notice, Traffic, VideoSample
 from hvt_ground.export_tracks import TrackTable
 from hvt_ground.eyes import Eyes, LockstepEyes, RealtimeEyes
+from hvt_ground.past.fill import Arrived, PastFill, Work
+from hvt_ground.past.look import PastLook
 from hvt_ground.reassemble import Counters
 from hvt_ground.record import Recorder
 from hvt_ground.sight import GroundSight, Picture, ReceivedStill
+from hvt_ground.still_numbers import StillNumbers
+from hvt_ground.timing import SessionTiming
 
 __all__ = ["GroundSession"]
 
-_log = logging.getLogger(__name__)
-
 _SECOND_NS = 1_000_000_000
 _MILLION = 1_000_000
+_ANEW_NS = 5 * _SECOND_NS
+"""What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
+_MOST_RESULTS = 4096
+"""Reports take 32 each; in a flood the newest count."""
 
 
 class GroundSession:
@@ -45,6 +52,7 @@ class GroundSession:
     In lockstep it sees in the receiving thread instead: nothing is skipped, and the same input gives the same tracks.
 
     ``sight_of(emit)`` builds the eyes. ``report()`` is called when there is something for the edge to hear.
+    ``past_look`` finds boxes in video that was kept while the link was away.
     """
 
     def __init__(
@@ -54,15 +62,18 @@ class GroundSession:
         recorder: Recorder | None,
         recording: Path | None,
         tables: Sequence[TrackTable] = (),
+        timing: SessionTiming | None = None,
         sight_of: Callable[[Callable[[Event], None]], GroundSight],
         to_local_ns: Callable[[int], int],
         clock: Callable[[], int],
         report: Callable[[], None],
+        past_look: PastLook | None = None,
     ) -> None:
         self.info = info
         self.recorder = recorder
         self.recording = recording
         self._tables = tables
+        self._timing = timing
         self.lockstep = info.pace == "lockstep"
         self.ledger = Ledger(window_ns=info.window_ns)
         self.sight = sight_of(self._emit)
@@ -79,9 +90,11 @@ class GroundSession:
         self.counters = Counters()
         """What the reassembly counted in this session; filled in when it ends."""
         self._keys = EdgeKeys(info.edge)
-        self._decoder = BaseDecoder()
+        self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
         self._last_step = -1
+        self._stepped_ns = self._reported_ns = 0
+        """When the newest report of tracks came, and the newest status."""
         self._to_local_ns = to_local_ns
         self._clock = clock
         self._report = report
@@ -91,7 +104,8 @@ class GroundSession:
         self._next_traffic_ns = 0
         self._results: list[StillResult] = []
         self._results_lock = threading.Lock()
-        self._still_sequences = DistinctIds(remember=4096)
+        self._still_numbers = StillNumbers()
+        self._past = PastFill(info, log=self._log_past, look=past_look)
         eyes = LockstepEyes if self.lockstep else RealtimeEyes
         self._eyes: Eyes = eyes(self._see, self._step, self._read, name=info.edge)
 
@@ -99,6 +113,20 @@ class GroundSession:
 
     def base(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
         """Take one access unit; False where the decoder could make nothing of it."""
+        good = self._access_unit(header, item, decode=decode, starts_run=starts_run)
+        if self._timing is not None:
+            self._timing.message(
+                Row.BASE,
+                item,
+                sequence=header.sequence,
+                frame_index=header.frame_index,
+                capture_ns=header.capture_ns,
+                send_ns=header.send_ns,
+                shown=good and decode,
+            )
+        return good
+
+    def _access_unit(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
         at_ns = header.send_ns
         self._count(Row.BASE, Channel.BASE, item, at_ns=at_ns)
         self.frames_received += 1
@@ -114,6 +142,7 @@ class GroundSession:
             return False
         self.frames_decoded += 1
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
+        self._past.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
         reference_ns = item.received_ns if self.lockstep else self._to_local_ns(header.capture_ns)
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
@@ -122,10 +151,20 @@ class GroundSession:
         return True
 
     def still(self, header: RoiHeader, item: Received, *, media_type: str) -> None:
-        """Take one still; a second one of the same number is ignored."""
-        if not self._still_sequences.add([header.sequence]):
+        """Take one still; a second one of the same number is counted and not shown, a third ignored."""
+        if not self._still_numbers.is_new(header.sequence, send_ns=header.send_ns):
+            if self._still_numbers.is_copy(header.sequence, send_ns=header.send_ns):
+                self._count(Row.ROI, Channel.ROI, item, at_ns=header.send_ns)
             return
         self._count(Row.ROI, Channel.ROI, item, at_ns=header.send_ns)
+        if self._timing is not None:
+            self._timing.still(
+                item,
+                sequence=header.sequence,
+                frame_index=header.frame_index,
+                capture_ns=header.capture_ns,
+                send_ns=header.send_ns,
+            )
         self.stills_received += 1
         self.ledger.record_fate("received", header.reason)
         still = ReceivedStill(header, item.payload, media_type)
@@ -137,21 +176,88 @@ class GroundSession:
         Raises:
             WireError: its boxes make no sense.
         """
+        now_ns = self._clock()
         if step.sequence <= self._last_step:
-            return
-        self._last_step = step.sequence
+            if step.reference >= 0 or now_ns - self._stepped_ns < _ANEW_NS:
+                return
+            self._step_decoder = TrackStepDecoder()
+        self._last_step, self._stepped_ns = step.sequence, now_ns
         self._count(Row.TRACKS, Channel.META, item, at_ns=step.send_ns)
         self.steps_received += 1
         tracks = self._step_decoder.decode(step)
+        if self._timing is not None:
+            self._timing.message(
+                Row.TRACKS,
+                item,
+                sequence=step.sequence,
+                frame_index=step.frame_index,
+                capture_ns=step.capture_ns,
+                send_ns=step.send_ns,
+                shown=tracks is not None,
+            )
         if tracks is not None:
             self._eyes.step(tracks, step.capture_ns)
 
     def status(self, status: Status, item: Received) -> None:
         """Take the edge's report; one that is not newer than the last is ignored."""
-        if self.last_status is not None and status.sequence <= self.last_status.sequence:
+        now_ns = self._clock()
+        old = self.last_status is not None and status.sequence <= self.last_status.sequence
+        if old and now_ns - self._reported_ns < _ANEW_NS:
             return
+        self._reported_ns = now_ns
         self._count(Row.STATUS, Channel.META, item, at_ns=status.send_ns)
+        if self._timing is not None:
+            self._timing.message(Row.STATUS, item, sequence=status.sequence, send_ns=status.send_ns)
         self.last_status = status
+
+    # What was kept while the link was away
+
+    @property
+    def past(self) -> Arrived:
+        """How much of it has come."""
+        return self._past.arrived
+
+    @property
+    def has_room(self) -> bool:
+        """Whether `later` takes more."""
+        return self._eyes.has_room
+
+    def past_piece(self, header: PastHeader, item: Received, *, delivered: bool) -> None:
+        """Count a piece, of whichever session; ``delivered``: with it an object was whole, and is of use."""
+        self._count(Row.PAST, Channel.PAST, item, at_ns=header.send_ns)
+        if self._timing is not None:
+            self._timing.message(
+                f"{Row.PAST}-{header.kind}",
+                item,
+                sequence=header.number,
+                send_ns=header.send_ns,
+                shown=delivered,
+            )
+
+    def stored_still(self, still: ReceivedStill) -> Work | None:
+        """What the eyes are to do with a still of this session; None where it has come before, on whichever way."""
+        if not self._still_numbers.is_new_stored(still.header.sequence):
+            return None
+        return self._read_stored(still)
+
+    def stored_video(self, units: Sequence[PastUnit]) -> Work:
+        """What the receiving thread is to do with a stretch of this session's base stream, when nothing comes."""
+        return self._past.fill(units, boxes=self.at_leisure)
+
+    def later(self, work: Work) -> bool:
+        """Let the eyes do it, as far as the picture of now leaves them time; False where too much waits already."""
+        return self._eyes.later(work)
+
+    def at_leisure(self, work: Work) -> bool:
+        """The same for what gives way to that, too."""
+        return self._eyes.at_leisure(work)
+
+    def tell_past(self) -> None:
+        """Put a line into the recording's log on what has come since the last one."""
+        news = self._past.take_news()
+        if news.first is not None:
+            at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // _SECOND_NS))
+            self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
 
     def note(self, level: str, text: str) -> None:
         """Put a line into the recording's log."""
@@ -165,6 +271,11 @@ class GroundSession:
             return tuple(taken)
 
     @property
+    def newest_index(self) -> int:
+        """Frame index of the newest access unit; -1 before the first."""
+        return self._last_index
+
+    @property
     def duration_s(self) -> float:
         """From the first frame received to the last."""
         if self._first_index is None:
@@ -176,8 +287,12 @@ class GroundSession:
         try:
             if self._eyes.close():
                 self.sight.end()
+            self.tell_past()
+            self._decoder.reset()
             self.note("info", f"session {self.info.session_id:016x} ended")
         finally:
+            if self._timing is not None:
+                self._timing.close()
             for table in self._tables:
                 table.close()
             if self.recorder is not None:
@@ -219,12 +334,22 @@ class GroundSession:
 
     def _read(self, stills: Sequence[ReceivedStill]) -> None:
         self.sight.read(stills)
+        if self._timing is not None:
+            self._timing.read(one.header.sequence for one in stills)
         self._hear_results()
         self._report()
 
+    def _read_stored(self, still: ReceivedStill) -> Work:
+        self.sight.read([still])
+        self._past.note_still(still.header.frame_index, still.header.capture_ns)
+        self._hear_results()
+        self._report()
+        yield
+        return True
+
     def _hear_results(self) -> None:
         with self._results_lock:
-            self._results += self.sight.take_results()
+            self._results = (self._results + self.sight.take_results())[-_MOST_RESULTS:]
 
     # Account
 
@@ -260,6 +385,11 @@ class GroundSession:
                 tracks_refined=self.sight.refined,
             )
         )
+
+    def _log_past(self, event: Event) -> None:
+        """Into the recording only: a table of tracks is in the order of frames."""
+        if self.recorder is not None:
+            self.recorder.log(event)
 
     def _emit(self, event: Event) -> None:
         if self.recorder is not None:

@@ -41,6 +41,10 @@ def _history_bytes(base_size: tuple[int, int]) -> int:
     return min(_MOST_HISTORY_BYTES, _HISTORY_FRAMES * 3 * base_size[0] * base_size[1])
 
 
+def _lent_nothing() -> None:
+    """What there is to release where nothing was lent."""
+
+
 @dataclass(frozen=True, slots=True)
 class Picture:
     """A decoded base frame."""
@@ -66,6 +70,8 @@ class SightParts:
     """The one that ``fusion`` moves boxes by."""
     camera: CameraMotion | None
     """None where the camera's motion is not followed."""
+    release: Callable[[], None] = _lent_nothing
+    """Called when the session has ended: its models may serve another."""
 
 
 class GroundSight:
@@ -200,8 +206,13 @@ class GroundSight:
         return self._stills.take_results()
 
     def end(self) -> None:
-        """The session is over: what still waits is given out as unmatched."""
+        """The session is over: what still waits is given out as unmatched, and what is large is let go of.
+
+        A ground goes on for days, and its edges come and go.
+        """
         self._stills.end(self._now)
+        self._history.clear()
+        self._parts.release()
 
     # The base stream
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hvt_common.link.wire import RoiHeader, StillResult, fitted_text
+from hvt_common.link.wire import Flags, RoiHeader, StillResult, fitted_text
 from hvt_common.values import Image, Posterior, View
 from hvt_common.vision.base_crop import base_crop
 from hvt_common.vision.still_codecs import BaseMissingError, StillError, psnr_y_db, still_codec
@@ -23,6 +23,8 @@ __all__ = ["Carried", "Moment", "StillStage"]
 
 SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
+_MOST_SPOILT, _SPOILT_TICKS = 32, 150
+"""After so many undecodable stills in so many ticks the next are dropped unseen until the time is over."""
 MAX_WAITING = 64
 """Stills that wait for their base frame; beyond, the oldest is read without it."""
 
@@ -89,6 +91,8 @@ class StillStage:
         self._emit = emit
         self._waiting: list[ReceivedStill] = []
         self._results: list[StillResult] = []
+        self._spoilt: deque[int] = deque(maxlen=_MOST_SPOILT)
+        """When the last ones came that could not be decoded, in ticks."""
         self.dropped: Counter[str] = Counter()
         """Stills of which nothing could be made, by reason."""
         self.outcomes: Counter[str] = Counter()
@@ -108,7 +112,9 @@ class StillStage:
         if surplus > 0:
             ready, self._waiting = ready + self._waiting[:surplus], self._waiting[surplus:]
         self._read(ready, now)
-        for settled in self._refiner.settle(self._log, now_frame=now.frame_index):
+        for settled in self._refiner.settle(
+            self._log, now_frame=now.frame_index, known_as=self._fusion.known_as
+        ):
             self._settled(settled, now)
 
     def end(self, now: Moment) -> None:
@@ -138,7 +144,9 @@ class StillStage:
             if decoded is not None:
                 by_frame.setdefault(still.header.frame_index, []).append((still, decoded))
         for frame_index, pairs in by_frame.items():
-            base_bgr = self._history.frame_before(frame_index, within=self._gap_ticks)
+            # Of an outage there may be no picture, and the last one before it is not the same place any more.
+            stored = any(still.header.flags & Flags.STORED for still, _ in pairs)
+            base_bgr = self._history.frame_before(frame_index, within=0 if stored else self._gap_ticks)
             readings = self._reader.read([decoded for _, decoded in pairs], base_bgr)
             for (still, decoded), objects in zip(pairs, readings.objects, strict=True):
                 self._offer(still, decoded, objects, base_bgr, now)
@@ -147,8 +155,20 @@ class StillStage:
                 if known is not None:
                     self._fusion.take_found(readings.found, known=known)
 
+    def _out_of_patience(self, now: Moment) -> bool:
+        """Whether so many stills could not be decoded lately that somebody sends them on purpose.
+
+        Each costs a line in the recording and, from libjpeg, one on stderr.
+        """
+        spoilt = self._spoilt
+        return len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_TICKS
+
     def _decode(self, still: ReceivedStill, now: Moment) -> Decoded | None:
         header = still.header
+        if self._out_of_patience(now):
+            self.dropped["undecodable"] += 1
+            self._answer(header, header.track_id, None)
+            return None
         try:
             base_bgr = self._history.frame(header.frame_index)
             image = decode_still(still, base_bgr=base_bgr, view=self._view)
@@ -159,6 +179,7 @@ class StillStage:
             return None
         except StillError as error:
             self.dropped["undecodable"] += 1
+            self._spoilt.append(now.frame_index)
             self._notice(now, f"still {header.sequence} cannot be decoded: {error}")
             for track_id, _ in _shown(header):
                 self._answer(header, track_id, None)
@@ -199,6 +220,7 @@ class StillStage:
                 carried=carried,
                 news=news,
                 part=part,
+                stored=bool(header.flags & Flags.STORED),
             )
             for settled in self._refiner.offer(seen, now_frame=now.frame_index):
                 self._settled(settled, now)
@@ -224,7 +246,7 @@ class StillStage:
         carried, track_id = settled.still.carried, settled.track_id
         if track_id is not None:
             self._name_track(settled.still, track_id)
-            if carried.found_base_px is not None:
+            if carried.found_base_px is not None and not settled.still.stored:
                 frame_index = settled.still.frame_index
                 self._fusion.take_box(track_id, carried.found_base_px, frame_index=frame_index)
         before, after = settled.class_before, settled.class_after
@@ -234,10 +256,12 @@ class StillStage:
         self, carried: Carried, now: Moment, track_id: int | None, before: str, after: str, confidence: float
     ) -> Refinement:
         header = carried.received.header
-        # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already.
+        stored = bool(header.flags & Flags.STORED)
+        # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. What
+        # was kept while the link was away tells of then, and nobody looked on.
         return Refinement(
-            frame_index=now.frame_index,
-            capture_ns=now.capture_ns,
+            frame_index=header.frame_index if stored else now.frame_index,
+            capture_ns=header.capture_ns if stored else now.capture_ns,
             still_sequence=header.sequence,
             track_id=track_id,
             edge_track_id=carried.track_id,
@@ -252,6 +276,7 @@ class StillStage:
             quality_pct=header.quality_pct,
             still_bgr=carried.decoded.image_bgr,
             crop_base_px=self._to_base(header.crop_source_px),
+            stored=stored,
         )
 
     # What goes back and what is told

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from hvt_common.units import bitrate_text
@@ -10,16 +12,19 @@ from hvt_ground.session import GroundSession
 __all__ = ["summary", "table"]
 
 
-def summary(session: GroundSession, *, unusable: int) -> dict[str, Any]:
+def summary(session: GroundSession, *, unusable: int, past_recordings: Sequence[Path] = ()) -> dict[str, Any]:
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do.
 
-    ``unusable`` counts messages of the edge that were skipped, over all its sessions.
+    ``unusable`` counts messages of the edge that were skipped, over all its sessions; ``past_recordings`` are of
+    sessions that it kept things of, and that were over when they came.
     """
     info, sight, counters = session.info, session.sight, session.counters
     account = session.ledger.summary(session.duration_s)
     worst = account.worst_window_bps
     unread = sight.outcomes.get("unread", 0)
-    waiting = session.stills_received - sum(sight.outcomes.values()) - sum(session.stills_dropped.values())
+    past = session.past
+    came = session.stills_received + past.stills
+    waiting = came - sum(sight.outcomes.values()) - sum(session.stills_dropped.values())
     return {
         "edge": info.edge,
         "session": f"{info.session_id:016x}",
@@ -31,6 +36,7 @@ def summary(session: GroundSession, *, unusable: int) -> dict[str, Any]:
         "duration_s": round(session.duration_s, 3),
         "base_bytes": account.base_bytes,
         "roi_bytes": account.roi_bytes,
+        "past_bytes": account.past_bytes,
         "meta_bytes": account.meta_bytes,
         "overhead_bytes": account.overhead_bytes,
         "total_bps": account.total_bps,
@@ -52,6 +58,13 @@ def summary(session: GroundSession, *, unusable: int) -> dict[str, Any]:
             "mean_bytes": round(account.roi_bytes / session.stills_received)
             if session.stills_received
             else 0,
+        },
+        "past": {
+            "stills": past.stills,
+            "frames": past.frames,
+            "frames_left_out": past.left_out,
+            "video_s": round(past.video_s, 3),
+            "recordings": [str(path) for path in past_recordings],
         },
         "tracks": sight.tracks,
         "tracks_refined": sight.refined,
@@ -99,6 +112,12 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("keyframes", f"{content['keyframe_requests']} asked for"),
     ]
+    past = content["past"]
+    if past["stills"] or past["frames"]:
+        rows.append(
+            ("outages", f"{past['stills']} stills and {past['video_s']:.1f} s of video came afterwards")
+        )
+    rows += [("former session", path) for path in past["recordings"]]
     if latency["p50"] is not None:
         since = "receiving" if content["pace"] == "lockstep" else "capture"
         spread = f"p50 {latency['p50']:.0f} ms, p95 {latency['p95']:.0f}, max {latency['max']:.0f}"

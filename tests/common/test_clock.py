@@ -1,10 +1,11 @@
-"""Clock offset between the two sides."""
+"""Time on both sides: a clock without steps, and the offset between two of them."""
 
 from __future__ import annotations
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hvt_common.clock import SteadyClock
 from hvt_common.link.clock import ClockOffset
 
 MS = 1_000_000
@@ -79,3 +80,27 @@ def test_a_clock_that_was_set_is_believed_at_once():
     exchange(clock, at_ns=40_000 * MS, offset_ns=3_600_000 * MS, out_ns=90 * MS, held_ns=0, back_ns=10 * MS)
     assert clock.offset_ns == 3_600_000 * MS  # the better of those after the step
     assert clock.error_ns == 40 * MS
+
+
+def test_a_clock_that_was_wrong_at_the_start_is_said_once(caplog):
+    """A drone without a battery for its clock would record a flight of 1970, and nobody would know why."""
+    wall, monotonic = [1_000_000 * MS], [5_000 * MS]
+    clock = SteadyClock(wall_ns=lambda: wall[0], monotonic_ns=lambda: monotonic[0])
+    for drift_ms, said in ((9_000, 0), (3_600_000, 1), (7_200_000, 1), (0, 1)):
+        monotonic[0] += 2_000 * MS
+        wall[0] = 995_000 * MS + monotonic[0] + drift_ms * MS
+        assert clock() == 995_000 * MS + monotonic[0]
+        assert len(caplog.records) == said
+    assert caplog.records[0].getMessage().startswith("the clock of this machine was set by +3600 s")
+
+
+def test_a_wall_clock_that_is_set_leaves_no_step():
+    """NTP coming up in mid-flight would look like an hour in a queue, or silence the camera for as long."""
+    wall, monotonic = [1_000_000 * MS], [5_000 * MS]
+    clock = SteadyClock(wall_ns=lambda: wall[0], monotonic_ns=lambda: monotonic[0])
+    shown = [clock()]
+    for step_ms in (3_600_000, -7_200_000, 0):
+        wall[0] += (step_ms + 40) * MS
+        monotonic[0] += 40 * MS
+        shown.append(clock())
+    assert shown == [(1_000_000 + 40 * step) * MS for step in range(4)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hvt_common.config import (
@@ -224,6 +224,7 @@ KINDS: dict[str, Kind] = {
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
+@example("\r/")
 @given(
     text=st.one_of(st.text(), st.from_regex(r"~?[0-9a-z./%x+-]{0,9}", fullmatch=True), st.just("9" * 5000))
 )

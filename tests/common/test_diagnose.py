@@ -23,6 +23,8 @@ from hvt_common.link.probe import why_no_link
 from hvt_common.link.rights import Rights
 from hvt_common.link.session import open_session
 from hvt_common.link.zenoh_config import LinkSettings, configure
+from outsider import joined
+from processes import free_ports
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +158,46 @@ def test_the_watch_explains_once_and_is_quiet_when_the_link_comes(
     assert lines == [
         f"no link: {endpoint}: nobody listens on port {free_port} there: is the other side running?"
     ]
+
+
+def test_a_second_link_that_does_not_come_is_said_once(
+    free_port: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Answers that were to overtake pictures would wait behind them, and refused calls would cost bytes."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    file = tmp_path / "one.json5"
+    file.write_text("{ transport: { unicast: { max_links: 1 } } }")
+    settings = LinkSettings("edge", connect=(endpoint,), name="uav-1", links=2)
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,), zenoh_config=file)),
+        open_session(settings) as session,
+        LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch,
+    ):
+        _until(lambda: caplog.records)
+        time.sleep(0.6)
+        assert watch.trouble == ""
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said.startswith(
+        "one of the two links is missing: answers and pictures share the other; either the other"
+    )
+
+
+def test_a_guest_with_one_link_is_no_half(
+    free_port: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A viewer that calls with one link would be reported as a loss, and the user search for what is not missing."""
+    own, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    settings = LinkSettings("edge", listen=(own,), connect=(other,), name="uav-1", links=2)
+    with (
+        open_session(LinkSettings("ground", listen=(other,), links=2)),
+        open_session(settings) as session,
+        LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch,
+        joined(own),
+    ):
+        _until(lambda: len(session.info.links()) == 3)
+        time.sleep(1.5)
+        assert watch.trouble == ""
+    assert not caplog.records
 
 
 def _until(true: object, *, within_s: float = 25.0) -> None:

@@ -87,13 +87,14 @@ def test_totals_put_every_byte_in_one_place():
     ledger.count(Channel.BASE, payload_bytes=5_000, attachment_bytes=39, overhead_bytes=240, at_ns=0)
     ledger.count(Channel.ROI, payload_bytes=1_500, attachment_bytes=90, overhead_bytes=136, at_ns=10)
     ledger.count(Channel.META, payload_bytes=200, attachment_bytes=0, overhead_bytes=84, at_ns=20)
+    ledger.count(Channel.PAST, payload_bytes=700, attachment_bytes=40, overhead_bytes=120, at_ns=20)
     summary = ledger.summary(2.0)
-    assert (summary.base_bytes, summary.roi_bytes) == (5_000, 1_500)
-    assert (summary.meta_bytes, summary.overhead_bytes) == (39 + 90 + 200, 240 + 136 + 84)
-    assert summary.line_bytes == ledger.line_bytes == 5_279 + 1_726 + 284
-    assert summary.messages == {"base": 1, "roi": 1, "meta": 1}
+    assert (summary.base_bytes, summary.roi_bytes, summary.past_bytes) == (5_000, 1_500, 700)
+    assert (summary.meta_bytes, summary.overhead_bytes) == (39 + 90 + 40 + 200, 240 + 136 + 120 + 84)
+    assert summary.line_bytes == ledger.line_bytes == 5_279 + 1_726 + 860 + 284
+    assert summary.messages == {"base": 1, "roi": 1, "past": 1, "meta": 1}
     assert (summary.base_bps, summary.roi_bps) == (5_279 * 4, 1_726 * 4)
-    assert summary.total_bps == (5_279 + 1_726 + 284) * 4
+    assert summary.total_bps == (5_279 + 1_726 + 860 + 284) * 4
     assert (ledger.first_ns, ledger.last_ns) == (0, 20)
     assert ledger.messages(Channel.ROI) == 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -172,6 +173,62 @@ def test_the_users_file_goes_before_our_defaults_and_after_our_arguments(tmp_pat
     assert config.get_json("transport/link/tx/queue/size/data_high") == "9"
     assert config.get_json("transport/link/tx/queue/size/background") == "1"
     assert config.get_json("transport/shared_memory/enabled") == "false"
+
+
+def _links(settings):
+    config, _ = configure(settings)
+    return json.loads(config.get_json("connect/endpoints")), config.get_json("transport/unicast/max_links")
+
+
+def test_two_links_by_priority_are_asked_for_only_where_wanted(tmp_path):
+    """A second connection costs a handshake and keep-alives that the budget does not count."""
+    there = (
+        "tcp/192.0.2.1:7447",
+        "tls/192.0.2.1:7448#so_sndbuf=1",
+        "tcp/192.0.2.1:1?prio=2-7",
+        "udp/192.0.2.1:1",
+    )
+    assert _links(LinkSettings("edge", connect=there)) == (list(there), "1")
+    split = [
+        *("tcp/192.0.2.1:7447?prio=1-3", "tcp/192.0.2.1:7447?prio=4-7"),
+        *("tls/192.0.2.1:7448?prio=1-3#so_sndbuf=1", "tls/192.0.2.1:7448?prio=4-7#so_sndbuf=1"),
+        *there[2:],
+    ]
+    assert _links(LinkSettings("edge", connect=there, links=2)) == (split, "2")
+    assert _links(LinkSettings("asker", connect=there))[0] == list(there)
+    path = tmp_path / "two.json5"
+    path.write_text("{ transport: { unicast: { max_links: 2 } } }")
+    assert _links(LinkSettings("edge", connect=there, zenoh_config=path)) == (split, "2")
+    assert _links(LinkSettings("ground"))[1] == "2", "who listens takes two from whoever asks"
+
+
+def test_tls_links_do_not_hide_seconds_of_video_in_the_kernel():
+    """The socket of a full TLS link would grow to megabytes, and every picture be seconds old."""
+    config, _ = configure(LinkSettings("edge"))
+    for protocol in ("tcp", "tls"):
+        assert config.get_json(f"transport/link/{protocol}/so_sndbuf") == "65536"
+
+
+def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
+    """Answers would wait behind pictures although two links were asked for, or a row would be lost between them."""
+    with open_session(ground(endpoint)) as listener:
+        inbox = Inbox(capacity=64, overflow="newest")
+        subscriber = subscribe(listener, "hvt/uav-1/*", inbox=inbox)
+        with open_session(LinkSettings("edge", connect=(endpoint,), links=2)) as connector:
+            queryable = serve(connector, Row.INFO, keys=KEYS, answer=lambda question: question)
+            wait_for(lambda: len(connector.info.links()) == 2)
+            for session in (connector, listener):
+                assert sorted(one.priorities for one in session.info.links()) == [(1, 3), (4, 7)]
+            rows = (Row.BASE, Row.ROI, Row.TRACKS, Row.PAST, Row.STATUS)
+            publishers = {row: declare_publisher(connector, row, keys=KEYS) for row in rows}
+            wait_for(lambda: all(one.matching_status.matching for one in publishers.values()))
+            for row, publisher in publishers.items():
+                publisher.put(str(row).encode())
+            came = {inbox.get(timeout_s=5).payload.decode() for _ in rows}
+            assert came == {str(row) for row in rows}
+            assert ask(listener, Row.INFO, keys=KEYS, question=b"who?", timeout_s=5) == b"who?"
+            queryable.undeclare()
+        subscriber.undeclare()
 
 
 @pytest.mark.parametrize(

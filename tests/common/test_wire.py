@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import struct
 import zlib
@@ -22,10 +23,13 @@ from hvt_common.link.wire import (
     ControlRequest,
     CorruptError,
     Feedback,
-    Flags,
     Health,
     Info,
     Message,
+    PastHave,
+    PastHeader,
+    PastStill,
+    PastUnit,
     RoiHeader,
     Status,
     StillResult,
@@ -34,6 +38,10 @@ from hvt_common.link.wire import (
     UnknownVersionError,
     WireError,
     kinds,
+    pack_past_still,
+    pack_past_units,
+    parse_past_still,
+    parse_past_units,
 )
 from hvt_common.link.wire.fields import (
     I63,
@@ -54,6 +62,7 @@ from hvt_common.link.wire.fields import (
 )
 from hvt_common.link.wire.sealed import WIRE_VERSION, Nested
 from hvt_common.values import View
+from messages import BASE, EXAMPLES, FEEDBACK, INFO, REQUEST, ROI, STATUS, STEP
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "wire.md"
 MESSAGES: tuple[type[Message], ...] = (
@@ -65,136 +74,8 @@ MESSAGES: tuple[type[Message], ...] = (
     ControlRequest,
     ControlAnswer,
     Feedback,
+    PastHeader,
 )
-
-BASE = BaseHeader(
-    session_id=0x1234567890ABCDEF,
-    sequence=9_000,
-    frame_index=9_100,
-    capture_ns=1_790_000_000_123_456_789,
-    send_delay_ns=31_000_000,
-    flags=Flags.KEYFRAME | Flags.PARAMETER_SETS,
-)
-ROI = RoiHeader(
-    session_id=0x1234567890ABCDEF,
-    sequence=311,
-    frame_index=9_100,
-    capture_ns=1_790_000_000_123_456_789,
-    send_delay_ns=-5,
-    flags=0,
-    track_id=57,
-    box_source_px=(-3.125, 10.0, 90.875, 64.5),
-    crop_source_px=(0, 2, 105, 73),
-    class_name="van",
-    confidence=0.613,
-    reason="small",
-    codec="jpeg",
-    quality_pct=65,
-    parameters={"base": 9_099, "gain": 1.5, "how": "residual"},
-    also=(AlsoShown(track_id=60, box_source_px=(40.0, 2.5, 104.875, 70.0)),),
-)
-STEP = TrackStep(
-    session_id=0x1234567890ABCDEF,
-    sequence=1_800,
-    frame_index=9_100,
-    capture_ns=1_790_000_000_123_456_789,
-    send_delay_ns=44_000_000,
-    reference=1_799,
-    boxes=bytes(range(120)),
-)
-HEALTH = Health(
-    frames_captured=9_101,
-    frames_encoded=9_001,
-    frames_dropped=100,
-    keyframes=61,
-    tracks=204,
-    base_queue=1,
-    still_queue=3,
-    encode_ms=36.4,
-    detect_ms=57.1,
-    feedback_age_ms=412,
-)
-STATUS = Status(
-    session_id=0x1234567890ABCDEF,
-    sequence=600,
-    state="running",
-    send_ns=1_790_000_600_000_000_000,
-    media_ns=606_000_000_000,
-    last_base_sequence=9_000,
-    last_still_sequence=311,
-    base_bytes=49_000_000,
-    roi_bytes=9_000_000,
-    meta_bytes=500_000,
-    overhead_bytes=2_300_000,
-    base_messages=9_001,
-    roi_messages=312,
-    meta_messages=602,
-    worst_window_bps=(712_000, 148_000, 800_000),
-    sent={"small": 200, "uncertain": 112},
-    deferred={"budget": 1_900},
-    dropped={"stale": 44, "border": 3, "queue full": 2},
-    health=HEALTH,
-)
-INFO = Info(
-    session_id=7,
-    edge="uav-1",
-    software="0.1.0",
-    started_ns=1,
-    source_size=(3840, 2160),
-    base_size=(1280, 720),
-    view_scale=1 / 3,
-    view_offset_px=(0.0, 0.0),
-    fps=15.0,
-    codec="hevc",
-    pace="realtime",
-    method="M5",
-    budget_bps=800_000,
-    base_bps=650_000,
-    window_ns=1_000_000_000,
-    class_names=("pedestrian", "people", "bicycle", "Straßenbahn"),
-    received_ns=2,
-    answered_ns=3,
-)
-FEEDBACK = Feedback(
-    session_id=7,
-    receiver_id=U64,
-    sequence=1,
-    send_ns=5,
-    last_frame_index=-1,
-    base_messages=0,
-    base_bytes=0,
-    roi_messages=0,
-    roi_bytes=0,
-    lost=0,
-    corrupt=0,
-    base_sequence=U32,
-    base_held_us=66_000,
-    still_sequence=-1,
-    delay_p50_ms=-1,
-    clock_offset_ns=-I63,
-    clock_error_ns=-1,
-    stills=(
-        StillResult(
-            still_sequence=4,
-            track_id=57,
-            class_name="minivan",
-            confidence=0.9,
-            entropy_nats=0.25,
-            ground_track_id=12,
-            again=False,
-        ),
-    ),
-)
-REQUEST = ControlRequest(session_id=0, command="keyframe", arguments={})
-ANSWER = ControlAnswer(
-    session_id=7,
-    accepted=True,
-    reason="",
-    still_ask=3,
-    frame_index=9_100,
-    tracks=(TrackNow(track_id=57, class_id=3, confidence=0.613, box_source_px=(-3.125, 10.0, 90.875, 64.5)),),
-)
-EXAMPLES: tuple[Message, ...] = (BASE, ROI, STEP, INFO, STATUS, REQUEST, ANSWER, FEEDBACK)
 
 
 def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911, PLR0912 - one case for each kind
@@ -460,8 +341,103 @@ def test_info_gives_the_view():
     assert view == View.fitted((3840, 2160), (1280, 720), fit="crop")
 
 
+# What an edge kept while its link was away
+
+stored_still = st.builds(
+    PastStill, st.binary(max_size=1024), st.text(max_size=16), st.binary(min_size=1, max_size=300)
+)
+stored_units = st.lists(
+    st.tuples(st.integers(0, U32), st.integers(0, I63), st.booleans(), st.binary(min_size=1, max_size=40)),
+    min_size=1,
+    max_size=8,
+    unique_by=(lambda row: row[0], lambda row: row[1]),
+).map(
+    lambda rows: tuple(
+        PastUnit(frame, at, keyframe, data)
+        for frame, at, (_, _, keyframe, data) in zip(
+            sorted(row[0] for row in rows), sorted(row[1] for row in rows), rows, strict=True
+        )
+    )
+)
+
+
+@given(still=stored_still, units=stored_units)
+@settings(max_examples=200, deadline=None)
+def test_what_was_kept_survives_the_wire(still, units):
+    """What an operator sees of an outage would not be what the edge saw."""
+    assert parse_past_still(pack_past_still(still)) == still
+    assert parse_past_units(pack_past_units(units)) == units
+
+
+nonsense = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), U64)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.binary(max_size=8),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=20,
+)
+
+
+@given(data=st.binary(max_size=400) | nonsense.map(msgpack.packb))
+@example(data=b"")
+@example(data=b"\x91" * 100_000)
+@example(data=b"\xdd\xff\xff\xff\xff")
+@example(data=b"\xc6\xff\xff\xff\xff")
+@example(data=b"\xc7\x0c\xff" + b"\xff" * 12)
+@example(data=bytes(MAX_PAYLOAD_BYTES + 1))
+@settings(max_examples=400, deadline=None)
+def test_any_bytes_of_a_kept_object_are_refused_or_within_bounds(data):
+    """One hostile or damaged object would end the ground."""
+    with contextlib.suppress(WireError):
+        still = parse_past_still(data)
+        assert len(still.attachment) <= 1024
+        assert still.payload
+    with contextlib.suppress(WireError):
+        units = parse_past_units(data)
+        assert 1 <= len(units) <= 2400
+        assert all(
+            0 <= unit.frame_index <= U32 and 0 <= unit.capture_ns <= I63 and unit.data for unit in units
+        )
+        assert [unit.frame_index for unit in units] == sorted({unit.frame_index for unit in units})
+
+
 @pytest.mark.parametrize(
-    "message", [*MESSAGES, AlsoShown, Health, StillResult, TrackNow], ids=lambda message: message.__name__
+    "rows",
+    [
+        [],
+        [[1, 5, True, b""]],
+        [[1, 5, 1, b"x"]],
+        [[-1, 5, True, b"x"]],
+        [[2**32, 5, True, b"x"]],
+        [[1, 2**63, True, b"x"]],
+        [[1, 5, True, b"x"], [1, 6, False, b"x"]],
+        [[1, 5, True, b"x"], [2, 5, False, b"x"]],
+        [[1, 5, True]],
+        [[frame, frame, False, b"x"] for frame in range(2401)],
+    ],
+)
+def test_kept_video_that_cannot_be_one_is_refused(rows):
+    """Frames out of order would freeze the viewer that plays the hole."""
+    with pytest.raises(WireError):
+        parse_past_units(msgpack.packb(rows))
+
+
+@pytest.mark.parametrize(
+    "values", [[], [b"", "e", b""], [b"", b"", b"x"], [bytes(1025), "", b"x"], [b"", "e" * 65, b"x"]]
+)
+def test_a_kept_still_that_cannot_be_one_is_refused(values):
+    """Its header would be taken for something else."""
+    with pytest.raises(WireError):
+        parse_past_still(msgpack.packb(values))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [*MESSAGES, AlsoShown, Health, PastHave, StillResult, TrackNow],
+    ids=lambda message: message.__name__,
 )
 def test_the_document_lists_every_field_with_its_bounds(message):
     """Whoever writes a subscriber from docs/wire.md would read the wrong field."""

@@ -14,7 +14,7 @@ from hvt_ground.config import GroundConfig
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = ("docs/deployment.md", "CONTRIBUTING.md", "CHANGELOG.md")
 # Of other programs, or of every command.
-OTHER_FLAGS = {"--help", "--config", "--print-config", "--build", "--now"}
+OTHER_FLAGS = {"--help", "--config", "--print-config", "--build", "--now", "--accounting", "--out"}
 
 
 def _text(name: str) -> str:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -104,19 +105,23 @@ def _all(edges: tuple[str, ...]) -> set[str]:
     return {EdgeKeys(edge).key(row) for edge in edges for row in (*WRITTEN, Row.ALIVE)}
 
 
-def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_port: int) -> None:
-    """Behind a router an edge cannot tell who asks: the router has to keep the rights, row by row."""
+@pytest.mark.parametrize("links", [1, 2])
+def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_port: int, links: int) -> None:
+    """Behind a router an edge cannot tell who asks: the router has to keep the rights, row by row, on each link."""
     endpoint = f"tls/127.0.0.1:{free_port}"
     with ExitStack() as stack:
         stack.enter_context(_router(fleet.file("hub"), endpoint))
 
         def opened(name: str, role: str) -> zenoh.Session:
             settings = fleet.settings(name, role, connect=(endpoint,))  # type: ignore[arg-type]
-            return stack.enter_context(open_session(settings))
+            return stack.enter_context(open_session(replace(settings, links=links)))  # type: ignore[arg-type]
 
         edges = {name: _Edge(opened(name, "edge"), name) for name in EDGES}
         base, guest = _Ground(opened("base", "ground")), _Ground(opened("guest", "ground"))
         _until(lambda: all(edge.wanted() for edge in edges.values()), "the streams are wanted")
+        _until(
+            lambda: all(len(edge.session.info.links()) == links for edge in edges.values()), "all links stand"
+        )
         _until(lambda: EdgeKeys("uav-1").key(Row.ALIVE) in guest.came, "the guest sees the edge")
         for edge in edges.values():
             edge.write()

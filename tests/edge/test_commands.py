@@ -231,7 +231,7 @@ def test_one_that_never_fits_comes_smaller_within_some_seconds():
 
 REFUSED = [
     ({"track": 9}, "no track 9 at frame 59: the edge's own tracks there are 5"),
-    ({"track": 5, "at_ms": -9000}, "of 9 s ago is no longer held: frames go back 2.9 s"),
+    ({"track": 5, "at_ms": -9000}, "of 9 s ago is not held: frames go back 2.9 s"),
     ({"frame": 1000}, "frame 1000 is yet to come: the newest is 59"),
     ({"x": 900, "y": 0, "w": 100, "h": 10}, "not inside the frame of 960x540 source pixels"),
     ({"x": -1, "y": 0, "w": 100, "h": 10}, "not inside the frame"),

@@ -6,6 +6,7 @@ import threading
 
 from hvt_common.link.wire import Feedback, StillResult
 from hvt_edge.feedback import FeedbackInbox
+from messages import feedback
 
 U32 = 2**32 - 1
 
@@ -25,24 +26,13 @@ def result(sequence: int, *, track: int = 1, name: str = "car", again: bool = Fa
 
 def report(*stills: StillResult, frame: int = -1, base: int = 0, roi: int = 0, receiver: int = 1) -> Feedback:
     """A receiver report."""
-    return Feedback(
-        session_id=7,
+    return feedback(
         receiver_id=receiver,
-        sequence=0,
-        send_ns=1,
         last_frame_index=frame,
         base_messages=base,
-        base_bytes=0,
         roi_messages=roi,
-        roi_bytes=0,
-        lost=0,
-        corrupt=0,
         base_sequence=base - 1,
-        base_held_us=0,
         still_sequence=roi - 1,
-        delay_p50_ms=-1.0,
-        clock_offset_ns=0,
-        clock_error_ns=-1,
         stills=stills,
     )
 

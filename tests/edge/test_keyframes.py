@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -49,7 +50,7 @@ def test_while_one_is_due_stills_know_it():
     plan = KeyframePlan(KeyframeSettings(interval_ns=0))
     plan.done(0)
     assert not plan.due(1_000 * MS)
-    assert plan.request(1_000 * MS)
+    assert plan.request(1_000 * MS) is None
     assert plan.due(1_000 * MS)
     assert not plan.now(1_100 * MS, fits=False)
     assert plan.due(1_100 * MS)
@@ -62,9 +63,10 @@ def test_a_request_that_crossed_a_keyframe_is_answered_by_it():
     """One loss would cost two keyframes, and the second would push pictures and stills aside for nothing."""
     plan = KeyframePlan(KeyframeSettings(interval_ns=0))
     plan.done(0)
-    assert not plan.request(200 * MS)
+    assert plan.request(200 * MS) is None
     assert not plan.due(250 * MS)
-    assert plan.request(400 * MS)
+    assert plan.request(400 * MS) is None
+    assert plan.due(400 * MS)
     assert plan.requests == 2
 
 
@@ -91,7 +93,7 @@ def test_a_ground_that_joins_right_after_a_keyframe_sees_a_picture_within_a_seco
 )
 def test_every_request_is_answered_in_time_and_not_more_often(asks, room, interval_s):
     """A ground would wait for a picture; or many grounds together would make the stream all keyframes."""
-    settings = KeyframeSettings(interval_ns=interval_s * 1_000 * MS)
+    settings = KeyframeSettings(interval_ns=interval_s * 1_000 * MS, refill_ns=0)
     keyframes = play(KeyframePlan(settings), 240, fits=lambda n: n in room, asked=lambda n: n in asks)
     for ask in asks:
         near = [
@@ -104,3 +106,72 @@ def test_every_request_is_answered_in_time_and_not_more_often(asks, room, interv
         assert (second - first) * STEP_NS >= settings.rest_ns
         because_asked = any(first < ask <= second for ask in asks)
         assert because_asked or (interval_s and (second - first) * STEP_NS >= settings.interval_ns)
+
+
+def ask_at_twenty_a_second(plan: KeyframePlan, *, takes_ms: int, losses: bool) -> tuple[int, list[str]]:
+    """Keyframes and refusals of a minute."""
+    keyframes, refusals = 0, []
+    for number, now_ns in enumerate(range(0, 60_000 * MS, 50 * MS)):
+        if losses:
+            plan.note_losses(number, 2**40 + number)
+        if (refusal := plan.request(now_ns)) is not None:
+            refusals.append(refusal)
+        if plan.now(now_ns, fits=True):
+            plan.done(now_ns)
+            plan.note_cost(takes_ms * MS)
+            keyframes += 1
+    return keyframes, refusals
+
+
+@pytest.mark.parametrize(
+    ("takes_ms", "losses", "most"),
+    [
+        (160, False, 1 + 6 + 60_000 // 700),
+        (470, False, 1 + 6 + 60_000 // (470 / 0.35)),
+        (470, True, 1 + 6 + 60_000 // 600),  # the purse's own go between
+    ],
+    ids=["cheap", "dear", "with invented losses"],
+)
+def test_a_commander_cannot_make_the_stream_all_keyframes(takes_ms, losses, most):
+    """Whoever may command could push pictures and stills aside with three keyframes a second, for ever."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0))
+    keyframes, refusals = ask_at_twenty_a_second(plan, takes_ms=takes_ms, losses=losses)
+    assert 30 < keyframes <= most, "three a second would be 180"
+    assert len(plan._losses) <= 16
+    assert plan.requests == 1200 - len(refusals)
+    assert "the last keyframe came" in refusals[-1]
+    assert "ask again in" in refusals[-1]
+
+
+def test_recovery_after_losses_is_never_refused():
+    """The picture would stay dark because a ground asked for what it needed: six losses in six seconds, then rest."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0))
+    plan.done(0)
+    plan.note_cost(470 * MS)
+    for start_ns in (1_000 * MS, 30_000 * MS):
+        for loss in range(6):
+            now_ns = start_ns + loss * 1_000 * MS
+            assert plan.request(now_ns) is None
+            assert plan.due(now_ns)
+            assert plan.request(now_ns + 10 * MS) is None, "the same loss is asked about twice"
+            plan.done(now_ns + 60 * MS)
+            assert plan.request(now_ns + 100 * MS) is None, "it crossed the keyframe on the way"
+            assert not plan.due(now_ns + 100 * MS)
+
+
+def test_a_reported_loss_is_a_reason_once():
+    """One old loss would be a ticket to as many keyframes as somebody cares to ask for."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0, burst=1))
+    plan.done(0)
+    plan.note_cost(3_500 * MS)  # the next in ten seconds
+    assert plan.request(20_000 * MS) is None
+    plan.done(20_000 * MS)
+    plan.note_losses(1, 5)
+    assert plan.request(20_600 * MS) is not None, "too soon, whoever lost what"
+    assert plan.request(20_800 * MS) is None
+    plan.done(20_800 * MS)
+    plan.note_losses(1, 5)
+    plan.note_losses(1, 4)
+    assert plan.request(22_000 * MS) is not None, "nothing more was lost"
+    plan.note_losses(2, 1)
+    assert plan.request(22_000 * MS) is None, "another ground has its own losses"

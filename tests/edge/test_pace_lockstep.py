@@ -9,7 +9,7 @@ import pytest
 from clips import framed, smooth_pictures
 from hvt_common.link.keys import Row
 from hvt_common.link.ledger import Ledger
-from hvt_common.link.wire import BaseHeader, Feedback
+from hvt_common.link.wire import BaseHeader
 from hvt_edge.base_stage import BaseStage
 from hvt_edge.budget import BudgetSettings, RollingBudget
 from hvt_edge.cadence import Cadence
@@ -19,6 +19,7 @@ from hvt_edge.feedback import FeedbackInbox
 from hvt_edge.keyframes import KeyframePlan
 from hvt_edge.pace_lockstep import LockstepPace
 from hvt_edge.send import Sender
+from messages import feedback
 
 SIZE = (320, 192)
 
@@ -35,25 +36,11 @@ class Ground:
         assert row is Row.BASE
         assert attachment is not None
         self.frames.append(BaseHeader.parse(attachment, payload).frame_index)
-        report = Feedback(
+        report = feedback(
             session_id=1,
-            receiver_id=1,
             sequence=len(self.frames),
-            send_ns=1,
             last_frame_index=self.frames[-1],
             base_messages=len(self.frames),
-            base_bytes=0,
-            roi_messages=0,
-            roi_bytes=0,
-            lost=0,
-            corrupt=0,
-            base_sequence=-1,
-            base_held_us=0,
-            still_sequence=-1,
-            delay_p50_ms=-1.0,
-            clock_offset_ns=0,
-            clock_error_ns=-1,
-            stills=(),
         )
         self.inbox.receive(report, now_ns=1)
 

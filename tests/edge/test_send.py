@@ -102,10 +102,12 @@ def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
         last_still_sequence=70_000,
         base_bytes=10**9,
         roi_bytes=10**9,
+        past_bytes=10**9,
         meta_bytes=10**9,
         overhead_bytes=10**9,
         base_messages=10**6,
         roi_messages=10**6,
+        past_messages=10**6,
         meta_messages=10**6,
         worst_window_bps=(10**7, 10**7, 10**7),
         sent=counts,
@@ -195,7 +197,7 @@ def test_the_ledger_counts_the_very_bytes_that_were_put():
     assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
     assert rig.ledger.base_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Row.BASE)
     assert rig.ledger.roi_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Row.ROI)
-    assert [rig.ledger.messages(one) for one in Channel] == [30, 10, 2]
+    assert [rig.ledger.messages(one) for one in Channel] == [30, 10, 0, 2]
     assert rig.ledger.line_bytes == sum(size for _, size in rig.budget._events)
 
 

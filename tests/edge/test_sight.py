@@ -231,7 +231,7 @@ def test_a_track_gets_its_stills_when_they_are_due():
 def test_while_a_keyframe_is_due_stills_are_held():
     """A still would take the room that the keyframe waits for."""
     rig = Rig()
-    assert rig.keyframes.request(FRAMES[0].capture_ns + 500_000_000)
+    assert rig.keyframes.request(FRAMES[0].capture_ns + 500_000_000) is None
     rig.run()
     assert rig.out.stills == []
     rig.keyframes.done(FRAMES[-1].capture_ns)

@@ -9,6 +9,7 @@ import threading
 import time
 from fractions import Fraction
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import pairwise
 
 import av
 import cv2
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from av.video.reformatter import Interpolation
 
+from hvt_common.clock import SteadyClock
 from hvt_common.errors import UserError
 from hvt_edge.source import open_source
 from hvt_edge.sources.folder import sequence_files
@@ -364,6 +366,25 @@ def test_an_http_stream_plays_live_and_comes_back_after_it_ends(http_stream, cap
     assert frames[0].base_bgr.shape == (180, 320, 3)
     assert "opening it again" in caplog.text
     assert not [thread for thread in threading.enumerate() if thread.name == "hvt-source"]
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_a_clock_that_is_set_neither_stops_a_camera_nor_dates_it_anew(http_stream, monkeypatch, step_s):
+    """NTP would silence the camera for as long as the clock was ahead, or put an hour into the recording."""
+    wall_ns, set_by_s = time.time_ns, [0]
+    monkeypatch.setattr(time, "time_ns", lambda: wall_ns() + set_by_s[0] * 1_000_000_000)
+    with open_source(http_stream, size=(320, 180), fps=20, clock=SteadyClock()) as source:
+        times = []
+        for frame in source.frames(start_ns=0):
+            times.append(frame.capture_ns)
+            if len(times) == 10:
+                set_by_s[0] = step_s
+            if len(times) == 25:
+                break
+    gaps = [later - earlier for earlier, later in pairwise(times)]
+    assert min(gaps) > 0
+    assert max(gaps) < 30_000_000_000
 
 
 def test_a_slow_consumer_gets_fresh_frames_and_no_queue(http_stream):

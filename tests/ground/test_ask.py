@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+import messages
 from hvt_common.errors import UserError
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.session import declare_publisher, open_session, serve
-from hvt_common.link.wire import ControlAnswer, ControlRequest, Info, RoiHeader
+from hvt_common.link.wire import ControlAnswer, ControlRequest, RoiHeader
 from hvt_common.link.zenoh_config import LinkSettings, configure
 from hvt_common.vision.still_codecs import JpegCodec
 from hvt_ground.ask import AskedStill, EdgeClient, RefusedError
@@ -26,25 +27,8 @@ PICTURE = cv2.resize(
     np.random.default_rng(1).integers(0, 255, (8, 12, 3), np.uint8), (96, 64), interpolation=cv2.INTER_CUBIC
 )
 DATA = JpegCodec().encode(PICTURE, quality_pct=90).data
-INFO = Info(
-    session_id=7,
-    edge="uav-1",
-    software="0.1.0",
-    started_ns=1,
-    source_size=(960, 540),
-    base_size=(640, 360),
-    view_scale=2 / 3,
-    view_offset_px=(0.0, 0.0),
-    fps=15.0,
-    codec="hevc",
-    pace="realtime",
-    method="M5",
-    budget_bps=800_000,
-    base_bps=650_000,
-    window_ns=10**9,
-    class_names=("car",),
-    received_ns=2,
-    answered_ns=3,
+INFO = replace(
+    messages.INFO, source_size=(960, 540), base_size=(640, 360), view_scale=2 / 3, class_names=("car",)
 )
 YES = ControlAnswer(session_id=7, accepted=True, reason="", still_ask=3, frame_index=40, tracks=())
 HEADER = RoiHeader(

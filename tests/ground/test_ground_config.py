@@ -39,6 +39,9 @@ def test_without_flags_it_listens_and_needs_no_model():
         (["--labels", "names.txt"], "--labels names.txt names a classifier's classes"),
         (["--labels", "names.txt", "--classifier", "detector"], "--classifier is no file"),
         (["--refine", "vote"], "choose one of replace, fuse"),
+        (["--timing", "a.csv", "--tracks", "./a.csv"], "--tracks and --timing both name a.csv: give each"),
+        (["--timing", "a.csv", "--summary", "b/../a.csv"], "--timing and --summary both name b/../a.csv"),
+        (["--record", "a.rrd", "--summary", "a.rrd"], "--record and --summary both name a.rrd"),
         (["--detect-every", "0"], "whole number from 1"),
         (["--threads", "many"], "whole number from 1"),
     ],
@@ -47,6 +50,13 @@ def test_settings_that_contradict_are_one_sentence(argv, said):
     """The user would guess which of two settings won."""
     with pytest.raises(UserError, match=said):
         read(*argv)
+
+
+def test_folders_and_devices_may_be_named_twice(tmp_path):
+    """``--record out --tracks out`` would be refused, though each file in it has a name of its own."""
+    read("--record", str(tmp_path), "--tracks", str(tmp_path), "--timing", str(tmp_path / "a.csv"))
+    read("--record", "out", "--tracks", "out")
+    read("--timing", "/dev/null", "--summary", "/dev/null")
 
 
 def test_every_flag_explains_itself(capsys):

@@ -13,6 +13,8 @@ from hvt_ground.reassemble import (
     REORDER_UNITS,
     REORDER_WAIT_NS,
     RESTART_SILENCE_NS,
+    RIVAL_AFTER_NS,
+    RIVAL_SILENCE_NS,
     SEQUENCE_SLACK,
     SILENCE_NS,
     Arrival,
@@ -233,6 +235,54 @@ def test_two_edges_of_one_name_do_not_thrash(running):
     assert not running.wants()
 
 
+def beside(ground, count, *, interval_ns=FRAME_NS, first=4):
+    """The first edge goes on, and a second one of the same id beside it; the sequence that comes next."""
+    for sequence in range(first, first + count):
+        ground.send(sequence, key=sequence == first, after_ns=interval_ns // 2)
+        ground.send(sequence - first, session=2, key=sequence % 3 == 0, after_ns=interval_ns // 2)
+    return first + count
+
+
+def test_a_second_edge_of_one_id_is_noticed_and_waits_until_the_first_is_silent(running):
+    """In each pause of the first the operator would look through another drone's eyes, and never be told."""
+    end = beside(running, 40)
+    assert [unit.rival for unit in running.out if unit.header.session_id == 2][-20:] == [True] * 20
+    assert not any(unit.rival for unit in running.out if unit.header.session_id == 1)
+    assert running.send(end, session=2, key=True, after_ns=RIVAL_SILENCE_NS - 100 * MS) == [("foreign", end)]
+    assert not running.wants(), "nothing is missed while the first may go on"
+    assert running.send(end) == [("decode", end)]
+    assert running.send(end + 1, session=2, after_ns=RIVAL_SILENCE_NS + MS) == [("foreign", end + 1)]
+    assert running.wants()
+    assert running.send(end + 2, session=2, key=True) == [("decode", end + 2)]
+    assert running.out[-1].starts_session
+    # The first comes back: now it is the second.
+    for sequence in range(end + 3, end + 43):
+        assert running.send(sequence, session=2) == [("decode", sequence)]
+        assert running.send(sequence, key=True) == [("foreign", sequence)]
+    assert running.out[-1].rival
+
+
+def test_a_second_edge_does_not_get_in_at_a_low_frame_rate(ground):
+    """With two frames a second every pause between them would look like a restart."""
+    ground.send(0, key=True)
+    for sequence in range(1, 4):
+        ground.send(sequence, after_ns=500 * MS)
+    beside(ground, 30, interval_ns=500 * MS)
+    assert ground.decoded() == list(range(34))
+    assert {unit.header.session_id for unit in ground.out if unit.verdict == "decode"} == {1}
+
+
+def test_a_restart_is_not_taken_for_a_second_edge(running):
+    """A restarted edge would stay dark for seconds."""
+    running.send(0, key=True, session=2)
+    running.send(4)  # still in flight when the new one began
+    running.send(1, session=2, after_ns=SILENCE_NS + ADOPTION_INTERVAL_NS)
+    assert running.wants()
+    assert running.send(2, key=True, session=2) == [("decode", 2)]
+    assert not any(unit.rival for unit in running.out)
+    assert RIVAL_AFTER_NS > FRAME_NS
+
+
 def test_sessions_change_at_most_once_a_second(running):
     """An edge that crashes and starts over and over would reset the screen with every try."""
     running.now_ns += 2 * ADOPTION_INTERVAL_NS
@@ -396,3 +446,28 @@ def test_a_flood_of_invented_sessions_does_not_disturb_a_live_one(sessions, keys
     assert ground.decoded() == list(range(len(sessions) + 1))
     assert ground.core.counters.sessions == 1
     assert not ground.wants()
+
+
+def test_the_picture_comes_back_after_somebody_has_counted_on_in_the_edges_name():
+    """One burst of forged numbers would darken the screen until the edge had counted up to them: minutes."""
+    ground = Ground()
+    for sequence in range(10):
+        ground.send(sequence, key=sequence == 0)
+    for ahead in range(2000):  # four seconds of a flood, within what is plausible
+        ground.send(10 + ahead, session=1, after_ns=2 * MS)
+    assert ground.decoded()[-1] == 2009
+    assert ground.send(70) == [("stale", 70)]
+    for sequence in range(71, 71 + 80):
+        key = ground.wants()
+        if key:
+            ground.core.keyframe_requested(ground.now_ns)
+        ground.send(sequence, key=key)
+    assert ground.decoded()[-1] == 150
+    assert_decodable(ground.out)
+    assert ground.core.counters.sessions == 2
+
+
+def test_a_replayed_keyframe_of_a_moment_ago_does_not_start_the_picture_afresh(running):
+    """Whoever repeats the last keyframe while the link is down would show the operator an old scene as the new."""
+    assert running.send(0, key=True, after_ns=3 * RESTART_SILENCE_NS) == [("duplicate", 0)]
+    assert running.core.counters.sessions == 1

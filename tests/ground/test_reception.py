@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
-from hvt_common.link.wire import BaseHeader
-from hvt_ground.reception import REPORT_LINE_BYTES, Reception, StepFree
+from hvt_common.link.wire import MAX_MISSING_STILLS, BaseHeader
+from hvt_ground.reception import REPORT_LINE_BYTES, Reception
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -87,10 +89,92 @@ def test_memory_is_bounded():
     assert len(reception._delays_ms) <= 256
 
 
-def test_a_wall_clock_that_is_set_leaves_no_step():
-    """NTP coming up on the ground would look like an hour in a queue."""
-    clock = StepFree(wall_ns=1_000 * S, monotonic_ns=5 * S)
-    assert clock.time_ns(1_001 * S, wall_ns=1_001 * S, monotonic_ns=6 * S) == 1_001 * S
-    # The clock was put an hour ahead: what is noted with it is taken back.
-    assert clock.time_ns(4_602 * S, wall_ns=4_602 * S, monotonic_ns=7 * S) == 1_002 * S
-    assert clock.time_ns(4_602 * S, wall_ns=4_602 * S + 5, monotonic_ns=7 * S + 5) == 1_002 * S
+def missing(reception: Reception, *, now_s: float = 1.0) -> tuple[int, ...]:
+    """What a report would name."""
+    return reception.take(round(now_s * S)).missing_stills
+
+
+def test_stills_that_never_came_are_named_until_they_come():
+    """The edge would take them for received, and never send them again."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    reception.still(1, size_bytes=900, arrived_ns=S // 2)
+    reception.still(4, size_bytes=900, arrived_ns=S)
+    assert missing(reception) == (0, 2, 3)
+    reception.still(2, size_bytes=900, arrived_ns=S)
+    reception.still(2, size_bytes=900, arrived_ns=S)
+    assert missing(reception) == (0, 3)
+    assert missing(reception, now_s=6.9) == (3,)
+    assert missing(reception, now_s=7.1) == ()
+
+
+def test_a_still_that_comes_with_what_was_kept_is_missed_no_more():
+    """The edge would send it a second time, on the way that is for now."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    reception.still(2, size_bytes=900, arrived_ns=0)
+    reception.stored_still(1)
+    reception.stored_still(7)
+    measured = reception.take(S)
+    assert (measured.missing_stills, measured.still_sequence) == ((0,), 2)
+
+
+def test_pieces_of_the_past_are_reported_on_as_often_as_anything():
+    """An edge that hears nothing of its pieces sends them again."""
+    reception = Reception()
+    reception.take(0)
+    for number in range(100):
+        reception.past(size_bytes=1_000, arrived_ns=number * 10 * MS)
+    assert reception.due(S)
+    assert reception.interval_ns(S) <= 150 * MS
+
+
+def test_a_ground_that_joins_late_misses_nothing_of_before():
+    """It would ask for stills of a past that nobody there has seen, on the thin link."""
+    reception = Reception()
+    reception.base(header(700), size_bytes=500, arrived_ns=0)
+    reception.still(90, size_bytes=900, arrived_ns=0)
+    assert missing(reception) == ()
+    reception.still(92, size_bytes=900, arrived_ns=0)
+    assert missing(reception) == (91,)
+
+
+def test_what_is_missing_is_bounded():
+    """A forged number would make reports too long to be sent, or the ground grow."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    reception.still(2**32 - 2, size_bytes=900, arrived_ns=0)
+    assert missing(reception) == tuple(range(2**32 - 2 - MAX_MISSING_STILLS, 2**32 - 2))
+    reception.still(2**32 - 1, size_bytes=900, arrived_ns=0)
+    assert len(missing(reception)) == MAX_MISSING_STILLS
+
+
+class Moment(int):
+    """A time that somebody reckons with just when a still comes in another thread."""
+
+    reception: Reception
+    threads: list[threading.Thread]
+
+    def __sub__(self, other):
+        sequence = 100 + 2 * len(self.threads)
+        came = threading.Thread(
+            target=self.reception.still, args=(sequence,), kwargs={"size_bytes": 1, "arrived_ns": S}
+        )
+        came.start()
+        came.join(0.1)  # it has to wait its turn
+        self.threads.append(came)
+        return int(self) - other
+
+
+def test_a_still_may_come_while_a_report_is_made():
+    """Stills are read in a thread of their own, which reports them at once: the ground would end with an error."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    reception.still(4, size_bytes=900, arrived_ns=0)
+    now = Moment(S)
+    now.reception, now.threads = reception, []
+    assert reception.take(now).missing_stills == (0, 1, 2, 3)
+    assert now.threads
+    for came in now.threads:
+        came.join()
+    assert reception.take(S).still_sequence == 100 + 2 * (len(now.threads) - 1)

@@ -41,6 +41,19 @@ def test_the_base_follows_a_link_thinner_than_the_budget(tmp_path):
     assert adapted["frames"] > fixed["frames"]  # more of them, and smaller ones
 
 
+def test_stills_find_their_moment_between_few_frames(tmp_path):
+    """Right behind a base frame the link is busy: at five a second no still would ever go, on the best of links."""
+    few = (
+        "--fps", "5", "--max-frames", "40", "--detect-every", "1",
+        "--budget", "500kbps", "--video-share", "0.6", "--cooldown", "0s",
+    )  # fmt: skip
+    with Link(tmp_path) as link:
+        link.ground("--once", "--detector", "motion", "--classifier", "none")
+        where = ["--connect", f"tcp/127.0.0.1:{link.port}"]
+        summary = link._start("hvt_edge.cli", [*where, *EDGE, *few], name="edge").finish(within_s=90)
+    assert summary["stills"]["sent"] >= 10
+
+
 def test_lockstep_never_adapts(tmp_path):
     """The same input would not give the same bytes."""
     summary = flown(tmp_path / "lockstep", "--pace", "lockstep", "--adapt", "--max-frames", "45")

@@ -81,7 +81,7 @@ def namespaces() -> Iterator[tuple[str, str]]:
             subprocess.run(["ip", "netns", "delete", name], check=False, capture_output=True)
 
 
-def measure(names: tuple[str, str], *, device: str, host: str, listens_in: int) -> list[dict]:
+def measure(names: tuple[str, str], *, device: str, host: str, listens_in: int, links: int = 1) -> list[dict]:
     """Run the two processes of this file and return what the sender wrote: one row for each size."""
 
     def process(namespace: str, *arguments: str) -> subprocess.Popen:
@@ -95,7 +95,7 @@ def measure(names: tuple[str, str], *, device: str, host: str, listens_in: int) 
     listener = process(names[listens_in], "listen", endpoint)
     try:
         assert listener.stdout.readline() == "up\n"
-        sender = process(names[0], "send", endpoint, device)
+        sender = process(names[0], "send", endpoint, device, str(links))
         out, _ = sender.communicate(timeout=60)
         assert sender.returncode == 0
     finally:
@@ -103,9 +103,10 @@ def measure(names: tuple[str, str], *, device: str, host: str, listens_in: int) 
     return json.loads(out)
 
 
-def test_the_ledger_agrees_with_the_kernel_on_a_link(namespaces):
+@pytest.mark.parametrize("links", [1, 2])
+def test_the_ledger_agrees_with_the_kernel_on_a_link(namespaces, links):
     """The budget would be held on paper while the radio carries more."""
-    rows = measure(namespaces, device="veth-a", host="10.99.0.2", listens_in=1)
+    rows = measure(namespaces, device="veth-a", host="10.99.0.2", listens_in=1, links=links)
     assert [row["size"] for row in rows] == list(SIZES)
     for row in rows:
         assert (
@@ -135,12 +136,12 @@ def listen(endpoint: str) -> None:
         subscriber.undeclare()
 
 
-def send(endpoint: str, device: str) -> None:
+def send(endpoint: str, device: str, links: str) -> None:
     """Send some messages of each size at 15 a second and print what the kernel and the ledger counted."""
     if device != "lo":
         _segment_in_software(device)
     rows = []
-    with open_session(LinkSettings("edge", connect=(endpoint,))) as session:
+    with open_session(LinkSettings("edge", connect=(endpoint,), links=int(links))) as session:
         publisher = declare_publisher(session, Row.BASE, keys=KEYS)
         while not publisher.matching_status.matching:
             time.sleep(0.01)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,16 +14,20 @@ from pathlib import Path
 import pytest
 import zenoh
 
+import hvt_edge.cli
 from fleet_keys import EXPIRED, Fleet
 from hvt_common.link.diagnose import LinkWatch
 from hvt_common.link.keys import EdgeKeys, Row, selector
 from hvt_common.link.session import ask, declare_publisher, open_session, serve
 from hvt_common.link.zenoh_config import LinkSettings, configure
+from hvt_common.stopping import STOP_SIGNALS
 from processes import Running, eventually, free_ports
 
 pytestmark = pytest.mark.integration
 
 UAV1, UAV2 = EdgeKeys("uav-1"), EdgeKeys("uav-2")
+PATIENCE_S = 0.3
+"""Nothing here is merely slow to come."""
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +129,9 @@ def refused(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
             session = stack.enter_context(_unchecked(settings))
             watches[name] = (
                 session,
-                stack.enter_context(LinkWatch(session, settings, served=lambda _: True)),
+                stack.enter_context(
+                    LinkWatch(session, settings, served=lambda _: True, patience_s=PATIENCE_S)
+                ),
             )
         eventually(
             lambda: all(watch.trouble for _, watch in watches.values()), within_s=40, what="all are explained"
@@ -154,7 +161,7 @@ def _edge(fleet: Fleet, endpoint: str, *, name: str = "uav-1") -> Iterator[zenoh
         serve(session, Row.INFO, keys=UAV1, answer=lambda _question: b"info")
         serve(session, Row.CONTROL, keys=UAV1, answer=lambda _question: b"done")
         token = session.liveliness().declare_token(UAV1.key(Row.ALIVE))
-        with LinkWatch(session, settings, served=lambda _ground: False):
+        with LinkWatch(session, settings, served=lambda _ground: False, patience_s=PATIENCE_S):
             yield session
         token.undeclare()  # type: ignore[no-untyped-call]
 
@@ -180,7 +187,12 @@ def test_an_edge_cannot_write_as_another(
             open_session(replace(fleet.settings("uav-1", "edge", connect=(endpoint,)), name=None))
         )
         stack.enter_context(
-            LinkWatch(ground, ground_settings, served=lambda name: f"hvt/{name}/alive" in came)
+            LinkWatch(
+                ground,
+                ground_settings,
+                served=lambda name: f"hvt/{name}/alive" in came,
+                patience_s=PATIENCE_S,
+            )
         )
         forger.liveliness().declare_token(UAV2.key(Row.ALIVE))
         serve(forger, Row.INFO, keys=UAV2, answer=lambda _question: b"forged")
@@ -247,9 +259,14 @@ def test_watching_commanding_and_being_a_stranger(
 # Real processes
 
 
-def _hvt_edge(fleet: Fleet, folder: Path, *arguments: str, name: str = "edge") -> Running:
-    common = ["--source", "demo", "--profile", "thin", "--detector", "motion", "--edge-id", "uav-1"]
-    return Running("hvt_edge.cli", [*common, *arguments], folder=folder, name=name)
+def _words(scene: Path) -> list[str]:
+    """Of an edge that starts fast: the demo would have to be drawn first."""
+    small = ("--source-fps", "10", "--fps", "10", "--size", "640x360", "--preset", "ultrafast")
+    return ["--source", str(scene), *small, "--detector", "motion", "--edge-id", "uav-1"]
+
+
+def _hvt_edge(scene: Path, folder: Path, *arguments: str, name: str = "edge") -> Running:
+    return Running("hvt_edge.cli", [*_words(scene), *arguments], folder=folder, name=name)
 
 
 def _hvt_ground(fleet: Fleet, who: str, folder: Path, *arguments: str) -> Running:
@@ -258,7 +275,7 @@ def _hvt_ground(fleet: Fleet, who: str, folder: Path, *arguments: str) -> Runnin
 
 
 def test_a_flight_with_keys_keeps_the_account(
-    fleet: Fleet, tmp_path: Path, free_port: int, started: list[Running]
+    fleet: Fleet, scene: Path, tmp_path: Path, free_port: int, started: list[Running]
 ) -> None:
     """A rule too strict for one row of the key table would lose that row only, and nobody would know."""
     endpoint = f"tls/127.0.0.1:{free_port}"
@@ -267,7 +284,7 @@ def test_a_flight_with_keys_keeps_the_account(
     ground.until("listening on")
     keys = ("--zenoh-config", str(fleet.file("uav-1")), "--send-tracks")
     edge = _hvt_edge(
-        fleet, tmp_path, "--connect", endpoint, *keys, "--pace", "lockstep", "--max-frames", "45"
+        scene, tmp_path, "--connect", endpoint, *keys, "--pace", "lockstep", "--max-frames", "45"
     )
     started.append(edge)
     sent, received = edge.finish(), ground.finish()
@@ -281,39 +298,53 @@ def test_a_flight_with_keys_keeps_the_account(
         assert "does not answer on control" not in one.said
 
 
-@pytest.mark.parametrize(
-    ("who", "says"),
-    [
-        ("guest", "guest.json5 lets it watch uav-1, not command it: no keyframes or stills on demand"),
-        ("stranger", "hvt-ground: 'uav-1' is linked, but nothing of edge uav-1 is seen here: its Zenoh"),
-    ],
-)
-def test_a_ground_is_told_what_it_may_not(
-    fleet: Fleet, tmp_path: Path, free_port: int, started: list[Running], who: str, says: str
-) -> None:
-    """The operator asks for a still, or waits for a picture, and nothing comes: the reason has to stand there."""
-    endpoint = f"tls/127.0.0.1:{free_port}"
-    with _edge(fleet, endpoint):
-        ground = _hvt_ground(fleet, who, tmp_path, "--connect", endpoint, "--record", str(tmp_path))
-        started.append(ground)
-        ground.until(says)
-        ground.stop()
+TOLD = {
+    "guest": "guest.json5 lets it watch uav-1, not command it: no keyframes or stills on demand",
+    "stranger": "hvt-ground: 'uav-1' is linked, but nothing of edge uav-1 is seen here: its Zenoh",
+    "uav-1": "hvt-edge: no link: ENDPOINT: the other side wants a certificate of this machine, and",
+}
 
 
-def test_an_edge_that_does_not_get_in_says_why_and_goes_on(
-    fleet: Fleet, tmp_path: Path, free_port: int, started: list[Running]
-) -> None:
-    """The engineer beside the drone sees only the drone's own log."""
-    endpoint = f"tls/127.0.0.1:{free_port}"
-    with open_session(fleet.settings("base", "ground", listen=(endpoint,))):
-        file = fleet.changed("uav-1", connect_certificate=None, connect_private_key=None)
-        edge = _hvt_edge(fleet, tmp_path, "--connect", endpoint, "--zenoh-config", str(file))
-        started.append(edge)
-        edge.until(f"hvt-edge: no link: {endpoint}: the other side wants a certificate of this machine, and")
-        assert edge.alive
-        edge.stop()
+@pytest.fixture(scope="module")
+def told(fleet: Fleet, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Running]]:
+    """A ground that may only watch, one that the edge does not know, an edge without a certificate: all at once."""
+    folder = tmp_path_factory.mktemp("told")
+    here, there = (f"tls/127.0.0.1:{port}" for port in free_ports(2))
+    bare = fleet.changed("uav-1", connect_certificate=None, connect_private_key=None)
+    with _edge(fleet, here), open_session(fleet.settings("base", "ground", listen=(there,))):
+        running = {who: _hvt_ground(fleet, who, folder, "--connect", here) for who in ("guest", "stranger")}
+        running["uav-1"] = _hvt_edge(
+            scene, folder, "--connect", there, "--zenoh-config", str(bare), name="uav-1"
+        )
+        yield running
+        for one in running.values():
+            if one.alive:
+                one.kill()
 
 
+@pytest.mark.parametrize("who", TOLD)
+def test_who_may_not_is_told_by_its_own_program_and_goes_on(told: dict[str, Running], who: str) -> None:
+    """The operator waits for a picture and nothing comes; the engineer beside the drone sees only the drone's log."""
+    before, _, after = TOLD[who].partition("ENDPOINT")
+    process = told[who]
+    process.until(before, within_s=90)
+    process.until(after)
+    assert process.alive
+    process.stop()
+
+
+@pytest.fixture
+def own_handlers() -> Iterator[None]:
+    """A program in this process takes signals and logging for itself."""
+    handlers = {one: signal.getsignal(one) for one in STOP_SIGNALS}
+    kept = logging.getLogger().handlers[:]
+    yield
+    for one, handler in handlers.items():
+        signal.signal(one, handler)
+    logging.getLogger().handlers[:] = kept
+
+
+@pytest.mark.usefixtures("own_handlers")
 @pytest.mark.parametrize(
     ("case", "says"),
     [
@@ -329,7 +360,7 @@ def test_an_edge_that_does_not_get_in_says_why_and_goes_on(
     ],
 )
 def test_an_edge_with_unfit_keys_does_not_start(
-    fleet: Fleet, tmp_path: Path, started: list[Running], case: str, says: str
+    fleet: Fleet, scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], case: str, says: str
 ) -> None:
     """Exit code 2 and a sentence, so that systemd does not try for ever and the reason is the last line."""
     own = fleet.copy(tmp_path / "keys")
@@ -339,11 +370,11 @@ def test_an_edge_with_unfit_keys_does_not_start(
     elif case == "missing":
         file = own.changed("uav-1", connect_private_key="/nowhere/uav-1.key")
     who = ("--edge-id", "uav-2") if case == "another id" else ()
-    edge = _hvt_edge(own, tmp_path, "--connect", "tls/127.0.0.1:9", "--zenoh-config", str(file), *who)
-    started.append(edge)
-    assert edge.wait(within_s=60) == 2
-    assert edge.said.count("\n") == 1, edge.said
-    assert edge.said.startswith(f"hvt-edge: {says.replace('KEYS', str(own.folder))}")
+    asked = [*_words(scene), "--connect", "tls/127.0.0.1:9", "--zenoh-config", str(file), *who]
+    assert hvt_edge.cli.main(asked) == 2
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1, said
+    assert said.startswith(f"hvt-edge: {says.replace('KEYS', str(own.folder))}")
 
 
 def test_a_ground_that_gets_no_answer_on_control_is_told(

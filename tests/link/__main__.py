@@ -1,4 +1,4 @@
-"""``make link``: edge and ground over bad links; one table, and its rows in build/link.json.
+"""``make link``: edge and ground over bad links; one table, its rows in build/link.json, a picture in build/link.png.
 
 Each run leaves its processes' output, the recording and the table of arrivals under build/link/SCENARIO.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import shlex
 import sys
 from collections.abc import Sequence
@@ -15,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from hvt_common.errors import exit_with_sentence
 from link.laboratory import Run, run
 from link.material import demo_clip, looped
-from link.measures import rate_over_time, rows
+from link.measures import Outcome, rate_over_time, rows
 from link.netns import UnavailableError
+from link.rows import row, save, table
 from link.script import LENGTHS, load_scenario, scenario_names
 
 BUILD = Path("build")
@@ -37,12 +36,13 @@ def _run(argv: Sequence[str] | None) -> int:
     names = asked.scenarios or scenario_names()
     scenarios = [load_scenario(name) for name in names]
     clip = Path(asked.clip) if asked.clip else demo_clip(BUILD / "link" / "demo.mp4")
-    console, found = Console(highlight=False), []
+    console, found, outcomes = Console(highlight=False), [], []
     for scenario in scenarios:
         folder = BUILD / "link" / scenario.name
+        lasts_s = scenario.script(asked.length, lasts=asked.lasts).lasts_s
         wanted = Run(
             scenario=scenario,
-            source=str(folder / "clip.mp4"),
+            source=str(looped(clip, folder / "clip.ffconcat", lasts_s=lasts_s + 15)),
             folder=folder,
             length=asked.length,
             lasts=asked.lasts,
@@ -51,47 +51,39 @@ def _run(argv: Sequence[str] | None) -> int:
             edge_arguments=shlex.split(asked.edge),
             ground_arguments=shlex.split(asked.ground),
         )
-        script = wanted.script
-        looped(clip, folder / "clip.mp4", lasts_s=script.lasts_s + 15)
-        console.print(f"{scenario.name}, {script.lasts_s:g} s: {scenario.about}")
-        found += _one(wanted, bars=dict(scenario.bars))
-    console.print(_table(found))
-    (BUILD / "link.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-    return int(asked.strict and any(row["holds"] is False for row in found))
+        console.print(f"{scenario.name}, {lasts_s:g} s: {scenario.about}")
+        measured, outcome = _one(wanted, bars=dict(scenario.bars))
+        found += measured
+        outcomes += [] if outcome is None else [outcome]
+        save(found, BUILD / f"{asked.name}.json")
+    console.print(table(found, title="make link"))
+    if outcomes:
+        _drawn(outcomes, BUILD / f"{asked.name}.png", console)
+    return int(asked.strict and any(one["holds"] is False for one in found))
 
 
-def _one(wanted: Run, *, bars: dict[str, str]) -> list[dict[str, Any]]:
+def _one(wanted: Run, *, bars: dict[str, str]) -> tuple[list[dict[str, Any]], Outcome | None]:
+    name = wanted.scenario.name
     try:
         outcome = run(wanted)
     except (UnavailableError, AssertionError) as error:
-        print(f"{wanted.scenario.name}: did not run: {error}", file=sys.stderr)
-        reason = {
-            "scenario": wanted.scenario.name,
-            "measure": "did not run",
-            "value": str(error).splitlines()[0],
-        }
-        return [{**reason, "bar": None, "holds": None if isinstance(error, UnavailableError) else False}]
+        print(f"{name}: did not run: {error}", file=sys.stderr)
+        holds = None if isinstance(error, UnavailableError) else False
+        said = str(error).splitlines()[0]
+        return [{**row(name, "did not run", None, None), "value": said, "holds": holds}], None
     series = {"began_s": outcome.began_s, "delivered_bps": rate_over_time(outcome)}
     (wanted.folder / "series.json").write_text(json.dumps(series) + "\n", encoding="utf-8")
-    return [_finite(row) for row in rows(outcome, bars)]
+    return rows(outcome, bars), outcome
 
 
-def _finite(row: dict[str, Any]) -> dict[str, Any]:
-    """JSON knows no infinity."""
-    value = row["value"]
-    return {**row, "value": "never"} if isinstance(value, float) and math.isinf(value) else row
-
-
-def _table(found: list[dict[str, Any]]) -> Table:
-    table = Table(title="make link", title_justify="left")
-    for name in ("scenario", "measure", "value", "bar", "holds"):
-        table.add_column(name, justify="left" if name in ("scenario", "measure") else "right")
-    for row in found:
-        holds = {True: "yes", False: "NO", None: ""}[row["holds"]]
-        value = row["value"]
-        shown = f"{value:.2f}" if isinstance(value, float) else "" if value is None else str(value)
-        table.add_row(row["scenario"], row["measure"], shown, row["bar"] or "", holds)
-    return table
+def _drawn(outcomes: Sequence[Outcome], path: Path, console: Console) -> None:
+    try:
+        from link.picture import draw  # matplotlib belongs to the study
+    except ImportError:
+        console.print("no picture: pip install 'hvt[study]' for matplotlib")
+        return
+    draw(outcomes, path)
+    console.print(f"drawn: {path}")
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -106,6 +98,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--lasts", help="another length, such as 60min for a soak")
     parser.add_argument("--carrier", choices=["relay", "netns"], default="relay")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--name", default="link", help="of the table and the picture in build/ [link]")
     parser.add_argument("--edge", default="", help="further arguments of hvt-edge, in one word")
     parser.add_argument("--ground", default="", help="further arguments of hvt-ground, in one word")
     parser.add_argument("--strict", action="store_true", help="exit code 1 where a bar does not hold")

@@ -1,4 +1,4 @@
-"""What the edge plays: a clip as long as the scenario, made by repeating a shorter one without coding it again."""
+"""What the edge plays: a clip as long as the scenario, made by repeating a shorter one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ __all__ = ["demo_clip", "looped"]
 
 _SIZE = (1280, 720)
 _FPS = 15
-_TIME_BASE_S = 90_000
 
 
 def demo_clip(path: Path) -> Path:
@@ -38,7 +37,7 @@ def demo_clip(path: Path) -> Path:
 
 
 def looped(clip: Path, path: Path, *, lasts_s: float) -> Path:
-    """Repeat the clip until it lasts so long; ``path`` is overwritten.
+    """Write a list (ffconcat) that plays the clip again and again until it lasts so long; ``path`` is overwritten.
 
     Raises:
         UserError: the clip cannot be read, or has no video.
@@ -48,21 +47,13 @@ def looped(clip: Path, path: Path, *, lasts_s: float) -> Path:
             stream = source.streams.video[0]
             packets = [packet for packet in source.demux(stream) if packet.size]
             span = max(p.pts + (p.duration or 1) for p in packets) - min(p.pts for p in packets)
-            first, base = min(p.pts for p in packets), stream.time_base
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with av.open(str(path), "w") as target:
-                out = target.add_stream_from_template(stream)
-                for turn in range(int(lasts_s / float(span * base)) + 1):
-                    for packet in packets:
-                        target.mux(_moved(packet, out, by=turn * span - first))
-    except (av.FFmpegError, IndexError, ValueError) as error:
+            turns = int(lasts_s / float(span * stream.time_base)) + 1
+    except (av.FFmpegError, IndexError, ValueError, OSError) as error:
         raise UserError(f"CLIP {clip} cannot be played: {error}") from None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # FFmpeg takes only plain names beside the list.
+    beside = path.with_name(f"{path.stem}-once{clip.suffix}")
+    beside.unlink(missing_ok=True)
+    beside.symlink_to(clip.resolve())
+    path.write_text("ffconcat version 1.0\n" + f"file {beside.name}\n" * turns, encoding="ascii")
     return path
-
-
-def _moved(packet: av.Packet, stream: av.VideoStream, *, by: int) -> av.Packet:
-    moved = av.Packet(bytes(packet))
-    moved.time_base, moved.stream = packet.time_base, stream
-    moved.pts, moved.dts = packet.pts + by, packet.dts + by
-    moved.duration, moved.is_keyframe = packet.duration, packet.is_keyframe
-    return moved

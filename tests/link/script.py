@@ -25,12 +25,14 @@ __all__ = [
     "Piece",
     "Scenario",
     "Script",
+    "Transport",
     "load_scenario",
     "scenario_names",
 ]
 
 SCENARIOS = Path(__file__).parent / "scenarios"
 Length = Literal["short", "full"]
+Transport = Literal["tcp", "udp"]
 LENGTHS: tuple[Length, ...] = ("short", "full")
 
 _WAVE_STEP_S = 0.25
@@ -166,6 +168,8 @@ class Scenario:
     """Of the edge, as its ``--budget`` takes it."""
     bars: Mapping[str, str]
     """What a measure must be: ``{"decodable frames, %": ">= 97"}``."""
+    transport: Transport
+    """``udp`` shows losses as losses; ``tcp`` turns them into delay."""
     _tables: Mapping[str, Mapping[str, Any]] = field(repr=False)
 
     def script(self, length: Length, *, seed: int = 0, lasts: str | None = None) -> Script:
@@ -198,7 +202,7 @@ def load_scenario(name: str | Path) -> Scenario:
 
 
 def _scenario(name: str, content: dict[str, Any]) -> Scenario:
-    _known(content, {"about", "budget", "link", "short", "full", "bars"}, where=name)
+    _known(content, {"about", "budget", "transport", "link", "short", "full", "bars"}, where=name)
     tables = {key: _table(content, key, where=name) for key in ("link", *LENGTHS)}
     for key in ("about", "budget"):
         if not isinstance(content.get(key), str):
@@ -208,7 +212,10 @@ def _scenario(name: str, content: dict[str, Any]) -> Scenario:
     for measure, bar in bars.items():
         if not isinstance(bar, str) or bar.split()[0] not in ("<=", ">=", "=="):
             raise UserError(f"{name}: bar {measure!r} is {bar!r}: write '<= 2', '>= 97' or '== 0'")
-    scenario = Scenario(name, content["about"], content["budget"], bars, tables)
+    transport = content.get("transport", "tcp")
+    if transport not in ("tcp", "udp"):
+        raise UserError(f"{name}: transport {transport!r} is not usable: tcp or udp")
+    scenario = Scenario(name, content["about"], content["budget"], bars, transport, tables)
     for length in LENGTHS:
         scenario.script(length)
     return scenario

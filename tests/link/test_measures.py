@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 
-from link.measures import Outcome, holds, measures, rate_over_time, rows
+from link.measures import KEPT_FROM, Outcome, measures, rate_over_time, rows
+from link.rows import holds
 from link.script import load_scenario
+from link.store_left import StoreLeft
 from link.timing import Arrival
-from link.watch import Sample, slope_mb_per_hour
+from link.watch import Sample, more_at_the_end, slope_mb_per_hour
 
 BEGAN_S = 1_790_000_000.0
+STORE = dict.fromkeys(
+    ("stills", "video_s", "evicted_stills", "evicted_segments", "unreadable", "given_up"), 0
+)
 
 
 def frame(index: int, *, delay_s: float = 0.1, shown: bool = True, size: int = 5000) -> Arrival:
@@ -21,16 +27,26 @@ def frame(index: int, *, delay_s: float = 0.1, shown: bool = True, size: int = 5
     return Arrival("base", index, index, capture_s, capture_s + 0.02, capture_s + delay_s, shown, size)
 
 
-def outcome(name: str, frames: list[Arrival], *, sent: int | None = None) -> Outcome:
+def outcome(
+    name: str, frames: list[Arrival], *, sent: int | None = None, store: dict[str, int] | None = None
+) -> Outcome:
     """What a run with these arrivals would be."""
-    sums = {"base_bytes": 1000, "roi_bytes": 10, "meta_bytes": 0, "overhead_bytes": 5}
+    sums = {"base_bytes": 1000, "roi_bytes": 10, "past_bytes": 7, "meta_bytes": 0, "overhead_bytes": 5}
     edge = {
         **sums,
         "frames": len(frames) if sent is None else sent,
         "frames_dropped": 3,
-        "stills": {"sent": 7},
+        "stills": {"sent": 8, "reasons": {"sent": {"utility": 7, "stored": 1}}},
+        "store": None if store is None else STORE | store,
     }
-    ground = {**sums, "roi_bytes": 8, "stills": {"received": 6}, "keyframe_requests": 2, "lost": 1}
+    ground = {
+        **sums,
+        "roi_bytes": 8,
+        "stills": {"received": 4},
+        "past": {"stills": 2, "frames": 50, "video_s": 5.0},
+        "keyframe_requests": 2,
+        "lost": 1,
+    }
     return Outcome(
         scenario=name,
         script=load_scenario(name).script("full"),
@@ -96,7 +112,7 @@ def test_live_again_asks_for_a_fresh_picture():
 
 def test_accounts_and_processes():
     """A hole in the account, or a process that had to be killed, would not show."""
-    result = outcome("outage-60s", [frame(i) for i in range(1200)])
+    result = outcome("outage-60s", [*(frame(i) for i in range(1200)), *(still(i) for i in range(6))])
     found = {row["measure"]: row for row in rows(result, {"stills lost": "== 0", "unheard of": "<= 1"})}
     assert found["ledger difference, bytes"]["value"] == 2
     assert (found["stills lost"]["value"], found["stills lost"]["holds"]) == (1, False)
@@ -105,6 +121,39 @@ def test_accounts_and_processes():
     assert found["ground, exit code"]["holds"] is False
     assert found["edge, memory slope MB/h"]["value"] == pytest.approx(1.0, abs=0.01)
     json.dumps(list(found.values()), allow_nan=False)
+
+
+def still(sequence: int, kind: str = "roi", *, shown: bool = True) -> Arrival:
+    """A still that came, on either way."""
+    return Arrival(kind, sequence, 0, BEGAN_S, BEGAN_S, BEGAN_S + 1, shown, 500)
+
+
+def test_what_is_still_kept_is_not_lost_and_what_was_given_up_is():
+    """An edge that throws away what it kept would lose nothing."""
+    first = KEPT_FROM
+    came = [still(number) for number in (0, 1, 2, 4, 5)]
+    past = [still(first, "past-still"), still(first + 1, "past-still", shown=False), still(3, "past-base")]
+
+    def lost(kept: set[int], **store: int) -> float:
+        result = outcome("outage-60s", [*came, *past], store=store)
+        return measures(replace(result, kept=StoreLeft(9, 0, stills=frozenset(kept))))["stills lost"]
+
+    assert lost({3, 6, first + 1, first + 2}) == 0
+    assert lost({3, 6, first + 2}) == 1, "a half of one came"
+    assert lost({6, first + 1}) == 1, "live still 3 is nowhere"
+    assert lost({3, first + 1}) == 1, "seven were sent, the last leaves no hole"
+    assert lost({3, 6, first + 1}, evicted_stills=3, given_up=1) == 4
+
+
+def test_what_the_store_did_is_told_where_it_did_something():
+    """The numbers of `outage-60s` would be nowhere, or in every scenario's table."""
+    frames = [frame(i) for i in range(600)]
+    found = measures(outcome("outage-60s", frames, store={"stills": 9, "video_s": 12}))
+    assert found["stills that came afterwards"] == 2
+    assert found["stills still kept at the end"] == 9
+    assert found["video still kept at the end, s"] == 12
+    assert "stills that came afterwards" not in measures(outcome("outage-60s", frames, store={}))
+    assert "stills that came afterwards" not in measures(outcome("outage-60s", frames))
 
 
 def test_bars_are_read_as_they_are_written():
@@ -123,7 +172,41 @@ def test_the_rate_over_time_leaves_nothing_out():
 
 
 def test_a_flat_memory_has_no_slope():
-    """The start would count as a leak."""
-    samples = [Sample(i, 50 + min(i, 30), 5, 5) for i in range(100)]
+    """The start would count as a leak, or the moment in which a recording is folded."""
+    samples = [Sample(i, 50 + min(i, 30) + 40 * (i == 70), 5, 5) for i in range(100)]
     assert slope_mb_per_hour(samples) == pytest.approx(0, abs=1e-6)
     assert slope_mb_per_hour(samples[:5]) is None
+
+
+def test_a_leak_has_a_slope_whatever_else_there_is():
+    """A megabyte an hour would hide behind what comes and goes."""
+    samples = [Sample(i / 4, 500 + i / 4 / 3600 + 9 * (i % 60 < 3), 5, 5) for i in range(14_400)]
+    assert slope_mb_per_hour(samples) == pytest.approx(1, abs=0.05)
+
+
+def test_more_at_the_end_is_what_stays():
+    """A leak of descriptors would not show, or an open file for a moment would."""
+
+    def samples(levels: list[int]) -> list[Sample]:
+        return [Sample(float(i), 50.0, level, 5) for i, level in enumerate(levels)]
+
+    def more(levels: list[int]) -> float | None:
+        return more_at_the_end(samples(levels), lambda sample: sample.descriptors)
+
+    assert more([20] * 100) == 0
+    assert more([20] * 85 + [27] + [20] * 14) == 0
+    assert more([20] * 30 + [18] * 40 + [20] * 30) == 0, "an outage took a socket and gave it back"
+    assert more([20] * 84 + [21] * 5 + [20] * 11) == 0, "an outage near the end opened a file"
+    assert more([20 + i // 10 for i in range(100)]) >= 4
+    assert more([20] * 10) is None
+
+
+def test_a_long_run_has_to_be_flat():
+    """An hour would be flown, and nobody say that memory grew."""
+    result = outcome("drone-fade", [frame(i) for i in range(900)])
+    soak = replace(result, script=load_scenario("drone-fade").script("full", lasts="60min"))
+    short = {row["measure"]: row["bar"] for row in rows(result, {})}
+    asked = {row["measure"]: row["bar"] for row in rows(soak, {})}
+    assert short["edge, memory slope MB/h"] is None
+    assert asked["edge, memory slope MB/h"] == asked["ground, memory slope MB/h"] == "<= 1"
+    assert asked["ledger difference, bytes"] == "== 0"

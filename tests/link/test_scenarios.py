@@ -17,7 +17,7 @@ from link.netns import UnavailableError
 from link.script import load_scenario, scenario_names
 from pictures import write_scene
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(480)]
 
 EDGE = (
     "--source-fps",
@@ -33,13 +33,14 @@ EDGE = (
 )
 GROUND = ("--detector", "motion", "--classifier", "none")
 AT_ONCE = 5
+SOAK_S = 60
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
     """Pictures for longer than any short script lasts."""
     folder = tmp_path_factory.mktemp("scene")
-    write_scene(folder, frames=400)
+    write_scene(folder, frames=10 * SOAK_S + 150)
     return folder
 
 
@@ -63,11 +64,12 @@ def outcomes(scene, tmp_path_factory) -> dict[str, Outcome | str]:
     """All scenarios over the relay, a few at a time."""
     folder = tmp_path_factory.mktemp("link")
     with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
+        soak = pool.submit(short, "drone-fade", scene, folder / "soak", lasts=f"{SOAK_S}s")
         names = sorted(scenario_names(), key=lambda name: -load_scenario(name).script("short").lasts_s)
         running = {name: pool.submit(short, name, scene, folder) for name in names}
         # The relay's TCP is a model; where there are namespaces, the kernel's own is asked too.
         running["kernel"] = pool.submit(short, "steady-300k", scene, folder / "kernel", carrier="netns")
-        return {name: _result(one) for name, one in running.items()}
+        return {name: _result(one) for name, one in (running | {"soak": soak}).items()}
 
 
 def _result(running: concurrent.futures.Future[Outcome]) -> Outcome | str:
@@ -85,15 +87,7 @@ def test_both_sides_survive(outcomes, name):
     assert not [text for text in outcome.said.values() if "Traceback" in text]
 
 
-def _today(name: str):
-    """What is known not to hold yet on a busy machine; to be taken out with the recovery that mends it."""
-    late = pytest.mark.xfail(
-        reason="after an outage past the lease the link sometimes stays gone", strict=False
-    )
-    return pytest.param(name, marks=late) if name == "outage-60s" else name
-
-
-@pytest.mark.parametrize("name", [_today(name) for name in scenario_names()])
+@pytest.mark.parametrize("name", scenario_names())
 def test_there_is_a_picture_at_the_end(outcomes, name):
     """After a fade the operator would look at the last frame before it."""
     outcome = outcomes[name]
@@ -116,6 +110,24 @@ def test_a_steady_link_loses_nothing(outcomes, name):
 def test_darkness_is_dark(outcomes, name):
     """The lab would be testing nothing."""
     assert measures(outcomes[name])["received in darkness, bytes"] == 0
+
+
+@pytest.mark.parametrize("side", ["edge", "ground"])
+def test_a_minute_of_fading_costs_neither_descriptors_nor_threads(outcomes, side):
+    """An hour of it would cost sixty times as many (`make soak` flies that hour)."""
+    found = measures(outcomes["soak"])
+    assert found[f"{side}, descriptors more at the end"] <= 0
+    assert found[f"{side}, threads more at the end"] <= 0
+
+
+def test_a_minute_of_fading_keeps_its_account(outcomes):
+    """What a bad link costs would be told wrongly by one of the two."""
+    outcome = outcomes["soak"]
+    assert outcome.exit_codes == {"edge": 0, "ground": 0}, outcome.said
+    found = measures(outcome)
+    assert found["ledger difference, bytes"] == 0
+    assert found["stills lost"] == 0
+    assert found["base messages lost"] == 0
 
 
 def test_a_satellite_is_far_away(outcomes):

@@ -24,6 +24,7 @@ NAMES = {
     "step-1M-200k-1M",
     "drone-fade",
     "burst-loss",
+    "burst-loss-udp",
     "outage-8s",
     "outage-60s",
     "satellite-600ms",
@@ -109,6 +110,7 @@ def test_a_soak_is_a_longer_scenario():
         (('rate = "1Mbps"', 'rate = "1Mbps"\nloss = "95%"'), "loss '95%' is too much"),
         (('rate = "1Mbps"', 'rate = "1Mbps"\nqueue = "1kB"'), "queue '1kB' is not usable"),
         (('rate = "1Mbps"', 'rate = "1Mbps"\ndelay = "9s"'), "delay '9s' is too much"),
+        (("[link]", 'transport = "quic"\n[link]'), "transport 'quic' is not usable: tcp or udp"),
         (('lasts = "10s"', 'lasts = "0s"'), "lasts 0 s is not usable"),
         (
             ('lasts = "10s"', 'lasts = "10s"\ndark = [{ at = "8s", lasts = "3s" }]'),
@@ -136,6 +138,8 @@ def test_what_cannot_be_used_is_named(tmp_path, change, sentence):
 
 def test_an_unknown_scenario_is_answered_with_the_known():
     """`make link SCENARIO=steady` would say nothing useful."""
-    with pytest.raises(UserError, match="'steady' is unknown: there are burst-loss, drone-fade"):
+    with pytest.raises(
+        UserError, match="'steady' is unknown: there are burst-loss, burst-loss-udp, drone-fade"
+    ):
         load_scenario("steady")
     assert LENGTHS == ("short", "full")

@@ -1,4 +1,4 @@
-"""Reads the ground's table of arrivals (see `link.timed_ground`)."""
+"""Reads what `hvt-ground --timing` wrote (see `hvt_ground.timing`)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class Arrival:
     """One message as the ground got it. Times are Unix seconds; edge and ground share this machine's clock."""
 
     kind: str
-    """base or roi."""
+    """base, roi, tracks, status, past-still, past-base or past-info."""
     sequence: int
     frame_index: int
     capture_s: float
     send_s: float
     received_s: float
     shown: bool
-    """It was decoded (base), or taken in (roi)."""
+    """It was decoded (base), or read (roi)."""
     line_bytes: int
 
     @property
@@ -31,7 +31,7 @@ class Arrival:
 
 
 def read_timing(path: Path) -> list[Arrival]:
-    """All whole rows, in order of arrival; none where there is no file yet."""
+    """All whole rows, as they were written; none where there is no file yet."""
     if not path.exists():
         return []
     text = path.read_text(encoding="ascii")

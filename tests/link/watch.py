@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import csv
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 import psutil
 
-__all__ = ["Sample", "Watch", "slope_mb_per_hour"]
+__all__ = ["WARM_UP", "Sample", "Watch", "more_at_the_end", "slope_mb_per_hour"]
 
 _EVERY_S = 0.25
 _MOST_SAMPLES = 20_000
-_WARM_UP = 0.4
+WARM_UP = 0.4
 """Share of the run that the slope leaves out."""
+_END = 0.8
+_POINTS = 200
+_LEAST_SAMPLES = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +45,16 @@ class Watch:
         self._every_s = _EVERY_S
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="link-watch")
+
+    def save(self, path: Path) -> None:
+        """As a table: what grew, and when."""
+        with path.open("w", newline="", encoding="ascii") as file:
+            table = csv.writer(file)
+            table.writerow(("process", "unix_s", "resident_mb", "descriptors", "threads"))
+            for name, samples in self.samples.items():
+                for one in samples:
+                    numbers = (f"{one.at_s:.2f}", f"{one.resident_mb:.2f}", one.descriptors, one.threads)
+                    table.writerow((name, *numbers))
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -71,9 +86,31 @@ class Watch:
 
 
 def slope_mb_per_hour(samples: list[Sample]) -> float | None:
-    """Of resident memory after the warm-up, by least squares; None of too few samples."""
-    late = samples[int(_WARM_UP * len(samples)) :]
+    """Of resident memory after the warm-up, by Theil and Sen; None of too few samples.
+
+    The median of the slopes between all pairs of points: what is taken for a moment (a recording that is folded) or
+    once (a library that loads late) does not bend it. The points are medians of equal parts of the time.
+    """
+    late = samples[int(WARM_UP * len(samples)) :]
     if len(late) < 8:
         return None
-    at_h = np.array([sample.at_s - late[0].at_s for sample in late]) / 3600
-    return float(np.polyfit(at_h, [sample.resident_mb for sample in late], 1)[0])
+    parts = np.array_split(np.array([(one.at_s, one.resident_mb) for one in late]), min(_POINTS, len(late)))
+    at_s, resident_mb = np.array([np.median(part, axis=0) for part in parts]).T
+    first, second = np.triu_indices(len(parts), k=1)
+    slopes = (resident_mb[second] - resident_mb[first]) / (at_s[second] - at_s[first])
+    return 3600 * float(np.median(slopes))
+
+
+def more_at_the_end(samples: list[Sample], of: Callable[[Sample], float]) -> float | None:
+    """What a run has more at its end than once it was warm; None of too few samples.
+
+    Medians of twentieths of the run: the most of those in its first 40 %, and the median of those from 80 % on. So
+    a file that is open for a moment counts for nothing, nor does what an outage opens for as long as it lasts, nor
+    the socket that it has taken away: what leaks stays.
+    """
+    if len(samples) < _LEAST_SAMPLES:
+        return None
+    parts = np.array_split(np.array([of(one) for one in samples]), 20)
+    levels = [float(np.median(part)) for part in parts]
+    warm, end = int(WARM_UP * len(levels)), int(_END * len(levels))
+    return float(np.median(levels[end:-1])) - max(levels[:warm])  # the very last is the ending

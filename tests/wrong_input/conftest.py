@@ -14,6 +14,7 @@ import pytest
 
 import hvt_edge.cli
 import hvt_ground.cli
+from hvt_common.stopping import STOP_SIGNALS
 from refusal import checked, snapshot
 
 Refused = Callable[..., str]
@@ -31,7 +32,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def refused(here: Path, capfd: pytest.CaptureFixture[str]) -> Iterator[Refused]:
     """Run a program in this process with wrong settings; return the sentence it refuses them with."""
-    handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {one: signal.getsignal(one) for one in STOP_SIGNALS}
     kept = logging.getLogger().handlers[:]
 
     def refused(program: str, *settings: str) -> str:

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
@@ -24,13 +26,12 @@ from hvt_common.link.probe import why_no_link
 from hvt_common.link.rights import Rights
 from hvt_common.link.zenoh_config import LinkSettings, configure
 
-__all__ = ["LinkWatch", "control_unanswered", "visit", "why_unlinked"]
+__all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit", "why_unlinked"]
 
 _log = logging.getLogger(__name__)
 
 _LOOK_S = 1.0
-_PATIENCE_S = 4.0
-"""A link that is merely slow to come needs no explanation."""
+PATIENCE_S = 4.0
 _FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
 """From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
 _SAY_AGAIN_S = 300.0
@@ -43,12 +44,15 @@ def why_unlinked(settings: LinkSettings) -> list[str]:
     return visit(configure(settings)[0])
 
 
-def control_unanswered(edge: str) -> str:
-    """What to tell a user whose question on ``control`` came to nothing while the edge is there."""
+def control_unanswered(edge: str, *, who: str = "this ground") -> str:
+    """What to tell a user whose question on ``control`` came to nothing while the edge is there.
+
+    The edge itself, or a ground or a router on the way, may have dropped it: all of them check.
+    """
     return (
-        f"{edge} does not answer on control: this ground may lack the right to command it (hvt-ground keys list "
-        f"shows who has it; add-ground without --watch-only gives it, then copy {edge}.json5 to the edge), or the "
-        "link is full"
+        f"{edge} does not answer on control: {who} may lack the right to command it (hvt-ground keys list shows who "
+        f"has it; add-ground without --watch-only gives it, then copy {edge}.json5 to the edge, and the others that "
+        "changed with it), or the link is full"
     )
 
 
@@ -60,12 +64,19 @@ class LinkWatch:
         settings: how it was opened.
         served: whether a machine of that name has shown life to us, or we to it: an edge that has appeared, a ground
             that subscribes. Called from the thread.
+        patience_s: a link that is merely slow to come, or to be of use, needs no explanation.
     """
 
     def __init__(
-        self, session: zenoh.Session, settings: LinkSettings, *, served: Callable[[str], bool]
+        self,
+        session: zenoh.Session,
+        settings: LinkSettings,
+        *,
+        served: Callable[[str], bool],
+        patience_s: float = PATIENCE_S,
     ) -> None:
         self._session = session
+        self._patience_s = patience_s
         self._config = configure(settings)[0]
         self._file = settings.zenoh_config
         self._edge = settings.name
@@ -73,6 +84,11 @@ class LinkWatch:
         self._rights = Rights.of(self._config)
         self._trouble = ""
         self._said_s = 0.0
+        self._two_links = _asked_for_twice(self._config)
+        """Places that are called twice."""
+        self._had_two: set[str] = set()
+        self._halved_s: float | None = None
+        """Since when one link of two has been missing; infinite once that is said."""
         self._first_seen_s: dict[str, float] = {}
         self._named: set[str] = set()
         self._stop = threading.Event()
@@ -108,12 +124,12 @@ class LinkWatch:
 
     def _run(self) -> None:
         linked_s = time.monotonic()
-        next_visit_s, pause_s = linked_s + _PATIENCE_S, _FIRST_PAUSE_S
-        while not self._stop.wait(_LOOK_S):
+        next_visit_s, pause_s = linked_s + self._patience_s, _FIRST_PAUSE_S
+        while not self._stop.wait(min(_LOOK_S, self._patience_s)):
             now_s = time.monotonic()
             if self._look(now_s):
                 self._trouble = ""
-                next_visit_s, pause_s = now_s + _PATIENCE_S, _FIRST_PAUSE_S
+                next_visit_s, pause_s = now_s + self._patience_s, _FIRST_PAUSE_S
             elif now_s >= next_visit_s:
                 self._explain()
                 next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
@@ -124,20 +140,46 @@ class LinkWatch:
             if self._stop.is_set():
                 return True
             try:
-                names = self._linked()
-                if names is not None:
-                    self._look_at(names, now_s)
+                links = self._session.info.links()
+                if links:
+                    self._look_at(self._names(links), now_s)
+                self._look_for_halves(links, now_s)
             except zenoh.ZError:  # somebody else closed it
                 return True
-            return names is not None
+            return bool(links)
 
-    def _linked(self) -> dict[str, bool] | None:
-        """Who is at the other end of the links, each with whether it is a router; None without any link."""
-        links = self._session.info.links()
-        if not links:
-            return None
+    def _names(self, links: list[zenoh.Link]) -> dict[str, bool]:
+        """Who is at the other end of the links, each with whether it is a router."""
         routers = {str(zid) for zid in self._session.info.routers_zid()}
         return {link.auth_identifier: str(link.zid) in routers for link in links if link.auth_identifier}
+
+    def _look_for_halves(self, links: list[zenoh.Link], now_s: float) -> None:
+        """Zenoh does not reopen one link before all are lost, and says nothing of one that is refused."""
+        if not self._is_halved(links):
+            self._halved_s = None
+        elif self._halved_s is None:
+            self._halved_s = now_s
+        elif now_s - self._halved_s > self._patience_s:
+            self._halved_s = math.inf
+            _log.warning(
+                "one of the two links is missing: answers and pictures share the other; either the other side takes "
+                "one only (transport.unicast.max_links, an older HVT or a router), or it was lost on the way and "
+                "comes back with the next outage of both"
+            )
+
+    def _is_halved(self, links: list[zenoh.Link]) -> bool:
+        """Whether one of two is missing: to a peer that has had two, or that we called twice.
+
+        One that called us, or that we call by another name than its address, may well have one only.
+        """
+        if not self._two_links:
+            return False
+        standing = Counter(str(link.zid) for link in links)
+        twice = {zid for zid, count in standing.items() if count > 1}
+        if len(self._had_two) < _MAX_NAMES:
+            self._had_two |= twice
+        called = {str(link.zid) for link in links if _bare(str(link.dst)) in self._two_links}
+        return any(zid in self._had_two | called for zid in standing.keys() - twice)
 
     def _explain(self) -> None:
         reasons = visit(self._config)
@@ -159,7 +201,7 @@ class LinkWatch:
             since_s = self._first_seen_s.setdefault(name, now_s)
             if not self._rights.knows(name):
                 self._say(name, self._stranger(name))
-            elif now_s - since_s > _PATIENCE_S and not router and self._is_hiding(name):
+            elif now_s - since_s > self._patience_s and not router and self._is_hiding(name):
                 self._say(name, self._hidden(name))
 
     def _is_hiding(self, name: str) -> bool:
@@ -201,14 +243,23 @@ class LinkWatch:
 
 def visit(config: zenoh.Config) -> list[str]:
     """One sentence for each endpoint that this configuration connects to. Blocks for some seconds an endpoint."""
-    endpoints = json.loads(config.get_json("connect/endpoints")) or []
-    if isinstance(endpoints, dict):
-        endpoints = [one for group in endpoints.values() for one in group]
     try:
         files = TlsFiles.of(config)
-        return [why_no_link(endpoint, files) for endpoint in dict.fromkeys(map(_bare, endpoints))]
+        return [why_no_link(endpoint, files) for endpoint in dict.fromkeys(map(_bare, _connects_to(config)))]
     except UserError as error:
         return [str(error)]
+
+
+def _asked_for_twice(config: zenoh.Config) -> set[str]:
+    places = Counter(map(_bare, _connects_to(config)))
+    return {place for place, count in places.items() if count > 1}
+
+
+def _connects_to(config: zenoh.Config) -> list[str]:
+    endpoints = json.loads(config.get_json("connect/endpoints")) or []
+    return (
+        [one for group in endpoints.values() for one in group] if isinstance(endpoints, dict) else endpoints
+    )
 
 
 def _bare(endpoint: str) -> str:

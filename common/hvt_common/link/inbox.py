@@ -22,7 +22,7 @@ class Received:
     attachment: bytes
     encoding: str
     received_ns: int
-    """Our Unix clock in Zenoh's callback."""
+    """Our clock in Zenoh's callback, Unix nanoseconds."""
 
     @property
     def size_bytes(self) -> int:
@@ -43,17 +43,27 @@ class Inbox:
 
     It is bounded in messages and in bytes: a payload may have megabytes. ``overflow`` says what gives way when it is
     full: ``newest`` for the base stream (what is queued stays whole up to a gap), ``oldest`` where the latest value
-    wins. A message that is larger than the whole inbox never enters.
+    wins. A message that is larger than the whole inbox never enters. With a ``share`` below 1 no key may take more
+    than that of it: a flood under one does not keep the others out.
     """
 
     def __init__(
-        self, *, capacity: int, overflow: Literal["newest", "oldest"], capacity_bytes: int = CAPACITY_BYTES
+        self,
+        *,
+        capacity: int,
+        overflow: Literal["newest", "oldest"],
+        capacity_bytes: int = CAPACITY_BYTES,
+        share: float = 1.0,
     ) -> None:
+        assert share == 1.0 or overflow == "newest", "what makes room for its own key would be another rule"
         self._items: deque[Received] = deque()
         self._bytes = 0
         self._capacity = capacity
         self._capacity_bytes = capacity_bytes
         self._overflow = overflow
+        self._share = share
+        self._by_key: dict[str, tuple[int, int]] = {}
+        """Messages and bytes of each key that has any."""
         self._changed = threading.Condition()
         self._closed = False
         self.dropped = 0
@@ -61,26 +71,21 @@ class Inbox:
 
     def put(self, item: Received) -> None:
         """Add a message, or drop one."""
-        size_bytes = item.size_bytes
         with self._changed:
-            while not self._has_room(size_bytes):
+            while not self._has_room(item):
                 self.dropped += 1
                 if self._overflow == "newest" or not self._items:
                     return
-                self._bytes -= self._items.popleft().size_bytes
+                self._take()
             self._items.append(item)
-            self._bytes += size_bytes
+            self._account(item, 1)
             self._changed.notify()
 
     def get(self, *, timeout_s: float) -> Received | None:
         """The oldest message; None after ``timeout_s``, or at once when closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._closed, timeout_s)
-            if not self._items:
-                return None
-            item = self._items.popleft()
-            self._bytes -= item.size_bytes
-            return item
+            return self._take() if self._items else None
 
     def close(self) -> None:
         """Wake whoever waits; what is queued can still be taken."""
@@ -91,5 +96,25 @@ class Inbox:
     def __len__(self) -> int:
         return len(self._items)
 
-    def _has_room(self, size_bytes: int) -> bool:
-        return len(self._items) < self._capacity and self._bytes + size_bytes <= self._capacity_bytes
+    def _take(self) -> Received:
+        item = self._items.popleft()
+        self._account(item, -1)
+        return item
+
+    def _account(self, item: Received, sign: int) -> None:
+        size_bytes = sign * item.size_bytes
+        self._bytes += size_bytes
+        count, held_bytes = self._by_key.get(item.key, (0, 0))
+        if count + sign:
+            self._by_key[item.key] = (count + sign, held_bytes + size_bytes)
+        else:
+            del self._by_key[item.key]
+
+    def _has_room(self, item: Received) -> bool:
+        count, held_bytes = self._by_key.get(item.key, (0, 0))
+        return (
+            len(self._items) < self._capacity
+            and self._bytes + item.size_bytes <= self._capacity_bytes
+            and count < self._share * self._capacity
+            and held_bytes + item.size_bytes <= self._share * self._capacity_bytes
+        )

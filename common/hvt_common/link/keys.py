@@ -42,6 +42,7 @@ class Row(StrEnum):
     BASE = "base"
     ROI = "roi"
     TRACKS = "tracks"
+    PAST = "past"
     STATUS = "status"
     INFO = "info"
     CONTROL = "control"
@@ -91,6 +92,12 @@ DELIVERIES: Mapping[Row, Delivery] = MappingProxyType(
             encoding="image/jpeg",
         ),
         Row.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "TrackStep", "DATA_LOW", "DROP"),
+        Row.PAST: Delivery(
+            Direction.EDGE_TO_GROUND,
+            "a piece of what was kept while the link was away; attachment PastHeader",
+            "BACKGROUND",
+            "BLOCK",
+        ),
         Row.STATUS: Delivery(Direction.EDGE_TO_GROUND, "Status", "INTERACTIVE_LOW", "DROP"),
         Row.INFO: Delivery(Direction.GROUND_ASKS, "empty question, Info", "INTERACTIVE_HIGH", "BLOCK"),
         Row.CONTROL: Delivery(

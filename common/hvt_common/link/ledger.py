@@ -30,9 +30,15 @@ class Channel(Enum):
 
     BASE = "base"
     ROI = "roi"
+    PAST = "past"
+    """What was kept while the link was away, and sent afterwards."""
     META = "meta"
     """Status, info, feedback and tracks."""
 
+
+_MOST_REASONS = 23
+"""Of one fate, each by its own name; a status carries one more."""
+_MOST_PENDING = 65_536
 
 # Measured between two peers of eclipse-zenoh 1.10 over TCP, with `ss -ti` (bytes_sent) and a veth's tx_bytes. It is
 # the length of a batch (2), frame header and sequence number (7) and push, key and put headers (5), without the
@@ -102,6 +108,7 @@ class LedgerSummary:
     duration_s: float
     base_bytes: int
     roi_bytes: int
+    past_bytes: int
     meta_bytes: int
     overhead_bytes: int
     messages: Mapping[str, int]
@@ -116,7 +123,7 @@ class LedgerSummary:
     @property
     def line_bytes(self) -> int:
         """Everything."""
-        return self.base_bytes + self.roi_bytes + self.meta_bytes + self.overhead_bytes
+        return self.base_bytes + self.roi_bytes + self.past_bytes + self.meta_bytes + self.overhead_bytes
 
 
 class Ledger:
@@ -142,8 +149,10 @@ class Ledger:
         """Payload of ``base``."""
         self.roi_bytes = 0
         """Payload of ``roi``."""
+        self.past_bytes = 0
+        """Payload of ``past``."""
         self.meta_bytes = 0
-        """Attachments of both, and payload and attachments of everything else."""
+        """Attachments of all three, and payload and attachments of everything else."""
         self.overhead_bytes = 0
         self.first_ns: int | None = None
         self.last_ns: int | None = None
@@ -158,6 +167,8 @@ class Ledger:
             self.base_bytes += payload_bytes
         elif channel is Channel.ROI:
             self.roi_bytes += payload_bytes
+        elif channel is Channel.PAST:
+            self.past_bytes += payload_bytes
         else:
             self.meta_bytes += payload_bytes
         line = payload_bytes + attachment_bytes + overhead_bytes
@@ -166,8 +177,9 @@ class Ledger:
         self._enter(at_ns, channel, line)
 
     def record_fate(self, fate: Fate, reason: str) -> None:
-        """Note what became of a still and why."""
-        self._fates[fate][reason] += 1
+        """Note what became of a still and why. Some come from the network: of many, the later are ``other``."""
+        fates = self._fates[fate]
+        fates[reason if reason in fates or len(fates) < _MOST_REASONS else "other"] += 1
 
     def fates(self, fate: Fate) -> dict[str, int]:
         """Number of stills with this fate, by reason."""
@@ -180,7 +192,7 @@ class Ledger:
     @property
     def line_bytes(self) -> int:
         """Everything counted so far."""
-        return self.base_bytes + self.roi_bytes + self.meta_bytes + self.overhead_bytes
+        return self.base_bytes + self.roi_bytes + self.past_bytes + self.meta_bytes + self.overhead_bytes
 
     def window_bytes(self, channel: Channel | None, now_ns: int) -> int:
         """Line bytes of the messages in the window that ends at ``now_ns``; of all channels for None.
@@ -214,6 +226,7 @@ class Ledger:
             duration_s=duration_s,
             base_bytes=self.base_bytes,
             roi_bytes=self.roi_bytes,
+            past_bytes=self.past_bytes,
             meta_bytes=self.meta_bytes,
             overhead_bytes=self.overhead_bytes,
             messages={channel.value: number for channel, number in self._messages.items()},
@@ -232,6 +245,9 @@ class Ledger:
             self._windows.restart()
         insort(self._pending, (at_ns, channel.value, line))
         self._release(before_ns=self._pending[-1][0] - self._slack_ns)
+        if len(self._pending) > _MOST_PENDING:  # a flood, or a sender whose clock stands still
+            self._release(before_ns=self._pending[-1][0] + 1)
+            self._windows.restart()
 
     def _release(self, *, before_ns: int) -> None:
         """Hand on, in order of time, what no late message can come before any more."""
@@ -242,14 +258,17 @@ class Ledger:
         del self._pending[:ready]
 
 
+_SUMS = (*(channel.value for channel in Channel), "total")
+
+
 @dataclass(slots=True)
 class _Windows:
     """Rolling sums over messages that come in order of time; the worst of each is kept."""
 
     window_ns: int
     entries: deque[tuple[int, str, int]] = field(default_factory=deque)
-    sums: dict[str, int] = field(default_factory=lambda: {"base": 0, "roi": 0, "meta": 0, "total": 0})
-    worst: dict[str, int] = field(default_factory=lambda: {"base": 0, "roi": 0, "meta": 0, "total": 0})
+    sums: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_SUMS, 0))
+    worst: dict[str, int] = field(default_factory=lambda: dict.fromkeys(_SUMS, 0))
 
     def add(self, at_ns: int, channel: str, line: int) -> None:
         """The window that ends with this message is the fullest that holds it and nothing later."""

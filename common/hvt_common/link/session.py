@@ -72,11 +72,13 @@ def declare_publisher(session: zenoh.Session, row: Row, *, keys: EdgeKeys) -> ze
     )
 
 
-def subscribe(session: zenoh.Session, key_expr: str, *, inbox: Sink) -> zenoh.Subscriber[None]:
-    """Copy every message of the key expression into the inbox; deletions are ignored."""
+def subscribe(
+    session: zenoh.Session, key_expr: str, *, inbox: Sink, clock: Callable[[], int] = time.time_ns
+) -> zenoh.Subscriber[None]:
+    """Copy every message of the key expression into the inbox, with its time by ``clock``; deletions are ignored."""
 
     def receive(sample: zenoh.Sample) -> None:
-        received_ns = time.time_ns()
+        received_ns = clock()
         if sample.kind != zenoh.SampleKind.PUT:
             return
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
@@ -94,20 +96,31 @@ def subscribe(session: zenoh.Session, key_expr: str, *, inbox: Sink) -> zenoh.Su
 
 
 def ask(
-    session: zenoh.Session, row: Row, *, keys: EdgeKeys, question: bytes, timeout_s: float
+    session: zenoh.Session,
+    row: Row,
+    *,
+    keys: EdgeKeys,
+    question: bytes,
+    timeout_s: float,
+    wanted: Callable[[bytes], bool] = lambda _answer: True,
 ) -> bytes | None:
-    """The first answer of a queryable row; None when there is none in time. Blocks for at most ``timeout_s``."""
+    """The first answer of a queryable row that is ``wanted``; None when there is none in time.
+
+    Blocks for at most ``timeout_s``. Two edges of one id both answer.
+    """
     delivery = DELIVERIES[row]
     replies = session.get(
         keys.key(row),
         payload=question,
         timeout=timeout_s,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
         congestion_control=getattr(zenoh.CongestionControl, delivery.congestion),
         priority=getattr(zenoh.Priority, delivery.priority),
     )
     for reply in replies:
-        if reply.ok is not None:
-            return reply.ok.payload.to_bytes()
+        if reply.ok is not None and wanted(data := reply.ok.payload.to_bytes()):
+            return data
     return None
 
 

@@ -21,6 +21,7 @@ __all__ = ["DEFAULT_ENDPOINT", "LinkSettings", "configure", "without_build_paths
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 _MAX_CONFIG_BYTES = 1_000_000
+_MAX_LINKS = "transport/unicast/max_links"
 
 _DEFAULTS: Mapping[str, Any] = {
     "mode": "peer",
@@ -44,8 +45,13 @@ _DEFAULTS: Mapping[str, Any] = {
     "transport/link/tx/queue/size/data_high": 4,
     "transport/link/tx/queue/size/background": 1,
     "transport/link/tcp/so_sndbuf": 65536,
+    # Without it the kernel lets the buffer of a full TLS link grow to megabytes: seconds of video.
+    "transport/link/tls/so_sndbuf": 65536,
     "transport/link/rx/max_message_size": 2 * MAX_PAYLOAD_BYTES,
 }
+
+_PRIORITIES = ("1-3", "4-7")
+"""Of two links to one place: answers, status and reports on the first, pictures, stills and tracks on the second."""
 
 _ASKER: Mapping[str, Any] = {
     "mode": "client",
@@ -71,6 +77,9 @@ class LinkSettings:
     """A JSON5 file of Zenoh's own settings, which go before our defaults."""
     insecure: bool = False
     """Allow listening beyond loopback without keys."""
+    links: Literal[1, 2] = 1
+    """How many links to each place that we connect to over TCP or TLS: with two, what is small and urgent does not
+    wait behind pictures in a full socket. ``max_links: 2`` in the file says the same."""
     name: str | None = None
     """Who this machine is: the id of an edge, which its certificate has to bear; None for whoever that names."""
 
@@ -90,10 +99,14 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
         _check_endpoint(endpoint)
     if listen or not file_listen:
         # Never Zenoh's own default: a peer that listens on every address.
-        config.insert_json5("listen/endpoints", json.dumps(listen))
-    if connect:
-        config.insert_json5("connect/endpoints", json.dumps(connect))
+        _insert_endpoints(config, "listen", listen)
     effective = listen or file_listen
+    two = settings.role != "asker" and (settings.links == 2 or _max_links(said) > 1)
+    if connect:
+        _insert_endpoints(config, "connect", _split(connect) if two else connect)
+    if settings.links == 2 or (effective and not _mentions(said, _MAX_LINKS)):
+        # Who listens takes what comes. Asking for more than one makes every handshake a kilobyte longer.
+        config.insert_json5(_MAX_LINKS, "2")
     if settings.role == "ground" and not effective and not _mentions(said, "mode"):
         # Since Zenoh 1.9 a router does not pass messages between two peers, but it does between a peer and a router.
         # An edge that listens is served just as well. ("client" would wait at its start, deaf to Ctrl-C.)
@@ -150,8 +163,29 @@ def _endpoints(said: dict[str, Any], side: str) -> tuple[str, ...]:
     return tuple(str(endpoint) for group in groups if isinstance(group, list) for endpoint in group)
 
 
+def _max_links(said: dict[str, Any]) -> int:
+    value: Any = said
+    for part in _MAX_LINKS.split("/"):
+        value = value.get(part) if isinstance(value, dict) else None
+    return value if isinstance(value, int) else 1
+
+
+def _split(endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    """Each endpoint once for each range of priorities; one with metadata of its own, or no stream, stays as it is."""
+    split: list[str] = []
+    for endpoint in endpoints:
+        place, hash_sign, settings = endpoint.partition("#")
+        if "?" in place or not place.startswith(("tcp/", "tls/")):
+            split.append(endpoint)
+        else:
+            split += [f"{place}?prio={one}{hash_sign}{settings}" for one in _PRIORITIES]
+    return tuple(split)
+
+
 _ENDPOINT = re.compile(
-    r"(?P<protocol>tcp|tls|udp|quic|ws)/(?P<host>\[[0-9a-fA-F:.%\w]+\]|[\w.-]+):(?P<port>\d{1,5})(\?[^#\s]*)?(#\S*)?"
+    r"(?P<protocol>tcp|tls|udp|quic|ws)/(?P<host>\[[0-9a-fA-F:.%\w]+\]|[\w.-]+):(?P<port>\d{1,5})"
+    r"(\?[!\"$-~]*)?(#[!-~]*)?",
+    re.ASCII,
 )
 
 
@@ -162,6 +196,14 @@ def _check_endpoint(endpoint: str) -> None:
             f"endpoint {endpoint!r} is not usable: PROTOCOL/HOST:PORT is accepted, such as {DEFAULT_ENDPOINT}, "
             "with tcp, tls, udp, quic or ws and a port of 1 to 65535"
         )
+
+
+def _insert_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) -> None:
+    try:
+        config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
+    except zenoh.ZError as error:  # what stands behind ? and # is Zenoh's to judge
+        reason = without_build_paths(re.sub(r".*msg: \"|\", location: .*", "", str(error)))
+        raise UserError(f"--{side} {' '.join(endpoints)}: Zenoh does not accept it: {reason}") from None
 
 
 def _check_reach(endpoint: str, *, allowed: bool) -> None:

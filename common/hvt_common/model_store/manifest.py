@@ -100,5 +100,8 @@ def _entry(name: str, table: Any, *, origin: str) -> ModelEntry:
 def _is_http(url: object) -> bool:
     if not isinstance(url, str) or any(ord(letter) <= 0x20 for letter in url):
         return False
-    parts = urlsplit(url)
+    try:
+        parts = urlsplit(url)
+    except ValueError:  # brackets that hold no address
+        return False
     return parts.scheme in ("http", "https") and bool(parts.hostname)

@@ -12,7 +12,7 @@ from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoRef
 
 from hvt_common.values import Image
 
-__all__ = ["MAX_SIDE_PX", "UNBIASED", "BaseDecoder"]
+__all__ = ["MAX_PICTURE_PX", "MAX_SIDE_PX", "UNBIASED", "BaseDecoder"]
 
 UNBIASED = (
     Interpolation.AREA
@@ -25,6 +25,10 @@ costs the base 0.9 dB at 650 kbps; this takes 2.5 ms a 720p frame more to decode
 
 MAX_SIDE_PX = 8192
 """HEVC level 6.2 ends near here; a larger picture from the network is not decoded."""
+MAX_PICTURE_PX = 35_651_584
+"""The luma samples of a picture of level 6.2 (ITU-T H.265, table A.8): 8192x4352."""
+_BLOCK_PX = 64
+"""A coded picture is filled up to whole blocks, and libavcodec's rows to as much."""
 
 
 class BaseDecoder:
@@ -33,9 +37,13 @@ class BaseDecoder:
     Slice threading is the only kind that returns each picture at once; frame threading lags by one or two. After a
     loss libavcodec returns nothing, or garbage, without an error: the caller starts again at a keyframe
     (`reset`) and never feeds a unit whose predecessor is missing.
+
+    Parameter sets may announce any size. A picture of more pixels than one of ``size`` (width, height) has, or
+    than there are in HEVC where that is not given, is refused before memory is taken for it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, size: tuple[int, int] | None = None) -> None:
+        self._max_px = MAX_PICTURE_PX if size is None else min(MAX_PICTURE_PX, _filled_px(size))
         self._context = self._open()
         self._to_bgr = VideoReformatter()
 
@@ -68,8 +76,14 @@ class BaseDecoder:
         """Forget all reference pictures; the next unit has to be a keyframe."""
         self._context = self._open()
 
-    @staticmethod
-    def _open() -> VideoCodecContext:
+    def _open(self) -> VideoCodecContext:
         context = av.CodecContext.create("hevc", "r")
         context.thread_type = "SLICE"
+        context.options = {"max_pixels": str(self._max_px)}
         return context
+
+
+def _filled_px(size: tuple[int, int]) -> int:
+    """Samples of a picture of this size with whatever fills it up to whole blocks."""
+    width, height = (-(-side // _BLOCK_PX) * _BLOCK_PX for side in size)
+    return width * height

@@ -85,13 +85,14 @@ def _literal_names(text: str) -> tuple[str, ...] | None:
         return None
     try:
         value = ast.literal_eval(text)
-    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        if isinstance(value, dict):
+            if sorted(map(str, value)) != sorted(map(str, range(len(value)))):
+                return None
+            value = [item for _, item in sorted(value.items(), key=lambda pair: int(pair[0]))]
+        return _names(value)
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        # Not a literal; or a key that is a list, or a number that is too long to print.
         return None
-    if isinstance(value, dict):
-        if sorted(map(str, value)) != sorted(map(str, range(len(value)))):
-            return None
-        value = [item for _, item in sorted(value.items(), key=lambda pair: int(pair[0]))]
-    return _names(value)
 
 
 def _json_names(text: str) -> tuple[str, ...] | None:

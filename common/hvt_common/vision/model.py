@@ -1,8 +1,8 @@
 """ONNX models, on onnxruntime or another runtime: the only file that imports onnxruntime.
 
 A model file comes from outside, so it is looked at before onnxruntime sees it: it must be a file, not too large,
-and its bytes must walk as an ONNX protobuf with a graph in it. No custom operator library is ever registered, and
-onnxruntime itself refuses external weights that lie outside the folder of the model (a test holds it to that). A
+its bytes must walk as an ONNX protobuf with a graph in it, and all its weights must be in it. What it declares has
+bounds, too. It is read as ONNX whatever its name ends in, and no custom operator library is ever registered. A
 model that another runtime will run is opened by onnxruntime first all the same: it says the ports and the metadata,
 and no runtime gets a file that onnxruntime refuses.
 """
@@ -10,6 +10,7 @@ and no runtime gets a file that onnxruntime refuses.
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from hvt_common.errors import UserError
+from hvt_common.vision.external_weights import external_weights, read_varint
 from hvt_common.vision.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.vision.providers import ONNXRUNTIME_PROVIDERS, Choice, choose_provider
 
@@ -31,6 +33,11 @@ _log = logging.getLogger(__name__)
 
 MAX_MODEL_BYTES = 1 << 30
 """1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
+
+_MOST_PORTS = 64
+_MOST_AXES = 8
+_MOST_ELEMENTS = 1 << 26
+"""Of one input or output with its free sizes taken as 1: 256 MiB of float32, a picture of 4096x4096 and more."""
 
 _ELEMENT_TYPES: Mapping[str, npt.DTypeLike] = {
     "tensor(float)": np.float32,
@@ -194,11 +201,29 @@ def _session(
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
     # Threads that spin between runs burn the cores that the encoder needs: half the CPU time for no gain.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # A file that ends in .ort would go to another parser.
+    options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
         # Without its own fallback, which tries the same again and prints banners.
-        return ort.InferenceSession(str(path), options, providers=list(providers), enable_fallback=0)
+        session = ort.InferenceSession(str(path), options, providers=list(providers), enable_fallback=0)
     except _ORT_ERRORS as error:
         raise UserError(f"model {path} cannot be opened: {_reason(error)}") from error
+    _check_ports(path, session)
+    return session
+
+
+def _check_ports(path: Path, session: ort.InferenceSession) -> None:
+    """Refuse a model whose ports nobody could feed or read."""
+    for side, ports in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
+        if not 1 <= len(ports) <= _MOST_PORTS:
+            raise UserError(f"model {path} has {len(ports)} {side}; 1 to {_MOST_PORTS} are accepted")
+        for port in map(_port, ports):
+            elements = math.prod(size or 1 for size in port.shape)
+            if len(port.shape) > _MOST_AXES or elements > _MOST_ELEMENTS:
+                raise UserError(
+                    f"model {path} declares {port.name!r:.40} with {len(port.shape)} axes and {elements:.3g} "
+                    f"numbers; at most {_MOST_AXES} axes and {_MOST_ELEMENTS} numbers are accepted"
+                )
 
 
 def _port(value: Any) -> Port:
@@ -234,6 +259,21 @@ def _check_file(path: Path) -> None:
         raise UserError(f"model {path} cannot be read: {error.strerror}") from error
     if _GRAPH_FIELD not in fields:
         raise UserError(f"model {path} is not an ONNX file (no graph in it)")
+    _check_whole(path)
+
+
+def _check_whole(path: Path) -> None:
+    try:
+        elsewhere = external_weights(path)
+    except ValueError as error:
+        raise UserError(f"model {path} is not an ONNX file, or is damaged ({error})") from error
+    except OSError as error:
+        raise UserError(f"model {path} cannot be read: {error.strerror}") from error
+    if elsewhere is not None:
+        raise UserError(
+            f"model {path} cannot be opened: it keeps weights in another file ({elsewhere!r:.80}); make it one file: "
+            "external_data=False in torch.onnx.export, or onnx.save(onnx.load(OLD), NEW)"
+        )
 
 
 def opset_versions(path: Path) -> dict[str, int]:
@@ -257,8 +297,8 @@ def _opset(data: bytes) -> tuple[str, int]:
     """Decode an OperatorSetIdProto: domain is field 1, version field 2."""
     domain, version, position = "", 0, 0
     while position < len(data):
-        tag, position = _varint(data, position)
-        value, position = _varint(data, position)
+        tag, position = read_varint(data, position)
+        value, position = read_varint(data, position)
         if tag == 0x0A:
             domain = data[position : position + value].decode(errors="replace")
             position += value
@@ -278,16 +318,16 @@ def _top_level_fields(file: BinaryIO, size_bytes: int) -> Iterator[tuple[int, in
     while position < size_bytes:
         file.seek(position)
         head = file.read(20)
-        tag, used = _varint(head, 0)
+        tag, used = read_varint(head, 0)
         field, wire_type = tag >> 3, tag & 7
         if field not in _MODEL_FIELDS:
             raise ValueError(f"unknown field {field} at byte {position}")
         start = position
         if wire_type == 0:
             start += used
-            _, used = _varint(head, used)
+            _, used = read_varint(head, used)
         elif wire_type == 2:
-            length, used = _varint(head, used)
+            length, used = read_varint(head, used)
             start += used
             used += length
         else:
@@ -296,13 +336,3 @@ def _top_level_fields(file: BinaryIO, size_bytes: int) -> Iterator[tuple[int, in
         if position > size_bytes:
             raise ValueError(f"field {field} ends {position - size_bytes} bytes past the end")
         yield field, start, position
-
-
-def _varint(data: bytes, start: int) -> tuple[int, int]:
-    """Decode a protobuf varint: (value, position after it)."""
-    value = 0
-    for count, byte in enumerate(data[start : start + 10]):
-        value |= (byte & 0x7F) << (7 * count)
-        if byte < 0x80:
-            return value, start + count + 1
-    raise ValueError("a number without an end")

@@ -32,7 +32,7 @@ class Source(ABC):
 
         Args:
             start_ns: Unix time of frame 0. Files, folders and the demo count media time from it; live sources
-                ignore it and read the wall clock once, when a frame was grabbed.
+                ignore it and read their clock once, when a frame was grabbed.
         """
 
     def close(self) -> None:

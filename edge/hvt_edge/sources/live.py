@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+from hvt_common.clock import SteadyClock
 from hvt_common.errors import UserError
 from hvt_common.values import Fit, Frame, Image
 from hvt_edge.resample import BaseSize, Gate, Resizer
@@ -53,6 +53,9 @@ class LiveSource(Source):
     Frames are not repeated when the camera is slower than the base rate. After a loss of signal the source is opened
     again, with growing pauses, until it is closed.
 
+    Args:
+        clock: of the capture times, Unix nanoseconds; must not go back, or the source is silent for as long.
+
     Attributes:
         dropped: frames that the consumer was too slow to take.
     """
@@ -61,9 +64,17 @@ class LiveSource(Source):
     frame_count = None
 
     def __init__(
-        self, grabber: Grabber, *, size: BaseSize, fps: float, fit: Fit, max_frames: int | None = None
+        self,
+        grabber: Grabber,
+        *,
+        size: BaseSize,
+        fps: float,
+        fit: Fit,
+        max_frames: int | None = None,
+        clock: Callable[[], int] | None = None,
     ) -> None:
         self.fps, self._limit = fps, max_frames
+        self._clock = clock or SteadyClock()
         self._grabber = grabber
         grabber.open()
         try:
@@ -82,7 +93,7 @@ class LiveSource(Source):
         self._thread.start()
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:  # noqa: ARG002 - a camera has its own time
-        """Frames as they come, until the source is closed; ``capture_ns`` is the wall clock when one was grabbed."""
+        """Frames as they come, until the source is closed; ``capture_ns`` is the clock's when one was grabbed."""
         index = 0
         while index != self._limit:
             with self._news:
@@ -113,7 +124,7 @@ class LiveSource(Source):
             while not self._stop.is_set():
                 try:
                     shot = self._grabber.grab()
-                    capture_ns = time.time_ns()
+                    capture_ns = self._clock()
                     if gate.accept(capture_ns):
                         self._offer(capture_ns, shot())
                 except SignalLost as error:

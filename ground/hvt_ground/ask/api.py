@@ -25,6 +25,7 @@ import cv2
 import zenoh
 
 from hvt_common.errors import UserError
+from hvt_common.link.diagnose import control_unanswered
 from hvt_common.link.inbox import Inbox, Received
 from hvt_common.link.keys import EdgeKeys, Row, parse_key, selector
 from hvt_common.link.session import ask, open_session, subscribe
@@ -32,6 +33,7 @@ from hvt_common.link.wire import Command, ControlAnswer, ControlRequest, Info, R
 from hvt_common.link.zenoh_config import LinkSettings
 from hvt_common.values import Image
 from hvt_common.vision.still_codecs import StillError
+from hvt_ground.ask.unanswered import Asker, who_is_seen_by_way_of
 from hvt_ground.decode_stills import ReceivedStill, decode_still
 
 __all__ = ["AskedStill", "EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge"]
@@ -102,17 +104,22 @@ def check_suffix(path: Path) -> None:
 class RemoteEdge:
     """One edge, at the other end of the link.
 
-    Every method raises `UserError` where it does not answer, and `RefusedError` where it says no.
+    Every method raises `UserError` where it does not answer, or our own keys do not let us ask, and `RefusedError`
+    where it says no.
     """
 
-    def __init__(self, session: zenoh.Session, edge: str) -> None:
+    def __init__(self, session: zenoh.Session, edge: str, *, asker: Asker | None = None) -> None:
         self.name = edge
         self._session = session
         self._keys = EdgeKeys(edge)
+        self._asker = asker or Asker()
 
     def info(self) -> Info:
         """What the edge says of its session."""
-        return self._parsed(Info.parse, self._ask(Row.INFO, b""))
+        answer = self._ask(Row.INFO, b"")
+        if answer is None:
+            raise UserError(self._absent())
+        return self._parsed(Info.parse, answer)
 
     def tracks(self) -> list[EdgeTrack]:
         """What it tracks now, by its own ids: 64 tracks at most."""
@@ -165,6 +172,7 @@ class RemoteEdge:
         """
         arguments = _still_arguments(track=track, box=box, at_s=at_s, frame=frame, quality_pct=quality_pct)
         until_s = time.monotonic() + timeout_s
+        self._check_may_command()
         info = self.info()
         inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest")
         subscriber = subscribe(self._session, self._keys.key(Row.ROI), inbox=inbox)
@@ -184,13 +192,11 @@ class RemoteEdge:
         self, command: str, arguments: Mapping[str, int | float | str] | None = None
     ) -> ControlAnswer:
         """Send any command of docs/wire.md; return the answer where it is accepted."""
-        try:
-            question = ControlRequest(session_id=0, command=command, arguments=arguments or {}).pack()
-        except ValueError as error:
-            raise UserError(f"{command}: {error}") from None
-        answer = self._parsed(ControlAnswer.parse, self._ask(Row.CONTROL, question))
-        if not answer.accepted:
-            raise RefusedError(f"{self.name} refuses: {answer.reason}")
+        self._check_may_command()
+        answer = self._commanded(command, arguments or {})
+        if answer is None:
+            present = self._ask(Row.INFO, b"") is not None
+            raise UserError(control_unanswered(self.name, who="this key") if present else self._absent())
         return answer
 
     def _wait(
@@ -205,27 +211,46 @@ class RemoteEdge:
                 return header, item
             if now_s >= ask_s:
                 try:
-                    self.command(Command.STILL_FATE, {"ask": answer.still_ask})
+                    self._commanded(Command.STILL_FATE, {"ask": answer.still_ask})
                 except RefusedError:
                     raise
                 except UserError:
-                    pass  # a late answer: the still itself may come all the same
+                    pass  # an answer that cannot be used, as no answer: the still itself may come all the same
                 ask_s = now_s + _FATE_S
         raise UserError(
             f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: "
             "the budget or the link is full"
         )
 
-    def _ask(self, row: Row, question: bytes) -> bytes:
+    def _commanded(self, command: str, arguments: Mapping[str, int | float | str]) -> ControlAnswer | None:
+        """The answer where the edge accepts; None where there is none in time."""
         try:
-            answer = ask(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
-        except zenoh.ZError:
-            answer = None
-        if answer is None:
-            raise UserError(
-                f"edge {self.name!r} does not answer: is it flying, does this link reach it, and may you command it?"
-            )
+            question = ControlRequest(session_id=0, command=command, arguments=arguments).pack()
+        except ValueError as error:
+            raise UserError(f"{command}: {error}") from None
+        data = self._ask(Row.CONTROL, question)
+        if data is None:
+            return None
+        answer = self._parsed(ControlAnswer.parse, data)
+        if not answer.accepted:
+            raise RefusedError(f"{self.name} refuses: {answer.reason}")
         return answer
+
+    def _check_may_command(self) -> None:
+        if refusal := self._asker.refusal(self.name):
+            raise UserError(refusal)
+
+    def _ask(self, row: Row, question: bytes) -> bytes | None:
+        try:
+            return ask(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
+        except zenoh.ZError:
+            return None
+
+    def _absent(self) -> str:
+        return (
+            f"edge {self.name!r} does not answer: is it flying, and does this link reach it?"
+            f"{who_is_seen_by_way_of(self._session)}"
+        )
 
     def _parsed(self, parse: Callable[[bytes], _Answer], data: bytes) -> _Answer:
         try:
@@ -237,8 +262,11 @@ class RemoteEdge:
 class EdgeClient:
     """The edges that can be reached from one place; a context manager. ``client["uav-1"]`` is one of them."""
 
-    def __init__(self, session: zenoh.Session, *, stack: ExitStack | None = None) -> None:
+    def __init__(
+        self, session: zenoh.Session, *, asker: Asker | None = None, stack: ExitStack | None = None
+    ) -> None:
         self._session = session
+        self._asker = asker
         self._stack = stack or ExitStack()
 
     @classmethod
@@ -250,7 +278,11 @@ class EdgeClient:
         """
         stack = ExitStack()
         settings = LinkSettings(role="asker", connect=endpoints, zenoh_config=zenoh_config)
-        return cls(stack.enter_context(open_session(settings)), stack=stack)
+        return cls(stack.enter_context(open_session(settings)), asker=Asker.of(settings), stack=stack)
+
+    def nobody(self) -> str:
+        """What to tell a user where `names` is empty."""
+        return f"no edge is there{who_is_seen_by_way_of(self._session)}"
 
     def names(self) -> list[str]:
         """The edges that are there now."""
@@ -259,7 +291,7 @@ class EdgeClient:
         return sorted({key[0] for key in keys if key is not None})
 
     def __getitem__(self, edge: str) -> RemoteEdge:
-        return RemoteEdge(self._session, edge)
+        return RemoteEdge(self._session, edge, asker=self._asker)
 
     def close(self) -> None:
         """Leave the link."""

@@ -29,7 +29,8 @@ def run(argv: Sequence[str]) -> int:
     do = _prepare(arguments)
     with EdgeClient.connect(*arguments.connect, zenoh_config=arguments.zenoh_config) as edges:
         if arguments.command == "edges":
-            for name in edges.names():
+            names = edges.names()
+            for name in names or [edges.nobody()]:
                 say(name)
             return 0
         do(edges[arguments.edge or _only_one(edges)])
@@ -40,7 +41,7 @@ def _only_one(edges: EdgeClient) -> str:
     names = edges.names()
     if len(names) == 1:
         return names[0]
-    raise UserError(f"--edge is missing: there are {', '.join(names) or 'none at this endpoint'}")
+    raise UserError(f"--edge is missing: there are {', '.join(names)}" if names else edges.nobody())
 
 
 def _prepare(arguments: argparse.Namespace) -> Callable[[RemoteEdge], None]:

@@ -32,7 +32,12 @@ _ROUTER_SETTINGS: dict[str, Any] = {
     "timestamping": {"enabled": False},
     "transport": {
         "shared_memory": {"enabled": False},
-        "link": {"tx": {"lease": 3000}, "rx": {"max_message_size": 2 * MAX_PAYLOAD_BYTES}},
+        "unicast": {"max_links": 2},
+        "link": {
+            "tx": {"lease": 3000},
+            "rx": {"max_message_size": 2 * MAX_PAYLOAD_BYTES},
+            "tls": {"so_sndbuf": 65536},
+        },
     },
 }
 """As deploy/zenoh/router.json5, open to the network."""
@@ -168,8 +173,9 @@ def _text(
         "connect_private_key": pair[1],
     }
     transport = settings.get("transport", {})
+    link = transport.get("link", {})
     said = settings | {
-        "transport": transport | {"link": transport.get("link", {}) | {"tls": tls}},
+        "transport": transport | {"link": link | {"tls": tls | link.get("tls", {})}},
         "access_control": _access(grants),
     }
     return (

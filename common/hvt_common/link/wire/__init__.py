@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hvt_common.link.wire.dialogue import (
+    MAX_MISSING_STILLS,
     MAX_STILL_RESULTS,
     MAX_TRACKS_NOW,
     Command,
@@ -13,6 +14,19 @@ from hvt_common.link.wire.dialogue import (
     TrackNow,
 )
 from hvt_common.link.wire.fields import WireError, fitted_text
+from hvt_common.link.wire.past import (
+    MAX_PAST_BYTES,
+    MAX_PAST_HAVES,
+    PastHave,
+    PastHeader,
+    PastKind,
+    PastStill,
+    PastUnit,
+    pack_past_still,
+    pack_past_units,
+    parse_past_still,
+    parse_past_units,
+)
 from hvt_common.link.wire.reports import Health, Info, Status, fitted_class_names
 from hvt_common.link.wire.sealed import (
     MAX_PAYLOAD_BYTES,
@@ -27,6 +41,9 @@ from hvt_common.link.wire.track_step import TrackStep, TrackStepDecoder, TrackSt
 
 __all__ = [
     "MAX_ALSO",
+    "MAX_MISSING_STILLS",
+    "MAX_PAST_BYTES",
+    "MAX_PAST_HAVES",
     "MAX_PAYLOAD_BYTES",
     "MAX_STILL_RESULTS",
     "MAX_TRACKS_NOW",
@@ -42,6 +59,11 @@ __all__ = [
     "Health",
     "Info",
     "Message",
+    "PastHave",
+    "PastHeader",
+    "PastKind",
+    "PastStill",
+    "PastUnit",
     "RoiHeader",
     "Status",
     "StillResult",
@@ -54,4 +76,8 @@ __all__ = [
     "fitted_class_names",
     "fitted_text",
     "kinds",
+    "pack_past_still",
+    "pack_past_units",
+    "parse_past_still",
+    "parse_past_units",
 ]

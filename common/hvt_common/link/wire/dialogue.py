@@ -21,9 +21,11 @@ from hvt_common.link.wire.fields import (
     TupleOf,
     carried,
 )
+from hvt_common.link.wire.past import MAX_PAST_HAVES, PastHave
 from hvt_common.link.wire.sealed import Message, Nested
 
 __all__ = [
+    "MAX_MISSING_STILLS",
     "MAX_STILL_RESULTS",
     "MAX_TRACKS_NOW",
     "Command",
@@ -35,6 +37,8 @@ __all__ = [
 ]
 
 MAX_STILL_RESULTS = 32
+MAX_MISSING_STILLS = 32
+"""How many one report names; of more, the newest."""
 MAX_TRACKS_NOW = 64
 """How many tracks one answer lists; of more, those seen with the most confidence."""
 _COUNT = Int(0, 2**53 - 1)
@@ -52,6 +56,8 @@ class Command(StrEnum):
     """What the edge tracks now, by its own ids."""
     SET_BUDGET = "set-budget"
     SET_METHOD = "set-method"
+    SEND_PAST = "send-past"
+    """Send what was kept of the base stream too, before what is left of the stills."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +122,7 @@ class StillResult:
 class Feedback(Message):
     """Payload of ``feedback``: a receiver report, counts since the receiver met this session."""
 
-    MAX_BYTES: ClassVar[int] = 4096
+    MAX_BYTES: ClassVar[int] = 6144
 
     session_id: int = carried(Int(0, U64))
     receiver_id: int = carried(Int(0, U64))
@@ -140,6 +146,8 @@ class Feedback(Message):
     """How long before ``send_ns`` it came: ``send_ns`` minus this is its time of arrival."""
     still_sequence: int = carried(Int(-1, U32))
     """The highest of ``roi`` that has come; -1 for none."""
+    missing_stills: tuple[int, ...] = carried(ListOf(Int(0, U32), MAX_MISSING_STILLS))
+    """Sequences of ``roi`` below it that have not come; the edge sends them again while they are worth it."""
     delay_p50_ms: float = carried(Scaled(-1, 3_600_000, 10))
     """Median capture to receive since the last report, clocks reconciled; -1 where unknown."""
     clock_offset_ns: int = carried(Int(-I63, I63))
@@ -148,3 +156,5 @@ class Feedback(Message):
     """The estimate is right within this; -1 where there is none."""
     stills: tuple[StillResult, ...] = carried(ListOf(Nested(StillResult), MAX_STILL_RESULTS))
     """New since the last report."""
+    past: tuple[PastHave, ...] = carried(ListOf(Nested(PastHave), MAX_PAST_HAVES))
+    """Objects of which pieces came since the last report."""

@@ -126,10 +126,13 @@ class Status(Message):
     last_still_sequence: int = carried(_LAST)
     base_bytes: int = carried(_COUNT)
     roi_bytes: int = carried(_COUNT)
+    past_bytes: int = carried(_COUNT)
+    """Pieces of what was kept while the link was away."""
     meta_bytes: int = carried(_COUNT)
     overhead_bytes: int = carried(_COUNT)
     base_messages: int = carried(_COUNT)
     roi_messages: int = carried(_COUNT)
+    past_messages: int = carried(_COUNT)
     meta_messages: int = carried(_COUNT)
     worst_window_bps: tuple[int, int, int] = carried(TupleOf(_BPS, 3))
     """Base, roi, total: the fullest rolling window of the run."""

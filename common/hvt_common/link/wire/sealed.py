@@ -54,6 +54,8 @@ class Message:
 
     __slots__ = ()
     MAX_BYTES: ClassVar[int] = 1024
+    MAX_PAYLOAD: ClassVar[int] = MAX_PAYLOAD_BYTES
+    """Bytes of the payload that it may be attached to."""
 
     def pack(self, payload: bytes = b"") -> bytes:
         """The message as bytes; ``payload`` is the Zenoh payload that it will be attached to, if any.
@@ -63,7 +65,7 @@ class Message:
         values = [kind.encode(getattr(self, name)) for name, kind in kinds(type(self))]
         packed: bytes = msgpack.packb([WIRE_VERSION, *values, 2**32 - 1])
         body = packed[:-_CRC_BYTES]
-        if len(packed) > self.MAX_BYTES or len(payload) > MAX_PAYLOAD_BYTES:
+        if len(packed) > self.MAX_BYTES or len(payload) > self.MAX_PAYLOAD:
             raise ValueError(f"{type(self).__name__} of {len(packed)} bytes or its payload is too long")
         return body + bytes((_CRC_TAG,)) + _checksum(body, payload).to_bytes(4, "big")
 
@@ -76,8 +78,8 @@ class Message:
         name = cls.__name__
         if len(data) > cls.MAX_BYTES:
             raise WireError(f"{name} of {len(data)} bytes is longer than {cls.MAX_BYTES}")
-        if len(payload) > MAX_PAYLOAD_BYTES:
-            raise WireError(f"payload of {len(payload)} bytes is longer than {MAX_PAYLOAD_BYTES}")
+        if len(payload) > cls.MAX_PAYLOAD:
+            raise WireError(f"payload of {len(payload)} bytes is longer than {cls.MAX_PAYLOAD}")
         array = _unpack(data, name)
         if len(data) <= _CRC_BYTES or data[-_CRC_BYTES] != _CRC_TAG:
             raise WireError(f"{name} does not end with its checksum")

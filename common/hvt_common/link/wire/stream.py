@@ -41,6 +41,8 @@ class Flags(IntFlag):
     """VPS, SPS and PPS are inside."""
     LOCKSTEP = 4
     """Sent as fast as the parts allow: capture times are media time and say nothing about delay."""
+    STORED = 8
+    """Kept at the edge while the link was away, and sent afterwards."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +94,8 @@ class RoiHeader(Message):
     """Attachment of ``roi``. Boxes are x1, y1, x2, y2 in source pixels, x2 and y2 exclusive."""
 
     MAX_BYTES: ClassVar[int] = 1024
+    MAX_PAYLOAD: ClassVar[int] = 2**20
+    """The largest still, 512x512 pixels, has 768 KiB before it is coded; a ground keeps hundreds in its queues."""
 
     session_id: int = carried(Int(0, U64))
     sequence: int = carried(Int(0, U32))

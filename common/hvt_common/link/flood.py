@@ -1,0 +1,40 @@
+"""Notices that far more messages come than anybody sends who means well. Pure: time is an argument."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Hashable
+
+__all__ = ["FloodWatch"]
+
+_SECOND_NS = 1_000_000_000
+_AGAIN_NS = 60 * _SECOND_NS
+"""Between two warnings: a flood is not to fill the log."""
+
+
+class FloodWatch:
+    """Counts messages of each kind second by second; may be used by any thread.
+
+    Args:
+        most_per_s: so many of one kind in a second are no flood; at least twice what the busiest peer sends.
+    """
+
+    def __init__(self, *, most_per_s: int) -> None:
+        self._most = most_per_s
+        self._lock = threading.Lock()
+        self._second = -1
+        self._counts: dict[Hashable, int] = {}
+        self._said_ns: int | None = None
+
+    def note(self, kind: Hashable, *, now_ns: int) -> int | None:
+        """A message of this kind came; its number in this second where that is worth a warning now, else None."""
+        with self._lock:
+            second = now_ns // _SECOND_NS
+            if second != self._second:
+                self._second = second
+                self._counts.clear()
+            count = self._counts[kind] = self._counts.get(kind, 0) + 1
+            if count <= self._most or (self._said_ns is not None and now_ns - self._said_ns < _AGAIN_NS):
+                return None
+            self._said_ns = now_ns
+            return count

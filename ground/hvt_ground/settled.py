@@ -1,0 +1,97 @@
+"""What a still says, and what it did: the values that refinement takes and gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, Literal, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Posterior
+
+__all__ = ["Outcome", "Settled", "Shown", "StillSeen"]
+
+Outcome = Literal["matched", "superseded", "no track", "ambiguous", "frame lost", "late", "overflow", "ended"]
+"""What became of a still:
+
+matched
+    it spoke on the class of ``track_id``.
+superseded
+    it belongs to ``track_id``, but a still of a later frame has already replaced the class.
+no track
+    no track of the ground overlaps its box enough at its frame.
+ambiguous
+    two tracks of the ground fit its box about equally well.
+frame lost
+    the ground never decoded its frame.
+late
+    its frame is older than the history, or was not reached within the hold time.
+overflow
+    more stills wait than are held; the oldest goes.
+ended
+    it still waited when the stream or its session ended.
+"""
+
+P = TypeVar("P")
+
+
+@dataclass(frozen=True, slots=True)
+class StillSeen(Generic[P]):
+    """A still that was decoded and classified."""
+
+    sequence: int
+    frame_index: int
+    capture_ns: int
+    edge_track_id: int
+    """The edge's own track; negative when the still was asked for by box."""
+    box_base_px: tuple[float, float, float, float]
+    """x1 y1 x2 y2, base pixels, without padding."""
+    class_name: str
+    """What the edge's detector called it."""
+    posterior: Posterior
+    """Of the classifier, over the `Refiner`'s ``classifier_classes``."""
+    carried: P
+    """Whatever the caller wants back with it (the coded still, its header)."""
+    news: float = 1.0
+    """How much the still shows that the base did not, 0…1; see `news`."""
+    part: int = 0
+    """Which of the objects that the still shows: each is offered by itself, under the still's sequence number."""
+    stored: bool = False
+    """It was kept while the link was away. Where nothing is known of its frame it may speak on the track that its
+    edge track is known as now: the object is the same, and so is its class."""
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Sequence and part."""
+        return self.sequence, self.part
+
+
+@dataclass(frozen=True, slots=True)
+class Settled(Generic[P]):
+    """A still and what it did."""
+
+    still: StillSeen[P]
+    outcome: Outcome
+    track_id: int | None
+    """The ground's track; None unless the outcome is matched or superseded."""
+    class_before: str
+    """The class that was shown for the track; without a track what the edge's detector said."""
+    class_after: str
+    """The class that is shown from now on; without a track what the still alone says."""
+    confidence: float
+    """Of ``class_after``, 0…1."""
+    entropy_nats: float
+    """Of the distribution that ``class_after`` was taken from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """Classes of N tracks, parallel to the `Tracks` they were asked for; fields of `events.Overlay`."""
+
+    base_classes: tuple[str, ...]
+    classes: tuple[str, ...]
+    confidences: npt.NDArray[np.float32]
+    """(N,) of ``classes``, 0…1."""
+    refined: npt.NDArray[np.bool_]
+    """(N,) True once a still has spoken."""

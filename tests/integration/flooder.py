@@ -1,0 +1,187 @@
+"""A second publisher on an edge's keys that says valid things as fast as it can, in a process of its own.
+
+    python flooder.py KIND ENDPOINT --edge uav-1 --seconds 4
+
+It listens to the edge first, so that what it says is of the session that runs. Prints how much it said.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+
+import zenoh
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from hvt_common.link.keys import EdgeKeys, Row
+from hvt_common.link.wire import (
+    BaseHeader,
+    ControlRequest,
+    Feedback,
+    PastHeader,
+    PastKind,
+    RoiHeader,
+    Status,
+    TrackStep,
+)
+from outsider import Message, Tap, joined
+
+Said = tuple[Row, bytes, bytes | None]
+
+
+def copies(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+    """Everything that was heard, over and over."""
+    rows = [row for row in (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS) if heard[row]]
+    for number in count():
+        row = rows[number % len(rows)]
+        message = heard[row][number // len(rows) % len(heard[row])]
+        yield row, message.payload, message.attachment or None
+
+
+def ahead(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+    """The session carried on in its own name: numbers that nobody has used yet, each a little further."""
+    pictures, stills = heard[Row.BASE][-8:], heard[Row.ROI][-8:]
+    for number in count(1):
+        message = pictures[number % len(pictures)]
+        header = BaseHeader.parse(message.attachment, message.payload)
+        lie = replace(header, sequence=header.sequence + number, frame_index=header.frame_index + number)
+        yield Row.BASE, message.payload, lie.pack(message.payload)
+        if stills:
+            message = stills[number % len(stills)]
+            still = RoiHeader.parse(message.attachment, message.payload)
+            lie_too = replace(still, sequence=still.sequence + 1000 + number)
+            yield Row.ROI, message.payload, lie_too.pack(message.payload)
+
+
+def statuses(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+    """Reports and tracks with numbers from far ahead."""
+    status = Status.parse(heard[Row.STATUS][-1].payload)
+    steps = [TrackStep.parse(one.payload) for one in heard[Row.TRACKS][-1:]]
+    for number in count(1):
+        yield Row.STATUS, replace(status, sequence=status.sequence + number).pack(), None
+        for step in steps:
+            further = {"sequence": step.sequence + number, "frame_index": step.frame_index + number}
+            yield Row.TRACKS, replace(step, **further).pack(), None
+
+
+def past(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+    """First pieces of large objects, none of which ever gets its second."""
+    header = BaseHeader.parse(heard[Row.BASE][-1].attachment, heard[Row.BASE][-1].payload)
+    payload = bytes(60_000)
+    for number in count():
+        piece = PastHeader(
+            session_id=header.session_id,
+            kind=PastKind.STILL if number % 2 else PastKind.BASE,
+            number=number,
+            offset=0,
+            total_bytes=4_000_000,
+            send_ns=header.send_ns,
+        )
+        yield Row.PAST, payload, piece.pack(payload)
+
+
+def reports(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+    """Receiver reports in a real ground's name, and in names that nobody has."""
+    real = Feedback.parse(heard[Row.FEEDBACK][-1].payload)
+    for number in count(1):
+        receiver = real.receiver_id if number % 2 else number
+        yield Row.FEEDBACK, replace(real, sequence=real.sequence + number, receiver_id=receiver).pack(), None
+
+
+KINDS: dict[str, Callable[[dict[Row, list[Message]]], Iterator[Said]]] = {
+    "copies": copies,
+    "ahead": ahead,
+    "statuses": statuses,
+    "past": past,
+    "reports": reports,
+}
+NEEDED = {
+    "copies": (Row.BASE, Row.ROI, Row.STATUS),
+    "ahead": (Row.BASE, Row.ROI),
+    "statuses": (Row.STATUS,),
+    "past": (Row.BASE,),
+    "reports": (Row.FEEDBACK,),
+}
+
+
+def main() -> None:
+    """Listen, then speak."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("kind", choices=[*KINDS, "questions"])
+    parser.add_argument("--hear", required=True)
+    parser.add_argument("--say", required=True)
+    parser.add_argument("--edge", default="uav-1")
+    parser.add_argument("--seconds", type=float, default=4.0)
+    asked = parser.parse_args()
+    keys = EdgeKeys(asked.edge)
+    with joined(asked.hear) as ears, joined(asked.say) as mouth:
+        if asked.kind == "questions":
+            said = ask(mouth, keys, seconds=asked.seconds)
+        else:
+            said = say(
+                asked.kind, listened(ears, keys, NEEDED[asked.kind]), mouth, keys, seconds=asked.seconds
+            )
+    print(json.dumps(said))
+
+
+def listened(session: zenoh.Session, keys: EdgeKeys, needed: tuple[Row, ...]) -> dict[Row, list[Message]]:
+    """Some of each row, by row."""
+    tap, end_s = Tap(session, f"hvt/{keys.edge}/**"), time.monotonic() + 40
+    while time.monotonic() < end_s:
+        heard: dict[Row, list[Message]] = {row: [] for row in Row}
+        for message in tap.messages:
+            heard[Row(message.key.rpartition("/")[2])].append(message)
+        if all(len(heard[row]) >= (12 if row is Row.BASE else 1) for row in needed):
+            return heard
+        time.sleep(0.1)
+    sys.exit(f"nothing came on {', '.join(row for row in needed if not heard[row])}")
+
+
+def say(
+    kind: str, heard: dict[Row, list[Message]], session: zenoh.Session, keys: EdgeKeys, *, seconds: float
+) -> dict[str, float]:
+    """As fast as the link takes it."""
+    end_s, said, size_bytes = time.monotonic() + seconds, 0, 0
+    for row, payload, attachment in KINDS[kind](heard):
+        session.put(
+            keys.key(row), payload, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        said += 1
+        size_bytes += len(payload)
+        if said % 16 == 0 and time.monotonic() > end_s:
+            break
+    return {"said": said, "bytes": size_bytes}
+
+
+def ask(session: zenoh.Session, keys: EdgeKeys, *, seconds: float) -> dict[str, float]:
+    """Questions on control that the edge understands: keyframes, and stills of any place."""
+    questions = [
+        ControlRequest(session_id=0, command=command, arguments=arguments).pack()
+        for command, arguments in (
+            ("keyframe", {}),
+            ("still", {"x": 40, "y": 40, "w": 200, "h": 120, "quality": 95}),
+            ("tracks", {}),
+        )
+    ]
+    end_s, said, answered = time.monotonic() + seconds, 0, 0
+
+    def heard(_reply: zenoh.Reply) -> None:
+        nonlocal answered
+        answered += 1
+
+    while time.monotonic() < end_s:
+        session.get(keys.key(Row.CONTROL), heard, payload=questions[said % len(questions)], timeout=1.0)
+        said += 1
+    time.sleep(1.2)
+    return {"said": said, "answered": answered}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""`hvt-ground still` by way of a ground that listens with TLS: who gets the picture, and what the others are told."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import pytest
+
+from fleet_keys import Fleet
+from hvt_ground.cli import main
+from processes import Running, eventually, free_ports
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """An edge and a ground with keys, and the fleet that they belong to."""
+
+    fleet: Fleet
+    endpoint: str
+
+    def asked(self, command: str, *words: str, file: Path) -> int:
+        """``hvt-ground COMMAND`` with this configuration; the exit code."""
+        return main([command, "--connect", self.endpoint, "--zenoh-config", str(file), *words])
+
+
+@pytest.fixture(scope="module")
+def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
+    """Edge ``uav-1`` flies to ground ``base``; ``ops`` may command, ``guest`` watches, ``stranger`` came too late."""
+    folder = tmp_path_factory.mktemp("flight")
+    fleet = Fleet(folder / "keys")
+    fleet.keys("add-edge", "uav-1")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    fleet.keys("add-ground", "ops")
+    fleet.keys("add-ground", "guest", "--watch-only")
+    before = {name: fleet.file(name).read_text() for name in ("base", "uav-1")}
+    fleet.keys("add-ground", "stranger")
+    for name, text in before.items():
+        fleet.file(name).write_text(text)
+    endpoint = f"tls/127.0.0.1:{free_ports(1)[0]}"
+    running: list[Running] = []
+
+    def start(module: str, name: str, *arguments: str) -> Running:
+        common = ["--zenoh-config", str(fleet.file(name)), "--detector", "motion", *arguments]
+        running.append(Running(module, common, folder=folder, name=name))
+        return running[-1]
+
+    try:
+        ground = start("hvt_ground.cli", "base", "--listen", endpoint, "--classifier", "none")
+        ground.until("listening on")
+        start(
+            *("hvt_edge.cli", "uav-1", "--connect", endpoint, "--edge-id", "uav-1"),
+            *("--source", str(scene), "--source-fps", "5", "--fps", "5", "--size", "640x360"),
+            *(
+                "--preset",
+                "ultrafast",
+                "--budget",
+                "500kbps",
+                "--video-share",
+                "0.6",
+                "--cooldown",
+                "0s",
+            ),
+        )
+        eventually(lambda: "stills" in ground.said, within_s=40, what="the ground sees pictures")
+        yield Flight(fleet, endpoint)
+    finally:
+        for one in running:
+            one.kill()
+
+
+@pytest.mark.parametrize("who", ["ops", "base"])
+def test_who_may_command_gets_the_still(
+    flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str], who: str
+) -> None:
+    """The operator's second screen could not look closer, once keys are in use."""
+    out = tmp_path / "crop.png"
+    words = ("--edge", "uav-1", "--box", "100,100,64,48", "--out", str(out))
+    assert flight.asked("still", *words, file=flight.fleet.file(who)) == 0, capsys.readouterr().err
+    picture = cv2.imread(str(out))
+    assert picture.shape == (48, 64, 3)
+    assert picture.std() > 0
+
+
+def test_who_only_watches_is_told_by_its_own_file(
+    flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """'Does not answer' would send the guest looking for a fault of the link."""
+    file, out = flight.fleet.file("guest"), tmp_path / "crop.png"
+    assert flight.asked("edges", file=file) == 0
+    assert capsys.readouterr().out == "uav-1\n"
+    assert flight.asked("still", "--out", str(out), file=file) == 2
+    assert capsys.readouterr().err == (
+        f"hvt-ground: {file} lets us watch uav-1, not command it: a key that hvt-ground keys add-ground makes "
+        "without --watch-only may\n"
+    )
+    assert not out.exists()
+
+
+def test_who_gives_itself_the_right_is_refused_there_and_told(
+    flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file is text: who writes more rights into it must not have them; an honest mistake needs its reason."""
+    bold = flight.fleet.changed(
+        "ops",
+        connect_certificate=str(flight.fleet.folder / "guest.pem"),
+        connect_private_key=str(flight.fleet.folder / "guest.key"),
+    )
+    out = tmp_path / "crop.png"
+    assert flight.asked("still", "--edge", "uav-1", "--out", str(out), file=bold) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(
+        "hvt-ground: uav-1 does not answer on control: this key may lack the right to command"
+    )
+    assert "hvt-ground keys list shows who has it" in said
+    assert said.count("\n") == 1
+    assert not out.exists()
+
+
+def test_a_key_that_the_ground_does_not_know_is_told(
+    flight: Flight, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A new key and an old file on the ground: an edge that is there would be called absent, and nothing more."""
+    file = flight.fleet.file("stranger")
+    assert flight.asked("keyframe", "--edge", "uav-1", file=file) == 2
+    said = capsys.readouterr().err
+    assert re.fullmatch(
+        r"hvt-ground: edge 'uav-1' does not answer: is it flying, and does this link reach it\?; base, to which we "
+        r"are linked, .* \(hvt-ground keys list; a base.json5 from before our key was made does not name it\)\n",
+        said,
+    ), said
+    assert flight.asked("edges", file=file) == 0
+    assert capsys.readouterr().out.startswith("no edge is there; base, to which we are linked, ")
+
+
+def test_an_edge_that_our_own_file_does_not_name_is_not_asked_for(
+    flight: Flight, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file from before the edge was added drops the question on our own machine."""
+    file = flight.fleet.file("ops")
+    assert flight.asked("keyframe", "--edge", "uav-7", file=file) == 2
+    assert f"{file} does not name uav-7: hvt-ground keys list shows" in capsys.readouterr().err

@@ -1,0 +1,342 @@
+"""Processes that are killed and started again, a router that goes, two edges of one id, clocks that are set."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hvt_common.link.wire import Feedback
+from link.relay import Relay
+from link.script import LinkState, Piece, Script
+from link.timing import Arrival, read_timing
+from outsider import Tap, joined
+from processes import Link, Running, eventually
+from rrd import Recording
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+
+TESTS = Path(__file__).resolve().parents[1]
+ROUTER = TESTS.parent / "deploy" / "router.py"
+SOON_S = 60.0
+"""Generous: the machine may be busy with other tests."""
+PLAYS = (
+    *(
+        "--source",
+        "scene",
+        "--size",
+        "320x180",
+        "--fps",
+        "10",
+        "--preset",
+        "ultrafast",
+        "--budget",
+        "300kbps",
+    ),
+    *("--detector", "motion", "--edge-id", "uav-1", "--wait", "60s"),
+)
+SEES = ("--detector", "motion", "--classifier", "none")
+
+
+@pytest.fixture(autouse=True)
+def long_scene(scene: Path, tmp_path: Path) -> None:
+    """What the edges of a test play, from where they run."""
+    repeated(scene, tmp_path / "scene")
+
+
+def repeated(scene: Path, folder: Path) -> None:
+    """Three minutes of it, for a busy machine; at little cost."""
+    folder.mkdir()
+    pictures = sorted(scene.iterdir())
+    for number in range(6 * len(pictures)):
+        (folder / f"{number:06d}.jpg").symlink_to(pictures[number % len(pictures)])
+
+
+def shown(folder: Path, *, name: str = "timing.csv") -> list[Arrival]:
+    """The frames that a ground has decoded so far."""
+    return [one for one in read_timing(folder / name) if one.kind == "base" and one.shown]
+
+
+def more_is_shown(folder: Path, *, than: int, name: str = "timing.csv") -> None:
+    """Wait until the picture has gone on for a second."""
+    eventually(
+        lambda: len(shown(folder, name=name)) >= than + 10, within_s=SOON_S, what="the picture goes on"
+    )
+
+
+def ended(file: Path) -> bool:
+    """Whether a recording is whole, with the end of its session in it."""
+    events = Recording(file).events() if file.exists() else []
+    return bool(events) and events[-1][2].endswith("ended")
+
+
+# Killed and started again
+
+
+@dataclass
+class Restarts:
+    """A flight in which the edge is killed and started again, then the ground, and both get a SIGHUP at last."""
+
+    edge: dict[str, Any]
+    """Of the second edge."""
+    first_was_whole: bool
+    """The first session's recording, while its ground went on with the second."""
+    files: list[Path]
+    """The killed ground's recordings."""
+    frames_before: int
+    """Shown by the killed ground, of the second session."""
+    second: dict[str, Any]
+    """Of the second ground."""
+    folder: Path
+
+
+@pytest.fixture(scope="module")
+def restarts(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Restarts:
+    """Both are killed with -9, one after the other."""
+    folder = tmp_path_factory.mktemp("restarts")
+    repeated(scene, folder / "scene")
+    with Link(folder) as link:
+        ground = link.ground(*SEES, "--record", "flights", "--timing", "timing.csv")
+        edge = link.edge(*PLAYS, name="killed")
+        more_is_shown(folder, than=10)
+        edge.kill()
+        began = len(shown(folder))
+        edge = link.edge(*PLAYS)
+        more_is_shown(folder, than=began + 10)
+        files = sorted((folder / "flights").iterdir())
+        whole = ended(files[0])
+        ground.kill()
+        seen = len(shown(folder)) - began
+        again = link.ground(*SEES, "--record", "again.rrd", "--timing", "again.csv", name="again")
+        more_is_shown(folder, than=10, name="again.csv")
+        assert edge.alive, edge.said
+        again.stop(signal.SIGHUP)
+        edge.stop(signal.SIGHUP)
+        return Restarts(
+            edge=edge.finish(within_s=0),
+            first_was_whole=whole,
+            files=files,
+            frames_before=seen,
+            second=again.finish(within_s=0),
+            folder=folder,
+        )
+
+
+def test_a_killed_edge_leaves_a_whole_recording_and_its_successor_begins_another(restarts):
+    """The flight before the crash would be lost, or run on into the one after it."""
+    assert restarts.first_was_whole
+    assert len(restarts.files) == 2
+    assert len(Recording(restarts.files[0]).video()) >= 10
+
+
+def test_a_killed_ground_leaves_a_recording_that_can_be_read(restarts):
+    """The crash would take the evidence of all that led to it."""
+    assert len(Recording(restarts.files[1]).video()) >= restarts.frames_before - 5 >= 10
+
+
+def test_a_ground_started_in_mid_flight_shows_the_edge_that_never_stopped(restarts):
+    """The drone would have to be landed to be seen again."""
+    assert restarts.second["session"] == restarts.edge["session"]
+    assert restarts.second["frames_decoded"] >= 20
+    assert restarts.edge["frames"] > restarts.second["frames_decoded"] + restarts.frames_before / 2
+
+
+def test_sighup_ends_both_with_summary_and_whole_recording(restarts):
+    """A terminal that closes would cut the recording off, and nobody would get the account."""
+    assert ended(restarts.folder / "again.rrd")
+    assert (
+        restarts.edge["frames"] > 0
+    )  # the summary is there, and both said goodbye with 0: see `Running.finish`
+
+
+# A router that goes
+
+
+@contextmanager
+def router(endpoint: str) -> Iterator[subprocess.Popen[str]]:
+    """deploy/router.py, as soon as it listens."""
+    command = [sys.executable, str(ROUTER), "--listen", endpoint]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert "listens on" in process.stdout.readline()
+            yield process
+        finally:
+            process.kill()
+
+
+def test_both_sides_come_back_to_a_router_that_was_killed(link: Link):
+    """After a power cut at the relay station somebody would have to start everything again, in the right order."""
+    with router(link.ground_endpoint):
+        ground = link._start(
+            "hvt_ground.cli",
+            ["--connect", link.ground_endpoint, *SEES, "--record", "flights", "--timing", "timing.csv"],
+            name="ground",
+        )
+        edge = link.edge(*PLAYS)
+        more_is_shown(link.folder, than=0)
+    killed_s = time.time()
+    with router(link.ground_endpoint):
+        eventually(
+            lambda: sum(one.send_s > killed_s + 1.0 for one in shown(link.folder)) >= 10,
+            within_s=2 * SOON_S,
+            what="the picture is back",
+        )
+        edge.stop()
+        ground.stop()
+    sessions = {one["session"] for one in as_list(ground.finish(within_s=0))}
+    assert sessions == {edge.finish(within_s=0)["session"]}
+
+
+def as_list(summaries: Any) -> list[dict[str, Any]]:
+    """A summary file holds one session, or a list of them."""
+    return summaries if isinstance(summaries, list) else [summaries]
+
+
+# Two edges of one id
+
+
+def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
+    """Two drones would fight for one screen; a fleet's copy-and-paste mistake would be found out in the air."""
+    ground = link.ground(*SEES, "--record", "flights", "--timing", "timing.csv")
+    first = link.edge(*PLAYS, name="first")
+    more_is_shown(link.folder, than=0)
+    second = link.edge(*PLAYS, "--record-base", "second.mkv", name="second")
+    assert second.wait(within_s=SOON_S) == 2
+    lines = [line for line in second.said.splitlines() if "runs on" not in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("hvt-edge: edge id 'uav-1' is in use: an edge of that id (session ")
+    assert not (link.folder / "second.mkv").exists()
+    # The first hangs for good: its token is still there, but nobody answers any more.
+    os.kill(first.process.pid, signal.SIGSTOP)
+    third = link.edge(*PLAYS, name="third")
+    more_is_shown(link.folder, than=len(shown(link.folder)))
+    third.stop()
+    ground.stop()
+    assert third.finish(within_s=0)["session"] in {
+        one["session"] for one in as_list(ground.finish(within_s=0))
+    }
+
+
+def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(link: Link):
+    """The picture would jump between two drones, or be another's, without a word."""
+    edges = {name: link.edge(*PLAYS, "--wait", "0s", name=name) for name in ("one", "two")}
+    for edge in edges.values():
+        edge.until("no ground yet")
+    ground = link.ground(*SEES, "--record", "flight.rrd", "--timing", "timing.csv")
+    ground.until("two edges call themselves uav-1")
+    more_is_shown(link.folder, than=20)
+    for edge in edges.values():
+        edge.kill()
+    ground.stop()
+    (seen,) = as_list(ground.finish(within_s=0))
+    said = [line for line in ground.said.splitlines() if "two edges call themselves uav-1" in line]
+    assert len(said) == 1
+    assert f"session {seen['session']} is shown" in said[0]
+    events = [text for _, _, text in Recording(link.folder / "flight.rrd").events()]
+    assert any("two edges call themselves uav-1" in text for text in events)
+    assert seen["unusable_messages"] > 0
+
+
+# Stills that are lost
+
+
+def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
+    """On a radio that loses datagrams the sharp pictures would have holes; or the gallery show some twice."""
+    lossy = Script(
+        (Piece(0.0, LinkState(4_000_000, delay_s=0.01, loss=0.12)),), lasts_s=60.0, queue_bytes=100_000
+    )
+    ground = link._start(
+        "hvt_ground.cli",
+        ["--listen", f"udp/127.0.0.1:{link.port}", *SEES, "--record", "flight.rrd", "--timing", "timing.csv"],
+        name="ground",
+    )
+    ground.until("listening on")
+    with Relay(lossy, protocol="udp", target_port=link.port, seed=3) as relay:
+        edge = link._start(
+            "hvt_edge.cli",
+            [
+                *("--connect", f"udp/127.0.0.1:{relay.port}", *PLAYS),
+                *(
+                    "--method",
+                    "M2",
+                    "--cooldown",
+                    "0s",
+                    "--min-gain",
+                    "1",
+                    "--gate",
+                    "60",
+                    "--video-share",
+                    "0.6",
+                ),
+                *("--still-codec", "jpeg"),
+            ],
+            name="edge",
+        )
+        more_is_shown(link.folder, than=0)
+        relay.begin()
+
+        def stills() -> list[int]:
+            return [one.sequence for one in read_timing(link.folder / "timing.csv") if one.kind == "roi"]
+
+        def came_late() -> bool:
+            return any(number < max(stills()[:place]) for place, number in enumerate(stills()) if place)
+
+        eventually(came_late, within_s=SOON_S, what="a still that was lost comes after later ones")
+        edge.stop()
+        ground.stop()
+    sent = edge.finish(within_s=0)["stills"]["reasons"]["sent"]
+    (seen,) = as_list(ground.finish(within_s=0))
+    arrived = stills()
+    assert sent["again"] >= 1
+    # Others may have come from the edge's store.
+    assert len(arrived) == len(set(arrived)) <= seen["stills"]["received"]
+    assert seen["stills"]["received"] <= sum(sent.values()) - sent["again"]
+    shown_stills = [value for _, value in Recording(link.folder / "flight.rrd").stills()]
+    assert len(shown_stills) == len(set(shown_stills))
+
+
+# Clocks that are set
+
+
+@pytest.mark.parametrize("step_s", [3600, -3600])
+@pytest.mark.parametrize("side", ["ground", "edge"])
+def test_a_clock_that_is_set_leaves_no_trace(
+    link: Link, monkeypatch: pytest.MonkeyPatch, side: str, step_s: int
+):
+    """For hours the picture would be an hour old by the ground's account, or reports and keyframes cease."""
+    (link.folder / "stepped.py").write_text((TESTS / "stepped.py").read_text())
+    monkeypatch.setenv("HVT_STEPPED", f"hvt_{side}.cli {step_s}")
+    modules = {"ground": "hvt_ground.cli", "edge": "hvt_edge.cli"} | {side: "stepped"}
+    heard = ["--listen", link.ground_endpoint, *SEES, "--record", "flight.rrd", "--timing", "timing.csv"]
+    ground: Running = link._start(modules["ground"], heard, name="ground")
+    ground.until("listening on")
+    edge = link._start(modules["edge"], ["--connect", link.ground_endpoint, *PLAYS], name="edge")
+    with joined(link.ground_endpoint) as third:
+        tap = Tap(third, "hvt/uav-1/feedback")
+        more_is_shown(link.folder, than=0)
+        (link.folder / "step").touch()
+        since = len(tap.messages)
+        more_is_shown(link.folder, than=len(shown(link.folder)) + 20)
+        eventually(lambda: len(tap.messages) >= since + 5, within_s=SOON_S, what="reports go on")
+    edge.stop()
+    ground.stop()
+    (seen,) = as_list(ground.finish(within_s=0))
+    assert edge.finish(within_s=0)["session"] == seen["session"]
+    assert seen["latency_ms"]["max"] < 60_000
+    assert seen["receive_latency_ms"]["max"] < 60_000
+    reports = [Feedback.parse(message.payload) for message in tap.messages]
+    sent_s = [one.send_ns / 1e9 for one in reports]
+    assert max(sent_s) - min(sent_s) < 300
+    assert all(one.delay_p50_ms < 60_000 and abs(one.clock_offset_ns) < 60e9 for one in reports)
+    captured_s = [one.capture_s for one in shown(link.folder)]
+    assert max(captured_s) - min(captured_s) < 300

@@ -1,0 +1,148 @@
+"""Edge and ground as real processes over a link that goes away: what was seen meanwhile comes afterwards."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+
+from hvt_edge.store.entry import FIRST_KEPT
+from hvt_edge.store.segment import read_segment
+from link.relay import Relay
+from link.script import LinkState, Piece, Script
+from processes import Link, eventually
+from rrd import Recording
+
+pytestmark = pytest.mark.integration
+
+LIGHT = LinkState(rate_bps=1_500_000, delay_s=0.02)
+DARK = LinkState(rate_bps=1_500_000, delay_s=0.02, dark=True)
+EDGE = (
+    "--source-fps", "10", "--fps", "10", "--size", "640x360", "--budget", "800kbps", "--detector", "motion",
+    "--preset", "ultrafast", "--detect-every", "5", "--cooldown", "0", "--wait", "60s",
+)  # fmt: skip
+
+
+def outage(*, begins_s: float, lasts_s: float) -> Script:
+    """A good link with one hole in it."""
+    pieces = (Piece(0.0, LIGHT), Piece(begins_s, DARK), Piece(begins_s + lasts_s, LIGHT))
+    return Script(pieces=pieces, lasts_s=200.0, queue_bytes=64_000)
+
+
+def times_in(path: Path) -> list[int]:
+    """Capture times of the frames in a Matroska file, in milliseconds after the first."""
+    with av.open(str(path)) as container:
+        return [packet.pts for packet in container.demux(video=0) if packet.size]
+
+
+def frames_shown(recordings: Iterable[Path]) -> dict[int, int]:
+    """Frame index → capture time (ns), of all video."""
+    return {frame: ns for path in recordings for frame, ns, _ in Recording(path).video()}
+
+
+def stills_taken(timing: Path) -> tuple[set[int], set[int]]:
+    """Numbers of the stills that came live, and of those that came whole from the store."""
+    live, past = set(), set()
+    with timing.open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row["kind"] == "roi":
+                live.add(int(row["sequence"]))
+            elif row["kind"] == "past-still" and row["shown_ns"] != "0":
+                past.add(int(row["sequence"]))
+    return live, past
+
+
+def admitted(sent: dict[str, Any]) -> set[int]:
+    """Numbers of all stills that the edge let go, into the link or into its store."""
+    reasons = sent["stills"]["reasons"]
+    live = {why: n for why, n in reasons["sent"].items() if why not in {"again", "stored"}}
+    kept = reasons["deferred"].get("stored", 0)
+    return set(range(sum(live.values()))) | {FIRST_KEPT + number for number in range(kept)}
+
+
+@pytest.mark.parametrize(
+    ("dark_s", "frames"),
+    [
+        pytest.param(2.7, 150, id="shorter-than-zenoh-notices"),
+        pytest.param(8.0, 220, id="session-of-zenoh-gone"),
+    ],
+)
+def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s, frames):
+    """The operator would never see what the drone saw while the link was away."""
+    timing, own = tmp_path / "timing.csv", tmp_path / "own.mkv"
+    script = outage(begins_s=2.0, lasts_s=dark_s)
+    with Link(tmp_path) as link, Relay(script, target_port=link.port) as relay:
+        ground = link.ground(
+            "--detector", "motion", "--classifier", "none",
+            "--record", str(tmp_path / "run.rrd"), "--timing", str(timing),
+        )  # fmt: skip
+        edge = link._start(
+            "hvt_edge.cli",
+            ["--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene), *EDGE,
+             "--max-frames", str(frames), "--store-folder", str(tmp_path / "store"), "--record-base", str(own)],
+            name="edge",
+        )  # fmt: skip
+        eventually(
+            lambda: not edge.alive or (timing.exists() and timing.read_text().count("\n") > 5),
+            within_s=60,
+            what="the ground has frames",
+        )
+        relay.begin()
+        sent = edge.finish(within_s=150)
+        ground.stop()
+        said = ground.summary()
+    assert not isinstance(said, list), "one session all the time"
+    store = sent["store"]
+    assert store["sent_video_s"] > (0.3 if dark_s < 5 else 4.0), "there was an outage"
+    left = [store[what] for what in ("stills", "segments", "video_s", "given_up", "unreadable")]
+    assert left == [0, 0, 0.0, 0, 0]
+    shown = frames_shown(tmp_path.glob("run*.rrd"))
+    first_ns = min(shown.values())
+    came = sorted(round((ns - first_ns) / 1e6) for ns in shown.values())
+    assert came == times_in(own), "each frame that was coded is in the recording, at its time"
+    live, past = stills_taken(timing)
+    assert live | past == admitted(sent), "each still that was admitted, by its number"
+    assert {number for number in past if number >= FIRST_KEPT} or dark_s < 5
+    assert sent["worst_window_bps"]["total"] <= 800_000
+    assert said["past_bytes"] == sent["past_bytes"] > 0
+
+
+def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, scene):
+    """What a drone saw before its computer was started again would stay on it for ever."""
+    store = tmp_path / "store"
+    arguments = ["--source", str(scene), *EDGE, "--store-folder", str(store)]
+    with Link(tmp_path) as link:
+        ground = link.ground(
+            "--detector", "motion", "--classifier", "none", "--record", str(tmp_path / "run.rrd")
+        )
+        first = link.edge(*arguments, name="first")
+        first.until("a ground listens", within_s=60)
+        ground.kill()
+        eventually(
+            lambda: len(list(store.rglob("*.past"))) > 2 and list(store.rglob("base-*.mkv")),
+            within_s=60,
+            what="the edge keeps what it sees",
+        )
+        first.kill()
+        (session,) = [one for one in store.iterdir() if one.is_dir()]
+        stills = {int(one.name.split("-")[1]) for one in session.glob("still-*.past")}
+        frames = {unit.frame_index for one in session.glob("base-*.mkv") for unit in read_segment(one)}
+        ground = link.ground(
+            "--detector", "motion", "--classifier", "none",
+            "--record", str(tmp_path / "again.rrd"), "--timing", str(tmp_path / "again.csv"),
+            name="again",
+        )  # fmt: skip
+        link.edge(*arguments, name="second")
+        eventually(lambda: not session.exists(), within_s=90, what="all of it has arrived")
+        ground.stop()
+        said = ground.summary()
+    got = said[0] if isinstance(said, list) else said
+    (recording,) = got["past"]["recordings"]
+    assert set(frames_shown([Path(recording)])) == frames
+    assert stills_taken(tmp_path / "again.csv")[1] == stills
+    assert len(stills) > 2
+    assert len(frames) > 5
