@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -12,6 +13,7 @@ from hvt_study.commands import COMMANDS
 __all__ = ["main"]
 
 _PROGRAM = "hvt-study"
+_INTERRUPTED = 130
 
 
 class _Parser(argparse.ArgumentParser):
@@ -22,8 +24,15 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``hvt-study``; 0, or 2 after one sentence on stderr where the user can mend something."""
-    return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
+    """Run ``hvt-study``; 0, or 2 after one sentence on stderr where the user can mend something.
+
+    130, as of a shell, where the user has interrupted it.
+    """
+    try:
+        return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
+    except KeyboardInterrupt:
+        print(f"{_PROGRAM}: interrupted", file=sys.stderr)
+        return _INTERRUPTED
 
 
 def _run(argv: Sequence[str] | None) -> int:

@@ -23,6 +23,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from hvt_common.clock import SteadyClock
 from hvt_common.link.inbox import Received
 from hvt_common.link.keys import EdgeKeys, Row
 from hvt_common.link.ledger import LedgerSummary, overhead_bytes
@@ -32,7 +33,6 @@ from hvt_common.vision.detect import MOTION, Detector
 from hvt_common.vision.tiles import tiled
 from hvt_edge.app import Edge
 from hvt_edge.build import base_size
-from hvt_edge.clock import SteadyClock
 from hvt_edge.config import EdgeConfig
 from hvt_edge.feedback import FeedbackInbox
 from hvt_edge.pace_lockstep import LockstepPace
@@ -46,7 +46,7 @@ from hvt_study.list_score import Listed
 from hvt_study.serial_link import LinkReport, SerialLink
 from hvt_study.sight_clip import TICK_FPS, Clip, TickSource
 
-__all__ = ["FlightPlan", "FlightReport", "coded_ticks", "fly"]
+__all__ = ["FlightPlan", "FlightReport", "coded_ticks", "fly", "weigh"]
 
 _START_NS = 1_700_000_000_000_000_000
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
@@ -85,6 +85,8 @@ class FlightReport:
     """CPU of the edge's stages a tick, whatever the number of cores."""
     digest: str
     """Of all payloads: two flights that sent the same have the same."""
+    back_bytes: int = 0
+    """Line bytes from the ground to the edge: reports on stills. The questions of a server are in ``line_bytes``."""
 
     @property
     def duration_s(self) -> float:
@@ -116,6 +118,19 @@ def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport
     if isinstance(detector, CachedDetector):
         saved_s = detector.saved_cpu_s - saved_s
     return edge.report(saved_cpu_s=saved_s)
+
+
+def weigh(plan: FlightPlan, *, detector: Detector) -> float:
+    """Fly without a ground; return the line bits a second, headers and transport included.
+
+    Where nothing that a ground says matters (methods without stills), that is to the bit what `fly` spends.
+
+    Raises:
+        UserError: the edge refuses its settings.
+    """
+    edge = _Scales(plan, detector=detector)
+    edge.run()
+    return edge.line_bytes * 8 / (plan.clip.ticks / TICK_FPS)
 
 
 class _MediaClock(SteadyClock):
@@ -237,7 +252,7 @@ class _Pace(LockstepPace):
 class _Edge(Edge):
     """The edge's own app over a clip of ticks and a simulated link."""
 
-    def __init__(self, plan: FlightPlan, *, detector: Detector, models: Models) -> None:
+    def __init__(self, plan: FlightPlan, *, detector: Detector, models: Models | None) -> None:
         # The detector is open already: the app is told of one that costs nothing to open.
         super().__init__(replace(plan.edge, quiet=True, detector=MOTION, tiles="off"), stop=threading.Event())
         self._plan = plan
@@ -263,6 +278,7 @@ class _Edge(Edge):
             picture_age_p95_ms=self._picture_age_p95_ms(),
             edge_cpu_ms=1e3 * (pace.cpu_s + saved_cpu_s) / ticks,
             digest=outlet.digest,
+            back_bytes=self.ground.back_bytes,
         )
 
     def _make_flow(self, stack: ExitStack, source: Source, detector: Detector) -> Any:  # noqa: ARG002
@@ -281,13 +297,12 @@ class _Edge(Edge):
         link: SerialLink[Received] = SerialLink(rate_bps=self._plan.link_bps)
         info = Info.parse(self._info(source, class_names, _START_NS))
         self._outlet = _Outlet(link, edge_id=self._config.edge_id)
-        self.ground = GroundSide(
-            replace(info, fps=TICK_FPS, started_ns=_START_NS),
-            config=self._plan.ground,
-            models=self._models,
-            link=link,
-        )
+        self.ground = self._make_ground(replace(info, fps=TICK_FPS, started_ns=_START_NS), link)
         return self._outlet
+
+    def _make_ground(self, info: Info, link: SerialLink[Received]) -> GroundSide:
+        assert self._models is not None, "only the scales do without"
+        return GroundSide(info, config=self._plan.ground, models=self._models, link=link)
 
     def _wait_for_ground(self, *_: Any) -> None:
         """It is there."""
@@ -321,3 +336,32 @@ class _Edge(Edge):
         at_ns = at_ns[at_ns >= shown[0, 0]]
         newest = shown[np.searchsorted(shown[:, 0], at_ns, side="right") - 1, 1]
         return float(np.percentile((at_ns - newest) / 1e6, 95)) if len(at_ns) else 0.0
+
+
+class _Nobody:
+    """A ground that takes what comes and looks at nothing."""
+
+    def __init__(self, link: SerialLink[Received]) -> None:
+        self._link = link
+        self.results: deque[tuple[int, StillResult]] = deque()
+
+    def pass_over(self, tick: int, *, capture_ns: int) -> None:
+        """Nothing is listed."""
+
+    def advance(self, now_ns: int | None) -> None:
+        """Let go of what has arrived."""
+        self._link.arrived(now_ns)
+
+
+class _Scales(_Edge):
+    """The same edge, of which only the bytes are of interest."""
+
+    def __init__(self, plan: FlightPlan, *, detector: Detector) -> None:
+        super().__init__(plan, detector=detector, models=None)
+
+    @property
+    def line_bytes(self) -> int:
+        return sum(self._outlet.line_bytes.values())
+
+    def _make_ground(self, info: Info, link: SerialLink[Received]) -> Any:  # noqa: ARG002
+        return _Nobody(link)

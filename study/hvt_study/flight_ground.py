@@ -7,26 +7,37 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
-import numpy as np
-
 from hvt_common.link.inbox import Received
-from hvt_common.link.keys import Row, parse_key
-from hvt_common.link.wire import BaseHeader, Info, RoiHeader, Status, StillResult, TrackStep
-from hvt_common.values import Tracks, View
+from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row, parse_key
+from hvt_common.link.ledger import overhead_bytes
+from hvt_common.link.wire import (
+    MAX_STILL_RESULTS,
+    BaseHeader,
+    Feedback,
+    Info,
+    RoiHeader,
+    Status,
+    StillResult,
+    TrackStep,
+)
+from hvt_common.values import Tracks
 from hvt_common.vision.classify import Classifier
 from hvt_common.vision.detect import Detector
 from hvt_ground.build import Models, make_sight
 from hvt_ground.config import GroundConfig
-from hvt_ground.events import Event, Overlay
+from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.eyes import LockstepEyes, Read, See, Step
 from hvt_ground.session import GroundSession
 from hvt_ground.sight import Picture, ReceivedStill
-from hvt_study.list_score import Listed
+from hvt_study.flight_record import FlightRecord, Watch
+from hvt_study.metrics.contract import FrameView
+from hvt_study.metrics.seen import SeenTick
 from hvt_study.serial_link import Arrival, SerialLink
 
 __all__ = ["GroundSide", "InlineExecutor", "SharedModels"]
 
 _MOST_RESULTS = 1024
+_RECEIVER = 1 << 40  # as many bytes on the wire as a random one
 _T = TypeVar("_T")
 
 
@@ -49,9 +60,12 @@ class SharedModels(Models):
     def __init__(self, detector: Detector, classifier: Classifier | None = None) -> None:
         self._shared = detector, classifier
 
-    def take(self) -> tuple[Detector, Classifier | None]:
+    def take(self, edge: str | None = None) -> tuple[Detector, Classifier | None]:  # noqa: ARG002
         """The same for every session."""
         return self._shared
+
+    def give_back(self, detector: Detector, classifier: Classifier | None) -> None:
+        """They were never away."""
 
 
 class _Eyes(LockstepEyes):
@@ -105,24 +119,36 @@ class GroundSide:
         self, info: Info, *, config: GroundConfig, models: Models, link: SerialLink[Received]
     ) -> None:
         self._link = link
+        self._info = info
         self._now_ns = info.started_ns
-        self._view = View(info.source_size, info.base_size, info.view_scale, info.view_offset_px)
+        self._models = models
+        detector, classifier = self._borrowed = models.take()
+        shared = SharedModels(detector, classifier)
         self._session = _Session(
             info,
-            sight_of=lambda emit: make_sight(config, models, info=info, emit=self._heard_by(emit)),
+            sight_of=lambda emit: make_sight(config, shared, info=info, emit=self._heard_by(emit)),
             to_local_ns=lambda at_ns: at_ns,
             clock=lambda: self._now_ns,
             report=lambda: None,
         )
-        self._newest = Listed()
+        self._watch = Watch(self._session.sight)
+        self._record = FlightRecord(
+            info.view,
+            started_ns=info.started_ns,
+            classes=len(detector.class_names),
+            classifier=classifier,
+        )
+        self._newest = SeenTick()
         self._decoded = False
         self._behind_ns = 0
         """By how much the newest picture came after its capture."""
         self._uncoded: deque[tuple[int, int]] = deque()
-        self.lists: dict[int, Listed] = {}
+        self.lists: dict[int, SeenTick] = {}
         """By tick."""
         self.results: deque[tuple[int, StillResult]] = deque()
         """What the edge is to hear, with the time at which it does."""
+        self.back_bytes = 0
+        """Line bytes of the reports that say something of stills; the way back is not the budget's."""
         self.arrivals: list[Arrival[Received]] = []
         """Everything, in order."""
         self.base_delays_ns: list[int] = []
@@ -151,6 +177,10 @@ class GroundSide:
         """Take in what is left and end the session."""
         self.advance(None)
         self._session.close()
+        if self.lists:
+            last = max(self.lists)
+            self.lists[last] = self._record.complete(self.lists[last], lists=self.lists)
+        self._models.give_back(*self._borrowed)
 
     def _receive(self, arrival: Arrival[Received]) -> None:
         """As `hvt_ground.receive` hands on what is whole and in order."""
@@ -160,6 +190,7 @@ class GroundSide:
             self._picture(BaseHeader.parse(item.attachment, item.payload), arrival)
         elif row is Row.ROI:
             header = RoiHeader.parse(item.attachment, item.payload)
+            self._record.still(header, arrival)
             self._session.still(header, item, media_type=item.encoding)
         elif row is Row.TRACKS:
             self._session.tracks(TrackStep.parse(item.payload), item)
@@ -169,11 +200,43 @@ class GroundSide:
     def _answer(self, last: Arrival[Received]) -> None:
         """What the ground has to say goes back in the time that the newest message took to come."""
         back_ns = self._now_ns + (last.arrival_ns - last.enter_ns)
-        self.results.extend((back_ns, one) for one in self._session.take_results(_MOST_RESULTS))
+        results = self._session.take_results(_MOST_RESULTS)
+        self._record.answers(results)
+        for first in range(0, len(results), MAX_STILL_RESULTS):
+            self.back_bytes += self._weight(results[first : first + MAX_STILL_RESULTS])
+        self.results.extend((back_ns, one) for one in results)
+
+    def _weight(self, results: tuple[StillResult, ...]) -> int:
+        """Line bytes of a report with these, as `hvt_ground.report_back` would send it."""
+        frames, stills = self._session.frames_received, self._session.stills_received
+        payload = Feedback(
+            session_id=self._info.session_id,
+            receiver_id=_RECEIVER,
+            sequence=frames,
+            send_ns=self._now_ns,
+            last_frame_index=self._session.last_frame_index,
+            base_messages=frames,
+            base_bytes=self._session.ledger.base_bytes,
+            roi_messages=stills,
+            roi_bytes=self._session.ledger.roi_bytes,
+            lost=0,
+            corrupt=0,
+            base_sequence=frames - 1,
+            base_held_us=0,
+            still_sequence=stills - 1,
+            missing_stills=(),
+            delay_p50_ms=self._behind_ns / 1e6,
+            clock_offset_ns=0,
+            clock_error_ns=0,
+            stills=results,
+            past=(),
+        ).pack()
+        key, encoding = EdgeKeys(self._info.edge).key(Row.FEEDBACK), DELIVERIES[Row.FEEDBACK].encoding
+        return len(payload) + overhead_bytes(len(payload), 0, key=key, encoding=encoding)
 
     def _picture(self, header: BaseHeader, arrival: Arrival[Received]) -> None:
         while self._uncoded and self._uncoded[0][0] < header.frame_index:
-            self._take_list(self._uncoded.popleft()[0])
+            self._take_list(self._uncoded.popleft()[0], at_ns=arrival.arrival_ns)
         self._behind_ns = arrival.arrival_ns - header.capture_ns
         self.base_delays_ns.append(self._behind_ns)
         self.shown_ns.append((arrival.arrival_ns, header.capture_ns))
@@ -181,31 +244,42 @@ class GroundSide:
         self._decoded = True
         whole = self._session.base(header, arrival.message, decode=True, starts_run=starts)
         assert whole, f"the base frame {header.frame_index} cannot be decoded"
-        self.lists[header.frame_index] = self._newest
+        self._answer(arrival)
+        found = self._watch.take_found()
+        detections = None if found is None else self._record.detected(found, self._watch.class_names)
+        self._put_down(header.frame_index, at_ns=arrival.arrival_ns, detections=detections)
 
     def _take_uncoded(self, *, until_ns: int | None) -> None:
         while self._uncoded:
             tick, capture_ns = self._uncoded[0]
-            if until_ns is not None and capture_ns + self._behind_ns > until_ns:
+            at_ns = capture_ns + self._behind_ns
+            if until_ns is not None and at_ns > until_ns:
                 return
             self._uncoded.popleft()
-            self._take_list(tick)
+            self._take_list(tick, at_ns=at_ns)
 
-    def _take_list(self, tick: int) -> None:
+    def _take_list(self, tick: int, *, at_ns: int) -> None:
         """What an operator is shown at a tick of which no picture comes."""
         if self._decoded:
             self._note(self._session.sight.list_at(tick))
-        self.lists[tick] = self._newest
+        self._put_down(tick, at_ns=at_ns)
+
+    def _put_down(self, tick: int, *, at_ns: int, detections: FrameView | None = None) -> None:
+        self.lists[tick] = self._record.complete(
+            self._newest, lists=self.lists, at_ns=at_ns, detections=detections
+        )
 
     def _heard_by(self, emit: Callable[[Event], None]) -> Callable[[Event], None]:
         def tell(event: Event) -> None:
             if isinstance(event, Overlay):
                 self._note(event)
+            elif isinstance(event, Refinement):
+                self._record.refinement(event, at_ns=self._now_ns)
             emit(event)
 
         return tell
 
     def _note(self, overlay: Overlay) -> None:
-        boxes = self._view.to_source(overlay.boxes_base_px)
-        limits = np.array([*self._view.source_size, *self._view.source_size], np.float32)
-        self._newest = Listed(np.clip(boxes, 0, limits), tuple(overlay.classes))
+        tracks = self._watch.listed
+        assert tracks is not None, "a list was made of some"
+        self._newest = self._record.listed(overlay, tracks)

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from operator import eq
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from hvt_common.values import Boxes
-from hvt_common.vision.boxes import iou
+from hvt_study.metrics.match import matched_rows
 
 __all__ = ["ListScore", "Listed", "score_lists"]
 
-_IOU = 0.5
 _IGNORED_SHARE = 0.5
 """A box with so much of it in one ignored region is neither right nor wrong."""
 
@@ -92,24 +90,12 @@ def score_lists(
 
 
 def _tick(truth: Listed, shown: Listed, same_class: Callable[[str, str], bool]) -> ListScore:
-    matches = _matches(truth.boxes_base_px, shown.boxes_base_px)
+    matches = matched_rows(truth.boxes_base_px, shown.boxes_base_px).tolist()
     right = sum(same_class(shown.classes[column], truth.classes[row]) for row, column in matches)
     free = np.ones(len(shown.classes), bool)
     free[[column for _, column in matches]] = False
     passed_over = int(_inside(shown.boxes_base_px[free], truth.ignored_base_px).sum())
     return ListScore(len(matches), right, len(truth.classes), len(shown.classes) - passed_over)
-
-
-def _matches(wanted: Boxes, shown: Boxes) -> list[tuple[int, int]]:
-    """(row of the truth, row of what is shown)."""
-    if not len(wanted) or not len(shown):
-        return []
-    overlap = iou(wanted, shown)
-    # A pair that counts is worth more than any sum of overlaps.
-    value = np.where(overlap >= _IOU, overlap + min(overlap.shape), 0.0)
-    rows, columns = linear_sum_assignment(value, maximize=True)
-    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-    return [(row, column) for row, column in pairs if overlap[row, column] >= _IOU]
 
 
 def _inside(boxes: Boxes, regions: Boxes) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import csv
-from collections import Counter, defaultdict
+import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from hvt_common.errors import UserError
-from hvt_common.vision.boxes import iou
+from hvt_study.metrics.classes import class_score
+from hvt_study.metrics.contract import NO_ID, FrameLabels, FrameView, Tick
 
 __all__ = ["Labelled", "Score", "read_tracks", "read_truth", "score"]
 
 SMALL_SHARE = 0.0012
 """Objects of less than this share of the frame count as small: about 33x33 pixels of 1280x720."""
-_IOU = 0.5
 _LEAST_VISIBLE = 0.5
 
 
@@ -88,57 +88,34 @@ def score(
     frames: Sequence[int] = (),
 ) -> Score:
     """Match tracks to objects frame by frame and count; ``frames`` limits it to some (default: all of the truth)."""
-    pairs: Counter[tuple[str, str]] = Counter()
-    small: Counter[bool] = Counter()
-    missed: Counter[str] = Counter()
-    unmatched: Counter[str] = Counter()
-    for frame in frames or sorted(truth):
-        wanted = truth.get(frame, _labelled([]))
-        found = tracks.get(frame, _labelled([]))
-        matches = _match(wanted, found)
-        areas = np.prod(wanted.boxes_xyxy_px[:, 2:] - wanted.boxes_xyxy_px[:, :2], axis=1)
-        for row, name in enumerate(wanted.classes):
-            if row not in matches:
-                missed[name] += 1
-                continue
-            said = found.classes[matches[row]]
-            pairs[name, said] += 1
-            if areas[row] < SMALL_SHARE * frame_area_px:
-                small[said == name] += 1
-        unmatched.update(said for row, said in enumerate(found.classes) if row not in matches.values())
-    return _counted(pairs, small=small, missed=missed, unmatched=unmatched)
-
-
-def _counted(
-    pairs: Counter[tuple[str, str]], *, small: Counter[bool], missed: Counter[str], unmatched: Counter[str]
-) -> Score:
-    matched = pairs.total()
-    objects = matched + missed.total()
-    right = sum(count for (name, said), count in pairs.items() if name == said)
-    f1 = []
-    for name in {name for name, _ in pairs} | set(missed):
-        hits = pairs[name, name]
-        actual = missed[name] + sum(count for (true, _), count in pairs.items() if true == name)
-        claimed = unmatched[name] + sum(count for (_, said), count in pairs.items() if said == name)
-        f1.append(2 * hits / max(1, actual + claimed))
+    nothing = _labelled([])
+    ticks = [
+        _tick(truth.get(frame, nothing), tracks.get(frame, nothing)) for frame in frames or sorted(truth)
+    ]
+    one = class_score(ticks, limits_px2=(SMALL_SHARE * frame_area_px, math.inf))
     return Score(
-        objects=objects,
-        recall=matched / max(1, objects),
-        top1=right / max(1, matched),
-        macro_f1=float(np.mean(f1)) if f1 else 0.0,
-        small_top1=small[True] / max(1, small.total()),
-        seen_right=right / max(1, objects),
+        objects=one.counts.labels,
+        recall=_or_zero(one.recall),
+        top1=_or_zero(one.counts.top1_found),
+        macro_f1=_or_zero(one.macro_f1_all),
+        small_top1=_or_zero(one.by_size["small"].top1_found),
+        seen_right=_or_zero(one.counts.top1_all),
     )
 
 
-def _match(wanted: Labelled, found: Labelled) -> dict[int, int]:
-    """Rows of the truth → rows of the tracks, one to one, most overlap in all, whatever the classes."""
-    if not wanted.classes or not found.classes:
-        return {}
-    overlap = iou(wanted.boxes_xyxy_px, found.boxes_xyxy_px)
-    rows, columns = linear_sum_assignment(np.where(overlap >= _IOU, -overlap, 0.0))
-    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-    return {row: column for row, column in pairs if overlap[row, column] >= _IOU}
+def _tick(wanted: Labelled, found: Labelled) -> Tick:
+    ids = np.full(len(found.classes), NO_ID, np.int64)
+    labels = FrameLabels(
+        wanted.boxes_xyxy_px.astype(np.float32),
+        np.full(len(wanted.classes), NO_ID, np.int64),
+        wanted.classes,
+    )
+    boxes, sure = found.boxes_xyxy_px.astype(np.float32), np.ones(len(ids), np.float32)
+    return labels, FrameView(boxes, ids, found.classes, sure, found.classes)
+
+
+def _or_zero(value: float) -> float:
+    return 0.0 if math.isnan(value) else value
 
 
 def _labelled(rows: Sequence[tuple[list[float], str]]) -> Labelled:

@@ -1,9 +1,14 @@
-"""The clip that all flights of one comparison fly over: its pictures, opened once, and what is really in them."""
+"""The clip that all flights of one comparison fly over: its pictures, opened once, and what is really in them.
+
+A clip is small, and it can be sent to another process: the pictures are read when they are played, one at a time,
+from the source or from a file of raw pixels that processes share (`stage_clip`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -18,20 +23,31 @@ from hvt_edge.sources.demo import DemoSource
 from hvt_study.list_score import Listed
 from hvt_study.virtual_camera import SCHEME, open_camera
 
-__all__ = ["TICK_FPS", "Clip", "TickSource", "clip_name", "share_clip"]
+__all__ = [
+    "DEMO_LEAST_VISIBLE",
+    "TICK_FPS",
+    "Clip",
+    "TickSource",
+    "clip_name",
+    "share_clip",
+    "stage_clip",
+    "staged_bytes",
+]
 
 TICK_FPS = 15.0
 """At so many ticks a second the list of the ground is judged, whatever is coded."""
 _ANY_SIZE = (64, 64)  # of base frames, which are made for each flight anew
-_LEAST_VISIBLE = 0.5
+DEMO_LEAST_VISIBLE = 0.5
+"""An object of the demo of which less is to be seen is not asked for."""
 _MOST_SHARED_BYTES = 4 << 30
 
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Pictures at `TICK_FPS`, in a file that all processes map, or read again from the source where that is large."""
+    """Pictures at `TICK_FPS`, in a file that processes share, or read again from the source where that is large."""
 
     spec: str
+    """What ``--source`` takes, if it ends by itself: a video, a folder of images, ``demo``; or ``still:PICTURE``."""
     source_size: tuple[int, int]
     """(width, height) in pixels."""
     ticks: int
@@ -41,15 +57,26 @@ class Clip:
     """What is in each picture, boxes in *source* pixels; None where the source does not know."""
     class_names: tuple[str, ...] = ()
     """Of the truth."""
+    source_fps: float | None = None
+    """Rate at which the images of a folder were taken, or one that overrides a video's time stamps; None: 15 for a
+    folder, the video's own."""
+    seed: int = 0
+    """Of the demo's scene, or of the way of the camera over a picture."""
 
-    def images(self) -> Iterator[Image]:
+    def images(self) -> Generator[Image, None, None]:
         """Every picture, in order."""
         if self.pixels is None:
-            yield from _open(self.spec, most=self.ticks).images()
+            yield from _open(
+                self.spec, most=self.ticks, source_fps=self.source_fps, seed=self.seed, annotated=False
+            ).images()
             return
         wide, high = self.source_size
-        shape = (self.ticks, high, wide, 3)
-        yield from np.memmap(self.pixels, np.uint8, mode="r", shape=shape)
+        with self.pixels.open("rb") as file:  # not mapped: what is resident would grow with the clip
+            for _ in range(self.ticks):
+                image = np.empty((high, wide, 3), np.uint8)
+                if file.readinto(image.data.cast("B")) < image.nbytes:
+                    return
+                yield image
 
 
 class TickSource(Source):
@@ -106,6 +133,36 @@ def share_clip(spec: str, *, max_frames: int | None, folder: Path) -> Clip:
     return Clip(spec, size, len(truth), path, known or None, names)
 
 
+def stage_clip(clip: Clip, *, folder: Path) -> Clip:
+    """The clip with its pixels in a file in ``folder``, which is there, so that every flight need not decode or draw.
+
+    The very same clip where it is large (over 4 GiB), or the disk is full; nothing is left behind then.
+    """
+    if not staged_bytes(clip):
+        return clip
+    path = folder / "clip.bgr"
+    count = 0
+    try:
+        with path.open("wb") as file, closing(clip.images()) as images:
+            for image in images:
+                file.write(np.ascontiguousarray(image).data)
+                count += 1
+    except OSError:
+        path.unlink(missing_ok=True)
+        return clip
+    if not count:
+        path.unlink()
+        return clip
+    return replace(clip, pixels=path, ticks=min(count, clip.ticks))
+
+
+def staged_bytes(clip: Clip) -> int:
+    """What `stage_clip` takes of its folder, if there is room; 0 where it leaves the clip as it is."""
+    wide, high = clip.source_size
+    size_bytes = clip.ticks * wide * high * 3
+    return 0 if clip.pixels is not None or size_bytes > _MOST_SHARED_BYTES else size_bytes
+
+
 @dataclass(frozen=True, slots=True)
 class _Reel:
     images: Callable[[], Iterator[Image]]
@@ -113,14 +170,23 @@ class _Reel:
     """Of one of them, in its pixels."""
 
 
-def _open(spec: str, *, most: int | None) -> _Reel:
+def _open(
+    spec: str,
+    *,
+    most: int | None,
+    source_fps: float | None = None,
+    seed: int = 0,
+    annotated: bool = True,
+) -> _Reel:
     if spec.startswith(SCHEME):
-        camera = open_camera(spec, fps=TICK_FPS)
+        camera = open_camera(spec, fps=TICK_FPS, seed=seed, annotated=annotated)
         return _Reel(
             lambda: islice(camera.images(), most),
             lambda index: None if (seen := camera.truth(index)) is None else Listed(*seen),
         )
-    source = open_source(spec, size=_ANY_SIZE, fps=TICK_FPS, max_frames=most)
+    source = open_source(
+        spec, size=_ANY_SIZE, fps=TICK_FPS, max_frames=most, source_fps=source_fps, seed=seed
+    )
     if source.live:
         source.close()
         raise UserError(f"clip {spec!r} is live: give a file, a folder of images, demo or {SCHEME}PICTURE")
@@ -132,6 +198,6 @@ def _open(spec: str, *, most: int | None) -> _Reel:
 
 def _demo_truth(source: DemoSource, index: int) -> Listed:
     truth, names = source.scene.truth(index / TICK_FPS), source.scene.class_names
-    asked = truth.visible >= _LEAST_VISIBLE
+    asked = truth.visible >= DEMO_LEAST_VISIBLE
     kinds = tuple(names[kind] for kind in truth.class_ids[asked].tolist())
     return Listed(truth.boxes_source_px[asked], kinds, truth.boxes_source_px[~asked])

@@ -7,11 +7,12 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.values import Boxes
 from hvt_common.vision.detect import Detector
 from hvt_edge.methods.selectors import SELECTORS, select
 from hvt_edge.source import Source
@@ -26,8 +27,8 @@ _INPUT_COLUMNS = ("frame", "x1", "y1", "x2", "y2", "conf", "class")
 class RawDetections:
     """What a detector said of one frame, in its order."""
 
-    boxes_xyxy_px: Boxes
-    """(N, 4)."""
+    boxes_xyxy_px: npt.NDArray[Any]
+    """(N, 4) float32 of a detector, float64 of a table: the limits of sides and areas are met to the last ROI."""
     confidences: tuple[float, ...]
     class_names: tuple[str, ...]
 
@@ -64,15 +65,15 @@ def read_csv(path: Path) -> dict[int, RawDetections]:
     """Read raw detections, columns ``frame,x1,y1,x2,y2,conf,class`` with a header, by frame in the file's order."""
     grouped: dict[int, list[tuple[list[float], float, str]]] = {}
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with path.open(encoding="utf-8-sig", newline="") as file:
             for number, line in enumerate(_rows(file, path), start=2):
                 frame, box, confidence, name = _parsed(line, path=path, number=number)
                 grouped.setdefault(frame, []).append((box, confidence, name))
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path} cannot be read ({error}): give a CSV file of detections") from None
     return {
         frame: RawDetections(
-            np.array([box for box, _, _ in found], np.float32).reshape(-1, 4),
+            np.array([box for box, _, _ in found], np.float64).reshape(-1, 4),
             tuple(confidence for _, confidence, _ in found),
             tuple(name for _, _, name in found),
         )

@@ -60,7 +60,8 @@ def test_regions_without_labels_are_known(picture):
     """What VisDrone says nothing about must not count as a false alarm."""
     found = read_annotations(picture.with_suffix(".txt"))
     assert found.classes == ("car",)
-    assert found.ignored_px.tolist() == [[10, 10, 60, 60], [500, 300, 520, 320]]
+    assert found.ignored_px.tolist() == [[10, 10, 60, 60]]
+    assert found.beside_px.tolist() == [[500, 300, 520, 320]]  # a single object: boxes on it alone
     camera = VirtualCamera(picture)
     assert sum(len(camera.truth(index)[2]) for index in range(0, 200, 20)) > 0
 

@@ -55,6 +55,7 @@ def test_known_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (DETECTIONS + "7,0,0,nan,9,0.5,car\n", "not finite"),
         (DETECTIONS + "7,0,0,x,9,0.5,car\n", "line 8"),
         (DETECTIONS + "7,0\n", "line 8"),
+        (DETECTIONS + f"7,0,0,9,9,0.5,{'x' * 200_000}\n", "cannot be read (field larger than field limit"),
     ],
 )
 def test_a_wrong_file_is_one_sentence(
@@ -67,6 +68,44 @@ def test_a_wrong_file_is_one_sentence(
     assert said in capsys.readouterr().err
     assert main(["sweep", str(source)]) == 2
     assert "--size is missing" in capsys.readouterr().err
+
+
+def test_numbers_stay_as_they_are_written(tmp_path: Path) -> None:
+    """A side of 11.999999999999998 is below the limit of 12 in every other program; the selectors must agree."""
+    source = tmp_path / "detections.csv"
+    head = DETECTIONS.partition("\n")[0]
+    source.write_text(f"{head}\n0,8.4,8.4,20.4,20.4,0.9,car\n1,100,100,112,112,0.9,car\n")
+    assert 20.4 - 8.4 < 12
+    assert main(["sweep", str(source), "--size", "1280x720", "--out", str(tmp_path)]) == 0
+    assert {name: int(row["selected"]) for name, row in rows_of(tmp_path).items()} == {
+        "permissive": 2,
+        "conf_size_top1": 1,
+        "strict_small_only": 1,
+        "balanced_top2": 1,
+    }
+
+
+def test_a_table_of_a_spreadsheet(tmp_path: Path) -> None:
+    """Some write a byte order mark before the first name."""
+    source = tmp_path / "detections.csv"
+    source.write_text(DETECTIONS, encoding="utf-8-sig")
+    assert len(read_csv(source)) == 3
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("--confidence", "0.5"), ("--nms-iou", "0.5"), ("--detect-every", "5"), ("--detector", "aerial-nano")],
+)
+def test_what_has_no_say_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, str]
+) -> None:
+    """Who asks for confident detections alone must not get a table of all."""
+    source = tmp_path / "detections.csv"
+    source.write_text(DETECTIONS)
+    assert main(["sweep", str(source), "--size", "640x480", *words]) == 2
+    assert f"{words[0]} has no say over {source}" in capsys.readouterr().err
+    assert main(["sweep", str(tmp_path / "a.mp4"), "--detector", "aerial-nano", "--size", "640x480"]) == 2
+    assert "--size has no say" in capsys.readouterr().err
 
 
 @pytest.mark.realdata

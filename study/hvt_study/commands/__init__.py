@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from typing import Final, Protocol
 
-from hvt_study.commands import score, sight, sweep, track
+from hvt_study.commands import plan, report, run, score, sight, sweep, track, tune
 
 __all__ = ["COMMANDS", "Command"]
 
@@ -27,6 +27,10 @@ class Command(Protocol):
 
 
 COMMANDS: Final[dict[str, Command]] = {
+    "plan": plan,
+    "run": run,
+    "report": report,
+    "tune": tune,
     "score": score,
     "sight": sight,
     "sweep": sweep,

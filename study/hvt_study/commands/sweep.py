@@ -23,6 +23,11 @@ __all__ = ["SUMMARY", "add_arguments", "run"]
 
 _ANY_SIZE = (64, 64)  # of base frames, which the sweep does not look at
 
+_USUAL = {"detect_every": 5, "confidence": 0.25, "nms_iou": 0.45}
+"""Of a clip."""
+_OF_A_CLIP = ("detector", *_USUAL)
+_OF_A_TABLE = ("size",)
+
 SUMMARY = "Apply the pilot's four selectors to raw detections and print what each keeps."
 
 
@@ -40,9 +45,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--size", metavar="WxH", default=argparse.SUPPRESS, help="for a CSV file: size of the frames"
     )
-    parser.add_argument("--detect-every", type=int, default=5, metavar="N", help="frames of the clip")
-    parser.add_argument("--confidence", type=float, default=0.25, help="least confidence of a raw detection")
-    parser.add_argument("--nms-iou", type=float, default=0.45, help="overlap above which two boxes are one")
+    parser.add_argument(
+        "--detect-every",
+        type=int,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help=f"for a clip: one frame in so many (default: {_USUAL['detect_every']})",
+    )
+    parser.add_argument(
+        "--confidence",
+        type=float,
+        default=argparse.SUPPRESS,
+        help=f"for a clip: least confidence of a raw detection (default: {_USUAL['confidence']:g})",
+    )
+    parser.add_argument(
+        "--nms-iou",
+        type=float,
+        default=argparse.SUPPRESS,
+        help=f"for a clip: overlap above which two boxes are one (default: {_USUAL['nms_iou']:g})",
+    )
     parser.add_argument(
         "--out", type=Path, default=argparse.SUPPRESS, metavar="DIR", help="also write sweep.csv"
     )
@@ -63,6 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _from_csv(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections], float]:
+    _refuse(arguments, _OF_A_CLIP, "a table of detections")
     if not hasattr(arguments, "size"):
         raise UserError(
             f"--size is missing: {arguments.source} does not say how large its frames are, for example 1280x720"
@@ -72,21 +94,30 @@ def _from_csv(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections], 
 
 
 def _from_clip(arguments: argparse.Namespace) -> tuple[dict[int, RawDetections], float]:
+    _refuse(arguments, _OF_A_TABLE, "a clip and says its size")
     if not hasattr(arguments, "detector"):
         raise UserError(f"--detector is missing: {arguments.source} is a clip, give FILE.onnx")
-    if arguments.detect_every < 1:
-        raise UserError(
-            f"--detect-every {arguments.detect_every} is not accepted: give a whole number from 1"
-        )
-    detector = open_detector(arguments.detector, confidence=arguments.confidence, nms_iou=arguments.nms_iou)
+    said = {**_USUAL, **vars(arguments)}
+    every = said["detect_every"]
+    if every < 1:
+        raise UserError(f"--detect-every {every} is not accepted: give a whole number from 1")
+    detector = open_detector(said["detector"], confidence=said["confidence"], nms_iou=said["nms_iou"])
     with open_source(str(arguments.source), size=_ANY_SIZE, fps=_own_rate(arguments.source)) as source:
         found = track(
-            detect_clip(source, detector, every=arguments.detect_every),
+            detect_clip(source, detector, every=every),
             description="detecting",
-            total=None if source.frame_count is None else -(-source.frame_count // arguments.detect_every),
+            total=None if source.frame_count is None else -(-source.frame_count // every),
             transient=True,
         )
         return dict(found), float(source.view.source_size[0] * source.view.source_size[1])
+
+
+def _refuse(arguments: argparse.Namespace, names: Sequence[str], what: str) -> None:
+    """What would have no effect is a misunderstanding."""
+    for name in names:
+        if hasattr(arguments, name):
+            flag = "--" + name.replace("_", "-")
+            raise UserError(f"{flag} has no say over {arguments.source}, which is {what}: leave it out")
 
 
 def _own_rate(path: Path) -> float:

@@ -1,0 +1,84 @@
+"""``hvt-study plan``: how many runs, bytes and hours a study would take."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from typing import TYPE_CHECKING
+
+from hvt_common.errors import UserError
+from hvt_common.report import print_table
+from hvt_study.commands.study_arguments import (
+    add_accounting,
+    add_plan_arguments,
+    add_pool_arguments,
+    jobs_of,
+    open_sequences,
+    study_plan,
+)
+
+if TYPE_CHECKING:
+    from hvt_study.matrix.estimate import Estimate
+
+__all__ = ["SUMMARY", "add_arguments", "hours_in_words", "run"]
+
+SUMMARY = "Say how many runs, bytes and hours `hvt-study run` with the same arguments would take."
+_MANY_JOBS = 16
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Those of ``run``, so that one line can be both."""
+    add_plan_arguments(parser, writes=False)
+    add_accounting(parser, default="span")
+    add_pool_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure a tick, count, print. Nothing is written."""
+    try:
+        from hvt_study.matrix.estimate import estimate, time_of_a_tick  # noqa: PLC0415 - other commands do without
+    except ImportError as error:
+        raise UserError(f"a study needs {error.name}: pip install 'hvt[study]'") from None
+    jobs = [jobs_of(arguments)] if hasattr(arguments, "jobs") else [1, os.cpu_count() or 1, _MANY_JOBS]
+    sequences = open_sequences(arguments)
+    plan = study_plan(arguments, sequences)
+    tick_s = time_of_a_tick(plan)
+    found = estimate(plan, tuple(sequence for _, sequence in sequences), tick_s=tick_s)
+    print_table("The study", _lines(found, tick_s=tick_s, jobs=tuple(dict.fromkeys(jobs))))
+    return 0
+
+
+def _lines(found: Estimate, *, tick_s: float, jobs: tuple[int, ...]) -> list[tuple[str, str]]:
+    return [
+        ("sequences", f"{found.sequences}"),
+        ("ticks, 15 a second", f"{found.ticks}"),
+        ("runs", f"{found.runs}"),
+        ("pictures and annotations", _bytes(found.source_bytes)),
+        ("cache, up to about", _bytes(found.cache_bytes)),
+        ("temporary files of each process", _bytes(found.scratch_bytes)),
+        ("one tick of a flight", f"{1e3 * tick_s:.0f} ms"),
+        *(
+            (f"hours with {many} process{'es' * (many > 1)}", hours_in_words(found.hours(many)))
+            for many in jobs
+        ),
+    ]
+
+
+def hours_in_words(hours: float) -> str:
+    """What is short in a unit in which it is a number: 0.0 hours say nothing."""
+    if hours >= 1:
+        return f"{hours:.1f}"
+    seconds = 3600 * hours
+    if seconds >= 1:
+        short = f"{seconds / 60:.0f} minutes" if seconds >= 120 else f"{seconds:.0f} s"
+    else:
+        short = "less than 1 s"
+    return f"{hours:.4f} ({short})"
+
+
+def _bytes(count: float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}"
+        count /= 1000
+    return f"{count:.1f} GB"

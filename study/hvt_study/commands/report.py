@@ -1,0 +1,55 @@
+"""``hvt-study report``: the pages and figures of a study, made again from its table."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_common.report import say
+from hvt_study.commands.study_arguments import add_accounting
+
+__all__ = ["SUMMARY", "add_arguments", "run"]
+
+SUMMARY = (
+    "Make report.html, report.md and figures again from a study's results.parquet, or of several joined."
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The study's folder, or several that are to be one."""
+    parser.add_argument(
+        "folders",
+        nargs="+",
+        type=Path,
+        metavar="DIR",
+        help="with results.parquet; sweep.csv of hvt-study sweep is taken in where it is there",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=argparse.SUPPRESS,
+        metavar="DIR",
+        help="write there, with one results.parquet of all; needed where there are several (default: DIR itself)",
+    )
+    add_accounting(parser, default=argparse.SUPPRESS)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write them; say where."""
+    try:
+        from hvt_study.report.join import join_studies  # noqa: PLC0415 - the other commands do without
+        from hvt_study.report.write import write_report  # noqa: PLC0415
+    except ImportError as error:
+        raise UserError(f"the report needs {error.name}: pip install 'hvt[study]'") from None
+    out: Path | None = getattr(arguments, "out", None)
+    if out is not None:
+        join_studies(arguments.folders, out)
+    elif len(arguments.folders) > 1:
+        raise UserError(
+            f"{len(arguments.folders)} studies are given, and no place for the one: add --out DIR"
+        )
+    where = arguments.folders[0] if out is None else out
+    write_report(where, accounting=getattr(arguments, "accounting", None))
+    say(str(where / "report.html"))
+    return 0

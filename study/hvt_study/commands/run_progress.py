@@ -1,0 +1,76 @@
+"""How far a study is: a bar on a terminal, elsewhere a line a minute, so that logs stay short."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from datetime import timedelta
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+__all__ = ["RunProgress", "time_left_s"]
+
+_LINE_EVERY_S = 60
+_REMEMBERED = 64
+
+
+class RunProgress:
+    """Of ``what``, such as runs. The time left is told by how fast the last ones were done."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._console = Console(stderr=True, highlight=False)
+        self._began_s = self._said_s = time.monotonic()
+        self._steps: deque[tuple[float, int]] = deque([(self._began_s, 0)], maxlen=_REMEMBERED)
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[more]}"),
+            console=self._console,
+            transient=True,
+        )
+        self._task = self._bar.add_task(what, total=None, more="")
+
+    def update(self, done: int, of: int, *, failed: int = 0) -> None:
+        """So many are done, of so many."""
+        now_s = time.monotonic()
+        self._steps.append((now_s, done))
+        more = self._more(of, failed)
+        self._bar.update(self._task, completed=done, total=of, more=more)
+        if not self._console.is_terminal and (now_s - self._said_s >= _LINE_EVERY_S or done == of):
+            self._said_s = now_s
+            gone = timedelta(seconds=round(now_s - self._began_s))
+            self.note(f"{self._what}: {done} of {of} in {gone}" + f", {more}" * bool(more))
+
+    def note(self, text: str) -> None:
+        """Say something that stays."""
+        self._console.print(text, markup=False, soft_wrap=True)
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._console.is_terminal:
+            self._bar.stop()
+
+    def _more(self, of: int, failed: int) -> str:
+        left_s = time_left_s(self._steps, of)
+        words = [f"{failed} failed"] if failed else []
+        if left_s:
+            words.append(f"about {timedelta(seconds=round(left_s))} left")
+        return ", ".join(words)
+
+
+def time_left_s(steps: deque[tuple[float, int]], of: int) -> float:
+    """From (time, done) of the last steps, oldest first, to the end; 0 where nothing is to be done."""
+    (first_s, first), (last_s, last) = steps[0], steps[-1]
+    return (last_s - first_s) / (last - first) * (of - last) if last > first else 0.0

@@ -1,0 +1,116 @@
+"""``hvt-study tune``: better weights for a method, judged on sequences that the search has not seen."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+from hvt_common.errors import UserError
+from hvt_common.report import write_json
+from hvt_study.commands.run_progress import RunProgress
+from hvt_study.commands.study_arguments import (
+    add_plan_arguments,
+    add_pool_arguments,
+    make_out,
+    open_pool,
+    open_sequences,
+    study_plan,
+)
+
+if TYPE_CHECKING:
+    from hvt_study.matrix.tune import Tuned
+
+__all__ = ["SUMMARY", "add_arguments", "run"]
+
+SUMMARY = "Search for a method's parameters on some sequences; report what they are worth on others."
+_MOST_TRIALS = 100_000
+_HIGHEST_SEED = 2**32 - 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Those of ``run``, and what to search."""
+    add_plan_arguments(parser, methods=False)
+    add_pool_arguments(parser)
+    parser.add_argument("--method", required=True, help="the one to tune, such as M5")
+    parser.add_argument(
+        "--parameters", default="", metavar="NAME,…", help="which of its parameters (default: all)"
+    )
+    parser.add_argument("--trials", type=int, default=40, metavar="N", help="proposals that are flown")
+    parser.add_argument(
+        "--held-out", type=float, default=0.34, metavar="SHARE", help="of the sequences, for the report alone"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the search")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Search, print, write tune.json."""
+    try:
+        from hvt_study.matrix.tune import split, tunable, tune  # noqa: PLC0415 - Optuna is an extra
+    except ImportError as error:
+        raise UserError(f"tuning needs {error.name}: pip install 'hvt[study]'") from None
+    if not 1 <= arguments.trials <= _MOST_TRIALS:
+        raise UserError(
+            f"--trials {arguments.trials} is not accepted: give a whole number from 1 to {_MOST_TRIALS}"
+        )
+    if not 0 <= arguments.seed <= _HIGHEST_SEED:
+        raise UserError(
+            f"--seed {arguments.seed} is not accepted: give a whole number from 0 to {_HIGHEST_SEED}"
+        )
+    names = [word.strip() for word in arguments.parameters.split(",") if word.strip()]
+    parameters = tunable(arguments.method, names)
+    plan = study_plan(arguments, open_sequences(arguments))
+    if len(plan.still_codecs) > 1:
+        raise UserError(
+            f"--still-codecs {arguments.still_codecs} are several: parameters are searched for one, name it"
+        )
+    train, held_out = split(plan.sequences, held_out=arguments.held_out)
+    written = make_out(arguments.out, name="tune.json")
+    pool, _ = open_pool(arguments)
+    progress = RunProgress(f"{arguments.method}, trials")
+
+    def on_trial(number: int, worth: float, best: float) -> None:
+        progress.note(f"trial {number}: {worth:.4f}, best {best:.4f}")
+        progress.update(number, arguments.trials)
+
+    with progress, pool as workers:
+        found = tune(
+            plan,
+            method=arguments.method,
+            parameters=parameters,
+            train=train,
+            held_out=held_out,
+            trials=arguments.trials,
+            pool=workers,
+            seed=arguments.seed,
+            on_trial=on_trial,
+        )
+    try:
+        write_json(written, {**asdict(found), "held_out_gain": found.gain})
+    except OSError as error:
+        raise UserError(f"{written} cannot be written ({error.strerror}): name another --out") from None
+    _print(found, written)
+    return 0
+
+
+def _print(found: Tuned, written: Path) -> None:
+    console = Console(highlight=False)
+    table = Table(title="held out: objects shown with their class, of all", title_justify="left", box=None)
+    for head in ("sequence", "regime", "default", "tuned", "kbps", "kbps"):
+        table.add_column(head, justify="left" if head in ("sequence", "regime") else "right")
+    for one in found.held_out:
+        rates = f"{one.default_bps / 1e3:.0f}", f"{one.tuned_bps / 1e3:.0f}"
+        table.add_row(one.sequence, one.regime, f"{one.default:.4f}", f"{one.tuned:.4f}", *rates)
+    console.print(table)
+    flags = ",".join(f"{name}={value:g}" for name, value in found.parameters.items())
+    console.print(
+        f"training {found.train_default:.4f} to {found.train_tuned:.4f}, held out {found.gain:+.4f}: "
+        f"--method {found.method} --tune {flags}"
+    )
+    console.print(
+        f"against video of the same bits: hvt-study run … --methods M0,{found.method} --tune {written}"
+    )

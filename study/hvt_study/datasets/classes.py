@@ -1,0 +1,135 @@
+"""Which class of a detector or classifier speaks of which class of a dataset.
+
+Names are compared by kind (`hvt_common.vision.class_names`): COCO's ``person`` speaks of VisDrone's ``pedestrian``
+and ``people``, an ImageNet ``pickup`` of UAVDT's ``truck``. Within one kind names stay apart where model and dataset
+have the very same ones, else they become one word. Where a dataset has one class of a kind, that is the word.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from hvt_common.errors import UserError
+from hvt_common.vision.class_names import MOVING, kind_of
+from hvt_common.vision.labels import first_synonym
+
+__all__ = ["ClassMap", "map_classes"]
+
+_VEHICLE = "vehicle"
+_VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
+"""What a dataset means that calls all of them so."""
+_SHOWN = 12
+
+
+@dataclass(frozen=True, slots=True)
+class ClassMap(Mapping[str, tuple[str, ...]]):
+    """Model class → classes of the dataset that it speaks of; classes that speak of none are not in it."""
+
+    spoken: Mapping[str, tuple[str, ...]]
+    words: Mapping[str, str]
+    """Word in which a name is compared, for all names of model and dataset that have a partner."""
+    unmatched_dataset: tuple[str, ...]
+    """Classes of the dataset of which the model cannot speak, sorted."""
+    unmatched_model: tuple[str, ...]
+    """Classes of the model that the dataset does not have, sorted."""
+
+    def __getitem__(self, name: str) -> tuple[str, ...]:
+        return self.spoken[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.spoken)
+
+    def __len__(self) -> int:
+        return len(self.spoken)
+
+    def word(self, name: str) -> str:
+        """The word in which a name of either side is compared; its own plain form where it has no partner."""
+        return self.words.get(name) or _plain(name)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Words that both sides have, sorted: what metrics can be asked of."""
+        return tuple(sorted(set(self.words.values())))
+
+    def __str__(self) -> str:
+        """One line for logs and reports."""
+        merged: dict[str, set[str]] = defaultdict(set)
+        for names in self.spoken.values():
+            for name in names:
+                merged[self.words[name]].add(name)
+        text = _some(
+            [
+                word if names == {word} else f"{word} ({'+'.join(sorted(names))})"
+                for word, names in sorted(merged.items())
+            ]
+        )
+        if self.unmatched_dataset:
+            text += f"; the model has no {_some(self.unmatched_dataset)}"
+        if self.unmatched_model:
+            text += f"; the dataset has no {_some(self.unmatched_model)}"
+        return text
+
+
+def map_classes(model_names: Iterable[str], dataset_classes: Iterable[str]) -> ClassMap:
+    """Find the partners.
+
+    Args:
+        model_names: class names of a detector or classifier (VisDrone's ten, COCO's 80, ImageNet's 1000 …).
+        dataset_classes: `Sequence.class_set`.
+
+    Raises:
+        UserError: the two share no kind at all.
+    """
+    models, classes = tuple(dict.fromkeys(model_names)), tuple(dict.fromkeys(dataset_classes))
+    ours, theirs = _by_kind(models, classes), _by_kind(classes, classes)
+    spoken: dict[str, tuple[str, ...]] = {}
+    words: dict[str, str] = {}
+    for kind in ours.keys() & theirs.keys():
+        found, words_of = _pair(ours[kind], theirs[kind], kind=kind)
+        spoken |= found
+        words |= words_of
+    if MOVING in models and len(models) == 1:  # the motion detector does not say what it is that moves
+        spoken, words = {MOVING: classes}, dict.fromkeys((MOVING, *classes), MOVING)
+    if not spoken or not classes:
+        raise UserError(
+            f"the model's classes ({_some(models)}) and those of the dataset ({_some(classes)}) have nothing in "
+            "common: give a model of one of these kinds, or labels=reference"
+        )
+    return ClassMap(
+        spoken={name: spoken[name] for name in models if name in spoken},
+        words=words,
+        unmatched_dataset=tuple(sorted(name for name in classes if name not in words)),
+        unmatched_model=tuple(sorted(name for name in models if name not in spoken)),
+    )
+
+
+def _pair(
+    models: list[str], classes: list[str], *, kind: str
+) -> tuple[dict[str, tuple[str, ...]], dict[str, str]]:
+    """Of one kind: what each model class speaks of, and the word of every name."""
+    if len(classes) > 1 and {_plain(name) for name in models} == {_plain(name) for name in classes}:
+        named = {_plain(name): name for name in classes}
+        spoken: dict[str, tuple[str, ...]] = {name: (named[_plain(name)],) for name in models}
+        return spoken, {name: _plain(name) for name in (*models, *classes)}
+    word = _plain(classes[0]) if len(classes) == 1 else kind
+    return dict.fromkeys(models, tuple(classes)), dict.fromkeys((*models, *classes), word)
+
+
+def _by_kind(names: Collection[str], classes: Collection[str]) -> dict[str, list[str]]:
+    all_one = any(_plain(name) == _VEHICLE for name in classes)
+    found: dict[str, list[str]] = defaultdict(list)
+    for name in names:
+        kind = kind_of(name)
+        found[_VEHICLE if all_one and kind in _VEHICLES else kind].append(name)
+    return found
+
+
+def _plain(name: str) -> str:
+    return first_synonym(name).casefold()
+
+
+def _some(names: Collection[str]) -> str:
+    shown = ", ".join(list(names)[:_SHOWN])
+    return f"{shown} … {len(names)} in all" if len(names) > _SHOWN else shown or "none"

@@ -1,0 +1,151 @@
+"""All labels of a sequence as one table sorted by frame, and the small callable that finds them again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Boxes
+from hvt_study.datasets.labels import FrameLabels, covered_share, inside_frame
+
+__all__ = ["LabelTable", "Regions", "TableLabels", "file_stamp"]
+
+_COVERED = 0.5
+"""An object with so much of it in regions of which nothing is known does not count, as in VisDrone's toolkit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Regions:
+    """Boxes by frame that are not asked for: regions in which nothing counts, and single objects."""
+
+    frames: npt.NDArray[np.int64]
+    """(M,)"""
+    boxes: Boxes
+    """(M, 4)"""
+    land: npt.NDArray[np.bool_]
+    """(M,) True for regions whose objects nobody has labelled, False for a single object that does not count."""
+
+
+@dataclass(frozen=True, slots=True)
+class LabelTable:
+    """N objects and M regions of all frames, as parallel arrays sorted by frame; frame numbers as in the files."""
+
+    frames: npt.NDArray[np.int64]
+    boxes: Boxes
+    ids: npt.NDArray[np.int64]
+    class_ids: npt.NDArray[np.int64]
+    """Index into ``class_names``."""
+    class_names: tuple[str, ...]
+    ignored: Regions
+    occlusion: npt.NDArray[np.int8] | None = None
+    truncation: npt.NDArray[np.int8] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        frames: npt.NDArray[np.int64],
+        boxes: Boxes,
+        ids: npt.NDArray[np.int64],
+        class_ids: npt.NDArray[np.int64],
+        class_names: tuple[str, ...],
+        ignored: Regions,
+        size: tuple[int, int],
+        occlusion: npt.NDArray[np.int8] | None = None,
+        truncation: npt.NDArray[np.int8] | None = None,
+    ) -> LabelTable:
+        """From rows in any order: boxes are cut at the frame of this (width, height), empty ones left out."""
+        boxes, regions = inside_frame(boxes, size), inside_frame(ignored.boxes, size)
+        rows = _kept(frames, boxes)
+        places = _kept(ignored.frames, regions)
+        return cls(
+            frames=frames[rows],
+            boxes=boxes[rows],
+            ids=ids[rows],
+            class_ids=class_ids[rows],
+            class_names=class_names,
+            ignored=Regions(ignored.frames[places], regions[places], ignored.land[places]),
+            occlusion=None if occlusion is None else occlusion[rows],
+            truncation=None if truncation is None else truncation[rows],
+        )
+
+    @property
+    def class_set(self) -> tuple[str, ...]:
+        """All names that the annotations may use, whether they do or not, sorted."""
+        return tuple(sorted(self.class_names))
+
+    @property
+    def last_frame(self) -> int:
+        """The highest frame number; -1 where there is none."""
+        ends = [frames[-1] for frames in (self.frames, self.ignored.frames) if len(frames)]
+        return int(max(ends, default=-1))
+
+    def at(self, frame: int) -> FrameLabels:
+        """What is in a frame; objects mostly in unlabelled regions are left out."""
+        begin, end = np.searchsorted(self.frames, [frame, frame + 1])
+        first, last = np.searchsorted(self.ignored.frames, [frame, frame + 1])
+        boxes, regions = self.boxes[begin:end], self.ignored.boxes[first:last]
+        land = self.ignored.land[first:last]
+        counts = covered_share(boxes, regions[land]) < _COVERED
+        rows = begin + np.flatnonzero(counts)
+        return FrameLabels(
+            boxes_xyxy_px=self.boxes[rows],
+            ids=self.ids[rows],
+            class_names=tuple(self.class_names[kind] for kind in self.class_ids[rows].tolist()),
+            ignored_xyxy_px=regions[land],
+            beside_xyxy_px=regions[~land],
+            occlusion=None if self.occlusion is None else self.occlusion[rows],
+            truncation=None if self.truncation is None else self.truncation[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TableLabels:
+    """Labels by source frame, read from files when first asked for; the last few tables stay in memory."""
+
+    read: Callable[..., LabelTable]
+    """A function of a module."""
+    arguments: tuple[Hashable, ...]
+    """Its arguments; `Path`s among them are files."""
+    first_frame: int
+    """Number in the files of source frame 0."""
+
+    def __call__(self, index: int) -> FrameLabels:
+        """Of one source frame."""
+        return self.table().at(self.first_frame + index)
+
+    def table(self) -> LabelTable:
+        """All of them; `UserError` where a file is wrong."""
+        paths = (path for path in self.arguments if isinstance(path, Path))
+        return _read_once(self.read, self.arguments, tuple(file_stamp(path) for path in paths))
+
+
+@lru_cache(maxsize=4)
+def _read_once(
+    read: Callable[..., LabelTable],
+    arguments: tuple[Any, ...],
+    stamps: tuple[Any, ...],  # noqa: ARG001 - part of the key
+) -> LabelTable:
+    return read(*arguments)
+
+
+def file_stamp(path: Path) -> tuple[int, int]:
+    """Changes with the file; zeros where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0
+    return status.st_mtime_ns, status.st_size
+
+
+def _kept(frames: npt.NDArray[np.int64], boxes: Boxes) -> npt.NDArray[np.intp]:
+    """Rows whose boxes have an area, by frame and then as in the file."""
+    order = np.argsort(frames, kind="stable")
+    sides = boxes[order, 2:] - boxes[order, :2]
+    return order[(sides > 0).all(axis=1)]

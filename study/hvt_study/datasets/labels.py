@@ -1,0 +1,76 @@
+"""What is in one frame of a dataset, and which parts of it count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Boxes
+
+__all__ = ["NO_ID", "UNKNOWN", "FrameLabels", "covered_share", "inside_frame", "no_boxes"]
+
+NO_ID = -1
+"""Of an object whose dataset knows no identities."""
+UNKNOWN = -1
+"""Occlusion or truncation of which the dataset says nothing."""
+
+
+def no_boxes() -> Boxes:
+    """(0, 4) float32."""
+    return np.empty((0, 4), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLabels:
+    """N objects, M regions and P things to be passed over in one source frame; boxes in source pixels, inside it."""
+
+    boxes_xyxy_px: Boxes = field(default_factory=no_boxes)
+    """(N, 4) float32, x2 and y2 exclusive."""
+    ids: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    """(N,) the same for one object in all frames; `NO_ID` where the dataset knows none."""
+    class_names: tuple[str, ...] = ()
+    """N words of the dataset (car, van, truck, bus, pedestrian, people, bicycle, motor, tricycle …)."""
+    ignored_xyxy_px: Boxes = field(default_factory=no_boxes)
+    """(M, 4) float32: regions in which nothing counts, neither for nor against."""
+    beside_xyxy_px: Boxes = field(default_factory=no_boxes)
+    """(P, 4) float32: single objects that are not asked for. Boxes on them count neither for nor against; labels in
+    front of them are labels."""
+    occlusion: npt.NDArray[np.int8] | None = None
+    """(N,) 0 none, 1 partly, 2 heavily hidden, `UNKNOWN`; None where the dataset never says."""
+    truncation: npt.NDArray[np.int8] | None = None
+    """(N,) 0 wholly inside the frame, 1 partly outside, `UNKNOWN`; None where the dataset never says."""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def covered_share(boxes: Boxes, regions: Boxes) -> npt.NDArray[np.float64]:
+    """(N,) share of each box that the regions together cover; where regions overlap nothing counts twice.
+
+    The regions' edges cut the plane into a grid of cells, each of which is covered wholly or not at all.
+    """
+    if not len(boxes) or not len(regions):
+        return np.zeros(len(boxes))
+    xs, ys = np.unique(regions[:, [0, 2]]), np.unique(regions[:, [1, 3]])
+    left, right = regions[:, None, 0] <= xs[:-1], regions[:, None, 2] >= xs[1:]
+    above, below = regions[:, None, 1] <= ys[:-1], regions[:, None, 3] >= ys[1:]
+    covered = ((left & right)[:, :, None] & (above & below)[:, None, :]).any(axis=0)
+    wide = _shared(boxes[:, [0, 2]], xs)
+    high = _shared(boxes[:, [1, 3]], ys)
+    area = np.einsum("nx,xy,ny->n", wide, covered.astype(np.float64), high)
+    whole = (boxes[:, 2:] - boxes[:, :2]).astype(np.float64).prod(axis=1)
+    return np.asarray(area / np.maximum(whole, 1e-9), np.float64)
+
+
+def inside_frame(boxes: Boxes, size: tuple[int, int]) -> Boxes:
+    """The boxes cut at the edges of a frame of this (width, height)."""
+    return np.asarray(np.clip(boxes, 0, np.array([*size, *size], np.float32)), np.float32)
+
+
+def _shared(spans: npt.NDArray[np.float32], edges: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """(N, len(edges) - 1): how much of each span lies in each cell."""
+    first = np.maximum(spans[:, :1], edges[:-1])
+    last = np.minimum(spans[:, 1:], edges[1:])
+    return np.asarray(np.clip(last - first, 0, None), np.float64)

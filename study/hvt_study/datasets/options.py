@@ -1,0 +1,105 @@
+"""What may follow a dataset's path in its URI: ``?fps=24&labels=none``."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl
+
+from hvt_common.errors import UserError
+
+__all__ = ["Options", "parse_numbers", "split_options"]
+
+_MOST_SEEDS = 10_000
+_HIGHEST_SEED = 2**32 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """All of them; what is not given is as here."""
+
+    fps: float | None = None
+    """Rate at which the images were taken, other than the dataset's own."""
+    annotated: bool = True
+    """False with ``labels=none``: pictures alone."""
+    view: float | None = None
+    """Height that the virtual camera sees at its lowest, in heights of the picture."""
+    seeds: tuple[int, ...] = (0,)
+    """Of the virtual camera's ways; each gives sequences of its own."""
+
+
+def split_options(uri: str, place: str, *, accepted: Collection[str]) -> tuple[str, Options]:
+    """The path and the options of what follows the scheme.
+
+    Raises:
+        UserError: names the option that is not one, or its value.
+    """
+    path, mark, query = place.rpartition("?")
+    if not mark or Path(place).exists():
+        return place, Options()
+    pairs = parse_qsl(query, keep_blank_values=True)
+    given: dict[str, Any] = {}
+    for name, value in pairs:
+        if name not in accepted:
+            words = ", ".join(sorted(accepted)) or "none"
+            raise UserError(f"dataset {uri!r} has the unknown option {name!r}: accepted here are {words}")
+        field, parse = _OPTIONS[name]
+        given[field] = parse(uri, value)
+    return path, Options(**given)
+
+
+def parse_numbers(uri: str, text: str) -> tuple[int, ...]:
+    """``0-4`` or ``1,5`` or both, sorted, each once.
+
+    Raises:
+        UserError: for anything else, or more than can be meant.
+    """
+    numbers: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,10})(?:-([0-9]{1,10}))?\s*", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if last < first or last > _HIGHEST_SEED or last - first >= _MOST_SEEDS:
+            raise UserError(
+                f"dataset {uri!r} asks for the seeds {text!r}: accepted are whole numbers from 0 to {_HIGHEST_SEED}, "
+                f"at most {_MOST_SEEDS} of them, such as 0-4 or 1,5"
+            )
+        numbers |= set(range(first, last + 1))
+    return tuple(sorted(numbers))
+
+
+def _fps(uri: str, text: str) -> float:
+    return _number(uri, "fps", text, 0.1, 1000)
+
+
+def _view(uri: str, text: str) -> float:
+    return _number(uri, "view", text, 0.1, 3)
+
+
+def _annotated(uri: str, text: str) -> bool:
+    if text not in ("annotations", "none"):
+        raise UserError(f"dataset {uri!r} says labels={text}: accepted are annotations and none")
+    return text == "annotations"
+
+
+def _number(uri: str, name: str, text: str, least: float, most: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not least <= value <= most:
+        raise UserError(
+            f"dataset {uri!r} says {name}={text}: accepted is a number from {least:g} to {most:g}"
+        )
+    return value
+
+
+_OPTIONS: Mapping[str, tuple[str, Callable[[str, str], Any]]] = {
+    "fps": ("fps", _fps),
+    "labels": ("annotated", _annotated),
+    "view": ("view", _view),
+    "seeds": ("seeds", parse_numbers),
+}

@@ -1,0 +1,149 @@
+"""Reference labels: what a detector, and a classifier if wanted, say of the untouched source frames.
+
+The protocol of DDS, AccMPEG and Reducto: such labels say how much of what the model *could* have seen survives the
+link, not that the model was right. Answers are remembered by the pixels that were asked about (`CachedDetector`), so
+that a run that was killed does not ask twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.errors import UserError
+from hvt_common.values import Boxes, Image
+from hvt_common.vision.classify import Classifier
+from hvt_common.vision.detect import MOTION, Detector
+from hvt_common.vision.labels import first_synonym
+from hvt_common.vision.track import weak_confidence
+from hvt_edge.crop import PADDING, crop_box
+from hvt_edge.resample import Resizer
+from hvt_study.cached_detector import CachedDetector
+from hvt_study.datasets.contract import Sequence
+from hvt_study.datasets.labels import NO_ID, FrameLabels, inside_frame
+
+__all__ = ["CONFIDENCE", "ReferenceLabels", "open_reference_detector", "reference_labels", "with_labels"]
+
+CONFIDENCE = 0.25
+"""From which a detection is a label."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceLabels:
+    """Labels of those source frames that ticks show. Small, and it can be sent to another process."""
+
+    frames: Mapping[int, FrameLabels]
+    class_set: tuple[str, ...]
+    """All that the model can say, sorted."""
+
+    def __call__(self, index: int) -> FrameLabels:
+        """Of a source frame that a tick shows."""
+        return self.frames[index]
+
+    def pack(self) -> dict[str, Any]:
+        """As JSON holds it, without loss."""
+        frames = {
+            str(index): [one.boxes_xyxy_px.tolist(), list(one.class_names)]
+            for index, one in self.frames.items()
+        }
+        return {"class_set": list(self.class_set), "frames": frames}
+
+    @classmethod
+    def unpack(cls, packed: Mapping[str, Any]) -> ReferenceLabels:
+        """What `pack` gave."""
+        frames = {int(index): _labels(boxes, names) for index, (boxes, names) in packed["frames"].items()}
+        return cls(frames, tuple(packed["class_set"]))
+
+    def __or__(self, other: ReferenceLabels) -> ReferenceLabels:
+        """Those of both: chunks of one sequence that were labelled apart."""
+        return ReferenceLabels(
+            {**self.frames, **other.frames}, tuple(sorted({*self.class_set, *other.class_set}))
+        )
+
+
+def open_reference_detector(spec: str, *, provider: str, folder: Path) -> CachedDetector:
+    """The network that ``spec`` names, with its memory in ``folder``; it shares answers with the flights' own.
+
+    Raises:
+        UserError: no such model; or the motion detector, which knows no single frames.
+    """
+    if spec == MOTION:
+        raise UserError(f"reference labels cannot come from {MOTION!r}: give a detection network")
+    return CachedDetector(spec, confidence=weak_confidence(CONFIDENCE), provider=provider, folder=folder)
+
+
+def reference_labels(
+    sequence: Sequence,
+    *,
+    detector: Detector,
+    classifier: Classifier | None = None,
+    size: tuple[int, int] | None = None,
+    ticks: range | None = None,
+    on_tick: Callable[[int], None] = lambda _: None,
+) -> ReferenceLabels:
+    """Label the frames that ticks show, one at a time.
+
+    Args:
+        sequence: its own labels are not looked at.
+        detector: speaks of boxes and classes; its answers below `CONFIDENCE` are passed over.
+        classifier: names each box anew, by its crop with the margin of stills.
+        size: (width, height) to which frames are brought for the detector; None: as they are.
+        ticks: which of them, with step 1; None: all that the sequence plays.
+        on_tick: called with each when it is done.
+    """
+    chosen = range(sequence.ticks) if ticks is None else ticks
+    resizer = None if size is None else Resizer(sequence.source_size, size, fit="letterbox")
+    frames: dict[int, FrameLabels] = {}
+    with closing(sequence.clip.images()) as images:
+        for tick, image in zip(chosen, islice(images, chosen.start, chosen.stop), strict=False):
+            index = sequence.frame_at_tick(tick)
+            if index not in frames:
+                frames[index] = _label(np.asarray(image), detector, classifier, resizer)
+            on_tick(tick)
+    model = detector if classifier is None else classifier
+    return ReferenceLabels(frames, tuple(sorted({first_synonym(name) for name in model.class_names})))
+
+
+def with_labels(sequence: Sequence, labels: ReferenceLabels) -> Sequence:
+    """The sequence with these labels in place of its own."""
+    return replace(sequence, labels=labels, class_set=labels.class_set)
+
+
+def _label(
+    image: Image, detector: Detector, classifier: Classifier | None, resizer: Resizer | None
+) -> FrameLabels:
+    """(height, width, 3) BGR source pixels to labels in source pixels."""
+    frame = None if resizer is None else resizer.frame(image, index=0, capture_ns=0)
+    found = detector.detect(image if frame is None else frame.base_bgr)
+    sure = found.confidences >= CONFIDENCE
+    boxes = found.boxes_xyxy_px[sure]
+    if resizer is not None:
+        boxes = resizer.view.to_source(boxes)
+    boxes = inside_frame(boxes, (image.shape[1], image.shape[0]))
+    there = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+    boxes = boxes[there]
+    names = tuple(first_synonym(detector.class_names[kind]) for kind in found.class_ids[sure][there].tolist())
+    if classifier is not None and len(boxes):
+        answers = classifier.classify(list(_crops(image, boxes)))
+        names = tuple(first_synonym(answer.class_name) for answer in answers)
+    return _labels(boxes, names)
+
+
+def _labels(boxes: npt.ArrayLike, names: Iterable[str]) -> FrameLabels:
+    """(N, 4) boxes in source pixels and their N words; nobody knows which object is which."""
+    array = np.asarray(boxes, np.float32).reshape(-1, 4)
+    return FrameLabels(array, np.full(len(array), NO_ID, np.int64), tuple(names))
+
+
+def _crops(image: Image, boxes: Boxes) -> Iterator[Image]:
+    size = image.shape[1], image.shape[0]
+    for left, top, right, bottom in boxes.tolist():
+        x1, y1, x2, y2 = crop_box((left, top, right, bottom), padding=PADDING, source_size=size)
+        yield image[y1:y2, x1:x2]

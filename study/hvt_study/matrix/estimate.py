@@ -1,0 +1,107 @@
+"""What a study will take, before it is begun: runs, bytes, hours. The time of a tick is measured, not assumed."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from hvt_common.errors import UserError
+from hvt_study.datasets.contract import Sequence
+from hvt_study.matrix.execute import run_spec
+from hvt_study.matrix.methods import METHODS, Kind, MatrixMethod
+from hvt_study.matrix.plan import StudyPlan, first_runs
+from hvt_study.matrix.workshop import open_workshop
+from hvt_study.sight_clip import staged_bytes
+
+__all__ = ["Estimate", "estimate", "time_of_a_tick"]
+
+_TRIAL_TICKS = 30
+_USUAL_WEIGHTS = 2.2
+"""Times that video is coded without a ground until its total is right; measured on drone_carpark and the demo."""
+_WEIGHT_SHARE = 0.5
+"""What one of them takes of a flight."""
+_ROW_BYTES = 9_000
+_DETECTION_BYTES = 4_096
+"""One file, of a block."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Of a whole study."""
+
+    sequences: int
+    ticks: int
+    """Of all sequences."""
+    runs: int
+    """Rows of results.parquet; where methods spend the same, several rows share one flight, and it takes less."""
+    source_bytes: int
+    """Pictures and annotations."""
+    cache_bytes: int
+    scratch_bytes: int
+    """Pixels of one sequence in the folder for temporary files, for each process."""
+    cpu_s: float
+    """On one core of this machine."""
+
+    def hours(self, jobs: int) -> float:
+        """With so many processes, each on a core of its own."""
+        return self.cpu_s / jobs / 3600
+
+
+def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, tick_s: float) -> Estimate:
+    """Count what `hvt_study.matrix.schedule.run_all` would do; ``tick_s`` is what a flight takes for a tick."""
+    ticks = sum(one.cut(plan.max_ticks).ticks for one in sequences)
+    video = [method for method in plan.methods if method.kind is Kind.VIDEO]
+    each = len(plan.regimes) * len(plan.models)
+    others = [method for method in plan.methods if method.kind is not Kind.VIDEO]
+    hybrids = each * sum(_variants(one, plan) for one in others)
+    at_budget = each * sum(_variants(one, plan) * _flights(one) for one in plan.methods)
+    matched = hybrids * sum(_flights(one) for one in video)
+    labelled = plan.labels == "reference"
+    flights = at_budget + matched * (1 + _USUAL_WEIGHTS * _WEIGHT_SHARE) + labelled * len(plan.models)
+    looks = (at_budget + matched) / plan.detect_every + labelled * len(plan.models)
+    runs = len(sequences) * (hybrids + each * len(video) + hybrids * len(video))
+    return Estimate(
+        sequences=len(sequences),
+        ticks=ticks,
+        runs=runs,
+        source_bytes=sum(_size(path) for one in sequences for path in one.files),
+        cache_bytes=runs * _ROW_BYTES + round(ticks * looks * _DETECTION_BYTES),
+        scratch_bytes=max(staged_bytes(one.cut(plan.max_ticks).clip) for one in sequences),
+        cpu_s=ticks * flights * tick_s,
+    )
+
+
+def time_of_a_tick(plan: StudyPlan) -> float:
+    """Fly the first hybrid of the plan (or the first method) for two seconds, and return what a tick took.
+
+    Raises:
+        UserError: the first sequence or a model cannot be used, or the edge does not take the settings.
+    """
+    specs = list(first_runs(replace(plan, sequences=plan.sequences[:1])))
+    spec = next((one for one in specs if METHODS[one.method].kind is Kind.HYBRID), specs[0])
+    spec = replace(spec, max_ticks=_TRIAL_TICKS)
+    with TemporaryDirectory(prefix="hvt-study-") as folder:
+        trial = replace(plan, cache=Path(folder))
+        shop = open_workshop(spec, cache=trial.cache)  # what is done once for all runs over a sequence
+        began_s = time.monotonic()
+        row = run_spec(spec, trial)
+        took_s = time.monotonic() - began_s
+    if row["failed"]:
+        raise UserError(f"{spec.method} at {spec.regime} cannot be flown: {row['failed']}")
+    return took_s / shop.sequence.ticks
+
+
+def _variants(method: MatrixMethod, plan: StudyPlan) -> int:
+    return len(plan.still_codecs) if method.sends_stills else 1
+
+
+def _flights(method: MatrixMethod) -> int:
+    return max(1, len(method.fps_choices))
+
+
+def _size(path: Path) -> int:
+    if path.is_dir():
+        return sum(one.stat().st_size for one in path.iterdir() if one.is_file())
+    return path.stat().st_size if path.is_file() else 0

@@ -1,0 +1,111 @@
+"""Which runs a study takes: first those that decide what they spend, then video at each of their totals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from hvt_common.errors import UserError
+from hvt_common.units import parse_bitrate
+from hvt_edge.config import REGIMES
+from hvt_study.matrix.methods import METHODS, Kind, MatrixMethod
+from hvt_study.matrix.spec import ModelChoice, RunSpec, Target
+
+__all__ = ["Regime", "StudyPlan", "first_runs", "following_runs", "parse_regimes"]
+
+
+@dataclass(frozen=True, slots=True)
+class Regime:
+    """A budget and what it is called."""
+
+    name: str
+    budget_bps: int
+
+
+@dataclass(frozen=True, slots=True)
+class StudyPlan:
+    """What to compare, on what, with what."""
+
+    sequences: tuple[tuple[str, str], ...]
+    """(URI of the dataset, name of the sequence)."""
+    methods: tuple[MatrixMethod, ...]
+    regimes: tuple[Regime, ...]
+    still_codecs: tuple[str, ...]
+    models: tuple[ModelChoice, ...]
+    labels: Literal["annotations", "reference"]
+    cache: Path
+    size: tuple[int, int] = (1280, 720)
+    max_ticks: int | None = None
+    detect_every: int = 5
+    tune: Mapping[str, tuple[str, ...]] | None = None
+    """Parameters by method."""
+
+
+def parse_regimes(text: str) -> tuple[Regime, ...]:
+    """``low,moderate,300kbps`` as regimes, in that order.
+
+    Raises:
+        UserError: a word that is neither the name of a regime nor a bitrate.
+    """
+    regimes: dict[str, Regime] = {}
+    for word in (part.strip() for part in text.split(",")):
+        if word in REGIMES:
+            regimes[word] = Regime(word, REGIMES[word].budget_bps)
+            continue
+        try:
+            regimes[word] = Regime(word, parse_bitrate(word, name="--regimes"))
+        except UserError:
+            raise UserError(
+                f"--regimes {word!r} is not accepted: give {', '.join(REGIMES)} or a bitrate such as 300kbps"
+            ) from None
+    return tuple(regimes.values())
+
+
+def first_runs(plan: StudyPlan) -> Iterator[RunSpec]:
+    """Runs that need no other: hybrids and peers, and video at the whole budget."""
+    for dataset, sequence in plan.sequences:
+        for models in plan.models:
+            for regime in plan.regimes:
+                for method in plan.methods:
+                    for codec in plan.still_codecs if method.sends_stills else ("",):
+                        yield _spec(plan, dataset, sequence, method, regime, models, codec)
+
+
+def following_runs(plan: StudyPlan, spec: RunSpec, row: Mapping[str, Any]) -> Iterator[RunSpec]:
+    """Video at the total that this run really spent; nothing for a run that failed, or is video itself."""
+    if METHODS[spec.method].kind is Kind.VIDEO or row["failed"] or not row["total_bps"]:
+        return
+    target = Target(spec.method, spec.still_codec, int(row["total_bps"]))
+    for method in plan.methods:
+        if method.kind is Kind.VIDEO:
+            regime = Regime(spec.regime, spec.budget_bps)
+            yield _spec(plan, spec.dataset, spec.sequence, method, regime, spec.models, "", target)
+
+
+def _spec(
+    plan: StudyPlan,
+    dataset: str,
+    sequence: str,
+    method: MatrixMethod,
+    regime: Regime,
+    models: ModelChoice,
+    codec: str,
+    target: Target | None = None,
+) -> RunSpec:
+    return RunSpec(
+        dataset=dataset,
+        sequence=sequence,
+        method=method.name,
+        regime=regime.name,
+        budget_bps=regime.budget_bps,
+        models=models,
+        still_codec=codec,
+        labels=plan.labels,
+        size=plan.size,
+        max_ticks=plan.max_ticks,
+        detect_every=plan.detect_every,
+        target=target,
+        tune=(plan.tune or {}).get(method.name, ()),
+    )

@@ -1,0 +1,104 @@
+"""Bits and stills: what a run spent, and on what.
+
+Sizes are line bytes (payload, metadata and transport) as the ledger counts them. They are divided by the processed
+span. The pilot's notebooks divided the bytes of the 300 frames that they processed by the length of the whole clip;
+``accounting="pilot"`` does the same, for comparison with its printed table and for nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from hvt_common.link.keys import Row
+from hvt_study.metrics.contract import NO_ID
+from hvt_study.metrics.stills import RefinedObject, StillArrival
+
+__all__ = ["Accounting", "BitSplit", "StillCounts", "bit_split", "still_counts"]
+
+Accounting: TypeAlias = Literal["span", "pilot"]
+
+
+@dataclass(frozen=True, slots=True)
+class BitSplit:
+    """Bits a second, of everything and of its parts; the parts add up to the whole."""
+
+    base_bps: float
+    roi_bps: float
+    track_bps: float
+    """The edge's own tracks."""
+    other_bps: float
+    """Status, requests and whatever else crossed the line."""
+
+    @property
+    def total_bps(self) -> float:
+        """Everything."""
+        return self.base_bps + self.roi_bps + self.track_bps + self.other_bps
+
+
+@dataclass(frozen=True, slots=True)
+class StillCounts:
+    """The stills of a run."""
+
+    stills: int
+    stills_per_min: float
+    mean_bytes: float
+    """Payload of a still; NaN where there is none."""
+    tracks_refined: int
+    """Distinct tracks of the ground on whose class a still has spoken."""
+
+
+def bit_split(
+    row_bytes: Mapping[str, int],
+    *,
+    processed_s: float,
+    clip_s: float | None = None,
+    accounting: Accounting = "span",
+) -> BitSplit:
+    """Line bits a second by row of the key table.
+
+    Args:
+        row_bytes: line bytes of each row that sent anything (``FlightReport.line_bytes``).
+        processed_s: media time from the first processed frame to the end of the last.
+        clip_s: length of the whole clip; needed for the pilot's accounting.
+        accounting: what to divide by.
+
+    Raises:
+        ValueError: the time to divide by is missing or not above 0.
+    """
+    seconds = _seconds(processed_s, clip_s, accounting)
+    known = {row: 8 * row_bytes.get(row, 0) / seconds for row in (Row.BASE, Row.ROI, Row.TRACKS)}
+    return BitSplit(
+        base_bps=known[Row.BASE],
+        roi_bps=known[Row.ROI],
+        track_bps=known[Row.TRACKS],
+        other_bps=sum(8 * size / seconds for row, size in row_bytes.items() if row not in known),
+    )
+
+
+def still_counts(
+    stills: Sequence[StillArrival],
+    refined: Sequence[RefinedObject],
+    *,
+    processed_s: float,
+    clip_s: float | None = None,
+    accounting: Accounting = "span",
+) -> StillCounts:
+    """Count what arrived; times as in `bit_split`."""
+    seconds = _seconds(processed_s, clip_s, accounting)
+    sizes = [one.size_bytes for one in stills]
+    return StillCounts(
+        stills=len(sizes),
+        stills_per_min=60 * len(sizes) / seconds,
+        mean_bytes=sum(sizes) / len(sizes) if sizes else math.nan,
+        tracks_refined=len({one.track_id for one in refined} - {NO_ID}),
+    )
+
+
+def _seconds(processed_s: float, clip_s: float | None, accounting: Accounting) -> float:
+    seconds = clip_s if accounting == "pilot" else processed_s
+    if seconds is None or not seconds > 0:
+        raise ValueError(f"the {accounting} accounting divides by {seconds} s, must be above 0")
+    return seconds

@@ -1,0 +1,170 @@
+"""Classes of tracks over time: every track at every tick, before and after refinement.
+
+Boxes and labels are matched at each tick as `match` does, whatever their classes; then the names of each pair are
+compared. A still that names one track right for the rest of its life counts at every tick from then on, and a track
+that was never refined counts as often as one that was.
+
+Macro-F1 is scikit-learn's ``f1_score(average="macro")`` over the classes of the labels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from sklearn.metrics import f1_score
+
+from hvt_study.metrics.contract import Ticks
+from hvt_study.metrics.judged import Judged, judged
+from hvt_study.metrics.match import LEAST_IOU, matched_rows
+from hvt_study.metrics.sizes import LIMITS_PX2, SIZES, Size, of_size
+
+__all__ = ["ClassCounts", "ClassScore", "class_score"]
+
+_NOBODY = -1
+"""Stands for the class of what has no partner."""
+
+_Codes = npt.NDArray[np.int64]
+"""Classes as numbers, the same for labels and boxes."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClassCounts:
+    """Labels over some ticks."""
+
+    right: int = 0
+    """Found, and shown with their class."""
+    found: int = 0
+    """Matched with a box that is shown."""
+    labels: int = 0
+    """As judged."""
+
+    @property
+    def top1_found(self) -> float:
+        """Share of those found that have their class; NaN where nothing was found."""
+        return self.right / self.found if self.found else math.nan
+
+    @property
+    def top1_all(self) -> float:
+        """Share of all labels, missed ones included, that are shown with their class; NaN without labels."""
+        return self.right / self.labels if self.labels else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class ClassScore:
+    """Of one sequence, for the names before or after refinement."""
+
+    counts: ClassCounts
+    boxes: int
+    """Shown, as judged."""
+    macro_f1_found: float
+    """Over the matched pairs alone: how well the classes are told apart. NaN where nothing was found."""
+    macro_f1_all: float
+    """A missed label is a false negative of its class, a box on nothing a false positive of its own. NaN without
+    labels."""
+    by_size: Mapping[Size, ClassCounts]
+    """By the label's area in source pixels."""
+
+    @property
+    def recall(self) -> float:
+        """Share of the labels that were found, whatever the class; NaN without labels."""
+        return self.counts.found / self.counts.labels if self.counts.labels else math.nan
+
+    @property
+    def precision(self) -> float:
+        """Share of the boxes that are on a label; NaN without boxes."""
+        return self.counts.found / self.boxes if self.boxes else math.nan
+
+    @property
+    def f1(self) -> float:
+        """2 found / (labels + boxes), whatever the classes; 1 where nothing was there and nothing shown."""
+        total = self.counts.labels + self.boxes
+        return 2 * self.counts.found / total if total else 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """All labels of a sequence, and all boxes on nothing."""
+
+    true: _Codes
+    """(L,) class of each label."""
+    said: _Codes
+    """(L,) class of its box, `_NOBODY` where it was missed."""
+    areas_px2: npt.NDArray[np.float64]
+    """(L,)"""
+    stray: _Codes
+    """(S,) classes of the boxes without a label."""
+
+    def counts(self, rows: npt.NDArray[np.bool_]) -> ClassCounts:
+        """Of some labels."""
+        true, said = self.true[rows], self.said[rows]
+        return ClassCounts(int((true == said).sum()), int((said != _NOBODY).sum()), len(true))
+
+
+def class_score(
+    ticks: Ticks,
+    *,
+    refined: bool = True,
+    word: Callable[[str], str] = str,
+    classes: Collection[str] | None = None,
+    least_iou: float = LEAST_IOU,
+    limits_px2: tuple[float, float] = LIMITS_PX2,
+) -> ClassScore:
+    """Count right classes over all ticks.
+
+    Args:
+        ticks: every tick of the sequence, also those without a picture.
+        refined: names as shown; False takes those before refinement, of the very same boxes.
+        word: see `judged.judged`.
+        classes: likewise.
+        least_iou: from which on a box is on a label.
+        limits_px2: areas in source pixels between small and medium, and between medium and large.
+    """
+    frames = judged(ticks, word=word, classes=classes)
+    pairs = _paired(frames, refined=refined, least_iou=least_iou)
+    every = np.ones(len(pairs.true), np.bool_)
+    return ClassScore(
+        counts=pairs.counts(every),
+        boxes=sum(len(one.view) for one in frames),
+        macro_f1_found=_macro_f1(pairs, everything=False),
+        macro_f1_all=_macro_f1(pairs, everything=True),
+        by_size={size: pairs.counts(of_size(size, pairs.areas_px2, limits_px2=limits_px2)) for size in SIZES},
+    )
+
+
+def _paired(frames: Sequence[Judged], *, refined: bool, least_iou: float) -> _Pairs:
+    code_of: dict[str, int] = {}
+    true: list[_Codes] = [np.empty(0, np.int64)]
+    said, stray, areas = list(true), list(true), [np.empty(0)]
+    for one in frames:
+        labels = _codes(one.class_names, code_of)
+        shown = _codes(one.view.class_names if refined else one.view.names_before, code_of)
+        rows, columns = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px, least_iou=least_iou).T
+        partners = np.full(len(labels), _NOBODY, np.int64)
+        partners[rows] = shown[columns]
+        true.append(labels)
+        said.append(partners)
+        stray.append(np.delete(shown, columns))
+        areas.append(one.areas_px2)
+    return _Pairs(np.concatenate(true), np.concatenate(said), np.concatenate(areas), np.concatenate(stray))
+
+
+def _macro_f1(pairs: _Pairs, *, everything: bool) -> float:
+    found = pairs.said != _NOBODY
+    if everything:
+        nobody = np.full(len(pairs.stray), _NOBODY)
+        true, said = np.concatenate((pairs.true, nobody)), np.concatenate((pairs.said, pairs.stray))
+        wanted = np.unique(pairs.true)
+    else:
+        true, said = pairs.true[found], pairs.said[found]
+        wanted = np.unique(true)
+    if not len(wanted):
+        return math.nan
+    return float(f1_score(true, said, labels=wanted, average="macro", zero_division=0.0))
+
+
+def _codes(names: Sequence[str], code_of: dict[str, int]) -> _Codes:
+    return np.array([code_of.setdefault(name, len(code_of)) for name in names], np.int64)

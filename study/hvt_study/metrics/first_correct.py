@@ -1,0 +1,108 @@
+"""How long an object is there before the ground shows it with its right class.
+
+A true track is watched from the capture of its first judged tick until the list of its last one is shown. One that
+is never shown right is *censored*: it would have taken longer than it was watched. Quantiles are those of the
+Kaplan-Meier estimate (Kaplan and Meier 1958), which leaves out neither the censored ones (that would flatter every
+method that misses much) nor the time that they waited.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_study.metrics.contract import NO_ID, Ticks
+from hvt_study.metrics.judged import Judged, judged
+from hvt_study.metrics.match import LEAST_IOU, matched_rows
+
+__all__ = ["FirstCorrect", "first_correct"]
+
+
+@dataclass(frozen=True, slots=True)
+class FirstCorrect:
+    """Of the true tracks of one sequence."""
+
+    waits_s: npt.NDArray[np.float64]
+    """(N,) from the first tick's capture until the first list with the right class is shown, or the last list where
+    there was none."""
+    censored: npt.NDArray[np.bool_]
+    """(N,) never shown right."""
+
+    @property
+    def tracks(self) -> int:
+        """True tracks."""
+        return len(self.waits_s)
+
+    @property
+    def never(self) -> int:
+        """How many of them were censored."""
+        return int(self.censored.sum())
+
+    def quantile_s(self, share: float) -> float:
+        """Wait after which this share (0…1) of the tracks is right, by Kaplan-Meier.
+
+        Infinite where that share was not reached as long as anything was watched; NaN without tracks.
+        """
+        if not self.tracks:
+            return math.nan
+        waiting = 1.0
+        for wait_s in np.unique(self.waits_s[~self.censored]):
+            at_risk = (self.waits_s >= wait_s).sum()
+            waiting *= 1 - ((self.waits_s == wait_s) & ~self.censored).sum() / at_risk
+            if waiting <= 1 - share + 1e-12:
+                return float(wait_s)
+        return math.inf
+
+    @property
+    def median_s(self) -> float:
+        """See `quantile_s`."""
+        return self.quantile_s(0.5)
+
+    @property
+    def p90_s(self) -> float:
+        """See `quantile_s`."""
+        return self.quantile_s(0.9)
+
+
+def first_correct(
+    ticks: Ticks,
+    *,
+    fps: float,
+    shown_s: Sequence[float] | None = None,
+    refined: bool = True,
+    word: Callable[[str], str] = str,
+    classes: Collection[str] | None = None,
+    least_iou: float = LEAST_IOU,
+) -> FirstCorrect:
+    """Watch every true track.
+
+    ``fps`` is that of ticks; ``shown_s`` says of each when its list was shown, from the capture of the first: who
+    waits for a second pass waits for its classes. None: with its capture. The rest is as in `classes.class_score`.
+
+    Labels without ids are of no track and not watched.
+    """
+    first: dict[int, int] = {}
+    last: dict[int, int] = {}
+    right: dict[int, int] = {}
+    for tick, one in enumerate(judged(ticks, word=word, classes=classes)):
+        there = [track for track in one.ids.tolist() if track != NO_ID]
+        first = dict.fromkeys(there, tick) | first
+        last |= dict.fromkeys(there, tick)
+        right = dict.fromkeys(_right_ids(one, refined=refined, least_iou=least_iou), tick) | right
+    if shown_s is None:
+        shown_s = [tick / fps for tick in range(len(ticks))]
+    end_s = [shown_s[right.get(track, last[track])] for track in first]
+    waits_s = np.array(end_s, np.float64) - np.array(list(first.values()), np.float64) / fps
+    return FirstCorrect(waits_s, np.array([track not in right for track in first], np.bool_))
+
+
+def _right_ids(one: Judged, *, refined: bool, least_iou: float) -> list[int]:
+    """True tracks that this tick shows with their class."""
+    shown = one.view.class_names if refined else one.view.names_before
+    pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px, least_iou=least_iou).tolist()
+    hits = [row for row, column in pairs if shown[column] == one.class_names[row]]
+    return [track for track in one.ids[hits].tolist() if track != NO_ID]

@@ -1,0 +1,107 @@
+"""What is judged of a tick: nothing in ignored regions, in one vocabulary, and only classes that the labels know.
+
+Ignored regions go by the rule of VisDrone's own toolkit (``dropObjectsInIgr.m`` of the VisDrone2018-DET and MOT
+toolkits): a label or a box with half of its area or more in the ignored regions, taken together, is dropped before
+anything is matched. It counts neither for nor against anyone. A single object that is not asked for takes out the
+boxes on it, but neither labels in front of it nor the boxes that are on those. Every metric here goes by it, so that
+detection, classes and tracks are judged on the same objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Boxes
+from hvt_common.vision.boxes import iou
+from hvt_common.vision.class_names import MOVING
+from hvt_study.datasets.labels import FrameLabels, covered_share
+from hvt_study.metrics.contract import FrameView, Ticks, rows_of
+from hvt_study.metrics.match import LEAST_IOU
+
+__all__ = ["Judged", "judged"]
+
+_IGNORED_SHARE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """The N labels of one tick that count, and what was shown beside them."""
+
+    boxes_xyxy_px: npt.NDArray[np.float64]
+    """(N, 4), source pixels."""
+    ids: npt.NDArray[np.int64]
+    """(N,), `NO_ID` where the labels know no tracks."""
+    class_names: tuple[str, ...]
+    view: FrameView
+
+    @property
+    def areas_px2(self) -> npt.NDArray[np.float64]:
+        """(N,) source pixels squared."""
+        return _areas(self.boxes_xyxy_px)
+
+
+def judged(
+    ticks: Ticks, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
+) -> list[Judged]:
+    """Take out of every tick what is not to be judged.
+
+    Args:
+        ticks: of one sequence.
+        word: brings the names of labels and boxes into one vocabulary, such as
+            `hvt_common.vision.class_names.kind_of`; by default they are compared as they are.
+        classes: names in that vocabulary; labels and boxes of others are left out. None keeps all.
+            A box stays where its name before *or* after refinement is one of them, so that no still can take a false
+            box out of the account. What merely moves (`MOVING`) may be of any class and stays.
+    """
+    return [_judged(labels, view, word, classes) for labels, view in ticks]
+
+
+def _judged(
+    labels: FrameLabels, view: FrameView, word: Callable[[str], str], classes: Collection[str] | None
+) -> Judged:
+    names = tuple(map(word, labels.class_names))
+    before = tuple(map(word, view.names_before))
+    after = tuple(map(word, view.class_names))
+    wanted = _outside(labels.boxes_xyxy_px, labels.ignored_xyxy_px) & _known(names, classes)
+    known = _known(before, classes) | _known(after, classes)
+    asked = labels.boxes_xyxy_px[wanted]
+    shown = known & _judgeable(view.boxes_xyxy_px, labels, asked=asked)
+    in_words = FrameView(view.boxes_xyxy_px, view.ids, after, view.confidences, before)
+    return Judged(
+        boxes_xyxy_px=np.asarray(asked, np.float64),
+        ids=np.asarray(labels.ids, np.int64)[wanted],
+        class_names=rows_of(names, wanted),
+        view=in_words.rows(shown),
+    )
+
+
+def _judgeable(boxes: Boxes, labels: FrameLabels, *, asked: Boxes) -> npt.NDArray[np.bool_]:
+    """(N,) boxes that are right or wrong."""
+    outside = _outside(boxes, labels.ignored_xyxy_px)
+    if not len(labels.beside_xyxy_px):
+        return outside
+    free = _outside(boxes, np.concatenate((labels.ignored_xyxy_px, labels.beside_xyxy_px)))
+    return outside & (free | _on(boxes, asked))
+
+
+def _outside(boxes: Boxes, regions: Boxes) -> npt.NDArray[np.bool_]:
+    return np.asarray(covered_share(boxes, regions) < _IGNORED_SHARE)
+
+
+def _on(boxes: Boxes, asked: Boxes) -> npt.NDArray[np.bool_]:
+    """(N,) whether each box is on one of the labels."""
+    if not len(asked):
+        return np.zeros(len(boxes), np.bool_)
+    return np.asarray(iou(boxes, asked).max(axis=1) >= LEAST_IOU)
+
+
+def _known(names: Sequence[str], classes: Collection[str] | None) -> npt.NDArray[np.bool_]:
+    return np.array([classes is None or name == MOVING or name in classes for name in names], np.bool_)
+
+
+def _areas(boxes: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.asarray(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None).prod(axis=1))

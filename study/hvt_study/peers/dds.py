@@ -1,0 +1,130 @@
+"""A server-driven two-pass peer in the manner of DDS, on our codec, our link and our accounting.
+
+Du et al., "Server-Driven Video Streaming for Deep Learning Inference", SIGCOMM 2020. The edge sends every frame at a
+low quality; the ground looks at a segment of them, keeps what it is sure of and asks for the regions that it is not
+sure of; the edge codes the same frames again with these regions alone, the rest black; the ground pastes them into
+the first pass, looks again, and merges both into the final results, over which a tracker runs. docs/study-dds.md says
+what is as in DDS and what differs.
+
+Every byte counts, once: the first pass as ``base``, the second as ``roi``, what the ground asks as ``control``. All
+of it stays within the budget in every rolling window, and over the clip: the last second pass, which comes after the
+clip's end, is cut short where it would go beyond.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import closing
+from itertools import groupby
+
+import numpy as np
+
+from hvt_common.values import Frame
+from hvt_common.vision.detect import Detector
+from hvt_edge.budget import RollingBudget
+from hvt_edge.resample import Resizer
+from hvt_study.flight import FlightReport, coded_ticks
+from hvt_study.peers.dds_edge import DdsEdge, pass_rates
+from hvt_study.peers.dds_ground import DdsGround
+from hvt_study.peers.dds_line import Line
+from hvt_study.peers.dds_settings import DdsSettings
+from hvt_study.serial_link import LinkReport
+from hvt_study.sight_clip import TICK_FPS, Clip, TickSource
+
+__all__ = ["DdsSettings", "fly_dds"]
+
+_START_NS = 1_700_000_000_000_000_000
+_SECOND_NS = 1_000_000_000
+_LONGEST_TAIL_S = 30
+"""How long after the clip the last second pass may take."""
+
+
+def fly_dds(
+    clip: Clip,
+    *,
+    budget_bps: int,
+    link_bps: int,
+    size: tuple[int, int],
+    detector: Detector,
+    edge_id: str = "edge-1",
+    settings: DdsSettings = DdsSettings(),  # noqa: B008 - frozen
+) -> FlightReport:
+    """Fly the peer once; ``detector`` is the ground's, ``size`` (width, height) that of the base frames.
+
+    The list of a tick is the final one of that very frame, as an operator sees it when it is known, which is later
+    than with a stream that is shown as it comes: the delays of ``FlightReport.link`` are, for each coded frame, from
+    capture to the arrival of the pass that completes it (segment, question, second pass, and the frames before it).
+    ``picture_age_p95_ms`` is of the newest picture at the ground, that of a first pass, as in `hvt_study.flight.fly`.
+
+    Raises:
+        UserError: the budget is too small for two passes of this size and frame rate.
+    """
+    settings = settings.settled(budget_bps, size=size)
+    rates = pass_rates(budget_bps, size=size, settings=settings, edge_id=edge_id)
+    line = Line(
+        link_bps=link_bps, budget=RollingBudget(rates.budget), window_ns=settings.window_ns, edge_id=edge_id
+    )
+    coded = coded_ticks(clip.ticks, settings.rate)
+    segments = _segments(coded, settings.segment_ticks)
+    most_bytes = int(budget_bps * clip.ticks / TICK_FPS / 8)
+    resizer = Resizer(clip.source_size, size, fit="letterbox")
+    edge = DdsEdge(rates, size=size, settings=settings, segments=segments, line=line, most_bytes=most_bytes)
+    ground = DdsGround(detector, settings, resizer.view, segments, line, started_ns=_tick_ns(0))
+    with closing(_by_tick(TickSource(clip, resizer, ticks=coded), clip.ticks)) as frames:
+        for now_ns, frame in frames:
+            ground.advance(now_ns)
+            while ground.requests and ground.requests[0][0] <= now_ns:
+                edge.hear(ground.requests.popleft()[1])
+            if frame is not None:
+                edge.first_pass(frame)
+            edge.second_pass(now_ns)
+            if now_ns > _tick_ns(clip.ticks) and edge.idle and line.empty and not ground.requests:
+                break
+    ground.close(ticks=clip.ticks)
+    return _report(clip.ticks, edge=edge, ground=ground, line=line)
+
+
+def _segments(coded: frozenset[int], segment_ticks: int) -> tuple[tuple[int, ...], ...]:
+    """The coded ticks of each segment that has any."""
+    return tuple(tuple(ticks) for _, ticks in groupby(sorted(coded), key=lambda tick: tick // segment_ticks))
+
+
+def _by_tick(source: TickSource, ticks: int) -> Generator[tuple[int, Frame | None], None, None]:
+    """(time, frame to code) of every tick, and empty ones after the clip for what is still to come."""
+    tick = 0
+    for frame in source.frames(start_ns=_START_NS):
+        for between in range(tick, frame.index):
+            yield _tick_ns(between), None
+        yield frame.capture_ns, frame
+        tick = frame.index + 1
+    for after in range(tick, ticks + round(_LONGEST_TAIL_S * TICK_FPS)):
+        yield _tick_ns(after), None
+
+
+def _tick_ns(tick: int) -> int:
+    return _START_NS + round(tick * _SECOND_NS / TICK_FPS)
+
+
+def _report(ticks: int, *, edge: DdsEdge, ground: DdsGround, line: Line) -> FlightReport:
+    return FlightReport(
+        lists=tuple(ground.lists[tick] for tick in range(ticks)),
+        account=line.ledger.summary(ticks / TICK_FPS),
+        line_bytes=dict(line.line_bytes),
+        messages=dict(line.messages),
+        max_frame_bytes=line.max_frame_bytes,
+        link=LinkReport.of(ground.delays_ns, line.arrivals),
+        picture_age_p95_ms=_picture_age_p95_ms(ground.shown_ns, ticks),
+        edge_cpu_ms=1e3 * edge.cpu_s / ticks,
+        digest=line.digest,
+    )
+
+
+def _picture_age_p95_ms(shown_ns: list[tuple[int, int]], ticks: int) -> float:
+    """Over the ticks from the first picture on, as `hvt_study.flight` has it."""
+    shown = np.array(shown_ns, np.int64).reshape(-1, 2)
+    at_ns = np.array([_tick_ns(tick) for tick in range(ticks)], np.int64)
+    at_ns = at_ns[at_ns >= shown[0, 0]] if len(shown) else at_ns[:0]
+    if not len(at_ns):
+        return 0.0
+    newest = shown[np.searchsorted(shown[:, 0], at_ns, side="right") - 1, 1]
+    return float(np.percentile((at_ns - newest) / 1e6, 95))

@@ -1,0 +1,210 @@
+"""The camera's end of the two-pass peer: codes every frame once, and what is asked for a second time."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.link.keys import Row
+from hvt_common.values import AccessUnit, Frame, Image
+from hvt_edge.budget import BudgetSettings, RollingBudget
+from hvt_edge.encode import VBV_S, BaseEncoder, EncoderSettings, keyframe_floor_bytes, minimum_bps
+from hvt_study.peers.dds_line import Line, header_bps
+from hvt_study.peers.dds_regions import Blocks, block_grid, pasted
+from hvt_study.peers.dds_request import RegionRequest
+from hvt_study.peers.dds_settings import DdsSettings
+from hvt_study.sight_clip import TICK_FPS
+
+__all__ = ["DdsEdge", "PassRates", "most_kept", "pass_rates"]
+
+_KEYFRAME_DEBT_S = 10
+"""x265 never takes back what the first keyframe costs beyond a frame's share: so much media time pays for it."""
+_BLACK_FRAME_BYTES = 100
+"""What x265 takes for a frame with very little in it."""
+_KEPT_SEGMENTS = 4
+_KEPT_LEAST = 8
+
+
+@dataclass(frozen=True, slots=True)
+class PassRates:
+    """What the budget gives each pass: the payload that its encoder is opened for."""
+
+    first_bps: int
+    second_bps: int
+    budget: BudgetSettings
+
+
+def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings, edge_id: str) -> PassRates:
+    """Share out a budget of line bits a second.
+
+    Raises:
+        UserError: x265 cannot follow what is left for a pass.
+    """
+    request_bps = settings.request_bps
+    first_line = settings.share * (budget_bps - request_bps)
+    second_line = budget_bps - request_bps - first_line
+    fps = settings.rate
+    questions = TICK_FPS / settings.segment_ticks
+    bundles = min(fps, max(questions, second_line / 8 / settings.bundle_bytes))
+    small = settings.first_size(size)
+    first = first_line - _beside_bps(
+        first_line, Row.BASE, small, fps=fps, messages_per_s=fps, edge_id=edge_id
+    )
+    second = second_line - _beside_bps(
+        second_line, Row.ROI, size, fps=fps, messages_per_s=bundles, edge_id=edge_id
+    )
+    # Of the second pass most is black.
+    for payload, least in ((first, minimum_bps(small, fps)), (second, 8 * _BLACK_FRAME_BYTES * fps)):
+        if payload < least:
+            raise UserError(
+                f"DDS with {budget_bps} bps at {size[0]}x{size[1]} and {fps:g} fps leaves {payload:.0f} bps for a "
+                f"pass that needs {least:.0f}: use a larger budget, fewer frames a second, or another share or scale"
+            )
+    shared = BudgetSettings(
+        total_bps=budget_bps,
+        base_bps=round(first_line),
+        fps=fps,
+        window_ns=settings.window_ns,
+        metadata_bps=round(request_bps),
+        lend=True,
+    )
+    return PassRates(round(first), round(second), shared)
+
+
+def _beside_bps(
+    line_bps: float, row: Row, size: tuple[int, int], *, fps: float, messages_per_s: float, edge_id: str
+) -> float:
+    """What of a pass's rate is not x265's to spend."""
+    headers = header_bps(line_bps, units_per_s=fps, messages_per_s=messages_per_s, row=row, edge_id=edge_id)
+    return headers + 8 * keyframe_floor_bytes(size) / _KEYFRAME_DEBT_S
+
+
+def most_kept(settings: DdsSettings) -> int:
+    """How many frames either end keeps at most while it waits for the other."""
+    return max(_KEPT_LEAST, round(_KEPT_SEGMENTS * settings.segment_ticks * settings.rate / TICK_FPS) + 1)
+
+
+class DdsEdge:
+    """Two encoders over one budget. A frame stays in memory until the ground's answer about it has come and gone.
+
+    Args:
+        rates: of `pass_rates`.
+        size: (width, height) of the base frames.
+        segments: the coded ticks of each segment.
+        line: takes the messages; ``line.budget`` was opened with ``rates.budget``.
+        most_bytes: line bytes that the whole flight may take; a second pass beyond it is not sent.
+    """
+
+    def __init__(
+        self,
+        rates: PassRates,
+        *,
+        size: tuple[int, int],
+        settings: DdsSettings,
+        segments: Sequence[tuple[int, ...]],
+        line: Line,
+        most_bytes: int,
+    ) -> None:
+        self._settings, self._size, self._line = settings, size, line
+        self._most_bytes = most_bytes
+        self._budget: RollingBudget = line.budget
+        self._segments = {ticks[0]: ticks for ticks in segments}
+        self._first_size = settings.first_size(size)
+        fps, preset, vbv_s = settings.rate, settings.preset, max(VBV_S, 1 / settings.rate)
+        self._first, self._second = (
+            BaseEncoder(EncoderSettings(coded, fps=fps, bitrate_bps=rate_bps, preset=preset, vbv_s=vbv_s))
+            for coded, rate_bps in ((self._first_size, rates.first_bps), (size, rates.second_bps))
+        )
+        self._most = most_kept(settings)
+        self._kept: dict[int, Frame] = {}
+        self._asked: deque[tuple[int, Blocks]] = deque()
+        self._ready: list[AccessUnit] = []
+        self._first_done = self._second_done = False
+        self.cpu_s = 0.0
+        """Of both passes."""
+
+    @property
+    def idle(self) -> bool:
+        """Nothing that was asked for waits."""
+        return not self._asked and not self._ready
+
+    def first_pass(self, frame: Frame) -> None:
+        """Code and send a frame as it comes."""
+        began_s = time.process_time()
+        self._keep(frame)
+        small = replace(frame, base_bgr=self._shrunk(frame))
+        unit = self._first.encode(small, keyframe=not self._first_done)
+        self._first_done = True
+        size_bytes = self._line.weigh(Row.BASE, (unit,), at_ns=frame.capture_ns)
+        at_ns = self._budget.earliest_ns(size_bytes, now_ns=frame.capture_ns, base=True)
+        sent = self._line.send(Row.BASE, (unit,), at_ns=at_ns)
+        self._budget.record_base(sent, now_ns=at_ns, keyframe=unit.keyframe)
+        self.cpu_s += time.process_time() - began_s
+
+    def hear(self, payload: bytes) -> None:
+        """What the ground asks for."""
+        grid = block_grid(self._size, align_px=self._settings.align_px)
+        request = RegionRequest.parse(payload, grid=grid)
+        ticks = self._segments[request.first_tick]
+        for tick in [kept for kept in self._kept if kept < request.first_tick and not self._is_asked(kept)]:
+            del self._kept[tick]  # about these the ground had no question
+        for tick, blocks in zip(ticks, request.frames, strict=True):
+            if not blocks.any():
+                self._kept.pop(tick, None)
+            elif tick in self._kept:
+                self._asked.append((tick, blocks))
+
+    def second_pass(self, now_ns: int) -> None:
+        """Code and send what was asked for, as far as the budget has room now."""
+        began_s = time.process_time()
+        while not self.idle:
+            self._fill()
+            size_bytes = self._line.weigh(Row.ROI, self._ready, at_ns=now_ns)
+            if self._line.total_bytes + size_bytes > self._most_bytes:
+                self._ready.clear()
+                self._asked.clear()
+                self._most_bytes = 0  # what comes later would build on what was left out
+                break
+            if size_bytes > self._budget.still_room(now_ns):
+                break
+            self._budget.record_still(size_bytes, now_ns=now_ns)
+            self._line.send(Row.ROI, self._ready, at_ns=now_ns)
+            self._ready.clear()
+        self.cpu_s += time.process_time() - began_s
+
+    def _fill(self) -> None:
+        """Code what makes up the next message."""
+        while self._asked and sum(len(unit.data) for unit in self._ready) < self._settings.bundle_bytes:
+            self._ready.append(self._code_next())
+
+    def _code_next(self) -> AccessUnit:
+        tick, blocks = self._asked.popleft()
+        frame = self._kept.pop(tick)
+        picture = pasted(None, frame.base_bgr, blocks, align_px=self._settings.align_px)
+        unit = self._second.encode(replace(frame, base_bgr=picture), keyframe=not self._second_done)
+        self._second_done = True
+        return unit
+
+    def _keep(self, frame: Frame) -> None:
+        self._kept[frame.index] = frame
+        if len(self._kept) > self._most:
+            oldest = min(self._kept)
+            del self._kept[oldest]
+            if self._asked and self._asked[0][0] == oldest:
+                self._asked.popleft()
+
+    def _is_asked(self, tick: int) -> bool:
+        return any(tick == one for one, _ in self._asked)
+
+    def _shrunk(self, frame: Frame) -> Image:
+        if self._first_size == self._size:
+            return frame.base_bgr
+        return np.asarray(
+            cv2.resize(frame.base_bgr, self._first_size, interpolation=cv2.INTER_AREA), np.uint8
+        )

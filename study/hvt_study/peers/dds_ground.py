@@ -1,0 +1,201 @@
+"""The server's end of the two-pass peer: looks, asks, looks again, and lists what it found."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from hvt_common.link.keys import Row
+from hvt_common.values import AccessUnit, Detections, Image, Tracks, View
+from hvt_common.vision.detect import Detector
+from hvt_common.vision.hevc import BaseDecoder
+from hvt_common.vision.track import ByteTracker, TrackerSettings
+from hvt_study.metrics.contract import NO_ID, FrameView
+from hvt_study.metrics.seen import SeenTick
+from hvt_study.peers.dds_edge import most_kept
+from hvt_study.peers.dds_line import Line
+from hvt_study.peers.dds_regions import Blocks, asked_blocks, asked_boxes, combined, pasted
+from hvt_study.peers.dds_request import RegionRequest
+from hvt_study.peers.dds_settings import DdsSettings
+from hvt_study.sight_clip import TICK_FPS
+
+__all__ = ["DdsGround"]
+
+
+@dataclass(slots=True)
+class _Held:
+    """A frame that is not finished."""
+
+    tick: int
+    capture_ns: int
+    picture_bgr: Image
+    """Base size."""
+    found: Detections
+    """Of the first pass; of both once the second has come."""
+    blocks: Blocks
+    whole: bool = False
+    """Nothing more is to come for it."""
+
+
+@dataclass(slots=True)
+class DdsGround:
+    """Takes what the line delivers; frames are finished in order, each when the pass that completes it is there.
+
+    A frame about which nothing is asked is complete with its segment's question, that is when the last frame of the
+    segment is there; one that the edge had to leave out, when a later one comes. Between two coded frames the list is
+    foretold by the tracker.
+    """
+
+    detector: Detector
+    settings: DdsSettings
+    view: View
+    segments: Sequence[tuple[int, ...]]
+    """The coded ticks of each segment."""
+    line: Line
+    started_ns: int
+    """Capture of the first tick."""
+    lists: dict[int, SeenTick] = field(default_factory=dict)
+    """By tick."""
+    delays_ns: list[int] = field(default_factory=list)
+    """Of every coded frame, in order: capture to the arrival that finished it."""
+    shown_ns: list[tuple[int, int]] = field(default_factory=list)
+    """(arrival, capture) of every picture of the first pass."""
+    requests: deque[tuple[int, bytes]] = field(default_factory=deque)
+    """What the edge is to hear, with the time at which it does."""
+    _held: dict[int, _Held] = field(default_factory=dict)
+    _last_ticks: dict[int, tuple[int, ...]] = field(init=False)
+    _first: BaseDecoder = field(init=False)
+    _second: BaseDecoder = field(init=False)
+    _tracker: ByteTracker = field(init=False)
+    _listed_to: int = 0
+    _at_ns: int = 0
+
+    def __post_init__(self) -> None:
+        size = self.view.base_size
+        self._last_ticks = {ticks[-1]: ticks for ticks in self.segments}
+        self._first, self._second = BaseDecoder(size=size), BaseDecoder(size=size)
+        tracking = TrackerSettings.starting_at(
+            self.settings.confidence, camera_motion=self.settings.camera_motion
+        )
+        self._tracker = ByteTracker(tracking, fps=TICK_FPS)
+
+    def advance(self, now_ns: int) -> None:
+        """Take in what has arrived by now."""
+        for arrival in self.line.arrived(now_ns):
+            self._at_ns = arrival.arrival_ns
+            for unit in arrival.message.units:
+                if arrival.message.row is Row.BASE:
+                    self._first_pass(unit)
+                else:
+                    self._second_pass(unit)
+            self._finish()
+
+    def close(self, *, ticks: int) -> None:
+        """Nothing more comes: finish what is left, and list every tick up to the last."""
+        for held in self._held.values():
+            held.whole = True
+        self._finish()
+        self._list_between(ticks)
+
+    def _first_pass(self, unit: AccessUnit) -> None:
+        self.shown_ns.append((self._at_ns, unit.capture_ns))
+        picture = self._full(_decoded(self._first, unit))
+        found = self.detector.detect(picture)
+        size = self.view.base_size
+        regions = asked_boxes(found, size=size, settings=self.settings)
+        blocks = asked_blocks(regions, size=size, align_px=self.settings.align_px)
+        tick = unit.frame_index
+        self._held[tick] = _Held(tick, unit.capture_ns, picture, found, blocks)
+        if tick in self._last_ticks:
+            self._ask(self._last_ticks[tick])
+        if len(self._held) > most_kept(self.settings) + self.settings.segment_ticks:
+            next(iter(self._held.values())).whole = True
+
+    def _ask(self, ticks: tuple[int, ...]) -> None:
+        """Of a whole segment at once, as DDS does."""
+        frames = [self._held[tick] for tick in ticks]
+        if self.settings.steady:
+            every = np.logical_or.reduce([one.blocks for one in frames])
+            for one in frames:
+                one.blocks = every
+        for one in frames:
+            one.whole = not one.blocks.any()
+        if not all(one.whole for one in frames):
+            payload = RegionRequest(ticks[0], tuple(one.blocks for one in frames)).pack()
+            self.requests.append((self.line.send_request(payload, now_ns=self._at_ns), payload))
+
+    def _second_pass(self, unit: AccessUnit) -> None:
+        over = _decoded(self._second, unit)
+        for held in self._held.values():
+            if held.tick < unit.frame_index and not held.whole:
+                held.whole = True  # the edge had to leave it out
+        mine = self._held.get(unit.frame_index)
+        if mine is None or mine.whole:
+            return
+        mine.picture_bgr = pasted(mine.picture_bgr, over, mine.blocks, align_px=self.settings.align_px)
+        again = self.detector.detect(mine.picture_bgr)
+        mine.found = combined(mine.found, again, settings=self.settings)
+        mine.whole = True
+
+    def _finish(self) -> None:
+        """List the frames that are complete, in order."""
+        while self._held:
+            one = next(iter(self._held.values()))
+            if not one.whole:
+                return
+            del self._held[one.tick]
+            self._list_between(one.tick)
+            tracks = self._tracker.update(one.found, frame_index=one.tick, image_bgr=one.picture_bgr)
+            self.lists[one.tick] = self._seen(tracks, found=one.found)
+            self.delays_ns.append(self._at_ns - one.capture_ns)
+            self._listed_to = one.tick + 1
+
+    def _list_between(self, tick: int) -> None:
+        """Those before ``tick`` that were not coded."""
+        for between in range(self._listed_to, tick):
+            self.lists[between] = self._seen(self._tracker.extrapolated(frame_index=between))
+        self._listed_to = max(self._listed_to, tick)
+
+    def _seen(self, tracks: Tracks, *, found: Detections | None = None) -> SeenTick:
+        names = self._names(tracks.class_ids)
+        confidences = tracks.confidences.astype(np.float32)
+        return SeenTick(
+            self._inside(tracks.boxes_xyxy_px),
+            names,
+            ids=tracks.ids,
+            confidences=confidences,
+            classes_before=names,
+            confidences_before=confidences,
+            origins=("base",) * len(names),
+            shown_s=(self._at_ns - self.started_ns) / 1e9,
+            detections=None if found is None else self._detections(found),
+        )
+
+    def _detections(self, found: Detections) -> FrameView:
+        names = self._names(found.class_ids)
+        ids = np.full(len(names), NO_ID, np.int64)
+        return FrameView(self._inside(found.boxes_xyxy_px), ids, names, found.confidences, names)
+
+    def _names(self, class_ids: np.ndarray[tuple[int], np.dtype[np.int32]]) -> tuple[str, ...]:
+        return tuple(self.detector.class_names[kind] for kind in class_ids.tolist())
+
+    def _inside(self, boxes_base_px: np.ndarray) -> np.ndarray:
+        limits = np.array([*self.view.source_size, *self.view.source_size], np.float32)
+        return np.clip(self.view.to_source(boxes_base_px), 0, limits)
+
+    def _full(self, picture: Image) -> Image:
+        """Base size, whatever the scale of the first pass."""
+        size = self.view.base_size
+        if (picture.shape[1], picture.shape[0]) == size:
+            return picture
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def _decoded(decoder: BaseDecoder, unit: AccessUnit) -> Image:
+    picture = decoder.decode(unit.data)
+    assert picture is not None, f"frame {unit.frame_index} cannot be decoded"
+    return picture

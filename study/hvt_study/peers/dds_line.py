@@ -1,0 +1,154 @@
+"""The line between both ends of the peer: every message is weighed, counted once and sent over a serial link."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row
+from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.link.wire import BaseHeader, Flags
+from hvt_common.values import AccessUnit
+from hvt_edge.budget import RollingBudget
+from hvt_study.serial_link import Arrival, SerialLink
+
+__all__ = ["HEADER_BYTES", "PASS_ROWS", "Line", "UnitMessage", "header_bps"]
+
+HEADER_BYTES = 48
+"""What a `BaseHeader` takes at most."""
+PASS_ROWS = (Row.BASE, Row.ROI)
+"""The rows of the first and of the second pass."""
+_SESSION = 1 << 40  # as many bytes on the wire as a random one
+_SECOND_NS = 1_000_000_000
+_CHANNELS = {Row.BASE: Channel.BASE, Row.ROI: Channel.ROI, Row.CONTROL: Channel.META}
+_VIDEO = DELIVERIES[Row.BASE].encoding
+_FURTHER = struct.Struct(">II")
+"""Before each access unit but the first: its tick and its length."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnitMessage:
+    """Access units of one of the passes, as the ground gets them: one of the first, or some of the second."""
+
+    row: Row
+    units: tuple[AccessUnit, ...]
+
+
+def header_bps(
+    line_bps: float, *, units_per_s: float, messages_per_s: float, row: Row, edge_id: str
+) -> float:
+    """What headers and transport take of ``line_bps``."""
+    payload = round(line_bps / 8 / messages_per_s)
+    around = HEADER_BYTES + overhead_bytes(
+        payload, HEADER_BYTES, key=EdgeKeys(edge_id).key(row), encoding=_VIDEO
+    )
+    return 8 * (messages_per_s * around + (units_per_s - messages_per_s) * _FURTHER.size)
+
+
+class Line:
+    """Both directions. Edge to ground goes over a simulated link; what the ground asks takes its own time back."""
+
+    def __init__(self, *, link_bps: int, budget: RollingBudget, window_ns: int, edge_id: str) -> None:
+        self.budget = budget
+        self.ledger = Ledger(window_ns=window_ns, slack_ns=4 * window_ns)
+        self.line_bytes: Counter[str] = Counter()
+        self.messages: Counter[str] = Counter()
+        self.max_frame_bytes = 0
+        self.arrivals: list[Arrival[None]] = []
+        """Everything that crossed, without what was in it."""
+        self._keys = EdgeKeys(edge_id)
+        self._link: SerialLink[UnitMessage] = SerialLink(rate_bps=link_bps)
+        self._link_bps = link_bps
+        self._digest = hashlib.sha256()
+        self._under_way = 0
+
+    @property
+    def digest(self) -> str:
+        """Of all payloads so far."""
+        return self._digest.hexdigest()
+
+    @property
+    def total_bytes(self) -> int:
+        """Line bytes of everything that was sent."""
+        return self.line_bytes.total()
+
+    @property
+    def empty(self) -> bool:
+        """Whether everything that was sent to the ground has been taken out."""
+        return not self._under_way
+
+    def weigh(self, row: Row, units: Sequence[AccessUnit], *, at_ns: int) -> int:
+        """Line bytes of a message with these access units, were it sent then."""
+        payload = _payload(units)
+        attachment = self._header(row, units[0], at_ns=at_ns).pack(payload)
+        return self._weight(row, payload, attachment, encoding=_VIDEO)
+
+    def send(self, row: Row, units: Sequence[AccessUnit], *, at_ns: int) -> int:
+        """Edge to ground; return the line bytes. The budget is the caller's to tell."""
+        payload = _payload(units)
+        attachment = self._header(row, units[0], at_ns=at_ns).pack(payload)
+        size_bytes = self._count(row, payload, attachment, encoding=_VIDEO, at_ns=at_ns)
+        self.max_frame_bytes = max(self.max_frame_bytes, *(len(unit.data) for unit in units))
+        self._link.put(
+            UnitMessage(row, tuple(units)),
+            size_bytes=size_bytes,
+            enter_ns=at_ns,
+            urgent=row is Row.BASE,
+        )
+        self._under_way += 1
+        return size_bytes
+
+    def send_request(self, payload: bytes, *, now_ns: int) -> int:
+        """Ground to edge as soon as the budget's window has room; return when it is there."""
+        size_bytes = self._weight(Row.CONTROL, payload, b"", encoding=DELIVERIES[Row.CONTROL].encoding)
+        at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
+        self._count(Row.CONTROL, payload, b"", encoding=DELIVERIES[Row.CONTROL].encoding, at_ns=at_ns)
+        self.budget.record_metadata(size_bytes, now_ns=at_ns)
+        return at_ns + round(size_bytes * 8 * _SECOND_NS / self._link_bps)
+
+    def arrived(self, now_ns: int) -> list[Arrival[UnitMessage]]:
+        """What the ground has got by now."""
+        there = self._link.arrived(now_ns)
+        self._under_way -= len(there)
+        self.arrivals += [
+            Arrival(None, one.size_bytes, one.urgent, one.enter_ns, one.arrival_ns) for one in there
+        ]
+        return there
+
+    def _header(self, row: Row, unit: AccessUnit, *, at_ns: int) -> BaseHeader:
+        return BaseHeader(
+            session_id=_SESSION,
+            sequence=self.messages[row],
+            frame_index=unit.frame_index,
+            capture_ns=unit.capture_ns,
+            send_delay_ns=at_ns - unit.capture_ns,
+            flags=int(Flags.LOCKSTEP | ((Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0)),
+        )
+
+    def _weight(self, row: Row, payload: bytes, attachment: bytes, *, encoding: str) -> int:
+        key = self._keys.key(row)
+        around = overhead_bytes(len(payload), len(attachment), key=key, encoding=encoding)
+        return len(payload) + len(attachment) + around
+
+    def _count(self, row: Row, payload: bytes, attachment: bytes, *, encoding: str, at_ns: int) -> int:
+        size_bytes = self._weight(row, payload, attachment, encoding=encoding)
+        self.ledger.count(
+            _CHANNELS[row],
+            payload_bytes=len(payload),
+            attachment_bytes=len(attachment),
+            overhead_bytes=size_bytes - len(payload) - len(attachment),
+            at_ns=at_ns,
+        )
+        self.line_bytes[row] += size_bytes
+        self.messages[row] += 1
+        self._digest.update(payload)
+        return size_bytes
+
+
+def _payload(units: Sequence[AccessUnit]) -> bytes:
+    """The first is the header's; the others say what they are."""
+    first, *others = units
+    return first.data + b"".join(_FURTHER.pack(one.frame_index, len(one.data)) + one.data for one in others)

@@ -1,0 +1,107 @@
+"""Which regions of a first pass are asked for again: the rules of DDS, as pure functions of boxes.
+
+Du et al., "Server-Driven Video Streaming for Deep Learning Inference", SIGCOMM 2020; the public program is
+KuntaiDu/dds, whose names stand in brackets in `DdsSettings`. Boxes are x1, y1, x2, y2 in base pixels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse.csgraph import connected_components
+
+from hvt_common.values import Boxes, Detections, Image
+from hvt_common.vision.boxes import iou
+from hvt_common.vision.nms import suppress
+from hvt_study.peers.dds_settings import DdsSettings
+
+__all__ = [
+    "Blocks",
+    "asked_blocks",
+    "asked_boxes",
+    "block_grid",
+    "combined",
+    "merged",
+    "pasted",
+    "pixel_mask",
+]
+
+Blocks = npt.NDArray[np.bool_]
+"""(rows, columns): which blocks of ``align_px`` are asked for; those at the right and lower rim may be cut."""
+
+_TWIN_IOU = 0.8
+"""Above it two boxes are one object whatever their classes, as in our detectors."""
+
+
+def asked_boxes(found: Detections, *, size: tuple[int, int], settings: DdsSettings) -> Boxes:
+    """The regions, (K, 4), of a first pass's results at one frame of ``size`` (width, height).
+
+    Uncertain results (``low`` ≤ confidence < ``high``) that no confident one explains and that are not too large,
+    those that overlap merged, each enlarged and cut to the picture.
+    """
+    confident = found.confidences >= settings.high
+    boxes = found.boxes_xyxy_px[~confident & (found.confidences >= settings.low)]
+    sides = boxes[:, 2:] - boxes[:, :2]
+    boxes = boxes[sides.prod(axis=1) <= settings.max_area * size[0] * size[1]]
+    if confident.any() and len(boxes):
+        known = iou(boxes, found.boxes_xyxy_px[confident]).max(axis=1) > settings.overlap_iou
+        boxes = boxes[~known]
+    boxes = merged(boxes, over_iou=settings.merge_iou)
+    margin = (boxes[:, 2:] - boxes[:, :2]) * settings.enlarge
+    limits = np.array([*size, *size], np.float32)
+    grown = np.concatenate((boxes[:, :2] - margin, boxes[:, 2:] + margin), axis=1)
+    return np.asarray(np.clip(grown, 0, limits), np.float32)
+
+
+def merged(boxes_px: Boxes, *, over_iou: float) -> Boxes:
+    """One hull for each group of boxes that hang together by overlaps of more than ``over_iou``; in stable order."""
+    if len(boxes_px) < 2:
+        return boxes_px
+    count, group = connected_components(iou(boxes_px, boxes_px) > over_iou, directed=False)
+    hulls = np.empty((count, 4), np.float32)
+    for number in range(count):
+        members = boxes_px[group == number]
+        hulls[number] = (*members[:, :2].min(axis=0), *members[:, 2:].max(axis=0))
+    return hulls
+
+
+def block_grid(size: tuple[int, int], *, align_px: int) -> tuple[int, int]:
+    """(rows, columns) of blocks that cover a picture of ``size`` (width, height)."""
+    return -(-size[1] // align_px), -(-size[0] // align_px)
+
+
+def asked_blocks(boxes_px: Boxes, *, size: tuple[int, int], align_px: int) -> Blocks:
+    """Every block that a region touches."""
+    rows, columns = block_grid(size, align_px=align_px)
+    blocks = np.zeros((rows, columns), np.bool_)
+    first = np.floor(boxes_px[:, :2] / align_px).astype(int)
+    last = np.ceil(boxes_px[:, 2:] / align_px).astype(int)
+    for (left, top), (right, bottom) in zip(first.tolist(), last.tolist(), strict=True):
+        blocks[max(top, 0) : bottom, max(left, 0) : right] = True
+    return blocks
+
+
+def pixel_mask(blocks: Blocks, *, size: tuple[int, int], align_px: int) -> npt.NDArray[np.bool_]:
+    """(height, width): the pixels of these blocks."""
+    return blocks.repeat(align_px, axis=0).repeat(align_px, axis=1)[: size[1], : size[0]]
+
+
+def pasted(
+    under_bgr: Image | None, over_bgr: Image, blocks: Blocks, *, align_px: int
+) -> npt.NDArray[np.uint8]:
+    """A picture with these blocks of ``over_bgr`` and the rest of ``under_bgr``, or black where that is None."""
+    high, wide = over_bgr.shape[:2]
+    picture = np.zeros_like(over_bgr) if under_bgr is None else under_bgr.copy()
+    mask = pixel_mask(blocks, size=(wide, high), align_px=align_px)
+    np.copyto(picture, over_bgr, where=mask[..., None])
+    return picture
+
+
+def combined(first: Detections, second: Detections, *, settings: DdsSettings) -> Detections:
+    """The final results of a frame: the confident ones of the first pass and all of the second, without doubles."""
+    sure = first.confidences >= settings.high
+    boxes = np.concatenate((second.boxes_xyxy_px, first.boxes_xyxy_px[sure]))
+    scores = np.concatenate((second.confidences, first.confidences[sure]))
+    kinds = np.concatenate((second.class_ids, first.class_ids[sure]))
+    kept = suppress(boxes, scores, kinds, iou=settings.nms_iou, any_class_iou=_TWIN_IOU)
+    return Detections(boxes[kept], scores[kept], kinds[kept])

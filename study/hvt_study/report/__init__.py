@@ -1,0 +1,1 @@
+"""From the rows of a study to its tables, figures and pages."""

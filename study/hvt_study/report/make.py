@@ -1,0 +1,202 @@
+"""From rows to a report: which tables and figures, in which order, and what is said between them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+
+from hvt_study.matrix.accounting import in_accounting
+from hvt_study.report.answer import DECIDES, REFERENCES, answer, forests
+from hvt_study.report.appendix_tables import failed_table, metrics_table
+from hvt_study.report.captions import time_of
+from hvt_study.report.curve_figures import codec_figure, utility_figure
+from hvt_study.report.document import Part, Report, Section, Table
+from hvt_study.report.equal_sight import equal_sight
+from hvt_study.report.example_figures import crop_pictures, timeline_figure
+from hvt_study.report.examples import Example
+from hvt_study.report.intervals import ENOUGH
+from hvt_study.report.matrix_table import matrix_table
+from hvt_study.report.pair_figures import equal_figures
+from hvt_study.report.pair_tables import differences_table, equal_table
+from hvt_study.report.pairs import pairs
+from hvt_study.report.runs import Row, Setting, counts, sequence_of, settings
+from hvt_study.report.tables import (
+    named_table,
+    pilot_table,
+    proxy_table,
+    seen_table,
+    size_table,
+    spent_table,
+)
+
+__all__ = ["make_report"]
+
+_MATRICES = ("top1_all", "map_50", "hota")
+
+
+def make_report(rows: Sequence[Row], *, sweep: Table | None = None, example: Example | None = None) -> Report:
+    """All of it, in order; nothing is read or written.
+
+    Raises:
+        UserError: two different runs count at one place.
+    """
+    found = settings(rows)
+    accounting = next((str(row["accounting"]) for row in rows), "span")
+    sections = (
+        Section("The answer", tuple(answer(found))),
+        Section("Selector sweep", (sweep,) if sweep is not None else ()),
+        Section("End-to-end results", tuple(_each(found, spent_table, seen_table, named_table, size_table))),
+        Section("Method matrix", tuple(_matrices(found))),
+        Section("Against video at the same bits", tuple(_against(found))),
+        Section("Utility over bitrate", tuple(_utility(found))),
+        Section("Still codecs", tuple(_codecs(found))),
+        Section("One flight", tuple(_flight(rows, example))),
+        Section("The pilot's accounting and proxies", tuple(_pilot(rows, found))),
+        Section("Metrics", (metrics_table(accounting),)),
+        Section("Runs that do not count", tuple(_failed(rows))),
+        Section("What it was run with", tuple(_provenance(rows))),
+    )
+    return Report(
+        "Does the split beat the same bits spent on video?",
+        tuple(_lead(rows)),
+        tuple(section for section in sections if section.parts),
+    )
+
+
+def _lead(rows: Sequence[Row]) -> Iterator[str]:
+    good = sum(map(counts, rows))
+    sequences = len({(row["dataset"], row["sequence"]) for row in rows})
+    span_s = sum(row["duration_s"] or 0 for row in rows if counts(row))
+    bad = len(rows) - good
+    strays = _strays(rows)
+    accounting = next((row["accounting"] for row in rows), "span")
+    yield (
+        f"{_many(len(rows), 'run')} over {_many(sequences, 'sequence')}, {span_s / 60:.1f} minutes of flight. {good} "
+        f"count; {bad or 'none'} failed or missed the total to be matched. Rates are of every byte that crosses the "
+        f"line, over the {time_of(accounting)}, unless a table says otherwise."
+    )
+    if strays:
+        yield (
+            f"{_many(strays, 'run')} of video {'was' if strays == 1 else 'were'} coded to the total of a run that is "
+            "not the one in this table: no difference is taken from it."
+        )
+    yield (
+        f"Means are over sequences, with 95 % percentile bootstrap intervals in brackets from {ENOUGH} sequences on: "
+        "sequences are drawn, not frames. Of fewer than some ten the interval is too narrow. A dash stands where "
+        "there is no figure."
+    )
+
+
+def _strays(rows: Sequence[Row]) -> int:
+    """Followers that count and are in no pair, as in tables that were joined."""
+    paired = {
+        (name, row["key"])
+        for setting in settings(rows)
+        for pair in pairs(setting)
+        for name, row in pair.matched.items()
+    }
+    followers = [row for row in rows if counts(row) and row["matched_to"]]
+    return sum((sequence_of(row), row["key"]) not in paired for row in followers)
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _each(found: Iterable[Setting], *makers: object) -> Iterator[Part]:
+    for setting in found:
+        for make in makers:
+            assert callable(make)
+            table: Table = make(setting)
+            if table.rows:
+                yield table
+
+
+def _pilot(rows: Sequence[Row], found: Sequence[Setting]) -> Iterator[Part]:
+    """Both accountings, whichever the other tables are in."""
+    yield from _each(settings(in_accounting(rows, "span")), pilot_table)
+    yield from _each(found, proxy_table)
+
+
+def _matrices(found: Iterable[Setting]) -> Iterator[Part]:
+    for setting in found:
+        for column in _MATRICES:
+            table = matrix_table(setting, column)
+            if table is not None:
+                yield table
+
+
+def _against(found: Sequence[Setting]) -> Iterator[Part]:
+    for index, setting in enumerate(found):
+        table = differences_table(setting, list(pairs(setting)))
+        if table is not None:
+            yield table
+        if index:  # the first stands above all
+            yield from forests(setting, name=f"differences-{index + 1}")
+        equal = [
+            equal_sight(setting, arm, reference=reference, column=DECIDES)
+            for regime in setting.regimes
+            for arm in setting.hybrids(regime)
+            for reference in REFERENCES
+            if reference in setting.references()
+        ]
+        yield from equal_figures(setting, equal, name=f"equal-sight-{index + 1}", column=DECIDES)
+        yield from _there(equal_table(setting, equal, column=DECIDES))
+
+
+def _utility(found: Sequence[Setting]) -> Iterator[Part]:
+    for index, setting in enumerate(found):
+        yield from _there(utility_figure(setting, name=f"utility-{index + 1}"))
+
+
+def _codecs(found: Sequence[Setting]) -> Iterator[Part]:
+    for index, setting in enumerate(found):
+        yield from _there(codec_figure(setting, name=f"codecs-{index + 1}"))
+
+
+def _flight(rows: Sequence[Row], example: Example | None) -> Iterator[Part]:
+    """Only of a run that is in the table, and only if it is the very same flight."""
+    digests = {row["key"]: row["digest"] for row in rows}
+    if example is None or example.key not in digests:
+        return
+    if digests[example.key] != example.digest:
+        yield f"{example.title}: flown again, it sent other payloads than the run in the table, and is not shown."
+        return
+    yield f"Which flight is shown is decided by rule: {example.rule}."
+    yield timeline_figure(example, name="timeline")
+    if example.crops:
+        yield crop_pictures(example)
+
+
+def _failed(rows: Sequence[Row]) -> Iterator[Part]:
+    yield from _there(failed_table(rows))
+
+
+def _provenance(rows: Sequence[Row]) -> Iterator[Part]:
+    said: dict[str, list[str]] = {}
+    for row in rows:
+        for name, version in _versions(row["versions"]).items():
+            if version not in said.setdefault(name, []):
+                said[name].append(version)
+    if said:
+        yield "Software: " + "; ".join(f"{name} {', '.join(each)}" for name, each in said.items()) + "."
+    mixed = [name for name, each in said.items() if len(each) > 1]
+    if mixed:
+        yield f"Runs of different versions are mixed here: {', '.join(mixed)}."
+    yield (
+        "Every row of results.parquet has the full configuration (config), the software (versions), hashes of the "
+        "clip and the models (content) and of all payloads (digest), in the columns of these names."
+    )
+
+
+def _versions(text: str) -> dict[str, str]:
+    try:
+        found = json.loads(text or "{}")
+    except json.JSONDecodeError:
+        return {}
+    return {str(name): str(version) for name, version in found.items()} if isinstance(found, dict) else {}
+
+
+def _there(part: Part | None) -> Iterator[Part]:
+    if part is not None:
+        yield part
