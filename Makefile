@@ -55,7 +55,7 @@ bench-stills: setup ## still codecs on real crops: bytes at equal quality, time 
 bench-sight: setup ## what the ground sees at each bitrate, method by method, on a car park and on small objects
 	@$(BIN)/python -m bench.sight
 
-link: setup      ## edge and ground over bad links; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns SEED=
+link: setup      ## edge and ground over bad links; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns|tun SEED=
 	@PYTHONPATH=tests $(BIN)/python -m link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
 		$(if $(LASTS),--lasts $(LASTS)) $(if $(CARRIER),--carrier $(CARRIER)) $(if $(SEED),--seed $(SEED))
 

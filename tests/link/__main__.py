@@ -16,12 +16,12 @@ from typing import Any
 from rich.console import Console
 
 from hvt_common.errors import exit_with_sentence
-from link.laboratory import Run, run
+from link.laboratory import CARRIERS, Run, run
 from link.material import demo_clip, looped
 from link.measures import Outcome, rate_over_time, rows
-from link.netns import UnavailableError
 from link.rows import row, save, table
 from link.script import LENGTHS, load_scenario, scenario_names
+from link.sides import UnavailableError, congestion_control
 
 BUILD = Path("build")
 
@@ -37,6 +37,8 @@ def _run(argv: Sequence[str] | None) -> int:
     scenarios = [load_scenario(name) for name in names]
     clip = Path(asked.clip) if asked.clip else demo_clip(BUILD / "link" / "demo.mp4")
     console, found, outcomes = Console(highlight=False), [], []
+    if asked.carrier != "relay":
+        console.print(f"the kernel's TCP paces itself by {congestion_control()}")
     for scenario in scenarios:
         folder = BUILD / "link" / scenario.name
         lasts_s = scenario.script(asked.length, lasts=asked.lasts).lasts_s
@@ -96,7 +98,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--clip", default="", help="what the edge plays, repeated as needed [the demo scene]")
     parser.add_argument("--length", choices=LENGTHS, default="full")
     parser.add_argument("--lasts", help="another length, such as 60min for a soak")
-    parser.add_argument("--carrier", choices=["relay", "netns"], default="relay")
+    parser.add_argument("--carrier", choices=CARRIERS, default="relay")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--name", default="link", help="of the table and the picture in build/ [link]")
     parser.add_argument("--edge", default="", help="further arguments of hvt-edge, in one word")

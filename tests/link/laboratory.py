@@ -12,18 +12,21 @@ from pathlib import Path
 from typing import Literal
 
 from link.measures import Outcome
-from link.netns import GROUND_HOST, Namespaces
+from link.netns import Namespaces
 from link.relay import Relay
-from link.script import Length, Scenario, Script
+from link.script import Length, Scenario, Script, Transport
+from link.sides import GROUND_HOST, Sides
 from link.started import Started
 from link.store_left import store_left
 from link.timing import read_timing
+from link.tunnel import Tunnel
 from link.watch import Watch
 from processes import eventually, free_ports
 
-__all__ = ["Carrier", "Run", "run"]
+__all__ = ["CARRIERS", "Carrier", "Run", "run"]
 
-Carrier = Literal["relay", "netns"]
+Carrier = Literal["relay", "netns", "tun"]
+CARRIERS: tuple[Carrier, ...] = ("relay", "netns", "tun")
 
 _START_S = 150.0
 _TAKES_IN_S = 2.5
@@ -53,12 +56,19 @@ class Run:
         script = self.scenario.script(self.length, seed=self.seed, lasts=self.lasts)
         return script.without_delay() if self.carrier == "netns" else script
 
+    @property
+    def transport(self) -> Transport:
+        """What edge and ground speak over it."""
+        return (
+            "tcp" if self.carrier == "netns" else self.scenario.transport
+        )  # there the kernel's own is asked
+
 
 def run(asked: Run) -> Outcome:
     """Run one scenario from start to end; nothing is left running.
 
     Raises:
-        UnavailableError: the carrier is netns, and there are none to be had.
+        UnavailableError: the carrier is netns or tun, and there is none to be had.
         AssertionError: edge or ground did not come up.
     """
     asked.folder.mkdir(parents=True, exist_ok=True)
@@ -66,22 +76,17 @@ def run(asked: Run) -> Outcome:
     for old in (timing, *asked.folder.glob("run*.rrd")):
         old.unlink(missing_ok=True)
     shutil.rmtree(asked.folder / "store", ignore_errors=True)
-    with ExitStack() as stack:
-        (port,) = free_ports(1)
-        link: Relay | Namespaces
-        if asked.carrier == "netns":  # by TCP: it is the kernel's own that is asked there
-            link = stack.enter_context(Namespaces(script))
-            sides = {side: link.prefix(side) for side in link.names}
-            listen = connect = f"tcp/{GROUND_HOST}:{port}"
+    kind, (port,) = asked.transport, free_ports(1)
+    with _carrier(asked, script, target_port=port) as link, ExitStack() as stack:
+        if isinstance(link, Sides):
+            sides, open_to_all = {side: link.prefix(side) for side in link.names}, ["--insecure"]
+            listen = connect = f"{kind}/{GROUND_HOST}:{port}"
         else:
-            kind = asked.scenario.transport
-            link = stack.enter_context(Relay(script, protocol=kind, target_port=port, seed=asked.seed))
-            sides = {"edge": [], "ground": []}
+            sides, open_to_all = {"edge": [], "ground": []}, []
             listen, connect = f"{kind}/127.0.0.1:{port}", f"{kind}/127.0.0.1:{link.port}"
         ground = stack.enter_context(Started("ground", asked.folder, [
             *sides["ground"], sys.executable, "-m", "hvt_ground.cli", "--timing", str(timing), "--listen", listen,
-            *(["--insecure"] if asked.carrier == "netns" else []), "--record", str(asked.folder / "run.rrd"),
-            *asked.ground_arguments,
+            *open_to_all, "--record", str(asked.folder / "run.rrd"), *asked.ground_arguments,
         ]))  # fmt: skip
         ground.until("listening on", within_s=_START_S)
         edge = stack.enter_context(Started("edge", asked.folder, [
@@ -110,6 +115,14 @@ def run(asked: Run) -> Outcome:
         said={"edge": edge.said, "ground": ground.said},
         kept=store_left(asked.folder / "store"),
     )
+
+
+def _carrier(asked: Run, script: Script, *, target_port: int) -> Relay | Sides:
+    if asked.carrier == "netns":
+        return Namespaces(script)
+    if asked.carrier == "tun":
+        return Tunnel(script, seed=asked.seed)
+    return Relay(script, protocol=asked.transport, target_port=target_port, seed=asked.seed)
 
 
 def _playing(edge: Started, timing: Path) -> bool:

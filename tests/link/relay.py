@@ -19,11 +19,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Literal, Self
 
 from hvt_common.errors import exit_with_sentence
-from link.pipe import DATAGRAM_HEADER_BYTES, SEGMENT_BYTES, SEGMENT_HEADER_BYTES, Pipe, Stream
+from link.pipe import DATAGRAM_HEADER_BYTES, SEGMENT_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
 from link.script import LENGTHS, Script, load_scenario
 
 __all__ = ["Protocol", "Relay"]
@@ -173,21 +174,34 @@ async def _connection(relay: Relay, near: socket.socket) -> None:
             _log.debug("a connection ended: %s", ended.exceptions)
 
 
+@dataclass(frozen=True, slots=True)
+class _Flight:
+    """What is on its way, oldest first."""
+
+    queue: asyncio.Queue[tuple[Segment, bytes]] = field(
+        default_factory=lambda: asyncio.Queue(_FLIGHT_SEGMENTS)
+    )
+    later_sent: asyncio.Event = field(default_factory=asyncio.Event)
+    """Another segment is on its way: those that were lost before it may come at another time."""
+
+
 async def _way(source: socket.socket, sink: socket.socket, pipe: Pipe) -> None:
-    flight: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_FLIGHT_SEGMENTS)
+    flight = _Flight()
     async with asyncio.TaskGroup() as group:
         group.create_task(_offer(source, flight, pipe))
         group.create_task(_deliver(sink, flight))
 
 
-async def _offer(source: socket.socket, flight: asyncio.Queue[tuple[float, bytes]], pipe: Pipe) -> None:
+async def _offer(source: socket.socket, flight: _Flight, pipe: Pipe) -> None:
     stream, loop = Stream(pipe), asyncio.get_running_loop()
     while True:
         data = await loop.sock_recv(source, SEGMENT_BYTES)
         size = len(data) + SEGMENT_HEADER_BYTES
         while (at_s := _admitted_s(pipe, stream, size)) > time.monotonic():
             await _until(at_s)
-        await flight.put((stream.segment(size, time.monotonic()), data))
+        segment = stream.segment(size, time.monotonic())
+        flight.later_sent.set()
+        await flight.queue.put((segment, data))
         if not data:
             return
 
@@ -197,11 +211,15 @@ def _admitted_s(pipe: Pipe, stream: Stream, size_bytes: int) -> float:
     return max(stream.may_send_s(now_s), pipe.room_s(size_bytes, now_s))
 
 
-async def _deliver(sink: socket.socket, flight: asyncio.Queue[tuple[float, bytes]]) -> None:
+async def _deliver(sink: socket.socket, flight: _Flight) -> None:
     loop = asyncio.get_running_loop()
     while True:
-        arrives_s, data = await flight.get()
-        await _until(arrives_s)
+        segment, data = await flight.queue.get()
+        while (wait_s := segment.arrives_s - time.monotonic()) > 0:
+            flight.later_sent.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(wait_s):
+                    await flight.later_sent.wait()
         if not data:
             sink.shutdown(socket.SHUT_WR)
             return
