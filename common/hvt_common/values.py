@@ -65,6 +65,11 @@ class View:
         )
         return cls(source_size=source_size, base_size=base_size, scale=scale, offset_px=offset)
 
+    @property
+    def enlarges(self) -> bool:
+        """Whether the base has more pixels of the scene than the source."""
+        return self.scale > 1
+
     def to_base(self, boxes_source_px: Boxes) -> Boxes:
         """Map (N, 4) boxes from source to base pixels; not clipped."""
         return (boxes_source_px * self.scale + self._shift()).astype(np.float32)

@@ -115,7 +115,7 @@ def make_detector(config: EdgeConfig) -> Detector:
 def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
     """Run the detector once on what it will be given: a runtime may compile for each shape."""
     if config.candidates == "source":
-        warm_up_source(detector, view.source_size)
+        warm_up_source(detector, view.base_size if view.enlarges else view.source_size)
     else:
         warm_up(detector, view.base_size)
 

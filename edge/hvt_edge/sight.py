@@ -17,7 +17,11 @@ __all__ = ["Seen", "Sight", "SightSettings"]
 
 @dataclass(frozen=True, slots=True)
 class SightSettings:
-    """``candidates`` says on which pixels the detector runs and the tracker follows the camera."""
+    """``candidates`` says on which pixels the detector runs and the tracker follows the camera.
+
+    Of the source means before it is coded, at the finer of its two sizes: a source that the base enlarges is looked at
+    enlarged, for the ground's detector sees it so, and one that looks at fewer pixels would find less than it.
+    """
 
     detect_every: int = 5
     """Ticks from one detection to the next; see `Sight.see` for streams that code fewer ticks than that."""
@@ -107,6 +111,8 @@ class Sight:
         if self._settings.candidates == "decoded":
             assert base_bgr is not None, "detection on the decoded stream is due at coded ticks only"
             return self._detector.detect(base_bgr)
+        if self._view.enlarges:
+            return self._detector.detect(frame.base_bgr)
         found = self._detector.detect(frame.source_bgr)
         width, height = self._view.base_size
         boxes = self._view.to_base(found.boxes_xyxy_px)

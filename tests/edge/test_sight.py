@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
 from dataclasses import replace
@@ -16,6 +17,7 @@ from hvt_common.link.ledger import Ledger
 from hvt_common.link.wire import RoiHeader, StillResult
 from hvt_common.values import Frame, View
 from hvt_common.vision.track import ByteTracker, TrackerSettings
+from hvt_edge import still_stage
 from hvt_edge.budget import BudgetSettings, RollingBudget
 from hvt_edge.candidates import TrackMemory
 from hvt_edge.choose import Chooser, ChooserSettings
@@ -82,6 +84,24 @@ def test_candidates_of_the_source_lie_in_base_pixels():
     for frame, unit in zip(FRAMES[:4], UNITS, strict=False):
         large = np.repeat(np.repeat(frame.base_bgr, 2, axis=0), 2, axis=1)
         seen = eyes.see(Frame(frame.index, frame.capture_ns, large, frame.base_bgr), unit)
+    np.testing.assert_allclose(seen.tracks.boxes_xyxy_px[0], square_box(3), atol=3)
+
+
+def test_a_source_smaller_than_the_base_is_looked_at_enlarged():
+    """The edge would look at fewer pixels than the ground does, and its tracks would say less than the picture."""
+    looked_at = []
+
+    class Noting(RedSquares):
+        def detect(self, picture_bgr):
+            looked_at.append(picture_bgr)
+            return super().detect(picture_bgr)
+
+    view = View.fitted((160, 96), SIZE, fit="letterbox")
+    eyes = sight(detector=Noting(), view=view, candidates="source", detect_every=1)
+    for frame, unit in zip(FRAMES[:4], UNITS, strict=False):
+        small = frame.base_bgr[::2, ::2]
+        seen = eyes.see(Frame(frame.index, frame.capture_ns, small, frame.base_bgr), unit)
+    assert all(picture is frame.base_bgr for picture, frame in zip(looked_at, FRAMES, strict=False))
     np.testing.assert_allclose(seen.tracks.boxes_xyxy_px[0], square_box(3), atol=3)
 
 
@@ -263,8 +283,9 @@ def test_what_the_ground_says_counts_and_no_opinion_does_not():
     assert rig.memory._histories[1].belief.class_name == "bus"
 
 
-def test_the_worker_takes_all_frames_in_order_and_finishes():
+def test_the_worker_takes_all_frames_in_order_and_finishes(monkeypatch):
     """The last stills of a clip would be missing."""
+    monkeypatch.setattr(still_stage, "_FINISH_S", 30 * still_stage._FINISH_S)  # on a busy machine as well
     rig = Rig()
     with StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns) as worker:
         for frame, unit in zip(FRAMES, UNITS, strict=True):
@@ -277,17 +298,19 @@ def test_the_worker_takes_all_frames_in_order_and_finishes():
 
 def test_an_error_in_the_worker_is_raised_even_when_its_queue_is_full():
     """The edge would drop every further frame in silence and look alive."""
+    offered = threading.Event()
 
     class Broken(RedSquares):
         def detect(self, image_bgr):
-            time.sleep(0.1)
+            assert offered.wait(30)
             raise RuntimeError("model is gone")
 
     rig = Rig(detector=Broken())
     worker = StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns, length=2)
     for frame, unit in zip(FRAMES[:3], UNITS, strict=False):
         worker.offer(frame, unit)
-    worker._thread.join(10)
+    offered.set()
+    worker._thread.join(30)
     with pytest.raises(RuntimeError, match="model is gone"):
         assert worker.full
     worker.close()
@@ -295,9 +318,16 @@ def test_an_error_in_the_worker_is_raised_even_when_its_queue_is_full():
 
 def test_closing_a_busy_worker_is_quick_and_leaves_nothing_running():
     """Ctrl-C would hang behind a slow detector, or two threads would use one queue."""
-    rig = Rig(detector=RedSquares(takes_s=0.6))
+
+    class Slow(RedSquares):
+        def detect(self, image_bgr):
+            assert worker._given_up.wait(30), "for as long as anybody waits"
+            return super().detect(image_bgr)
+
+    rig = Rig(detector=Slow())
     worker = StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns)
     for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
         worker.offer(frame, unit)
     worker.close()
     assert not worker._thread.is_alive()
+    assert rig.stage._steps < 16, "what was not in hand was left"
