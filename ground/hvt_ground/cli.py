@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from hvt_common.allocator import keep_to_few_heaps
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.report import print_table, say, start_log, write_json
@@ -47,6 +48,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(to_toml(config), end="")
         return 0
     config = check(config)
+    keep_to_few_heaps()
     release_log = start_log("hvt-ground", quiet=config.quiet)
     stop = stop_on_signals()
     sessions = Ground(config, stop=stop, on_started=release_log).run()
