@@ -7,15 +7,19 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from typing import ParamSpec, TypeVar
 
 import cv2
 
 from hvt_common.errors import UserError
 
 __all__ = ["dask_pool", "local_pool"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _CONNECT_S = 10
 _TALKERS = ("distributed", "distributed.client", "tornado", "tornado.application", "asyncio")
@@ -32,7 +36,7 @@ def local_pool(jobs: int) -> Iterator[Executor]:
     """
     # Fresh processes: a fork would share threads and locks of what is open here.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_prepare)
+    pool = _Processes(jobs, mp_context=context, initializer=_prepare)
     try:
         yield pool
     except BaseException as error:
@@ -81,10 +85,23 @@ def dask_pool(address: str) -> Iterator[Executor]:
             pool.shutdown(wait=False)
 
 
+class _Processes(ProcessPoolExecutor):
+    """Starts its processes deaf to Ctrl-C: one that is still being imported would answer it with a traceback."""
+
+    def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
+        # What is blocked is inherited; here it is only late.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(fn, *args, **kwargs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _prepare() -> None:
     """Once in each process: one thread, no word of its own when interrupted, and no life after its parent."""
     cv2.setNumThreads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
 
 

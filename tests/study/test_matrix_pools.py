@@ -1,0 +1,29 @@
+"""The processes of a study."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+PROGRAM = """
+import multiprocessing, os, signal, time
+from hvt_study.matrix.pools import local_pool
+
+if __name__ == "__main__":
+    with local_pool(1) as pool:
+        done = pool.submit(os.getpid)
+        (child,) = multiprocessing.active_children()
+        os.kill(child.pid, signal.SIGINT)  # a moment after its start: it is still being imported
+        assert done.result(60) == child.pid
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ()), "here it is heard again"
+"""
+
+
+def test_a_process_that_is_being_started_does_not_answer_ctrl_c(tmp_path):
+    """Who stops a study in its first second would get a traceback for each process."""
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, str(program)], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")
