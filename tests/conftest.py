@@ -7,8 +7,14 @@ import socket
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
+
+# Hypothesis' own 200 ms for an example are an assertion on speed: a machine that stops the process for so long would
+# break a property that holds. Here and not in a fixture: `@settings` takes what is loaded when its module is read.
+settings.register_profile("hvt", deadline=None)
+settings.load_profile("hvt")
 
 
 @pytest.fixture(autouse=True, scope="session")

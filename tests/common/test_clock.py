@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.clock import SteadyClock
@@ -41,7 +41,6 @@ def test_an_even_path_gives_the_exact_offset():
     offset=st.integers(-(10**18), 10**18),
     paths=st.lists(st.tuples(delays, delays, delays), min_size=1, max_size=20),
 )
-@settings(deadline=None)
 def test_the_truth_is_within_the_stated_error(offset, paths):
     """The stated error would be a lie, and with it every latency."""
     clock = ClockOffset(window_ns=10**15)

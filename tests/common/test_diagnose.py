@@ -42,7 +42,7 @@ def _files(fleet: Fleet, name: str = "uav-1", *, ca: Fleet | None = None) -> Tls
 
 
 @contextmanager
-def _server(answer: bytes | None, *, hold_s: float = 0.0) -> Iterator[int]:
+def _server(answer: bytes | None) -> Iterator[int]:
     """A TCP server that sends something to who connects, or hangs up, or (None) keeps silent; yields its port."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         stop = threading.Event()
@@ -55,7 +55,7 @@ def _server(answer: bytes | None, *, hold_s: float = 0.0) -> Iterator[int]:
                     return
                 with taken:
                     if answer is None:
-                        stop.wait(20)
+                        stop.wait()
                     else:
                         taken.sendall(answer)
 
@@ -171,11 +171,12 @@ def test_a_second_link_that_does_not_come_is_said_once(
     with (
         open_session(LinkSettings("ground", listen=(endpoint,), zenoh_config=file)),
         open_session(settings) as session,
-        LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch,
     ):
-        _until(lambda: caplog.records)
-        time.sleep(0.6)
-        assert watch.trouble == ""
+        _until(session.info.links)
+        with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch:
+            _until(lambda: caplog.records)
+            time.sleep(0.6)
+            assert watch.trouble == ""
     (said,) = [record.getMessage() for record in caplog.records]
     assert said.startswith(
         "one of the two links is missing: answers and pictures share the other; either the other"
@@ -191,12 +192,12 @@ def test_a_guest_with_one_link_is_no_half(
     with (
         open_session(LinkSettings("ground", listen=(other,), links=2)),
         open_session(settings) as session,
-        LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch,
-        joined(own),
     ):
-        _until(lambda: len(session.info.links()) == 3)
-        time.sleep(1.5)
-        assert watch.trouble == ""
+        _until(lambda: len(session.info.links()) == 2)
+        with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch, joined(own):
+            _until(lambda: len(session.info.links()) == 3)
+            time.sleep(1.5)
+            assert watch.trouble == ""
     assert not caplog.records
 
 
@@ -207,17 +208,30 @@ def _until(true: object, *, within_s: float = 25.0) -> None:
         time.sleep(0.02)
 
 
-def test_the_watch_ends_with_its_session_and_holds_nobody_up(fleet: Fleet) -> None:
+def _watching() -> bool:
+    return any(one.name == "hvt-link-watch" for one in threading.enumerate())
+
+
+def test_the_watch_ends_with_its_session_and_holds_nobody_up(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Ctrl-C during a visit to a dead address has to end the program at once."""
+    _until(lambda: not _watching())
+    visiting = threading.Event()
+
+    def noted(endpoint: str, files: TlsFiles) -> str:
+        visiting.set()
+        return why_no_link(endpoint, files)
+
+    monkeypatch.setattr("hvt_common.link.diagnose.why_no_link", noted)
+    monkeypatch.setattr("hvt_common.link.probe._STEP_S", 60.0)  # the visit lasts until the server goes
     with _server(None) as port:
         settings = fleet.settings("uav-1", "edge", connect=(f"tls/127.0.0.1:{port}",))
         with open_session(settings) as session:
-            watch = LinkWatch(session, settings, served=lambda _: True)
-            with watch:
-                time.sleep(5.5)  # in the middle of a visit
-                began_s = time.monotonic()
-            assert time.monotonic() - began_s < 1
-    _until(lambda: not any(one.name == "hvt-link-watch" for one in threading.enumerate()))
+            with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2):
+                assert visiting.wait(25)
+            assert _watching(), "nobody has waited for the visit"
+    _until(lambda: not _watching())
 
 
 # Keys, before the start

@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import pytest
 import zenoh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
@@ -26,7 +26,6 @@ PATTERNS = st.from_regex(r"[ab*-]{1,8}", fullmatch=True)
 
 
 @given(edge=EDGE_IDS, row=st.sampled_from(Row))
-@settings(deadline=None)
 def test_a_key_parses_back(edge, row):
     """The ground would not know which edge a message is from."""
     assert parse_key(EdgeKeys(edge).key(row)) == (edge, row)
@@ -63,14 +62,12 @@ def test_a_foreign_key_is_none(key):
 
 
 @given(key=st.text(max_size=60))
-@settings(deadline=None)
 def test_no_key_raises(key):
     """The same for any text."""
     parse_key(key)
 
 
 @given(edge=st.from_regex(r"[ab-]{1,8}", fullmatch=True), pattern=PATTERNS)
-@settings(deadline=None)
 def test_the_selector_and_the_pattern_agree(edge, pattern):
     """The ground would record edges that were not asked for, or miss some that were."""
     key_expr = zenoh.KeyExpr(selector(Row.BASE, edges=pattern))

@@ -179,7 +179,6 @@ def test_framing_is_what_was_measured(payload, attachment, encoding, framing):
 
 
 @given(payload=st.integers(0, 4_000_000), attachment=st.integers(0, 500))
-@settings(deadline=None)
 def test_overhead_is_bounded_and_grows_with_size(payload, attachment):
     """A formula with a hole would let a still through that the link has no room for."""
     key = "hvt/uav-1/roi"

@@ -216,7 +216,7 @@ def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
         subscriber = subscribe(listener, "hvt/uav-1/*", inbox=inbox)
         with open_session(LinkSettings("edge", connect=(endpoint,), links=2)) as connector:
             queryable = serve(connector, Row.INFO, keys=KEYS, answer=lambda question: question)
-            wait_for(lambda: len(connector.info.links()) == 2)
+            wait_for(lambda: all(len(session.info.links()) == 2 for session in (connector, listener)))
             for session in (connector, listener):
                 assert sorted(one.priorities for one in session.info.links()) == [(1, 3), (4, 7)]
             rows = (Row.BASE, Row.ROI, Row.TRACKS, Row.PAST, Row.STATUS)

@@ -24,7 +24,6 @@ def played(times, fps, *, tail_s, slack_s=Fraction(0)):
     )
 
 
-@settings(deadline=None)
 @given(source=rates, base=rates, count=st.integers(1, 200), start=st.fractions(-5, 5, max_denominator=90_000))
 def test_any_rate_shows_the_latest_frame_at_or_before_each_instant(source, base, count, start):
     """A clip of any rate would stutter, drift, or show the future."""
@@ -34,7 +33,6 @@ def test_any_rate_shows_the_latest_frame_at_or_before_each_instant(source, base,
     assert len(out) == base_frame_count(count / source, fps=base)
 
 
-@settings(deadline=None)
 @given(
     gaps=st.lists(st.fractions(Fraction(1, 1000), 2, max_denominator=1000), min_size=1, max_size=60),
     base=rates,
@@ -112,7 +110,6 @@ def test_a_camera_that_pauses_does_not_burst_afterwards():
     assert len([t for t in taken if 60 <= t < 60.9]) == 10
 
 
-@settings(deadline=None)
 @given(
     source=st.tuples(st.integers(16, 4000), st.integers(16, 4000)),
     base=st.tuples(st.integers(32, 2000), st.integers(32, 2000)),

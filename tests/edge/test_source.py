@@ -425,8 +425,9 @@ def test_a_udp_stream_plays(tmp_path):
         stop.set()
         sender.join()
     assert [frame.index for frame in frames] == list(range(5))
-    gaps = np.diff([frame.capture_ns for frame in frames]) / 1e9
-    assert (gaps > 0.04).all()  # the base rate, although the sender is three times faster
+    # The base rate, although the sender is faster: four periods less the quarter that a frame may be early. Not each
+    # gap by itself: after a frame that is late the next may follow at once.
+    assert frames[-1].capture_ns - frames[0].capture_ns >= (4 - 1 / 4) / 15 * 1e9
 
 
 def test_closing_ends_a_reader_that_waits(http_stream):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import Counter
 from dataclasses import replace
@@ -196,10 +197,17 @@ def test_the_tracks_of_a_step_go_before_its_stills():
 
 def test_frames_that_wait_are_bounded_in_bytes():
     """A 4K camera and a slow detector would fill the drone's memory."""
+    counted = threading.Event()
+
+    class Slow(RedSquares):
+        def detect(self, image_bgr):
+            assert counted.wait(30)
+            return super().detect(image_bgr)
+
     rig = Rig()
     frame_bytes = FRAMES[0].source_bgr.nbytes + FRAMES[0].base_bgr.nbytes
     slow = Sight(
-        RedSquares(takes_s=0.3),
+        Slow(),
         ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         view=VIEW,
         settings=SightSettings(detect_every=1),
@@ -208,11 +216,15 @@ def test_frames_that_wait_are_bounded_in_bytes():
     worker = StillWorker(
         rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=4 * frame_bytes + 1
     )
-    offered = 0
+    worker.offer(FRAMES[0], UNITS[0])
+    while worker._frames.qsize():
+        time.sleep(0.001)
+    offered = 1
     while not worker.full and offered < 16:
         worker.offer(FRAMES[offered], UNITS[offered])
         offered += 1
-    assert offered in (4, 5), "four wait, and one may be in hand"
+    counted.set()
+    assert offered == 5, "four wait, and one is in hand"
     worker.close()
     roomy = StillWorker(Rig().stage, hear=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=1)
     assert not roomy.full

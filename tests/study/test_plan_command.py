@@ -104,7 +104,7 @@ def test_one_line_is_for_plan_and_run(tmp_path, capsys):
     assert main([*words, "--accounting", "pilot", "--tune", "M5:small_weight=0.7"]) == 0
     told = capsys.readouterr().out
     assert re.findall(r"hours with (\d+)", told) == ["3"]
-    assert re.search(r"hours with 3 processes[ │]+0\.\d{4} \(.+ s\)", told)
+    assert re.search(r"hours with 3 processes[ │]+0\.\d{4} \((less than 1 s|\d+ (s|minutes))\)", told)
     for more, wanted in (
         (("--jobs", "0"), "--jobs 0"),
         (("--dask", "tcp://127.0.0.1:1"), "--jobs 3 has no say with --dask"),
