@@ -19,8 +19,8 @@ __all__ = ["Seen", "Sight", "SightSettings"]
 class SightSettings:
     """``candidates`` says on which pixels the detector runs and the tracker follows the camera.
 
-    Of the source means before it is coded, at the finer of its two sizes: a source that the base enlarges is looked at
-    enlarged, for the ground's detector sees it so, and one that looks at fewer pixels would find less than it.
+    Of the source means before it is coded, at the finer of its two sizes: a source that the base enlarges is
+    looked at enlarged, for so the ground's detector sees it, and who looks at fewer pixels finds less.
     """
 
     detect_every: int = 5

@@ -60,7 +60,7 @@ class Eyes(Protocol):
 
     @property
     def idle(self) -> bool:
-        """Nothing waits."""
+        """Nothing waits, and nothing is in hand."""
         ...
 
     def picture(self, picture: Picture) -> None:
@@ -116,14 +116,16 @@ class RealtimeEyes:
         self._wake = threading.Event()
         self._ending = threading.Event()
         self._given_up = threading.Event()
+        self._in_hand = False
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"hvt-sight-{name}", daemon=True)
         self._thread.start()
 
     @property
     def idle(self) -> bool:
-        """Nothing waits."""
-        return not (self._has_news() or self._later or self._leisure)
+        """Nothing waits, and nothing is in hand."""
+        # What is in hand is asked for last: it is taken from what waits, and never put back.
+        return not (self._has_news() or self._later or self._leisure or self._in_hand)
 
     @property
     def has_room(self) -> bool:
@@ -203,7 +205,9 @@ class RealtimeEyes:
             while not self._given_up.is_set():
                 self._wake.wait(0.2)
                 self._wake.clear()
+                self._in_hand = True
                 self._work_off()
+                self._in_hand = False
                 if self._ending.is_set() and self.idle:
                     return
         except BaseException as error:  # noqa: BLE001 - handed to the receiving thread, which ends the process
@@ -264,7 +268,7 @@ class LockstepEyes:
 
     @property
     def idle(self) -> bool:
-        """Nothing waits."""
+        """Nothing waits, and nothing is in hand."""
         return all(future.done() for future in self._pending)
 
     def picture(self, picture: Picture) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from hvt_ground import rrd_release
 from hvt_ground.record import Recorder, RecorderSettings
+from processes import eventually
 from rrd import Recording
 
 
@@ -28,14 +29,18 @@ def settings_of(folder: Path, number: int = 0) -> RecorderSettings:
 def test_many_recordings_leave_no_threads(tmp_path):
     """A ground that runs for weeks opens one for each session: it would end with thousands of threads."""
 
-    def recorded(number: int) -> int:
-        with Recorder(settings_of(tmp_path, number)):
-            pass
-        return len(list(Path("/proc/self/task").iterdir()))
+    def threads() -> set[str]:
+        return {one.name for one in Path("/proc/self/task").iterdir()}
 
-    recorded(0)  # what is shared by all is there now
-    first = recorded(1)
-    assert [recorded(number) for number in range(2, 6)] == [first] * 4
+    def recorded(*numbers: int) -> None:
+        for number in numbers:
+            with Recorder(settings_of(tmp_path, number)):
+                pass
+
+    recorded(0, 1)  # what is shared by all is there now
+    before = threads()
+    recorded(2, 3, 4, 5)
+    eventually(lambda: threads() <= before, within_s=20, what="no thread of the four is left")
 
 
 @pytest.mark.parametrize("bindings", [None, object()], ids=["no such module", "no such names"])

@@ -12,14 +12,17 @@ import av
 import pytest
 
 from hvt_common.link.wire import BaseHeader, Command, ControlAnswer, ControlRequest
+from link.timing import read_timing
 from outsider import Tap, answer, joined
 from processes import Link, Running, eventually
 from rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
-PICTURE_WITHIN_S = 1.0
-STOPPED_WITHIN_S = 3.0
+STOPPED_WITHIN_S = 15.0
+"""Below the 20 s after which a lockstep edge gives its ground up, and the 60 s that one waits for its first."""
+LONG = 3000
+"""Pictures: minutes, on a slow machine too."""
 
 CHEAP = ("--size", "640x360", "--fps", "10", "--preset", "ultrafast", "--budget", "300kbps")
 
@@ -27,6 +30,15 @@ CHEAP = ("--size", "640x360", "--fps", "10", "--preset", "ultrafast", "--budget"
 def arguments(scene: Path, edge_id: str, *more: str) -> list[str]:
     """Settings of an edge that plays the scene in real time at little cost."""
     return ["--source", str(scene), "--source-fps", "10", "--edge-id", edge_id, *CHEAP, *more]
+
+
+@pytest.fixture(scope="module")
+def long_scene(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pictures of the scene over and over."""
+    folder, pictures = tmp_path_factory.mktemp("long"), sorted(scene.iterdir())
+    for number in range(LONG):
+        (folder / f"{number:06d}.jpg").symlink_to(pictures[number % len(pictures)])
+    return folder
 
 
 def count_frames(file: Path) -> int:
@@ -46,10 +58,8 @@ class Late:
     """What was seen of an edge that played on while grounds came and went."""
 
     keyframe_answer: ControlAnswer
-    keyframe_s: float
-    """From the third party's request to the keyframe's arrival."""
-    first_connecting_s: float
-    """Unix time at which the first ground said that it connects."""
+    keyframes: int
+    """That came to the third party after its request."""
     first_stop_s: float
     edge_stop_s: float
     first: dict[str, Any]
@@ -59,36 +69,38 @@ class Late:
 
 
 @pytest.fixture(scope="module")
-def late(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
-    """The edge plays from the start; a bare subscriber, a ground and then another ground join it."""
+def late(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
+    """The edge plays from the start; a bare subscriber, a ground and then another ground join it.
+
+    Keyframes are on no schedule: each that comes after the first was asked for.
+    """
     folder = tmp_path_factory.mktemp("late")
     with Link(folder) as link:
         edge = link.edge(
-            *arguments(scene, "uav-1", "--wait", "0s", "--record-base", "base.mkv"), listens=True
+            *arguments(long_scene, "uav-1", "--wait", "0s", "--keyframe-interval", "0s"),
+            *("--record-base", "base.mkv"),
+            listens=True,
         )
         edge.until("no ground yet")
         with joined(link.edge_endpoint) as third:
             eventually(lambda: answer(third, "hvt/uav-1/info"), within_s=20, what="the edge answers info")
-            time.sleep(2.0)  # the stream's own first keyframe is long gone
             tap = Tap(third, "hvt/uav-1/base")
+            eventually(lambda: any(one.frame_index > 10 for one in seen(tap)), within_s=60, what="it plays")
+            newest = seen(tap)[-1].frame_index
             request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
-            asked_s = time.time()
             reply = ControlAnswer.parse(answer(third, "hvt/uav-1/control", request.pack()) or b"")
-            eventually(lambda: keyframes_s(tap), within_s=5, what="a keyframe comes")
-            keyframe_s = keyframes_s(tap)[0] - asked_s
-        first = link.ground("--record", "first.rrd", name="first", connects=True)
-        connecting_s = time.time()
-        eventually(lambda: "uav-1: " in first.said, within_s=20, what="the first ground sees the edge")
-        time.sleep(3.0)
+            eventually(lambda: keyframes(tap, after=newest), within_s=20, what="a keyframe comes")
+        first = link.ground("--record", "first.rrd", "--timing", "first.csv", name="first", connects=True)
+        eventually(lambda: shown(folder / "first.csv") >= 30, within_s=60, what="the first ground's picture")
         first_stop_s = first.stop()
-        second = link.ground("--record", "second.rrd", "--once", name="second")
-        eventually(lambda: "uav-1: " in second.said, within_s=20, what="the second ground sees the edge")
-        time.sleep(3.0)
+        second = link.ground("--record", "second.rrd", "--timing", "second.csv", "--once", name="second")
+        eventually(
+            lambda: shown(folder / "second.csv") >= 30, within_s=60, what="the second ground's picture"
+        )
         edge_stop_s = edge.stop()
         return Late(
             keyframe_answer=reply,
-            keyframe_s=keyframe_s,
-            first_connecting_s=connecting_s,
+            keyframes=len(keyframes(tap, after=newest)),
             first_stop_s=first_stop_s,
             edge_stop_s=edge_stop_s,
             first=first.finish(within_s=0),
@@ -98,26 +110,34 @@ def late(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Late:
         )
 
 
-def keyframes_s(tap: Tap) -> list[float]:
-    """When keyframes came."""
-    headers = [(BaseHeader.parse(m.attachment, m.payload), m.received_s) for m in tap.messages]
-    return [received_s for header, received_s in headers if header.keyframe]
+def seen(tap: Tap) -> list[BaseHeader]:
+    """The frames that came, in their order."""
+    return [BaseHeader.parse(one.attachment, one.payload) for one in tap.messages]
 
 
-def test_a_keyframe_comes_within_a_second_of_asking(late):
+def keyframes(tap: Tap, *, after: int) -> list[BaseHeader]:
+    """Those of frames after this one."""
+    return [header for header in seen(tap) if header.keyframe and header.frame_index > after]
+
+
+def shown(timing: Path) -> int:
+    """How many frames a ground has decoded so far."""
+    return sum(one.kind == "base" and bool(one.shown) for one in read_timing(timing))
+
+
+def test_a_keyframe_comes_of_asking(late):
     """Whoever joins by himself, with docs/wire.md in hand, would wait for the next scheduled keyframe, 10 s."""
     assert late.keyframe_answer.accepted
-    assert late.keyframe_s <= PICTURE_WITHIN_S
+    assert late.keyframes == 1
 
 
-def test_a_late_ground_shows_a_picture_within_a_second(late):
-    """An operator who opens the ground in mid-flight would look at nothing."""
+def test_a_late_ground_asks_for_its_picture(late):
+    """An operator who opens the ground in mid-flight would look at nothing, up to the next scheduled keyframe."""
     recording = Recording(late.folder / "first.rrd")
-    captured_s = recording.video()[0][1] / 1e9
-    shown_s = captured_s + late.first["receive_latency_ms"]["max"] / 1000
-    assert shown_s - late.first_connecting_s <= PICTURE_WITHIN_S
-    assert recording.video()[0][0] > 20, "it did join late"
+    assert recording.video()[0][0] > 10, "it did join late"
+    assert late.first["keyframe_requests"] >= 1
     assert late.edge["keyframe_requests"] >= 2
+    assert late.edge["keyframes"] >= 3, "the flight's own, and one for each who asked"
 
 
 def test_a_restarted_ground_goes_on(late):
@@ -137,7 +157,7 @@ def test_ctrl_c_ends_a_ground_with_a_whole_recording(late):
 def test_ctrl_c_ends_an_edge_with_a_summary_and_its_ground_with_it(late):
     """Landing would need a kill -9, and the account of the flight be lost."""
     assert late.edge_stop_s <= STOPPED_WITHIN_S
-    assert 0 < late.edge["frames"] < 300
+    assert 0 < late.edge["frames"] < LONG
     assert late.edge["worst_window_bps"]["total"] <= 300_000
     assert count_frames(late.folder / "base.mkv") == late.edge["frames"] + late.edge["frames_kept"]
 
@@ -232,16 +252,18 @@ def test_either_side_stops_before_anybody_came(link, scene, sign):
     assert edge.finish()["frames"] == 0
 
 
-def test_a_lockstep_edge_does_not_wait_for_a_dead_ground(link, scene):
+def test_a_lockstep_edge_does_not_wait_for_a_dead_ground(link, long_scene):
     """A long run of a study, or Ctrl-C, would hang on a ground that crashed."""
     ground = link.ground("--record", "recordings")
+    lockstep = ("--wait", "60s", "--pace", "lockstep", "--detector", "motion", "--max-frames")
     stops, plays_on = (
-        link.edge(*arguments(scene, name, "--wait", "60s", "--pace", "lockstep"), name=name)
-        for name in ("uav-1", "uav-2")
+        link.edge(*arguments(long_scene, name, *lockstep, str(frames)), name=name)
+        for name, frames in (("uav-1", LONG), ("uav-2", 300))
     )
     for name in ("uav-1", "uav-2"):
         eventually(lambda name=name: f"{name}: " in served(ground), within_s=30, what=f"{name} is served")
     ground.kill()
     assert stops.stop() <= STOPPED_WITHIN_S
-    assert 0 < stops.finish()["frames"] < 300
-    assert plays_on.finish(within_s=15)["frames"] == 300
+    assert 0 < stops.finish()["frames"] < LONG
+    # Two seconds for each of its frames would be ten minutes.
+    assert plays_on.finish(within_s=120)["frames"] == 300

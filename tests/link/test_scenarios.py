@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import os
 from pathlib import Path
 
 import psutil
@@ -17,7 +18,7 @@ from link.netns import UnavailableError
 from link.script import load_scenario, scenario_names
 from pictures import write_scene
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(480)]
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(900)]
 
 EDGE = (
     "--source-fps",
@@ -32,7 +33,9 @@ EDGE = (
     "motion",
 )
 GROUND = ("--detector", "motion", "--classifier", "none")
-AT_ONCE = 5
+AT_ONCE = min(5, os.cpu_count() or 1)
+"""Flights in real time: so many as the machine has time for."""
+PICTURE_WITHIN_S = 3.0
 SOAK_S = 60
 
 
@@ -93,7 +96,8 @@ def test_there_is_a_picture_at_the_end(outcomes, name):
     outcome = outcomes[name]
     assert outcome.edge["frames"] > 0
     last = max(one.received_s for one in outcome.shown)
-    assert last > outcome.ended_s - 1.5, outcome.said
+    light_s = max((end_s for _, end_s in outcome.script.dark), default=0.0)
+    assert last > max(outcome.ended_s - PICTURE_WITHIN_S, outcome.began_s + light_s), outcome.said
     assert measures(outcome)["decodable frames, %"] > 0
 
 
