@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-PARTS = ("tracker", "detector", "pipeline", "latency", "providers")
+PARTS = ("tracker", "detector", "pipeline", "latency", "joining", "providers")
 
 
 def main(argv: list[str]) -> int:

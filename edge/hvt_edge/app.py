@@ -363,6 +363,8 @@ class Edge:
     def _say_goodbye(self, flow: _Flow) -> None:
         """Let the ground finish, then tell it that this was all."""
         sender = flow.sender
+        if self._following.keep is not None:
+            self._following.keep.send_no_more()
         self._send_status("ended", flow)
         if flow.link.heard():  # what is still in a queue would be lost with the session
             self._inbox.wait_for_end(

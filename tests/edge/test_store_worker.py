@@ -169,6 +169,23 @@ def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
     worker.close()
 
 
+def test_after_the_last_word_nothing_goes_out(tmp_path):
+    """The last report says how much there was: a ground that has it all would have closed its account already."""
+    with opened(tmp_path / "store") as folder:
+        add_units(folder, UNITS)
+    link = Link()
+    link.full.clear()
+    worker = worker_of(tmp_path / "store", link)
+    eventually(lambda: worker._outgoing.busy, within_s=10, what="a piece is being sent")
+    worker.send_no_more()
+    link.full.set()
+    for unit in UNITS[:10]:
+        worker.offer(KeptUnit(shifted(unit, 50), UNITS[0].data))
+    eventually(lambda: worker.numbers.segments == 2 and not worker.waiting, within_s=10, what="it is kept")
+    worker.close()
+    assert len(link.sent) == 1, "the one that was under way"
+
+
 def test_a_piece_whose_room_is_gone_comes_next_and_no_hole_is_left(tmp_path):
     """The ground would wait for the hole, and the object begin again."""
     with opened(tmp_path / "store") as folder:

@@ -332,6 +332,10 @@ class Keep:
         numbers = self.numbers
         return "" if numbers.empty else f"kept {numbers.stills} stills, {numbers.video_s:.0f} s"
 
+    def send_no_more(self) -> None:
+        """Before the last word to the ground, which says how much there was."""
+        self._worker.send_no_more()
+
     def close(self) -> None:
         """Keep what no ground has acknowledged, and leave the store in order; after the last word to the ground."""
         try:

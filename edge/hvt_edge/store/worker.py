@@ -29,6 +29,8 @@ _QUEUE = 512
 _TICK_S = 0.02
 _IDLE_S = 0.25
 _CLOSE_S = 5.0
+_LAST_PIECE_S = 1.0
+"""What is being sent when no more is to be sent has so long to go."""
 _TRICKLE_SHARE = 1 / 40
 """Of the total, where live stills always wait: they must not keep what was admitted before from ever arriving."""
 _SECOND_NS = 1_000_000_000
@@ -184,6 +186,10 @@ class StoreWorker:
             unreadable=folder.damaged,
             given_up=backfill.given_up,
         )
+
+    def send_no_more(self) -> None:
+        """Let nothing go out from now on, so that an account can be closed; what comes is kept all the same."""
+        self._outgoing.close(_LAST_PIECE_S)
 
     def close(self) -> None:
         """Write what waits, end the files, join the thread. A disk that hangs costs what waits, and a warning."""

@@ -1,0 +1,116 @@
+"""A ground that comes late, on loopback: how soon it has a picture, and how long each side takes to end."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from bench.material import FPS, clip, nano
+
+_GROUNDS = 5
+_PATIENCE_S = 60.0
+
+
+def rows() -> list[dict[str, object]]:
+    pictures_s, grounds_s, edge_s = _joined()
+    worst = FPS * max(pictures_s)
+    return [
+        {
+            "measure": f"a late ground's first picture after the first message, in frames; worst of {_GROUNDS}",
+            "value": worst,
+            "bar": f"<= {FPS:.0f}",
+            "holds": worst <= FPS,
+        },
+        {
+            "measure": "a ground ends after Ctrl-C, worst, s",
+            "value": max(grounds_s),
+            "bar": None,
+            "holds": None,
+        },
+        {"measure": "the edge ends after Ctrl-C, s", "value": edge_s, "bar": None, "holds": None},
+    ]
+
+
+def _joined() -> tuple[list[float], list[float], float]:
+    """Seconds from first message to first picture and from Ctrl-C to the end of each ground, and of the edge."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    pictures_s, grounds_s = [], []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with _running(
+            *(
+                "hvt_edge.cli",
+                "--source",
+                _long_clip(folder),
+                "--listen",
+                endpoint,
+                "--wait",
+                "0s",
+                "--quiet",
+            ),
+            # No keyframe but those that are asked for.
+            *("--detector", nano(), "--keyframe-interval", "0s"),
+        ) as edge:
+            for number in range(_GROUNDS):
+                timing = folder / f"{number}.csv"
+                with _running(
+                    *("hvt_ground.cli", "--connect", endpoint, "--quiet", "--detector", nano()),
+                    *("--record", folder / f"{number}.rrd", "--timing", timing),
+                ) as ground:
+                    pictures_s.append(_first_picture_s(timing))
+                    grounds_s.append(_end_s(ground))
+            return pictures_s, grounds_s, _end_s(edge)
+
+
+def _long_clip(folder: Path) -> Path:
+    """The clip forty times over: a list for FFmpeg, which takes only plain names beside it."""
+    (folder / "once.mp4").symlink_to(clip().resolve())
+    long = folder / "long.ffconcat"
+    long.write_text("ffconcat version 1.0\n" + "file once.mp4\n" * 40, encoding="ascii")
+    return long
+
+
+@contextlib.contextmanager
+def _running(module: str, *arguments: object) -> Iterator[subprocess.Popen]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, *map(str, arguments)], stdout=subprocess.DEVNULL
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _first_picture_s(timing: Path) -> float:
+    until_s = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < until_s:
+        text = timing.read_text(encoding="ascii") if timing.exists() else ""
+        told = list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+        shown_ns = [int(row["shown_ns"]) for row in told if row["kind"] == "base" and int(row["shown_ns"])]
+        if shown_ns:
+            return (shown_ns[0] - min(int(row["received_ns"]) for row in told)) / 1e9
+        time.sleep(0.05)
+    raise RuntimeError(f"no picture within {_PATIENCE_S:.0f} s")
+
+
+def _end_s(process: subprocess.Popen) -> float:
+    began_s = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    process.wait(_PATIENCE_S)
+    return time.monotonic() - began_s
+
+
+if __name__ == "__main__":
+    for one in rows():
+        print(one)
