@@ -1,10 +1,11 @@
-"""An inbox of which a test can tell when all that was put into it has been handled, however slow the machine is."""
+"""What a test of the receiving thread can wait for, however slow the machine is: all is handled, and it has ended."""
 
 from __future__ import annotations
 
 from hvt_common.link.inbox import Inbox, Received
+from hvt_ground.receive import EdgeReceiver
 
-__all__ = ["WatchedInbox"]
+__all__ = ["WatchedInbox", "end"]
 
 
 class WatchedInbox(Inbox):
@@ -30,3 +31,12 @@ class WatchedInbox(Inbox):
         with self._changed:
             self._handled |= not self._items
             return super().get(timeout_s=timeout_s)
+
+
+def end(receiver: EdgeReceiver, *, failing: bool) -> None:
+    """Close it, and raise what ended it; ``failing``: the test has failed already, and that is what is to be seen."""
+    receiver.close()
+    receiver._thread.join(60)  # on a busy machine it takes longer than `close` waits
+    assert not receiver._thread.is_alive(), "the receiver did not end"
+    if not failing and receiver.error is not None:
+        raise receiver.error

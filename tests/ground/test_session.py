@@ -10,7 +10,7 @@ from typing import Self
 import pytest
 
 from flight import Flight, Port, RedSquares, SameAnswer, sight_of, square_box
-from handled import WatchedInbox
+from handled import WatchedInbox, end
 from hvt_common.link.inbox import Inbox, Received
 from hvt_common.link.ledger import Channel, overhead_bytes
 from hvt_common.link.wire import Info
@@ -73,11 +73,7 @@ class Rig:
         return self
 
     def __exit__(self, kind, *_) -> None:
-        self.receiver.close()
-        self.receiver._thread.join(60)  # on a busy machine it takes longer than `close` waits
-        assert not self.receiver._thread.is_alive(), "the receiver did not end"
-        if kind is None and self.receiver.error is not None:
-            raise self.receiver.error
+        end(self.receiver, failing=kind is not None)
 
 
 @pytest.fixture(scope="module")

@@ -58,10 +58,8 @@ class Run:
 
     @property
     def transport(self) -> Transport:
-        """What edge and ground speak over it."""
-        return (
-            "tcp" if self.carrier == "netns" else self.scenario.transport
-        )  # there the kernel's own is asked
+        """What edge and ground speak over it; a shaped veth is there for the kernel's TCP."""
+        return "tcp" if self.carrier == "netns" else self.scenario.transport
 
 
 def run(asked: Run) -> Outcome:

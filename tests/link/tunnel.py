@@ -61,9 +61,8 @@ class Tunnel(Sides):
 
     def begin(self) -> float:
         """The script begins now; return the Unix time."""
-        self._playing = self._script.shifted(
-            time.monotonic()
-        )  # the thread takes it up before its next packet
+        # The thread takes it up before its next packet.
+        self._playing = self._script.shifted(time.monotonic())
         return time.time()
 
     def _build(self) -> None:
