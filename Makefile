@@ -56,17 +56,17 @@ bench-sight: setup ## what the ground sees at each bitrate, method by method, on
 	@$(BIN)/python -m bench.sight
 
 link: setup      ## edge and ground over bad links; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns|tun SEED=
-	@PYTHONPATH=tests $(BIN)/python -m link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
+	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
 		$(if $(LASTS),--lasts $(LASTS)) $(if $(CARRIER),--carrier $(CARRIER)) $(if $(SEED),--seed $(SEED))
 
 soak: setup      ## an hour of fading link: memory, descriptors, threads, account; LASTS=60min CLIP=
-	@PYTHONPATH=tests $(BIN)/python -m link drone-fade --name soak --lasts $(or $(LASTS),60min) $(if $(CLIP),--clip $(CLIP))
+	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link drone-fade --name soak --lasts $(or $(LASTS),60min) $(if $(CLIP),--clip $(CLIP))
 
 kills: setup     ## kill -9 of edge or ground in the air: what is left is readable; COUNT=50 SEED=
-	@PYTHONPATH=tests $(BIN)/python -m link.kills $(if $(COUNT),--count $(COUNT)) $(if $(SEED),--seed $(SEED))
+	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link.kills $(if $(COUNT),--count $(COUNT)) $(if $(SEED),--seed $(SEED))
 
 fuzz: setup      ## coverage-guided fuzzing of all that comes from outside: RUNS=1000000 TARGET=NAME; needs atheris
-	@PYTHONPATH=tests $(BIN)/python -m fuzz $(if $(RUNS),--runs $(RUNS)) $(if $(TARGET),--target $(TARGET))
+	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.fuzz $(if $(RUNS),--runs $(RUNS)) $(if $(TARGET),--target $(TARGET))
 
 bench-peers: setup ## the tracker beside roboflow trackers, which get an environment of their own (they are large)
 	@test -x build/peers/bin/python || $(PYTHON) -m venv build/peers

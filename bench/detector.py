@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.vision.classify import open_classifier
-from hvt_common.vision.detect import OnnxDetector
-from hvt_common.vision.model import ModelSettings, open_model
-from hvt_common.vision.motion import MotionDetector
+from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.detect import OnnxDetector
+from hvt_common.inference.motion import MotionDetector
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
 
 DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
 BAR = 1.10

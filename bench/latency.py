@@ -15,10 +15,10 @@ import numpy as np
 import psutil
 
 from bench.material import FPS, SIZE, clip, frames, nano
-from hvt_common.vision.detect import open_detector
-from hvt_common.vision.hevc import BaseDecoder
-from hvt_edge.encode import BaseEncoder
-from hvt_edge.rate import encoder_settings
+from hvt_common.inference.detect import open_detector
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.video.least_rate import encoder_settings
+from hvt_edge.video.x265 import BaseEncoder
 
 
 def rows() -> list[dict[str, object]]:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from hvt_common.values import Frame
-from hvt_edge.source import open_source
+from hvt_edge.source.opening import open_source
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE, FPS = (1280, 720), 15.0

@@ -16,17 +16,17 @@ from pathlib import Path
 
 from bench.material import FPS, SIZE, clip, frames, nano
 from hvt_common import __version__
-from hvt_common.link.inbox import Received
-from hvt_common.link.wire import BaseHeader, Flags, Info
+from hvt_common.inference.detect import open_detector
+from hvt_common.protocol.messages import BaseHeader, Flags, Info
+from hvt_common.transport.inbox import Received
 from hvt_common.values import AccessUnit, View
-from hvt_common.vision.detect import open_detector
-from hvt_common.vision.hevc import BaseDecoder
-from hvt_edge.encode import BaseEncoder
-from hvt_edge.rate import encoder_settings
-from hvt_ground.build import Models, make_sight
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.video.least_rate import encoder_settings
+from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
-from hvt_ground.record import Recorder, RecorderSettings
-from hvt_ground.session import GroundSession
+from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.wiring import Models, make_sight
 
 _FRAMES = 200
 _EVERY = 5

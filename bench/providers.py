@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 
 from hvt_common.errors import UserError
-from hvt_common.model_store.resolve import embedded_models
+from hvt_common.inference.detect import open_detector
+from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
+from hvt_common.inference.runtimes.providers import PROVIDERS
+from hvt_common.inference.store.resolve import embedded_models
 from hvt_common.values import Detections, Image
-from hvt_common.vision.detect import open_detector
-from hvt_common.vision.model import ModelSettings, OnnxModel, open_model
-from hvt_common.vision.providers import PROVIDERS
 
 DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
 LEAST_F1 = 0.99

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from bench.material import ROOT, data
-from hvt_common.report import write_json
+from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.sight import print_result
 from hvt_study.sight import SightPlan, SightResult, SightRow, compare
 from hvt_study.sight_methods import METHODS

@@ -24,15 +24,15 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.material import FPS, SIZE, data, frames
+from hvt_common.inference.classify import Classifier, open_classifier
+from hvt_common.inference.detect import open_detector
 from hvt_common.values import Image, View
-from hvt_common.vision.base_crop import base_crop, coded_size
-from hvt_common.vision.classify import Classifier, open_classifier
-from hvt_common.vision.detect import open_detector
-from hvt_common.vision.hevc import BaseDecoder
-from hvt_common.vision.still_codecs import StillCodec, psnr_y_db, still_codec, still_codec_names
-from hvt_edge.crop import PADDING, crop_box
-from hvt_edge.encode import BaseEncoder, EncoderSettings
-from hvt_edge.still import MAX_SIDE_PX
+from hvt_common.video.base_crop import base_crop, coded_size
+from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.still_codecs import StillCodec, psnr_y_db, still_codec, still_codec_names
+from hvt_edge.perception.crop import PADDING, crop_box
+from hvt_edge.stills.maker import MAX_SIDE_PX
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 
 KBPS = (800, 400)
 TAKEN = range(12, 150, 18)

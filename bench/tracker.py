@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import Detections
-from hvt_common.vision.track import ByteTracker
 
 COUNTS = (20, 50, 100, 500)
 FRAMES = {20: 150, 50: 150, 100: 100, 500: 30}

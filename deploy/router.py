@@ -18,9 +18,9 @@ import zenoh
 
 from hvt_common.config import PATH, TEXT, load, option, switch, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
-from hvt_common.link.diagnose import LinkWatch
-from hvt_common.link.session import open_session
-from hvt_common.link.zenoh_config import LinkSettings, configure
+from hvt_common.transport.doctor.diagnose import LinkWatch
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 
 __all__ = ["RouterConfig", "main"]
 

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import math
 import re
+from fractions import Fraction
 
 from hvt_common.errors import UserError
 
-__all__ = ["bitrate_text", "parse_bitrate", "parse_bytes", "parse_duration_s", "parse_share", "parse_size"]
+__all__ = [
+    "bitrate_text",
+    "exact_rate",
+    "parse_bitrate",
+    "parse_bytes",
+    "parse_duration_s",
+    "parse_share",
+    "parse_size",
+]
 
 _NUMBER = r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)"
 _BITRATE = re.compile(_NUMBER + r"\s*(bps|bit/s|kbps|kbit/s|k|Mbps|Mbit/s|M)?", re.IGNORECASE)
@@ -78,3 +87,8 @@ def parse_share(text: str, *, name: str) -> float:
 def bitrate_text(bps: float) -> str:
     """800000 → ``800 kbps``."""
     return f"{bps / 1e6:.2f} Mbps" if bps >= 1e6 else f"{bps / 1e3:.0f} kbps"
+
+
+def exact_rate(fps: float) -> Fraction:
+    """The rate as a fraction, so that no clip is long enough to drift: 29.97 is 2997/100, 30000/1001 itself."""
+    return Fraction(fps).limit_denominator(1001)

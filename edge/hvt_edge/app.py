@@ -9,18 +9,37 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, cast
 
-from hvt_common.clock import SteadyClock
-from hvt_common.link.diagnose import LinkWatch
-from hvt_common.link.keys import EdgeKeys
-from hvt_common.link.ledger import Channel, Ledger
-from hvt_common.link.same_id import refuse_same_id
-from hvt_common.link.session import open_session
-from hvt_common.link.wire import Feedback, Status
-from hvt_common.report import StatusLine
+from hvt_common.inference.detect import Detector
+from hvt_common.protocol.channels import EdgeKeys
+from hvt_common.protocol.ledger import Channel, Ledger
+from hvt_common.protocol.messages import Feedback, Status
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.reporting import StatusLine
+from hvt_common.transport.doctor.diagnose import LinkWatch
+from hvt_common.transport.doctor.duplicate_edge import refuse_same_id
+from hvt_common.transport.session import open_session
 from hvt_common.values import Fit
-from hvt_common.vision.detect import Detector
-from hvt_edge.base_stage import BaseStage
-from hvt_edge.build import (
+from hvt_edge.config import EdgeConfig, check_rate
+from hvt_edge.control.commands import Commands, Served
+from hvt_edge.control.link_control import LinkFollower, wait_for_ground
+from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.publisher import EdgeLink
+from hvt_edge.link.tracks_channel import TrackReporter
+from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.unacknowledged import Unacknowledged
+from hvt_edge.loop.counts import FrameCounts
+from hvt_edge.loop.lockstep import LockstepPace
+from hvt_edge.loop.realtime import RealtimePace
+from hvt_edge.source.closing import closing_on
+from hvt_edge.source.demo import check_truth, write_truth_of
+from hvt_edge.source.opening import Source, open_source
+from hvt_edge.status import make_info, make_status, status_text
+from hvt_edge.stills.stage import StillStage
+from hvt_edge.summary import EdgeRun, summary
+from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.reconfigure import HeldCadence, Renewal
+from hvt_edge.video.stage import BaseStage
+from hvt_edge.wiring import (
     SECOND_NS,
     base_size,
     check_files,
@@ -40,25 +59,6 @@ from hvt_edge.build import (
     make_split,
     warm_up_for,
 )
-from hvt_edge.commands import Commands, Served
-from hvt_edge.config import EdgeConfig, check_rate
-from hvt_edge.counts import FrameCounts
-from hvt_edge.feedback import FeedbackInbox
-from hvt_edge.follow import LinkFollower, wait_for_ground
-from hvt_edge.pace_lockstep import LockstepPace
-from hvt_edge.pace_realtime import RealtimePace
-from hvt_edge.publish import EdgeLink
-from hvt_edge.record_base import BaseRecorder
-from hvt_edge.renew import HeldCadence, Renewal
-from hvt_edge.reports import make_info, make_status, status_text
-from hvt_edge.send import Sender
-from hvt_edge.send_tracks import TrackReporter
-from hvt_edge.source import Source, open_source
-from hvt_edge.sources.closing import closing_on
-from hvt_edge.sources.demo import check_truth, write_truth_of
-from hvt_edge.still_stage import StillStage
-from hvt_edge.summary import EdgeRun, summary
-from hvt_edge.unacked import Unacknowledged
 
 __all__ = ["Edge"]
 

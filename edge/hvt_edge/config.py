@@ -23,19 +23,19 @@ from hvt_common.config import (
     switch,
 )
 from hvt_common.errors import UserError
-from hvt_common.link.keys import EdgeKeys
-from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT
+from hvt_common.inference.embedded import DETECTOR as EMBEDDED_DETECTOR
+from hvt_common.inference.runtimes.providers import PROVIDERS
+from hvt_common.inference.tiles import parse_tiles
+from hvt_common.protocol.channels import EdgeKeys
+from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
-from hvt_common.vision.embedded import DETECTOR as EMBEDDED_DETECTOR
-from hvt_common.vision.providers import PROVIDERS
-from hvt_common.vision.still_codecs import still_codec
-from hvt_common.vision.tiles import parse_tiles
-from hvt_edge.encode import PRESETS
-from hvt_edge.methods.registry import METHODS, method, tuning
+from hvt_common.video.still_codecs import still_codec
 from hvt_edge.profiles import PROFILES
-from hvt_edge.rate import least_base_bps
-from hvt_edge.source import check_shape
-from hvt_edge.split import FIRST_SHARE
+from hvt_edge.source.opening import check_shape
+from hvt_edge.stills.policy.registry import METHODS, method, tuning
+from hvt_edge.video.least_rate import least_base_bps
+from hvt_edge.video.share import FIRST_SHARE
+from hvt_edge.video.x265 import PRESETS
 
 __all__ = [
     "DEFAULT_SIZE",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hvt_common.link.ledger import Ledger
+from hvt_common.protocol.ledger import Ledger
 from hvt_common.units import bitrate_text
-from hvt_edge.store.worker import StoreNumbers
+from hvt_edge.backlog.worker import StoreNumbers
 
 __all__ = ["EdgeRun", "summary", "table"]
 

@@ -11,26 +11,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hvt_common.clock import SteadyClock
 from hvt_common.errors import UserError
-from hvt_common.link.diagnose import LinkWatch
-from hvt_common.link.keys import check_edge_pattern
-from hvt_common.link.session import open_session
-from hvt_common.link.wire import Info
-from hvt_common.link.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
-from hvt_common.report import StatusLine, check_writable
+from hvt_common.protocol.channels import check_edge_pattern
+from hvt_common.protocol.messages import Info
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.reporting import StatusLine, check_writable
+from hvt_common.transport.doctor.diagnose import LinkWatch
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_common.units import bitrate_text
-from hvt_ground.build import Models, make_past_look, make_sight, output_path, past_path
+from hvt_ground.backlog.recordings import PastRecording
 from hvt_ground.config import GroundConfig
-from hvt_ground.export_tracks import TrackTable
-from hvt_ground.live_view import LiveView
-from hvt_ground.past.recordings import PastRecording
-from hvt_ground.receive import EdgeReceiver
-from hvt_ground.record import Recorder, RecorderSettings
-from hvt_ground.session import GroundSession
-from hvt_ground.subscribe import EdgePort, GroundLink
-from hvt_ground.summary import summary
-from hvt_ground.timing import SessionTiming, TimingTable
+from hvt_ground.session.receiver import EdgeReceiver
+from hvt_ground.session.session import GroundSession
+from hvt_ground.session.subscribe import EdgePort, GroundLink
+from hvt_ground.sinks.rerun.live_view import LiveView
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.timing import SessionTiming, TimingTable
+from hvt_ground.sinks.tracks_table import TrackTable
+from hvt_ground.status import summary
+from hvt_ground.wiring import Models, make_past_look, make_sight, output_path, past_path
 
 __all__ = ["Ground"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from hvt_common.allocator import keep_to_few_heaps
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
-from hvt_common.report import print_table, say, start_log, write_json
-from hvt_common.stopping import stop_on_signals
+from hvt_common.runtime.allocator import keep_to_few_heaps
+from hvt_common.runtime.reporting import print_table, say, start_log, write_json
+from hvt_common.runtime.stopping import stop_on_signals
 from hvt_ground.config import GroundConfig, check
 
 __all__ = ["main"]
@@ -28,17 +28,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     if words[:1] == ["keys"]:
-        from hvt_ground.fleet import command as keys  # noqa: PLC0415 - who serves edges needs neither of these
+        from hvt_ground.pki import command as keys  # noqa: PLC0415 - who serves edges needs neither of these
 
         return keys.run(words[1:])
     if words and not words[0].startswith("-"):
-        from hvt_ground.ask import command as asking  # noqa: PLC0415
+        from hvt_ground.control import command as asking  # noqa: PLC0415
 
         if words[0] in asking.COMMANDS:
             return asking.run(words)
     try:  # only now: without Rerun this is a sentence, not a traceback
         from hvt_ground.app import Ground  # noqa: PLC0415
-        from hvt_ground.summary import table  # noqa: PLC0415
+        from hvt_ground.status import table  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise UserError(
             f"the package {error.name!r} is missing: install HVT with its extra, 'hvt[ground]'"

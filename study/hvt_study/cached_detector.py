@@ -20,10 +20,10 @@ import msgpack
 import numpy as np
 
 from hvt_common.errors import UserError
-from hvt_common.model_store import resolve_model
+from hvt_common.inference.detect import OnnxDetector
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
+from hvt_common.inference.store import resolve_model
 from hvt_common.values import Detections, Image
-from hvt_common.vision.detect import OnnxDetector
-from hvt_common.vision.model import ModelSettings, open_model
 from hvt_study.code_digest import code_digest
 from hvt_study.matrix.cache import CacheError, file_digest
 
@@ -41,7 +41,7 @@ class CachedDetector(OnnxDetector):
     """The network that ``spec`` names, on one thread; its answers lie in ``folder``, which processes may share.
 
     Raises:
-        UserError: as `hvt_common.vision.detect.open_detector`; or the folder cannot be made.
+        UserError: as `hvt_common.inference.detect.open_detector`; or the folder cannot be made.
         CacheError: from `detect`, it cannot be written any further.
     """
 

@@ -1,7 +1,7 @@
 """A whole flight in one process: the very edge and ground that fly, a simulated serial link between them, no clock.
 
 The edge is `hvt_edge.app.Edge` with its borders replaced: where frames come from (`TickSource`), where messages go
-(`SerialLink`), and when feedback comes back. The ground is `hvt_ground.session.GroundSession`. Media time is the only
+(`SerialLink`), and when feedback comes back. The ground is `GroundSession`. Media time is the only
 time: a message acts at the ground when the link has delivered it and not before, and what the ground says of a still
 is heard at the edge as much later as that still took to cross. The same input gives the same flight, always.
 
@@ -23,23 +23,23 @@ from typing import Any, cast
 
 import numpy as np
 
-from hvt_common.clock import SteadyClock
-from hvt_common.link.inbox import Received
-from hvt_common.link.keys import EdgeKeys, Row
-from hvt_common.link.ledger import LedgerSummary, overhead_bytes
-from hvt_common.link.wire import BaseHeader, Info, RoiHeader, Status, StillResult, TrackStep
+from hvt_common.inference.detect import MOTION, Detector
+from hvt_common.inference.tiles import tiled
+from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.ledger import LedgerSummary, overhead_bytes
+from hvt_common.protocol.messages import BaseHeader, Info, RoiHeader, Status, StillResult, TrackStep
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.transport.inbox import Received
 from hvt_common.values import Fit, Frame
-from hvt_common.vision.detect import MOTION, Detector
-from hvt_common.vision.tiles import tiled
 from hvt_edge.app import Edge
-from hvt_edge.build import base_size
 from hvt_edge.config import EdgeConfig
-from hvt_edge.feedback import FeedbackInbox
-from hvt_edge.pace_lockstep import LockstepPace
-from hvt_edge.resample import Resizer
-from hvt_edge.sources.contract import Source
-from hvt_ground.build import Models
+from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.loop.lockstep import LockstepPace
+from hvt_edge.source.contract import Source
+from hvt_edge.source.resample import Resizer
+from hvt_edge.wiring import base_size
 from hvt_ground.config import GroundConfig
+from hvt_ground.wiring import Models
 from hvt_study.cached_detector import CachedDetector
 from hvt_study.flight_ground import GroundSide, InlineExecutor
 from hvt_study.list_score import Listed
@@ -162,7 +162,7 @@ class _Inbox(FeedbackInbox):
 
 
 class _Outlet:
-    """The edge's end of the link: `hvt_edge.publish.EdgeLink` without Zenoh."""
+    """The edge's end of the link: `hvt_edge.link.publisher.EdgeLink` without Zenoh."""
 
     unusable = 0
 

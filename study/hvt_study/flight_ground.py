@@ -7,10 +7,11 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
-from hvt_common.link.inbox import Received
-from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row, parse_key
-from hvt_common.link.ledger import overhead_bytes
-from hvt_common.link.wire import (
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import Detector
+from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row, parse_key
+from hvt_common.protocol.ledger import overhead_bytes
+from hvt_common.protocol.messages import (
     MAX_STILL_RESULTS,
     BaseHeader,
     Feedback,
@@ -20,15 +21,14 @@ from hvt_common.link.wire import (
     StillResult,
     TrackStep,
 )
+from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
-from hvt_common.vision.classify import Classifier
-from hvt_common.vision.detect import Detector
-from hvt_ground.build import Models, make_sight
 from hvt_ground.config import GroundConfig
-from hvt_ground.events import Event, Overlay, Refinement
-from hvt_ground.eyes import LockstepEyes, Read, See, Step
-from hvt_ground.session import GroundSession
-from hvt_ground.sight import Picture, ReceivedStill
+from hvt_ground.events.events import Event, Overlay, Refinement
+from hvt_ground.perception.pipeline import Picture, ReceivedStill
+from hvt_ground.perception.worker import LockstepEyes, Read, See, Step
+from hvt_ground.session.session import GroundSession
+from hvt_ground.wiring import Models, make_sight
 from hvt_study.flight_record import FlightRecord, Watch
 from hvt_study.metrics.contract import FrameView
 from hvt_study.metrics.seen import SeenTick
@@ -183,7 +183,7 @@ class GroundSide:
         self._models.give_back(*self._borrowed)
 
     def _receive(self, arrival: Arrival[Received]) -> None:
-        """As `hvt_ground.receive` hands on what is whole and in order."""
+        """As `hvt_ground.session.receiver` hands on what is whole and in order."""
         item = arrival.message
         row = (parse_key(item.key) or ("", None))[1]
         if row is Row.BASE:
@@ -207,7 +207,7 @@ class GroundSide:
         self.results.extend((back_ns, one) for one in results)
 
     def _weight(self, results: tuple[StillResult, ...]) -> int:
-        """Line bytes of a report with these, as `hvt_ground.report_back` would send it."""
+        """Line bytes of a report with these, as `hvt_ground.session.receiver_report` would send it."""
         frames, stills = self._session.frames_received, self._session.stills_received
         payload = Feedback(
             session_id=self._info.session_id,

@@ -12,16 +12,16 @@ from typing import Any, cast
 
 import numpy as np
 
-from hvt_common.link.inbox import Received
-from hvt_common.link.wire import RoiHeader, StillResult
+from hvt_common.boxes import iou
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import Detector
+from hvt_common.protocol.messages import RoiHeader, StillResult
+from hvt_common.transport.inbox import Received
 from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View
-from hvt_common.vision.boxes import iou
-from hvt_common.vision.classify import Classifier
-from hvt_common.vision.detect import Detector
-from hvt_ground.classify_stills import Decoded, object_crops
-from hvt_ground.events import Overlay, Refinement
-from hvt_ground.refine import Refiner, Shown
-from hvt_ground.sight import GroundSight
+from hvt_ground.events.events import Overlay, Refinement
+from hvt_ground.perception.pipeline import GroundSight
+from hvt_ground.perception.stills.classify import Decoded, object_crops
+from hvt_ground.perception.stills.refine import Refiner, Shown
 from hvt_study.metrics.contract import NO_ID, FrameView
 from hvt_study.metrics.proxy import score_entropy_nats
 from hvt_study.metrics.seen import SeenTick

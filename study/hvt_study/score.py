@@ -50,7 +50,7 @@ class Score:
 
 
 def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
-    """Read a table of `hvt_ground.export_tracks` by frame (from 1); ``column`` is ``class`` or ``base_class``."""
+    """Read a tracks table of the ground by frame (from 1); ``column`` is ``class`` or ``base_class``."""
     rows: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
     try:
         with path.open(encoding="utf-8", newline="") as file:

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Literal
 
 from hvt_common.errors import UserError
-from hvt_common.model_store import resolve_model
-from hvt_common.vision.class_names import same_kind
-from hvt_common.vision.detect import MOTION
+from hvt_common.inference.class_names import same_kind
+from hvt_common.inference.detect import MOTION
+from hvt_common.inference.store import resolve_model
 from hvt_study.flight import FlightReport
 from hvt_study.list_score import Listed, ListScore, score_lists
 from hvt_study.sight_clip import TICK_FPS, clip_name, share_clip

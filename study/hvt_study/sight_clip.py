@@ -11,15 +11,18 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from hvt_common.errors import UserError
+from hvt_common.units import exact_rate
 from hvt_common.values import Frame, Image, View
-from hvt_edge.resample import Resizer, capture_time_ns, exact_rate
-from hvt_edge.source import open_source
-from hvt_edge.sources.contract import Source
-from hvt_edge.sources.demo import DemoSource
+from hvt_edge.source.contract import Source
+from hvt_edge.source.demo import DemoSource
+from hvt_edge.source.opening import open_source
+from hvt_edge.source.resample import Resizer, capture_time_ns
+from hvt_scene import Scene
 from hvt_study.list_score import Listed
 from hvt_study.virtual_camera import SCHEME, open_camera
 
@@ -197,7 +200,8 @@ def _open(
 
 
 def _demo_truth(source: DemoSource, index: int) -> Listed:
-    truth, names = source.scene.truth(index / TICK_FPS), source.scene.class_names
+    scene = cast(Scene, source.scene)
+    truth, names = scene.truth(index / TICK_FPS), scene.class_names
     asked = truth.visible >= DEMO_LEAST_VISIBLE
     kinds = tuple(names[kind] for kind in truth.class_ids[asked].tolist())
     return Listed(truth.boxes_source_px[asked], kinds, truth.boxes_source_px[~asked])

@@ -12,11 +12,11 @@ import numpy as np
 
 from hvt_common.config import load
 from hvt_common.errors import UserError
-from hvt_common.vision.detect import MOTION, Detector, open_detector
-from hvt_common.vision.track import weak_confidence
+from hvt_common.inference.detect import MOTION, Detector, open_detector
+from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
-from hvt_edge.resample import Resizer
+from hvt_edge.source.resample import Resizer
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_study.cached_detector import CachedDetector

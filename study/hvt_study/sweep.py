@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.vision.detect import Detector
-from hvt_edge.methods.selectors import SELECTORS, select
-from hvt_edge.source import Source
+from hvt_common.inference.detect import Detector
+from hvt_edge.source.opening import Source
+from hvt_edge.stills.policy.selectors import SELECTORS, select
 
 __all__ = ["COLUMNS", "RawDetections", "SweepRow", "detect_clip", "read_csv", "sweep"]
 

@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
+from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
-from hvt_common.vision.class_names import VISDRONE_NAMES
 from hvt_study.datasets.labels import FrameLabels, covered_share
 from hvt_study.datasets.visdrone_rows import read_image_rows
 

@@ -9,7 +9,7 @@ import json5
 import pytest
 
 from hvt_common.config import load
-from hvt_common.link.zenoh_config import LinkSettings, configure
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig

@@ -16,9 +16,9 @@ import zenoh
 
 from fleet_keys import Fleet
 from hvt_common.errors import UserError
-from hvt_common.link.keys import EdgeKeys, Row, selector
-from hvt_common.link.session import ask, declare_publisher, open_session, serve
-from hvt_common.link.zenoh_config import LinkSettings
+from hvt_common.protocol.channels import EdgeKeys, Row, selector
+from hvt_common.transport.session import ask, declare_publisher, open_session, serve
+from hvt_common.transport.zenoh_config import LinkSettings
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 EDGES = ("rov-1", "uav-1")

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from hvt_common.config import load
-from hvt_common.link.keys import EdgeKeys
+from hvt_common.protocol.channels import EdgeKeys
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig

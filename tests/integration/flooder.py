@@ -18,10 +18,10 @@ from pathlib import Path
 
 import zenoh
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from hvt_common.link.keys import EdgeKeys, Row
-from hvt_common.link.wire import (
+from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.messages import (
     BaseHeader,
     ControlRequest,
     Feedback,

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from link.relay import Relay
-from link.script import LinkState, Piece, Script
+from lab.link.relay import Relay
+from lab.link.script import LinkState, Piece, Script
 from processes import Link
 
 pytestmark = pytest.mark.integration

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from hvt_edge.cli import main
-from hvt_edge.methods.registry import METHODS
+from hvt_edge.stills.policy.registry import METHODS
 from processes import free_ports
 
 pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(120)]

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import zenoh
 
-from hvt_common.link.wire import Info, RoiHeader
-from hvt_common.vision.hevc import BaseDecoder
+from hvt_common.protocol.messages import Info, RoiHeader
+from hvt_common.video.hevc import BaseDecoder
 from outsider import Message, Tap, answer, joined
 from processes import Link, eventually
 from rrd import Recording

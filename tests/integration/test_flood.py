@@ -18,8 +18,8 @@ from typing import Any
 import psutil
 import pytest
 
-from hvt_common.link.wire import BaseHeader, ControlAnswer, ControlRequest, Feedback
-from hvt_edge.keyframes import KeyframeSettings
+from hvt_common.protocol.messages import BaseHeader, ControlAnswer, ControlRequest, Feedback
+from hvt_edge.operating.keyframes import KeyframeSettings
 from outsider import Tap, answer, joined
 from processes import Link, Running, eventually
 

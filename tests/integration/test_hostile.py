@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from hvt_common.link.wire import (
+from hvt_common.protocol.messages import (
     MAX_PAYLOAD_BYTES,
     BaseHeader,
     ControlAnswer,

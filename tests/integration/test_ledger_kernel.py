@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row
-from hvt_common.link.ledger import overhead_bytes
-from hvt_common.link.session import Inbox, LinkSettings, declare_publisher, open_session, subscribe
+from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row
+from hvt_common.protocol.ledger import overhead_bytes
+from hvt_common.transport.session import Inbox, LinkSettings, declare_publisher, open_session, subscribe
 
 pytestmark = pytest.mark.integration
 

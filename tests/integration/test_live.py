@@ -11,8 +11,8 @@ from typing import Any
 import av
 import pytest
 
-from hvt_common.link.wire import BaseHeader, Command, ControlAnswer, ControlRequest
-from link.timing import read_timing
+from hvt_common.protocol.messages import BaseHeader, Command, ControlAnswer, ControlRequest
+from lab.link.timing import read_timing
 from outsider import Tap, answer, joined
 from processes import Link, Running, eventually
 from rrd import Recording

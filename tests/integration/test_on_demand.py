@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_ground.ask import AskedStill, EdgeClient, EdgeTrack, RefusedError
+from hvt_ground.control import AskedStill, EdgeClient, EdgeTrack, RefusedError
 from processes import Link, eventually
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]

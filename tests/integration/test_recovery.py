@@ -15,17 +15,17 @@ from typing import Any
 
 import pytest
 
-from hvt_common.link.wire import Feedback
-from link.relay import Relay
-from link.script import LinkState, Piece, Script
-from link.timing import Arrival, read_timing
+from hvt_common.protocol.messages import Feedback
+from lab.link.relay import Relay
+from lab.link.script import LinkState, Piece, Script
+from lab.link.timing import Arrival, read_timing
 from outsider import Tap, joined
 from processes import Link, Running, eventually
 from rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
-TESTS = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parents[2] / "tests" / "support"
 ROUTER = TESTS.parent / "deploy" / "router.py"
 SOON_S = 60.0
 """Generous: the machine may be busy with other tests."""

@@ -16,11 +16,11 @@ import zenoh
 
 import hvt_edge.cli
 from fleet_keys import EXPIRED, Fleet
-from hvt_common.link.diagnose import LinkWatch
-from hvt_common.link.keys import EdgeKeys, Row, selector
-from hvt_common.link.session import ask, declare_publisher, open_session, serve
-from hvt_common.link.zenoh_config import LinkSettings, configure
-from hvt_common.stopping import STOP_SIGNALS
+from hvt_common.protocol.channels import EdgeKeys, Row, selector
+from hvt_common.runtime.stopping import STOP_SIGNALS
+from hvt_common.transport.doctor.diagnose import LinkWatch
+from hvt_common.transport.session import ask, declare_publisher, open_session, serve
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 from processes import Running, eventually, free_ports
 
 pytestmark = pytest.mark.integration
@@ -381,7 +381,7 @@ def test_a_ground_that_gets_no_answer_on_control_is_told(
     fleet: Fleet, free_port: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Its keyframe requests would go nowhere, and the picture would come back only by the clock."""
-    from hvt_ground.subscribe import GroundLink
+    from hvt_ground.session.subscribe import GroundLink
 
     caplog.set_level(logging.WARNING)
     endpoint = f"tls/127.0.0.1:{free_port}"

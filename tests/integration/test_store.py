@@ -10,10 +10,10 @@ from typing import Any
 import av
 import pytest
 
-from hvt_edge.store.entry import FIRST_KEPT
-from hvt_edge.store.segment import read_segment
-from link.relay import Relay
-from link.script import LinkState, Piece, Script
+from hvt_edge.backlog.entry import FIRST_KEPT
+from hvt_edge.backlog.segment import read_segment
+from lab.link.relay import Relay
+from lab.link.script import LinkState, Piece, Script
 from processes import Link, eventually
 from rrd import Recording
 

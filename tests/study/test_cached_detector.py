@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.model_store import resolve_model
+from hvt_common.inference.store import resolve_model
 from hvt_study.cached_detector import CachedDetector
 
 PICTURE = np.random.default_rng(3).integers(0, 255, (96, 128, 3), np.uint8)

@@ -12,9 +12,9 @@ import pytest
 
 from flight import RedSquares
 from hvt_common.errors import UserError
+from hvt_common.inference.class_names import COCO_NAMES, MOVING, VISDRONE_NAMES
+from hvt_common.inference.imagenet_names import IMAGENET_NAMES
 from hvt_common.values import Posterior
-from hvt_common.vision.class_names import COCO_NAMES, MOVING, VISDRONE_NAMES
-from hvt_common.vision.imagenet_names import IMAGENET_NAMES
 from hvt_study.datasets.classes import map_classes
 from hvt_study.datasets.labels import covered_share
 from hvt_study.datasets.reference import open_reference_detector, reference_labels, with_labels
@@ -276,7 +276,7 @@ def test_a_classifier_names_the_boxes(tmp_path):
 
 def test_a_detection_is_never_done_twice(tmp_path, monkeypatch):
     """A study that was killed goes on where it was."""
-    from hvt_common.vision.detect import OnnxDetector
+    from hvt_common.inference.detect import OnnxDetector
 
     write_visdrone(tmp_path / "root", "a")
     (sequence,) = open_dataset(f"visdrone:{tmp_path / 'root'}?labels=none")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvt_common.vision.class_names import same_kind
+from hvt_common.inference.class_names import same_kind
 from hvt_study.list_score import Listed, ListScore, score_lists
 
 

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from hvt_common.model_store import resolve_model
+from hvt_common.inference.store import resolve_model
 from processes import eventually, free_ports
 from small_study import PATIENT_S, arguments, flights, said, study, table, until, write_scene
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from hvt_common.vision.class_names import kind_of
+from hvt_common.inference.class_names import kind_of
 from hvt_study.metrics.classes import ClassCounts, class_score
 from hvt_study.metrics.contract import FrameView
 from hvt_study.metrics.first_correct import first_correct

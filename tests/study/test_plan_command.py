@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_edge.methods.registry import METHODS
+from hvt_edge.stills.policy.registry import METHODS
 from hvt_study.cli import main
 from hvt_study.commands.plan import hours_in_words
 from hvt_study.matrix.estimate import estimate

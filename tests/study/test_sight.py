@@ -10,7 +10,7 @@ import pytest
 from hvt_common.config import load
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
-from hvt_edge.scene import Scene
+from hvt_scene import Scene
 from hvt_study.cli import main
 from hvt_study.sight import Missing, SightResult, SightRow, jobs_of
 from hvt_study.sight_methods import FPS_CHOICES, METHODS, method_rows

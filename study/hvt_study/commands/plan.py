@@ -7,7 +7,7 @@ import os
 from typing import TYPE_CHECKING
 
 from hvt_common.errors import UserError
-from hvt_common.report import print_table
+from hvt_common.runtime.reporting import print_table
 from hvt_study.commands.study_arguments import (
     add_accounting,
     add_plan_arguments,

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.report import say
+from hvt_common.runtime.reporting import say
 from hvt_study.commands.run_progress import RunProgress
 from hvt_study.commands.study_arguments import make_out, open_pool, open_sequences, study_plan
 from hvt_study.matrix.accounting import in_accounting

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hvt_common.units import parse_size
-from hvt_edge.scene import Scene
+from hvt_scene import Scene
 from hvt_study.score import Score, read_tracks, read_truth, score
 
 __all__ = ["SUMMARY", "add_arguments", "run"]

@@ -14,9 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from hvt_common.errors import UserError
-from hvt_common.report import write_json
+from hvt_common.runtime.reporting import write_json
 from hvt_common.units import parse_size
-from hvt_edge.source import check_shape
+from hvt_edge.source.opening import check_shape
 from hvt_study.sight import SightPlan, SightResult, SightRow, compare
 from hvt_study.sight_methods import METHODS, method_rows
 

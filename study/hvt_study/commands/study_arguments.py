@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
-from hvt_common.report import check_writable
+from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.detect import MOTION, open_detector
+from hvt_common.inference.embedded import DETECTOR as EMBEDDED_DETECTOR
+from hvt_common.inference.labels import first_synonym
+from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
-from hvt_common.vision.classify import open_classifier
-from hvt_common.vision.detect import MOTION, open_detector
-from hvt_common.vision.embedded import DETECTOR as EMBEDDED_DETECTOR
-from hvt_common.vision.labels import first_synonym
-from hvt_common.vision.still_codecs import still_codec
-from hvt_edge.source import check_shape
+from hvt_common.video.still_codecs import still_codec
+from hvt_edge.source.opening import check_shape
 from hvt_ground.config import DETECTOR, NONE
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.uri import DATASETS, open_datasets

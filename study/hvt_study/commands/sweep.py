@@ -13,10 +13,10 @@ from rich.progress import track
 from rich.table import Table
 
 from hvt_common.errors import UserError
+from hvt_common.inference.detect import open_detector
 from hvt_common.units import parse_size
-from hvt_common.vision.detect import open_detector
-from hvt_edge.source import open_source
-from hvt_edge.sources.video import VideoSource
+from hvt_edge.source.opening import open_source
+from hvt_edge.source.video import VideoSource
 from hvt_study.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
 
 __all__ = ["SUMMARY", "add_arguments", "run"]

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hvt_common.errors import UserError
-from hvt_common.report import write_json
+from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.run_progress import RunProgress
 from hvt_study.commands.study_arguments import (
     add_plan_arguments,

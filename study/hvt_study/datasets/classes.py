@@ -1,6 +1,6 @@
 """Which class of a detector or classifier speaks of which class of a dataset.
 
-Names are compared by kind (`hvt_common.vision.class_names`): COCO's ``person`` speaks of VisDrone's ``pedestrian``
+Names are compared by kind (`hvt_common.inference.class_names`): COCO's ``person`` speaks of VisDrone's ``pedestrian``
 and ``people``, an ImageNet ``pickup`` of UAVDT's ``truck``. Within one kind names stay apart where model and dataset
 have the very same ones, else they become one word. Where a dataset has one class of a kind, that is the word.
 """
@@ -12,8 +12,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from hvt_common.errors import UserError
-from hvt_common.vision.class_names import MOVING, kind_of
-from hvt_common.vision.labels import first_synonym
+from hvt_common.inference.class_names import MOVING, kind_of
+from hvt_common.inference.labels import first_synonym
 
 __all__ = ["ClassMap", "map_classes"]
 

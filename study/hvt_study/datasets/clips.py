@@ -12,8 +12,9 @@ import av
 import av.error
 
 from hvt_common.errors import UserError
-from hvt_edge.resample import exact_rate, hold
-from hvt_edge.sources.video import VideoSource
+from hvt_common.units import exact_rate
+from hvt_edge.source.resample import hold
+from hvt_edge.source.video import VideoSource
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.options import Options
 from hvt_study.sight_clip import TICK_FPS, Clip

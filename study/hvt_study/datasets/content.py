@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from hvt_edge.sources.folder import sequence_files
+from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.contract import Sequence
 
 __all__ = ["content_hash"]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hvt_edge.resample import exact_rate
+from hvt_common.units import exact_rate
 from hvt_study.datasets.labels import NO_ID, UNKNOWN, FrameLabels
 from hvt_study.sight_clip import TICK_FPS, Clip
 

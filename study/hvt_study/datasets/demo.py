@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
-from hvt_edge.resample import base_frame_count, exact_rate
-from hvt_edge.scene import Scene
-from hvt_edge.scene.vehicles import CLASS_NAMES
+from hvt_common.units import exact_rate
+from hvt_edge.source.resample import base_frame_count
+from hvt_scene import Scene
+from hvt_scene.vehicles import CLASS_NAMES
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.options import parse_numbers

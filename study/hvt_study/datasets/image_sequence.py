@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 
 from hvt_common.errors import UserError
-from hvt_edge.resample import base_frame_count, exact_rate
-from hvt_edge.sources.folder import sequence_files
+from hvt_common.units import exact_rate
+from hvt_edge.source.folder import sequence_files
+from hvt_edge.source.resample import base_frame_count
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.label_table import LabelTable, TableLabels
 from hvt_study.sight_clip import TICK_FPS, Clip

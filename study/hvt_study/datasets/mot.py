@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.vision.labels import read_labels
+from hvt_common.inference.labels import read_labels
 from hvt_study.datasets.annotation_rows import Rows, read_rows
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.image_sequence import ImageSequence, find_folders

@@ -18,13 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import MOTION, Detector
+from hvt_common.inference.labels import first_synonym
+from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_common.values import Boxes, Image
-from hvt_common.vision.classify import Classifier
-from hvt_common.vision.detect import MOTION, Detector
-from hvt_common.vision.labels import first_synonym
-from hvt_common.vision.track import weak_confidence
-from hvt_edge.crop import PADDING, crop_box
-from hvt_edge.resample import Resizer
+from hvt_edge.perception.crop import PADDING, crop_box
+from hvt_edge.source.resample import Resizer
 from hvt_study.cached_detector import CachedDetector
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.labels import NO_ID, FrameLabels, inside_frame

@@ -13,8 +13,8 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.vision.class_names import VISDRONE_NAMES
-from hvt_edge.sources.folder import sequence_files
+from hvt_common.inference.class_names import VISDRONE_NAMES
+from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.image_sequence import find_folders
 from hvt_study.datasets.label_table import file_stamp

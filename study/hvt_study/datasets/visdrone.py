@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.vision.class_names import VISDRONE_NAMES
+from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels

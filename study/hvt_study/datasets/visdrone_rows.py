@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes
-from hvt_common.vision.class_names import VISDRONE_NAMES
 from hvt_study.datasets.annotation_rows import Rows, read_rows
 
 __all__ = ["VisDroneRows", "read_image_rows", "read_video_rows"]

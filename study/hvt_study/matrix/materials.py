@@ -15,11 +15,11 @@ import av
 
 from hvt_common import __version__
 from hvt_common.errors import UserError
-from hvt_common.model_store import resolve_model
-from hvt_common.vision.classify import Classifier, open_classifier
-from hvt_common.vision.detect import MOTION
-from hvt_common.vision.labels import first_synonym
-from hvt_common.vision.track import weak_confidence
+from hvt_common.inference.classify import Classifier, open_classifier
+from hvt_common.inference.detect import MOTION
+from hvt_common.inference.labels import first_synonym
+from hvt_common.inference.store import resolve_model
+from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, NONE
 from hvt_study.cached_detector import CachedDetector
 from hvt_study.code_digest import flight_code

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from hvt_common.link.keys import Row
+from hvt_common.protocol.channels import Row
 from hvt_study.flight import FlightReport
 from hvt_study.matrix.workshop import Workshop
 from hvt_study.metrics.bits import Accounting, bit_split, still_counts

@@ -18,7 +18,7 @@ from typing import Any
 import optuna
 
 from hvt_common.errors import UserError
-from hvt_edge.methods.registry import METHODS
+from hvt_edge.stills.policy.registry import METHODS
 from hvt_study.matrix.execute import run_spec
 from hvt_study.matrix.methods import METHODS as FLOWN
 from hvt_study.matrix.plan import StudyPlan

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
-from hvt_edge.methods.registry import METHODS, method, tuning
+from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_study.matrix.methods import METHODS as FLOWN
 
 __all__ = ["tuned_methods", "tuning_texts"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from hvt_common.vision.labels import first_synonym
+from hvt_common.inference.labels import first_synonym
 from hvt_study.datasets.classes import ClassMap, map_classes
 
 __all__ = ["joint_classes"]

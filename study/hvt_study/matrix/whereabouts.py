@@ -40,7 +40,7 @@ def _dataset(uri: str, folder: Path) -> str:
 
 
 def _model(spec: str, folder: Path) -> str:
-    """What has a folder or a suffix in it is a path, as for `hvt_common.model_store.resolve_model`."""
+    """What has a folder or a suffix in it is a path, as for `hvt_common.inference.store.resolve_model`."""
     separators = (os.sep, os.altsep or os.sep)
     is_path = "." in spec or any(one in spec for one in separators)
     return str(folder / spec) if is_path and not spec.startswith("~") else spec

@@ -13,8 +13,8 @@ import cv2
 from filelock import FileLock
 
 from hvt_common.errors import UserError
-from hvt_common.vision.classify import Classifier
-from hvt_common.vision.detect import Detector
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import Detector
 from hvt_study.datasets.classes import ClassMap
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.labels import FrameLabels

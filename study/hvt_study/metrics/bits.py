@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from hvt_common.link.keys import Row
+from hvt_common.protocol.channels import Row
 from hvt_study.metrics.contract import NO_ID
 from hvt_study.metrics.stills import RefinedObject, StillArrival
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.boxes import iou
+from hvt_common.inference.class_names import MOVING
 from hvt_common.values import Boxes
-from hvt_common.vision.boxes import iou
-from hvt_common.vision.class_names import MOVING
 from hvt_study.datasets.labels import FrameLabels, covered_share
 from hvt_study.metrics.contract import FrameView, Ticks, rows_of
 from hvt_study.metrics.match import LEAST_IOU
@@ -52,7 +52,7 @@ def judged(
     Args:
         ticks: of one sequence.
         word: brings the names of labels and boxes into one vocabulary, such as
-            `hvt_common.vision.class_names.kind_of`; by default they are compared as they are.
+            `hvt_common.inference.class_names.kind_of`; by default they are compared as they are.
         classes: names in that vocabulary; labels and boxes of others are left out. None keeps all.
             A box stays where its name before *or* after refinement is one of them, so that no still can take a false
             box out of the account. What merely moves (`MOVING`) may be of any class and stays.

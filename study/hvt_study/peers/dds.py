@@ -19,10 +19,10 @@ from itertools import groupby
 
 import numpy as np
 
+from hvt_common.inference.detect import Detector
 from hvt_common.values import Frame
-from hvt_common.vision.detect import Detector
-from hvt_edge.budget import RollingBudget
-from hvt_edge.resample import Resizer
+from hvt_edge.link.budget import RollingBudget
+from hvt_edge.source.resample import Resizer
 from hvt_study.flight import FlightReport, coded_ticks
 from hvt_study.peers.dds_edge import DdsEdge, pass_rates
 from hvt_study.peers.dds_ground import DdsGround

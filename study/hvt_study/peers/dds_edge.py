@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from hvt_common.errors import UserError
-from hvt_common.link.keys import Row
+from hvt_common.protocol.channels import Row
 from hvt_common.values import AccessUnit, Frame, Image
-from hvt_edge.budget import BudgetSettings, RollingBudget
-from hvt_edge.encode import VBV_S, BaseEncoder, EncoderSettings, keyframe_floor_bytes, minimum_bps
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.video.x265 import VBV_S, BaseEncoder, EncoderSettings, keyframe_floor_bytes, minimum_bps
 from hvt_study.peers.dds_line import Line, header_bps
 from hvt_study.peers.dds_regions import Blocks, block_grid, pasted
 from hvt_study.peers.dds_request import RegionRequest

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from hvt_common.link.keys import Row
+from hvt_common.inference.detect import Detector
+from hvt_common.protocol.channels import Row
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import AccessUnit, Detections, Image, Tracks, View
-from hvt_common.vision.detect import Detector
-from hvt_common.vision.hevc import BaseDecoder
-from hvt_common.vision.track import ByteTracker, TrackerSettings
+from hvt_common.video.hevc import BaseDecoder
 from hvt_study.metrics.contract import NO_ID, FrameView
 from hvt_study.metrics.seen import SeenTick
 from hvt_study.peers.dds_edge import most_kept

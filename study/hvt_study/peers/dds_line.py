@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hvt_common.link.keys import DELIVERIES, EdgeKeys, Row
-from hvt_common.link.ledger import Channel, Ledger, overhead_bytes
-from hvt_common.link.wire import BaseHeader, Flags
+from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row
+from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.protocol.messages import BaseHeader, Flags
 from hvt_common.values import AccessUnit
-from hvt_edge.budget import RollingBudget
+from hvt_edge.link.budget import RollingBudget
 from hvt_study.serial_link import Arrival, SerialLink
 
 __all__ = ["HEADER_BYTES", "PASS_ROWS", "Line", "UnitMessage", "header_bps"]

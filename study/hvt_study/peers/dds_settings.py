@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from hvt_common.errors import UserError
-from hvt_edge.encode import PRESETS
+from hvt_edge.video.x265 import PRESETS
 from hvt_study.sight_clip import TICK_FPS
 
 __all__ = ["RATES", "DdsSettings"]

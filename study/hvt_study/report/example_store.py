@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
-from hvt_common.report import write_json
+from hvt_common.runtime.reporting import write_json
 from hvt_study.report.enlarge import is_picture
 from hvt_study.report.examples import CropExample, Example, Lane, Timeline, Word
 

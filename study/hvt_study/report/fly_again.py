@@ -15,13 +15,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hvt_common.link.inbox import Received
-from hvt_common.link.keys import Row, parse_key
-from hvt_common.link.wire import Info, RoiHeader
+from hvt_common.protocol.channels import Row, parse_key
+from hvt_common.protocol.messages import Info, RoiHeader
+from hvt_common.transport.inbox import Received
 from hvt_common.values import Image, View
-from hvt_common.vision.base_crop import base_crop
-from hvt_common.vision.still_codecs import psnr_y_db
-from hvt_ground.events import Event, Refinement
+from hvt_common.video.base_crop import base_crop
+from hvt_common.video.still_codecs import psnr_y_db
+from hvt_ground.events.events import Event, Refinement
 from hvt_study.flight import FlightPlan, FlightReport, _Edge
 from hvt_study.flight_ground import GroundSide, SharedModels
 from hvt_study.matrix.flights import flight_plan

@@ -1,0 +1,253 @@
+"""Classifiers of crops: ImageNet-style networks in ONNX.
+
+How pixels are prepared, first rule that applies:
+
+1. The model's metadata says it: ``hvt.mean`` and ``hvt.scale`` (one number or three, network value =
+   (pixel - mean) * scale, pixels 0…255, numbers in the order of the network's channels) and ``hvt.channel_order``
+   (``RGB`` or ``BGR``).
+2. 1001 classes, TensorFlow's ImageNet with a background class: RGB, (pixel - 128) / 128.
+3. Anything else, as torchvision and the ONNX model zoo train (ResNet-50): RGB, mean 123.675 116.28 103.53, scale
+   1/58.395 1/57.12 1/57.375.
+
+The crop is resized to the network's input as a whole, without keeping its shape. The usual "shorter side 256, centre
+crop 224" is meant for photographs; a crop around a box is already centred on its object and must not lose its ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.errors import UserError
+from hvt_common.inference.imagenet_names import IMAGENET_NAMES
+from hvt_common.inference.labels import first_synonym, metadata_labels, read_labels
+from hvt_common.inference.letterbox import as_bgr
+from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
+from hvt_common.inference.store import resolve_model
+from hvt_common.values import Image, Posterior
+
+__all__ = ["Classifier", "OnnxClassifier", "Preparation", "open_classifier"]
+
+_IMAGENET_CLASSES = 1000
+_BACKGROUND = "background"
+_MAX_BATCH = 32
+_MAX_SIDE = 2048
+_USUAL_SIDE = 224
+
+
+class Classifier(Protocol):
+    """Says what crops show."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """What ``probabilities`` run over."""
+
+    def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
+        """One posterior a crop, in order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Preparation:
+    """Network value = (pixel - mean) * scale, channel by channel."""
+
+    mean: tuple[float, float, float]
+    scale: tuple[float, float, float]
+    rgb: bool = True
+
+
+_TENSORFLOW = Preparation(mean=(128.0,) * 3, scale=(1 / 128,) * 3)
+_TORCHVISION = Preparation(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 / 57.12, 1 / 57.375))
+
+
+def open_classifier(
+    spec: str, *, labels: Path | None = None, threads: int = 2, provider: str = "cpu"
+) -> Classifier:
+    """Open an ONNX classifier.
+
+    Args:
+        spec: The name of a model (`hvt_common.inference.store.resolve_model`), or the path of an ONNX file.
+        labels: Class names, one a line; else those in the model's metadata, else ImageNet's for 1000 or 1001
+            classes, else "class 0" and so on. Names of 1000 classes fit a model of 1001 (a background is put in
+            front), and 1001 names that begin with "background" fit a model of 1000. Of synonyms separated by commas
+            the first is shown.
+        threads: CPU threads of the network.
+        provider: What runs the network, one of `hvt_common.inference.runtimes.providers.PROVIDERS`.
+
+    Raises:
+        UserError: No such model, not a classifier, metadata or labels that do not fit.
+    """
+    path = resolve_model(spec, role="classifier")
+    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
+    return OnnxClassifier(model, labels=labels)
+
+
+class OnnxClassifier:
+    """A network from one image to one row of scores; arguments as of `open_classifier`.
+
+    Construction runs the network once on grey noise: that tells logits (softmax is applied) from probabilities
+    (each row sums to one).
+
+    Raises:
+        UserError: The model is not a classifier, or its metadata or the labels do not fit.
+    """
+
+    def __init__(self, model: OnnxModel, *, labels: Path | None = None) -> None:
+        self.model = model
+        self._channels_first, self._batch, self._size = _geometry(model)
+        self._output_index, classes, self._logits = self._try_out()
+        self.preparation = _preparation(model, classes)
+        self.class_names = _class_names(model, classes, labels)
+
+    def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
+        """Classify crops of any size; those of a model with a free batch go through together.
+
+        Args:
+            crops_bgr: (height, width, 3) uint8 each; grey is accepted too.
+        """
+        batch = self._batch or _MAX_BATCH
+        posteriors = []
+        for start in range(0, len(crops_bgr), batch):
+            crops = [self._prepared(crop) for crop in crops_bgr[start : start + batch]]
+            missing = self._batch - len(crops) if self._batch else 0
+            stack = np.stack(crops + crops[:1] * missing)
+            rows = self._probabilities(self.model.run(stack)[self._output_index])[: len(crops)]
+            posteriors += [self._posterior(row) for row in rows]
+        return posteriors
+
+    def _prepared(self, crop_bgr: Image) -> npt.NDArray[Any]:
+        """One crop as the network wants it, without the batch axis."""
+        crop = as_bgr(crop_bgr)
+        shrinks = crop.shape[1] >= self._size[0] and crop.shape[0] >= self._size[1]
+        resized = cv2.resize(crop, self._size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        ordered = resized[..., ::-1] if self.preparation.rgb else resized
+        mean, scale = (np.array(v, np.float32) for v in (self.preparation.mean, self.preparation.scale))
+        values = (ordered - mean) * scale
+        return (values.transpose(2, 0, 1) if self._channels_first else values).astype(
+            self.model.inputs[0].dtype
+        )
+
+    def _probabilities(self, output: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+        rows = output.reshape(len(output), -1).astype(np.float64)
+        # A row that is not finite says nothing: the uniform distribution.
+        rows[~np.isfinite(rows).all(axis=1)] = 1.0
+        if self._logits:
+            rows = np.exp(rows - rows.max(axis=1, keepdims=True))
+        rows = np.maximum(rows, 0)
+        return np.asarray(rows / np.maximum(rows.sum(axis=1, keepdims=True), 1e-12), np.float32)
+
+    def _posterior(self, probabilities: npt.NDArray[np.float32]) -> Posterior:
+        best = int(probabilities.argmax())
+        some = probabilities[probabilities > 0].astype(np.float64)
+        return Posterior(
+            class_name=self.class_names[best],
+            confidence=float(probabilities[best]),
+            entropy_nats=max(0.0, float(-(some * np.log(some)).sum())),
+            probabilities=probabilities,
+        )
+
+    def _try_out(self) -> tuple[int, int, bool]:
+        """Index of the output of scores, number of classes, and whether they are logits."""
+        batch, (width, height) = self._batch or 1, self._size
+        shape = (batch, 3, height, width) if self._channels_first else (batch, height, width, 3)
+        noise = np.random.default_rng(0).normal(0, 1, shape).astype(self.model.inputs[0].dtype)
+        for index, output in enumerate(self.model.run(noise)):
+            if _is_scores(output, batch):
+                row = output.reshape(batch, -1)[0].astype(np.float64)
+                probabilities = row.min() >= 0 and abs(row.sum() - 1) < 1e-2
+                return index, row.size, not probabilities
+        raise UserError(_not_a_classifier(self.model, "no output is one row of scores an image"))
+
+
+def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
+    """Whether channels come first, the batch (None: free), and the (width, height) of the input."""
+    shape = model.inputs[0].shape if len(model.inputs) == 1 else ()
+    if len(shape) != 4 or 3 not in (shape[1], shape[3]):
+        raise UserError(_not_a_classifier(model, "its input is not one image of three channels"))
+    if model.inputs[0].dtype not in (np.float32, np.float16):
+        raise UserError(_not_a_classifier(model, "its input is neither float32 nor float16"))
+    channels_first = shape[1] == 3
+    height, width = (side or _USUAL_SIDE for side in (shape[2:] if channels_first else shape[1:3]))
+    if max(width, height) > _MAX_SIDE:
+        raise UserError(_not_a_classifier(model, f"its input is {width}x{height} pixels"))
+    return channels_first, shape[0], (width, height)
+
+
+def _is_scores(output: npt.NDArray[Any], batch: int) -> bool:
+    """(batch, C), or (batch, C, 1, 1) as some exports leave it, with at least two classes."""
+    row = output.shape[1:]
+    numbers = np.issubdtype(output.dtype, np.floating)
+    return (
+        numbers
+        and output.ndim >= 2
+        and len(output) == batch
+        and row[0] >= 2
+        and all(size == 1 for size in row[1:])
+    )
+
+
+def _not_a_classifier(model: OnnxModel, why: str) -> str:
+    ports = "; ".join(map(str, (*model.inputs, *model.outputs)))
+    return (
+        f"model {model.path} is not a classifier that is known here: {why}"
+        f" (it has {ports}; accepted: an image (N, 3, H, W) or (N, H, W, 3) in, scores (N, C) out)"
+    )
+
+
+def _preparation(model: OnnxModel, classes: int) -> Preparation:
+    usual = _TENSORFLOW if classes == _IMAGENET_CLASSES + 1 else _TORCHVISION
+    order = model.metadata.get("hvt.channel_order", "RGB").upper()
+    if order not in ("RGB", "BGR"):
+        raise UserError(
+            f"model {model.path} has hvt.channel_order '{order}' in its metadata; RGB or BGR is accepted"
+        )
+    return Preparation(
+        mean=_three_numbers(model, "hvt.mean", usual.mean),
+        scale=_three_numbers(model, "hvt.scale", usual.scale),
+        rgb=order == "RGB",
+    )
+
+
+def _three_numbers(
+    model: OnnxModel, key: str, usual: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """One number for all channels or three, separated by spaces or commas, with or without brackets."""
+    metadata: Mapping[str, str] = model.metadata
+    if key not in metadata:
+        return usual
+    try:
+        numbers = [float(word) for word in metadata[key].strip("[]() ").replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 3) or not np.isfinite(numbers).all():
+        raise UserError(
+            f"model {model.path} has {key} '{metadata[key]}' in its metadata; one number or three do"
+        )
+    red, green, blue = numbers * 3 if len(numbers) == 1 else numbers
+    return red, green, blue
+
+
+def _class_names(model: OnnxModel, classes: int, labels: Path | None) -> tuple[str, ...]:
+    names = read_labels(labels) if labels is not None else metadata_labels(model.metadata)
+    if names is None and classes in (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):
+        names = IMAGENET_NAMES
+    if names is None:
+        return tuple(f"class {index}" for index in range(classes))
+    if (len(names), classes) == (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):
+        names = (_BACKGROUND, *names)
+    elif (len(names), classes) == (_IMAGENET_CLASSES + 1, _IMAGENET_CLASSES) and names[
+        0
+    ].lower() == _BACKGROUND:
+        names = names[1:]
+    if len(names) != classes:
+        origin = f"labels file {labels}" if labels is not None else f"metadata of {model.path}"
+        raise UserError(
+            f"{origin} has {len(names)} class names, {model.path} has {classes} classes; as many are expected"
+            f" (or {_IMAGENET_CLASSES} for {_IMAGENET_CLASSES + 1}, or the reverse if the first is '{_BACKGROUND}')"
+        )
+    return tuple(first_synonym(name) for name in names)

@@ -1,0 +1,224 @@
+"""Detectors: an ONNX network with one of the known heads, or plain motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
+from hvt_common.inference.detect_heads import ACCEPTED_HEADS, Head, choose_head
+from hvt_common.inference.labels import metadata_labels, read_labels
+from hvt_common.inference.letterbox import Letterboxer, as_bgr
+from hvt_common.inference.motion import MotionDetector
+from hvt_common.inference.nms import MAX_DETECTIONS, suppress
+from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
+from hvt_common.inference.store import resolve_model
+from hvt_common.values import Detections, Image
+
+__all__ = ["MOTION", "Detector", "OnnxDetector", "open_detector", "warm_up"]
+
+MOTION = "motion"
+"""The word that stands for the detector without weights."""
+
+_CELL = 32  # input sides are multiples of the largest usual stride
+_TRIAL_SIDE = 256
+_MAX_FREE_SIDE = 1920
+_MAX_SIDE = 8192
+
+
+_TWIN_IOU = 0.8
+"""Two boxes that overlap more are one object, whatever their classes: networks call one vehicle a car and a van. A
+rider and the bicycle below overlap less."""
+
+
+class Detector(Protocol):
+    """Finds objects in one image after the other; one instance serves one stream."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """What ``class_ids`` index."""
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """Detections in the pixels of this image, inside it, best first."""
+
+
+def open_detector(
+    spec: str,
+    *,
+    labels: Path | None = None,
+    confidence: float = 0.25,
+    nms_iou: float = 0.45,
+    size: tuple[int, int] | None = None,
+    threads: int = 2,
+    provider: str = "cpu",
+) -> Detector:
+    """Open the detector that ``spec`` names.
+
+    Args:
+        spec: ``motion``, the name of a model (see `resolve_model`), or the path of an ONNX file
+            with one of the heads of `detect_heads`.
+        labels: Class names, one a line; else those in the model's metadata, else COCO for 80 classes and VisDrone
+            for 10, else "class 0" and so on.
+        confidence: Least confidence of a detection, 0…1.
+        nms_iou: Largest overlap of two detections of one class, 0…1.
+        size: (width, height) of the network's input where the model leaves it free; else each image gets the
+            multiples of 32 that hold it (at most 1920 on the longer side).
+        threads: CPU threads of the network.
+        provider: What runs the network, one of `hvt_common.inference.runtimes.providers.PROVIDERS`.
+
+    Raises:
+        UserError: No such model, not a detector, labels that do not fit, a setting out of its range.
+    """
+    for name, value in (("confidence", confidence), ("NMS IoU", nms_iou)):
+        if not 0 <= value <= 1:
+            raise UserError(f"{name} {value} is not accepted; a number from 0 to 1 is")
+    if spec == MOTION:
+        return MotionDetector(confidence=confidence)
+    path = resolve_model(spec, role="detector", words=(MOTION,))
+    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
+    return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size)
+
+
+def warm_up(detector: Detector, size: tuple[int, int]) -> None:
+    """Run a network once at the (width, height) it will see: a runtime may compile for it, which takes 0.2 s.
+
+    A detector that remembers pictures, such as `motion`, is left alone.
+    """
+    if isinstance(detector, OnnxDetector):
+        detector.detect(np.zeros((size[1], size[0], 3), np.uint8))
+
+
+class OnnxDetector:
+    """A network with one of the known heads; arguments as of `open_detector`.
+
+    Construction runs the network once on grey: that tells the head by its values too, and warms it up.
+
+    Raises:
+        UserError: The model is not a detector, or the labels or the size do not fit it.
+    """
+
+    def __init__(
+        self,
+        model: OnnxModel,
+        *,
+        labels: Path | None = None,
+        confidence: float = 0.25,
+        nms_iou: float = 0.45,
+        size: tuple[int, int] | None = None,
+    ) -> None:
+        self.model = model
+        self.head: Head
+        self._confidence = confidence
+        self._nms_iou = nms_iou
+        self._fixed_size = _fixed_size(model, size)
+        self._output_index, self.head = _find_head(model, self._fixed_size or (_TRIAL_SIDE, _TRIAL_SIDE))
+        self.class_names = _class_names(model, self.head, labels)
+        dtype = model.inputs[0].dtype
+        assert dtype is not None
+        self._letterboxer = Letterboxer(
+            anchor=self.head.anchor, rgb=self.head.rgb, gain=self.head.gain, dtype=dtype
+        )
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """Run the network on one image of any size.
+
+        Args:
+            image_bgr: (height, width, 3) uint8; grey is accepted too.
+        """
+        image = as_bgr(image_bgr)
+        input_size = self.input_size((image.shape[1], image.shape[0]))
+        tensor, letterbox = self._letterboxer.fill(image, input_size)
+        output = self.model.run(tensor)[self._output_index].astype(np.float32, copy=False)
+        found = self.head.decode(output, confidence=self._confidence, input_size=input_size)
+        if self.head.suppresses:
+            kept = suppress(
+                found.boxes_input_px,
+                found.scores,
+                found.class_ids,
+                iou=self._nms_iou,
+                any_class_iou=_TWIN_IOU,
+            )
+        else:
+            kept = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
+        boxes = letterbox.to_image(found.boxes_input_px[kept])
+        class_ids = found.class_ids[kept]
+        inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & (class_ids < len(self.class_names))
+        return Detections(boxes[inside], found.scores[kept][inside], class_ids[inside])
+
+    def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
+        """(width, height) in pixels that the network gets for an image of this (width, height)."""
+        if self._fixed_size is not None:
+            return self._fixed_size
+        shrink = min(1.0, _MAX_FREE_SIDE / max(image_size))
+        width, height = (-int(-side * shrink // _CELL) * _CELL for side in image_size)
+        return max(width, _CELL), max(height, _CELL)
+
+
+def _fixed_size(model: OnnxModel, size: tuple[int, int] | None) -> tuple[int, int] | None:
+    """(width, height) of the input, from the model or the user; None where every image chooses its own."""
+    if len(model.inputs) != 1 or len(model.inputs[0].shape) != 4 or model.inputs[0].shape[1] not in (3, None):
+        raise UserError(_not_a_detector(model, "its input is not one (1, 3, height, width) image"))
+    batch, _, height, width = model.inputs[0].shape
+    if batch not in (1, None):
+        raise UserError(_not_a_detector(model, f"it takes {batch} images at once"))
+    if model.inputs[0].dtype not in (np.float32, np.float16):
+        raise UserError(_not_a_detector(model, "its input is neither float32 nor float16"))
+    if size is None:
+        return (width, height) if width and height else _half_free(width, height)
+    if any(side % _CELL or not 0 < side <= _MAX_SIDE for side in size):
+        raise UserError(
+            f"detector size {size[0]}x{size[1]} is not accepted; multiples of {_CELL} to {_MAX_SIDE} are"
+        )
+    if size[0] != (width or size[0]) or size[1] != (height or size[1]):
+        raise UserError(
+            f"detector size {size[0]}x{size[1]} does not fit {model.path}, whose input is {width}x{height}"
+        )
+    return size
+
+
+def _half_free(width: int | None, height: int | None) -> tuple[int, int] | None:
+    """A model with one free side gets a square; with both free, every image chooses."""
+    side = width or height
+    return (side, side) if side else None
+
+
+def _find_head(model: OnnxModel, trial_size: tuple[int, int]) -> tuple[int, Head]:
+    """Run the network once on grey and find the one output that a known head explains."""
+    width, height = trial_size
+    dtype = model.inputs[0].dtype
+    outputs = model.run(np.full((1, 3, height, width), 0.5, dtype))
+    task = model.metadata.get("task", "detect")
+    if task != "detect":
+        raise UserError(_not_a_detector(model, f"its task is '{task}'"))
+    heads = [(index, choose_head(output, trial_size)) for index, output in enumerate(outputs)]
+    known = [(index, head) for index, head in heads if head is not None]
+    if len(known) != 1:
+        raise UserError(
+            _not_a_detector(model, "of its outputs " + ("several" if known else "none") + " fit a known head")
+        )
+    return known[0]
+
+
+def _not_a_detector(model: OnnxModel, why: str) -> str:
+    outputs = "; ".join(map(str, model.outputs))
+    return (
+        f"model {model.path} is not a detector that is known here: {why}"
+        f" (outputs: {outputs}; accepted heads: {ACCEPTED_HEADS})"
+    )
+
+
+def _class_names(model: OnnxModel, head: Head, labels: Path | None) -> tuple[str, ...]:
+    names = read_labels(labels) if labels is not None else metadata_labels(model.metadata)
+    origin = f"labels file {labels}" if labels is not None else f"metadata of {model.path}"
+    if head.classes is None:
+        if names is None:
+            raise UserError(f"model {model.path} does not say its class names; give them with a labels file")
+        return names
+    if names is not None and len(names) != head.classes:
+        raise UserError(f"{origin} has {len(names)} class names; {model.path} has {head.classes} classes")
+    defaults = {len(COCO_NAMES): COCO_NAMES, len(VISDRONE_NAMES): VISDRONE_NAMES}
+    numbered = tuple(f"class {index}" for index in range(head.classes))
+    return names or defaults.get(head.classes, numbered)

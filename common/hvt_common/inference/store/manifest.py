@@ -1,0 +1,107 @@
+"""What a manifest says of a model, and how it is read.
+
+``manifest.toml`` beside this file is the built-in one; ``added.toml`` in the cache folder has the same form and holds
+what the user added. A table's name is the model's name; its keys are the fields of `ModelEntry`.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from importlib.resources import files
+from typing import Any
+from urllib.parse import urlsplit
+
+from hvt_common.errors import UserError
+
+__all__ = ["MAX_SIZE_BYTES", "ModelEntry", "builtin_manifest", "check_digest", "check_name", "parse_manifest"]
+
+MAX_SIZE_BYTES = 1 << 30
+"""1 GiB, as much as a model may have when it is opened."""
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,47}")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True, slots=True)
+class ModelEntry:
+    """One pinned model."""
+
+    name: str
+    size_bytes: int
+    sha256: str
+    """64 hexadecimal digits in lower case."""
+    urls: tuple[str, ...] = ()
+    """Where the file is, best first; empty for a model that only came by hand."""
+    task: str = ""
+    """detector or classifier."""
+    about: str = ""
+    classes: str = ""
+    licence: str = ""
+    preprocessing: Mapping[str, Any] | None = None
+    """channels, mean and scale (network value = (pixel - mean) * scale), fit. The adapters know it by themselves; it
+    stands here for whoever uses the file elsewhere, and a test holds both together."""
+
+
+def builtin_manifest() -> dict[str, ModelEntry]:
+    """The models that this version knows."""
+    text = (files("hvt_common.inference.store") / "manifest.toml").read_text(encoding="utf-8")
+    return parse_manifest(text, origin="the built-in manifest")
+
+
+def parse_manifest(text: str, *, origin: str) -> dict[str, ModelEntry]:
+    """Read a manifest.
+
+    Raises:
+        UserError: Not TOML, or an entry that is not as described here; the sentence names ``origin``.
+    """
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"{origin} is not valid TOML ({error})") from error
+    return {name: _entry(name, table, origin=origin) for name, table in tables.items()}
+
+
+def check_name(name: str) -> str:
+    """Return ``name``; `UserError` where it cannot be a model's name."""
+    if not _NAME.fullmatch(name):
+        raise UserError(f"model name '{name}' is not accepted: 1 to 48 of a-z, 0-9 and -")
+    return name
+
+
+def check_digest(digest: str) -> str:
+    """Return the SHA-256 in lower case; `UserError` where it is none."""
+    if not _DIGEST.fullmatch(digest.lower()):
+        raise UserError(f"SHA-256 '{digest}' is not accepted: 64 hexadecimal digits are")
+    return digest.lower()
+
+
+def _entry(name: str, table: Any, *, origin: str) -> ModelEntry:
+    known = {field.name for field in fields(ModelEntry)} - {"name"}
+    if not isinstance(table, dict) or not {"size_bytes", "sha256"} <= table.keys() <= known:
+        raise UserError(
+            f"{origin} has a model '{name}' that needs size_bytes and sha256 and takes {', '.join(sorted(known))}"
+        )
+    size, urls = table["size_bytes"], table.get("urls", [])
+    if not isinstance(size, int) or not 0 < size <= MAX_SIZE_BYTES:
+        raise UserError(
+            f"{origin}: size_bytes {size!r} of '{name}' is not accepted: 1 to {MAX_SIZE_BYTES} is"
+        )
+    if not isinstance(urls, list) or not all(_is_http(url) for url in urls):
+        raise UserError(f"{origin}: urls of '{name}' are not accepted: a list of http and https addresses is")
+    rest = {key: value for key, value in table.items() if key not in ("urls", "sha256")}
+    return ModelEntry(
+        name=check_name(name), urls=tuple(urls), sha256=check_digest(str(table["sha256"])), **rest
+    )
+
+
+def _is_http(url: object) -> bool:
+    if not isinstance(url, str) or any(ord(letter) <= 0x20 for letter in url):
+        return False
+    try:
+        parts = urlsplit(url)
+    except ValueError:  # brackets that hold no address
+        return False
+    return parts.scheme in ("http", "https") and bool(parts.hostname)

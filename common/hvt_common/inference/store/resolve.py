@@ -1,0 +1,61 @@
+"""From what the user wrote after ``--detector`` or ``--classifier`` to a file."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_common.inference.embedded import EMBEDDED_MODELS, embedded_model
+from hvt_common.inference.store.store import Store
+
+__all__ = ["embedded_models", "resolve_model"]
+
+
+def embedded_models() -> dict[str, Path]:
+    """The models that come with the package, by name."""
+    return {name: embedded_model(name) for name in EMBEDDED_MODELS}
+
+
+def resolve_model(
+    spec: str, *, role: str = "model", words: Sequence[str] = (), store: Store | None = None
+) -> Path:
+    """The file of a model that is named or that is a file already; a model of the cache is checked first.
+
+    Args:
+        spec: The name of an embedded model, of a model of the cache, or the path of a file. What has a folder or a
+            suffix in it is a path.
+        role: What the user calls it, for the sentence.
+        words: Words that mean no model and are handled before, for the sentence.
+        store: The cache; else the usual one.
+
+    Raises:
+        UserError: Nothing of that name. For a model that could be had, the command that fetches it and the way to
+            bring it by hand.
+    """
+    separators = [os.sep, os.altsep or os.sep]
+    if "." in spec or any(separator in spec for separator in separators):
+        return _file(spec, role=role)
+    embedded = embedded_models()
+    if spec in embedded:
+        return embedded[spec]
+    store = store if store is not None else Store()
+    entries = store.entries
+    if spec in entries:
+        return store.verified(spec)
+    if Path(spec).is_file():
+        return Path(spec)
+    names = [*words, *embedded, *entries]
+    near = "".join(f" (did you mean {name}?)" for name in difflib.get_close_matches(spec, names, n=1))
+    raise UserError(f"{role} '{spec}' is not known{near}: give one of {', '.join(names)}, or an ONNX file")
+
+
+def _file(spec: str, *, role: str) -> Path:
+    path = Path(spec).expanduser()
+    if not path.exists():
+        raise UserError(
+            f"{role} {spec} does not exist: give an ONNX file, or a name that 'hvt-models list' shows"
+        )
+    return path

@@ -1,0 +1,83 @@
+"""Every message of HVT as bytes, and back. docs/wire.md is the same for people of other languages."""
+
+from __future__ import annotations
+
+from hvt_common.protocol.messages.backlog import (
+    MAX_PAST_BYTES,
+    MAX_PAST_HAVES,
+    PastHave,
+    PastHeader,
+    PastKind,
+    PastStill,
+    PastUnit,
+    pack_past_still,
+    pack_past_units,
+    parse_past_still,
+    parse_past_units,
+)
+from hvt_common.protocol.messages.dialogue import (
+    MAX_MISSING_STILLS,
+    MAX_STILL_RESULTS,
+    MAX_TRACKS_NOW,
+    Command,
+    ControlAnswer,
+    ControlRequest,
+    Feedback,
+    StillResult,
+    TrackNow,
+)
+from hvt_common.protocol.messages.envelope import (
+    MAX_PAYLOAD_BYTES,
+    WIRE_VERSION,
+    CorruptError,
+    Message,
+    UnknownVersionError,
+    kinds,
+)
+from hvt_common.protocol.messages.fields import WireError, fitted_text
+from hvt_common.protocol.messages.reports import Health, Info, Status, fitted_class_names
+from hvt_common.protocol.messages.stream import MAX_ALSO, AlsoShown, BaseHeader, Flags, RoiHeader
+from hvt_common.protocol.messages.track_step import TrackStep, TrackStepDecoder, TrackStepEncoder
+
+__all__ = [
+    "MAX_ALSO",
+    "MAX_MISSING_STILLS",
+    "MAX_PAST_BYTES",
+    "MAX_PAST_HAVES",
+    "MAX_PAYLOAD_BYTES",
+    "MAX_STILL_RESULTS",
+    "MAX_TRACKS_NOW",
+    "WIRE_VERSION",
+    "AlsoShown",
+    "BaseHeader",
+    "Command",
+    "ControlAnswer",
+    "ControlRequest",
+    "CorruptError",
+    "Feedback",
+    "Flags",
+    "Health",
+    "Info",
+    "Message",
+    "PastHave",
+    "PastHeader",
+    "PastKind",
+    "PastStill",
+    "PastUnit",
+    "RoiHeader",
+    "Status",
+    "StillResult",
+    "TrackNow",
+    "TrackStep",
+    "TrackStepDecoder",
+    "TrackStepEncoder",
+    "UnknownVersionError",
+    "WireError",
+    "fitted_class_names",
+    "fitted_text",
+    "kinds",
+    "pack_past_still",
+    "pack_past_units",
+    "parse_past_still",
+    "parse_past_units",
+]

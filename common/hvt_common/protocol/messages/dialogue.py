@@ -1,0 +1,160 @@
+"""What the ground says: requests that the edge answers, and its running report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import ClassVar
+
+from hvt_common.protocol.messages.backlog import MAX_PAST_HAVES, PastHave
+from hvt_common.protocol.messages.envelope import Message, Nested
+from hvt_common.protocol.messages.fields import (
+    I63,
+    U32,
+    U64,
+    Flag,
+    Int,
+    ListOf,
+    MapOf,
+    Scalar,
+    Scaled,
+    Text,
+    TupleOf,
+    carried,
+)
+
+__all__ = [
+    "MAX_MISSING_STILLS",
+    "MAX_STILL_RESULTS",
+    "MAX_TRACKS_NOW",
+    "Command",
+    "ControlAnswer",
+    "ControlRequest",
+    "Feedback",
+    "StillResult",
+    "TrackNow",
+]
+
+MAX_STILL_RESULTS = 32
+MAX_MISSING_STILLS = 32
+"""How many one report names; of more, the newest."""
+MAX_TRACKS_NOW = 64
+"""How many tracks one answer lists; of more, those seen with the most confidence."""
+_COUNT = Int(0, 2**53 - 1)
+_FAR_PX = 32767
+
+
+class Command(StrEnum):
+    """What a ground may ask for; an edge answers a command that it does not serve with a reason."""
+
+    KEYFRAME = "keyframe"
+    STILL = "still"
+    STILL_FATE = "still-fate"
+    """What became of a still that was accepted."""
+    TRACKS = "tracks"
+    """What the edge tracks now, by its own ids."""
+    SET_BUDGET = "set-budget"
+    SET_METHOD = "set-method"
+    SEND_PAST = "send-past"
+    """Send what was kept of the base stream too, before what is left of the stills."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlRequest(Message):
+    """Payload of a question on ``control``."""
+
+    session_id: int = carried(Int(0, U64))
+    """The session it is meant for; 0 for whichever runs."""
+    command: str = carried(Text(24))
+    """A `Command`, or a word of some later version."""
+    arguments: Mapping[str, int | float | str] = carried(MapOf(Scalar(), 8, key_bytes=16))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackNow:
+    """A track of the edge, as an answer lists it."""
+
+    track_id: int = carried(Int(0, U32))
+    class_id: int = carried(Int(0, 2047))
+    """Index into `Info.class_names`."""
+    confidence: float = carried(Scaled(0, 1, 1000))
+    box_source_px: tuple[float, float, float, float] = carried(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    """x1, y1, x2, y2 in eighths of a pixel."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlAnswer(Message):
+    """Payload of the answer on ``control``."""
+
+    MAX_BYTES: ClassVar[int] = 4096
+
+    session_id: int = carried(Int(0, U64))
+    accepted: bool = carried(Flag())
+    reason: str = carried(Text(200))
+    """One sentence; empty where accepted."""
+    still_ask: int = carried(Int(-1, U32))
+    """The number of the still that was accepted: it comes on ``roi`` with the parameter ``ask`` of this value; -1
+    for any other command."""
+    frame_index: int = carried(Int(-1, U32))
+    """The frame that the still shows, or whose tracks these are; -1 where neither."""
+    tracks: tuple[TrackNow, ...] = carried(ListOf(Nested(TrackNow), MAX_TRACKS_NOW))
+    """For the command ``tracks``; else empty."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StillResult:
+    """What the ground made of one still."""
+
+    still_sequence: int = carried(Int(0, U32))
+    track_id: int = carried(Int(-1, U32))
+    """The edge's track, as the still said."""
+    class_name: str = carried(Text(64))
+    confidence: float = carried(Scaled(0, 1, 1000))
+    entropy_nats: float = carried(Scaled(0, 20, 1000))
+    ground_track_id: int = carried(Int(-1, U32))
+    """The ground's track that it refined; -1 where it matched none, or none yet."""
+    again: bool = carried(Flag())
+    """The still names a base frame that this ground does not have: please send it once more, without the base."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Feedback(Message):
+    """Payload of ``feedback``: a receiver report, counts since the receiver met this session."""
+
+    MAX_BYTES: ClassVar[int] = 6144
+
+    session_id: int = carried(Int(0, U64))
+    receiver_id: int = carried(Int(0, U64))
+    """Random, new at each start of the ground: several grounds may report on one edge."""
+    sequence: int = carried(Int(0, U32))
+    send_ns: int = carried(Int(0, I63))
+    """The ground's clock as it was at its start, carried on without steps."""
+    last_frame_index: int = carried(Int(-1, U32))
+    """The last frame that the ground is done with; -1 before the first. A lockstep edge waits for it."""
+    base_messages: int = carried(_COUNT)
+    base_bytes: int = carried(_COUNT)
+    roi_messages: int = carried(_COUNT)
+    roi_bytes: int = carried(_COUNT)
+    lost: int = carried(_COUNT)
+    """Messages of base and roi that never came."""
+    corrupt: int = carried(_COUNT)
+    """Messages that came and could not be used."""
+    base_sequence: int = carried(Int(-1, U32))
+    """The highest of ``base`` that has come; -1 for none. With what follows, the edge follows the link's rate."""
+    base_held_us: int = carried(Int(0, U32))
+    """How long before ``send_ns`` it came: ``send_ns`` minus this is its time of arrival."""
+    still_sequence: int = carried(Int(-1, U32))
+    """The highest of ``roi`` that has come; -1 for none."""
+    missing_stills: tuple[int, ...] = carried(ListOf(Int(0, U32), MAX_MISSING_STILLS))
+    """Sequences of ``roi`` below it that have not come; the edge sends them again while they are worth it."""
+    delay_p50_ms: float = carried(Scaled(-1, 3_600_000, 10))
+    """Median capture to receive since the last report, clocks reconciled; -1 where unknown."""
+    clock_offset_ns: int = carried(Int(-I63, I63))
+    """Edge clock minus ground clock, as the ground estimates it."""
+    clock_error_ns: int = carried(Int(-1, I63))
+    """The estimate is right within this; -1 where there is none."""
+    stills: tuple[StillResult, ...] = carried(ListOf(Nested(StillResult), MAX_STILL_RESULTS))
+    """New since the last report."""
+    past: tuple[PastHave, ...] = carried(ListOf(Nested(PastHave), MAX_PAST_HAVES))
+    """Objects of which pieces came since the last report."""

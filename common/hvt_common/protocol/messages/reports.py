@@ -1,0 +1,143 @@
+"""What the edge says about itself: `Info` when asked, `Status` once a second."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from hvt_common.protocol.messages.envelope import Message, Nested
+from hvt_common.protocol.messages.fields import (
+    I63,
+    U32,
+    U64,
+    Choice,
+    Int,
+    ListOf,
+    MapOf,
+    Real,
+    Scaled,
+    Text,
+    TupleOf,
+    carried,
+    fitted_text,
+)
+from hvt_common.values import View
+
+__all__ = ["Health", "Info", "Status", "fitted_class_names"]
+
+_TIME = Int(0, I63)
+_COUNT = Int(0, 2**53 - 1)
+_BPS = Int(0, 2**53 - 1)
+_SIDE = Int(1, 32767)
+_CLASS_NAME_BYTES = 64
+_CLASS_NAMES = 2048
+_CLASS_NAMES_BYTES = 60_000
+_LAST = Int(-1, U32)
+_REASONS = MapOf(Int(0, U32), 24)
+
+
+def fitted_class_names(names: Sequence[str]) -> tuple[str, ...]:
+    """As many of a detector's class names as an `Info` holds, each as it takes them."""
+    fitted: list[str] = []
+    size_bytes = 0
+    for name in names[:_CLASS_NAMES]:
+        fitted.append(fitted_text(name, _CLASS_NAME_BYTES))
+        size_bytes += 2 + len(fitted[-1].encode())
+        if size_bytes > _CLASS_NAMES_BYTES:
+            break
+    return tuple(fitted)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Info(Message):
+    """Payload of the answer to ``info``: everything about the session that does not change while it runs."""
+
+    MAX_BYTES: ClassVar[int] = 65536
+
+    session_id: int = carried(Int(0, U64))
+    edge: str = carried(Text(32))
+    software: str = carried(Text(32))
+    """Version of HVT on the edge."""
+    started_ns: int = carried(_TIME)
+    source_size: tuple[int, int] = carried(TupleOf(_SIDE, 2))
+    """(width, height) in pixels."""
+    base_size: tuple[int, int] = carried(TupleOf(_SIDE, 2))
+    view_scale: float = carried(Real(1e-4, 1e4))
+    view_offset_px: tuple[float, float] = carried(TupleOf(Real(-32767, 32767), 2))
+    """base = source x scale + offset, in base pixels."""
+    fps: float = carried(Real(0.01, 1000))
+    codec: str = carried(Text(24))
+    pace: str = carried(Choice(("realtime", "lockstep")))
+    method: str = carried(Text(48))
+    budget_bps: int = carried(_BPS)
+    base_bps: int = carried(_BPS)
+    """The part of the budget that the base stream may use."""
+    window_ns: int = carried(Int(1, 3_600_000_000_000))
+    """Length of the rolling window that the budget holds over."""
+    class_names: tuple[str, ...] = carried(ListOf(Text(_CLASS_NAME_BYTES), _CLASS_NAMES))
+    """Of the edge's detector."""
+    received_ns: int = carried(_TIME)
+    """When the edge received the question, its clock (t1)."""
+    answered_ns: int = carried(_TIME)
+    """When it answered (t2)."""
+
+    @property
+    def view(self) -> View:
+        """The map between source and base pixels."""
+        return View(self.source_size, self.base_size, self.view_scale, self.view_offset_px)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Health:
+    """How the edge is doing; counts are since its start."""
+
+    frames_captured: int = carried(_COUNT)
+    frames_encoded: int = carried(_COUNT)
+    frames_dropped: int = carried(_COUNT)
+    """Dropped before encoding."""
+    keyframes: int = carried(_COUNT)
+    tracks: int = carried(_COUNT)
+    """Distinct tracks seen."""
+    base_queue: int = carried(Int(0, U32))
+    """Access units that wait to be sent."""
+    still_queue: int = carried(Int(0, U32))
+    encode_ms: float = carried(Scaled(0, 60_000, 10))
+    """Mean since the last status."""
+    detect_ms: float = carried(Scaled(0, 60_000, 10))
+    feedback_age_ms: int = carried(Int(-1, U32))
+    """Since the last feedback from any ground; -1 for none yet."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status(Message):
+    """Payload of ``status``: the ledger's totals since the start, the fate of candidates, and health."""
+
+    MAX_BYTES: ClassVar[int] = 2048
+
+    session_id: int = carried(Int(0, U64))
+    sequence: int = carried(Int(0, U32))
+    state: str = carried(Choice(("running", "ended")))
+    send_ns: int = carried(_TIME)
+    media_ns: int = carried(_TIME)
+    """Length of the stream so far: frames of the source rate, dropped ones included, in nanoseconds."""
+    last_base_sequence: int = carried(_LAST)
+    """Of the last access unit sent before this message; -1 for none."""
+    last_still_sequence: int = carried(_LAST)
+    base_bytes: int = carried(_COUNT)
+    roi_bytes: int = carried(_COUNT)
+    past_bytes: int = carried(_COUNT)
+    """Pieces of what was kept while the link was away."""
+    meta_bytes: int = carried(_COUNT)
+    overhead_bytes: int = carried(_COUNT)
+    base_messages: int = carried(_COUNT)
+    roi_messages: int = carried(_COUNT)
+    past_messages: int = carried(_COUNT)
+    meta_messages: int = carried(_COUNT)
+    worst_window_bps: tuple[int, int, int] = carried(TupleOf(_BPS, 3))
+    """Base, roi, total: the fullest rolling window of the run."""
+    sent: Mapping[str, int] = carried(_REASONS)
+    """Stills sent, by reason."""
+    deferred: Mapping[str, int] = carried(_REASONS)
+    dropped: Mapping[str, int] = carried(_REASONS)
+    health: Health = carried(Nested(Health))  # noqa: RUF009 - a dataclass field, not a default

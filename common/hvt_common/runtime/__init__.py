@@ -1,0 +1,1 @@
+"""What every process needs: clock, stopping, priorities, allocator, status line, latency statistics."""

@@ -1,0 +1,175 @@
+"""What a run says of itself: a status line while it goes on, a table and a JSON file at its end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import logging.handlers
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from hvt_common.errors import UserError
+
+__all__ = ["StatusLine", "check_writable", "print_table", "say", "start_log", "write_json"]
+
+_PLAIN_EVERY = 5
+
+
+def start_log(program: str, *, quiet: bool) -> Callable[[], None]:
+    """Send the log to stderr, from when the returned function is called: until then it is held.
+
+    A start that fails says one sentence and nothing else. What runs each network is said unless ``quiet``.
+    """
+    stream = logging.StreamHandler()
+    stream.setFormatter(logging.Formatter(f"{program}: %(message)s"))
+    held = _HeldLog(stream)
+    logging.basicConfig(level=logging.WARNING, handlers=[held], force=True)
+    logging.getLogger("hvt_common.inference.runtimes.model").setLevel(
+        logging.WARNING if quiet else logging.INFO
+    )
+    return held.say_on
+
+
+class _HeldLog(logging.handlers.MemoryHandler):
+    """Keeps what is logged until it is released; what is never released is never said."""
+
+    def __init__(self, target: logging.Handler) -> None:
+        super().__init__(10_000, target=target, flushOnClose=False)
+        self._free = False
+
+    def say_on(self) -> None:
+        """Say what was held, and from now on everything at once."""
+        self._free = True
+        self.flush()
+
+    def shouldFlush(self, record: logging.LogRecord) -> bool:  # noqa: ARG002, N802 - the library's name
+        """At once, when free."""
+        return self._free
+
+    def flush(self) -> None:
+        """Logging itself flushes at exit: not what is still held."""
+        if self._free:
+            super().flush()
+
+
+class StatusLine:
+    """One line on a terminal, rewritten in place; elsewhere a line now and then, so that logs stay short.
+
+    Where nobody reads any more (a closed pipe, a lost terminal, a full disk) the run goes on without a word.
+    """
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._console = _Console(stderr=True, highlight=False, emoji=False)
+        self._quiet = quiet
+        self._updates = 0
+        self._live: Live | None = None
+        if self._console.is_terminal and not quiet:
+            self._live = Live(console=self._console, auto_refresh=False, transient=True)
+
+    def show(self, text: str) -> None:
+        """Replace the line (call about once a second)."""
+        with _going_on(sys.stderr):
+            if self._live is not None:
+                self._live.update(Text(text, overflow="ellipsis", no_wrap=True), refresh=True)
+            elif not self._quiet:
+                if self._updates % _PLAIN_EVERY == 0:
+                    print(text, file=sys.stderr, flush=True)
+                self._updates += 1
+
+    def note(self, text: str) -> None:
+        """Say something that stays, above the line."""
+        if not self._quiet:
+            with _going_on(sys.stderr):
+                self._console.print(text, markup=False, soft_wrap=True)
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            with _going_on(sys.stderr):
+                self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            with _going_on(sys.stderr):
+                self._live.stop()
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Rich would end the process here."""
+        raise BrokenPipeError
+
+
+@contextlib.contextmanager
+def _going_on(stream: TextIO) -> Iterator[None]:
+    """What cannot be said is not: from then on, nor is anything else."""
+    try:
+        yield
+        if stream is not None:  # None where the process was started with the stream closed
+            stream.flush()
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def say(text: str) -> None:
+    """Print a line on standard output."""
+    with _going_on(sys.stdout):
+        print(text)
+
+
+def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Print name and value pairs as a table."""
+    table = Table(title=Text(title), show_header=False, title_justify="left", title_style="bold")
+    table.add_column(style="cyan", no_wrap=True)
+    table.add_column()
+    for name, value in rows:
+        table.add_row(Text(name), Text(value))  # not markup: a path may have brackets in it
+    with _going_on(sys.stdout):
+        _Console(highlight=False).print(table)
+
+
+def check_writable(path: Path | None, *, name: str) -> None:
+    """Raise `UserError` now where a file could not be written later; leaves what is there as it was."""
+    if path is None:
+        return
+    if path.is_dir():
+        raise UserError(f"{name} {path} is a folder: name a file")
+    if not path.absolute().parent.is_dir():
+        raise UserError(
+            f"{name} {path} is in a folder that does not exist: make {path.absolute().parent} first"
+        )
+    if path.exists() and not path.is_file():  # /dev/stdout or a pipe: opening it to see may block
+        return
+    real = path.resolve()
+    fresh = not real.exists()
+    try:
+        with real.open("ab"):
+            pass
+        if fresh:
+            real.unlink()
+    except OSError as error:
+        raise UserError(f"{name} {path} cannot be written ({error.strerror}): name a file that can") from None
+
+
+def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:
+    """Write the summary; into a file whole or not at all."""
+    text = json.dumps(content, indent=2) + "\n"
+    if path.exists() and not path.is_file():  # /dev/stdout or a pipe: to be written to, not to be replaced
+        path.write_text(text, encoding="utf-8")
+        return
+    scratch = path.with_name(path.name + ".part")
+    scratch.write_text(text, encoding="utf-8")
+    scratch.replace(path)

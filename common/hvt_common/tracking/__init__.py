@@ -1,0 +1,1 @@
+"""ByteTrack: Kalman filter, association, camera motion."""

@@ -1,0 +1,348 @@
+"""ByteTrack: from the detections of each frame to tracks with lasting ids.
+
+Zhang et al., "ByteTrack: Multi-Object Tracking by Associating Every Detection Box", ECCV 2022. Confident detections
+are matched with predicted tracks first; tracks left over may take a weak detection near them; what is confident and
+still free starts a new track. The rules, constants and oddities are those of the authors' program, so that its
+results are reproduced. What is added: frames may pass without detection (`ByteTracker.predict`), and what finds no
+match after them is matched once more with a margin; the time of lost tracks is counted in frames whatever the
+rate of detection; a track has a class.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.tracking import kalman
+from hvt_common.tracking.association import grown, overlaps, pair
+from hvt_common.tracking.camera_motion import CameraMotion
+from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, Seen, TrackTable
+from hvt_common.values import Detections, Image, Tracks
+
+__all__ = ["ByteTracker", "TrackerSettings", "weak_confidence"]
+
+_Floats = npt.NDArray[np.float64]
+_Indices = npt.NDArray[np.int64]
+_Mask = npt.NDArray[np.bool_]
+
+_LOW_CONFIDENCE: Final = 0.1
+# Fixed in the authors' program, as costs 1 - IoU of at most 0.5, 0.7 and 0.15.
+_WEAK_COST_LIMIT: Final = 0.5
+_UNCONFIRMED_COST_LIMIT: Final = 0.7
+_DUPLICATE_COST_LIMIT: Final = 0.15
+
+# Box lengths; wider, and neighbours in a queue of cars are taken for each other.
+_MOST_GROWTH: Final = 0.75
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerSettings:
+    """The parameters of ByteTrack, with the authors' defaults."""
+
+    track_confidence: float = 0.5
+    """Detections above it are matched first and may start tracks (``track_thresh``)."""
+    low_confidence: float = _LOW_CONFIDENCE
+    """Detections above it and below ``track_confidence`` may only carry a track on."""
+    new_confidence: float | None = None
+    """Least confidence that starts a track; None is ``track_confidence`` + 0.1."""
+    match_iou: float = 0.2
+    """Least IoU (times confidence, with ``fuse_scores``) of a first match; 1 - ``match_thresh``."""
+    track_buffer: int = 30
+    """How long a lost track is remembered, in frames at 30 fps; scaled to the real rate."""
+    fuse_scores: bool = True
+    """Weigh overlaps by the detection's confidence, except for weak detections (off with ``mot20``)."""
+    min_box_area_px2: float = 10.0
+    """Tracks whose box is not larger than this are not listed."""
+    search_growth_per_s: float = 3.0
+    """After frames without detection, what is left over is matched once more with boxes larger on every side, by
+    this many of their own lengths for a second without (0.75 at most). Where every frame is searched nothing
+    changes; 0 is off."""
+    class_decay: float = 0.9
+    """What a class vote is still worth one matched detection later: 1 never forgets."""
+    camera_motion: Literal["off", "flow", "ecc"] = "off"
+    """How to estimate the camera's motion, which then moves all tracks before they are matched."""
+
+    @classmethod
+    def starting_at(
+        cls, confidence: float, *, camera_motion: Literal["off", "flow", "ecc"]
+    ) -> TrackerSettings:
+        """What both sides run with: detections from ``confidence`` start tracks, weaker ones carry them on."""
+        return cls(
+            track_confidence=confidence,
+            low_confidence=weak_confidence(confidence),
+            new_confidence=confidence,
+            camera_motion=camera_motion,
+        )
+
+    def __post_init__(self) -> None:
+        """Check every bound; a `ValueError` names the setting."""
+        for name in ("track_confidence", "low_confidence", "match_iou", "class_decay"):
+            _check_range(name, getattr(self, name), 0.0, 1.0)
+        if self.new_confidence is not None:
+            _check_range("new_confidence", self.new_confidence, 0.0, math.inf)
+        _check_range("search_growth_per_s", self.search_growth_per_s, 0.0, math.inf)
+        _check_range("min_box_area_px2", self.min_box_area_px2, 0.0, math.inf)
+        _check_range("track_buffer", self.track_buffer, 0, math.inf)
+        if self.low_confidence > self.track_confidence:
+            raise ValueError(
+                f"low_confidence is {self.low_confidence}, must not exceed track_confidence {self.track_confidence}"
+            )
+        if self.camera_motion not in ("off", "flow", "ecc"):
+            raise ValueError(f"camera_motion is {self.camera_motion!r}, must be 'off', 'flow' or 'ecc'")
+
+    @property
+    def birth_confidence(self) -> float:
+        """The least confidence that starts a track."""
+        return self.track_confidence + 0.1 if self.new_confidence is None else self.new_confidence
+
+
+def _check_range(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:  # also refuses NaN
+        raise ValueError(f"{name} is {value}, must be from {low} to {high}")
+
+
+def weak_confidence(confidence: float) -> float:
+    """From where a detector is to report, so that weak detections may carry on tracks begun at ``confidence``."""
+    return min(confidence, _LOW_CONFIDENCE)
+
+
+class ByteTracker:
+    """Follows objects through consecutive frames of one camera at ``fps`` frames a second.
+
+    Call `update` for a frame that was searched for objects and `predict` for one that was not, with rising frame
+    indices. Frames left out altogether are stepped over; an interruption longer than the lost buffer ends
+    all tracks. Detections whose numbers are not finite, or whose box has no area, are left out.
+    Class ids must be small (an index into class names), not negative.
+
+    A track is confirmed when the next update finds it again (with a detection every n-th frame: n frames after the
+    one that started it), and at once at the first update of all. Only confirmed tracks that the last
+    update found are listed; ``started`` marks the update that confirmed them or found them again.
+    """
+
+    def __init__(self, settings: TrackerSettings | None = None, *, fps: float) -> None:
+        if not (math.isfinite(fps) and fps > 0):
+            raise ValueError(f"fps is {fps}, must be a finite number above 0")
+        self._settings = settings or TrackerSettings()
+        self._fps = fps
+        self._buffer_frames = int(fps / 30.0 * self._settings.track_buffer)
+        method = self._settings.camera_motion
+        self._camera = None if method == "off" else CameraMotion(method, scale=None)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: as a new tracker, with ids from 1."""
+        self._table = TrackTable.empty()
+        self._frame_index: int | None = None
+        self._updated_index: int | None = None
+        self._next_id = 1
+        if self._camera is not None:
+            self._camera.reset()
+
+    def update(self, detections: Detections, *, frame_index: int, image_bgr: Image | None = None) -> Tracks:
+        """The tracks at a frame that a detector has searched; boxes in base pixels.
+
+        ``image_bgr`` is that frame; it is needed only to follow the camera's motion.
+        A `ValueError` means that ``frame_index`` does not rise or that the class ids are negative.
+        """
+        seen = Seen.of(detections, low_confidence=self._settings.low_confidence)
+        self._advance(frame_index, image_bgr, hold_unconfirmed=True)
+        self._forget_stale(frame_index)
+        self._make_room_for(seen)
+        first = self._updated_index is None
+        match, free = self._match(seen, growth=self._growth(frame_index))
+        self._updated_index = frame_index
+        self._correct(seen, match, frame_index)
+        kept = self._retire(match, frame_index)
+        self._start(seen.take(free), frame_index, confirmed=first)
+        kept = np.concatenate((kept, np.ones(len(self._table) - len(kept), bool)))
+        kept &= ~self._duplicates(kept)
+        if not kept.all():
+            self._table.keep(kept)
+        return self._listed(frame_index)
+
+    def predict(self, *, frame_index: int, image_bgr: Image | None = None) -> Tracks:
+        """The tracks at a frame without detection: those of the last update, moved on by the Kalman filter."""
+        self._advance(frame_index, image_bgr, hold_unconfirmed=False)
+        self._table.started[:] = False
+        return self._listed(frame_index)
+
+    def extrapolated(self, *, frame_index: int) -> Tracks:
+        """What `predict` would list at this or a later frame if the camera stood still; nothing is changed.
+
+        For lists to show between frames that are given to the tracker. ``started`` is False throughout.
+        A `ValueError` means that ``frame_index`` lies before the last frame.
+        """
+        last = frame_index if self._frame_index is None else self._frame_index
+        if frame_index < last:
+            raise ValueError(f"frame_index is {frame_index}, must not be below the last one, {last}")
+        table = self._table
+        elapsed = frame_index - last
+        states = table.states.copy()
+        for _ in range(min(elapsed, self._buffer_frames + 2)):
+            kalman.predict(states)
+        ended = elapsed > self._buffer_frames + 1
+        listed = self._listed(frame_index, states=states[:0] if ended else states)
+        return replace(listed, started=np.zeros(len(listed), bool))
+
+    def _advance(self, frame_index: int, image_bgr: Image | None, *, hold_unconfirmed: bool) -> None:
+        """Bring all states to this frame: Kalman steps, then the camera's motion."""
+        if self._frame_index is not None and frame_index <= self._frame_index:
+            raise ValueError(f"frame_index is {frame_index}, must be above the last one, {self._frame_index}")
+        elapsed = 1 if self._frame_index is None else frame_index - self._frame_index
+        self._frame_index = frame_index
+        affine = None if self._camera is None or image_bgr is None else self._camera.step(image_bgr)
+        table = self._table
+        if elapsed > self._buffer_frames + 1:
+            table.keep(np.zeros(len(table), bool))
+        if not len(table):
+            return
+        for _ in range(elapsed - 1):
+            kalman.predict(table.states)
+        # The authors' program matches unconfirmed tracks where they started, without the step to this frame.
+        # They are at rest; what it changes is the gain of the correction that confirms them.
+        moving = table.phase != UNCONFIRMED
+        if hold_unconfirmed and not moving.all():
+            states = table.states[moving]
+            kalman.predict(states)
+            table.states[moving] = states
+        else:
+            kalman.predict(table.states)
+        if affine is not None:
+            kalman.warp(table.states, affine)
+
+    def _forget_stale(self, frame_index: int) -> None:
+        """Drop lost tracks whose time ran out between two updates; each has had one chance to be found, though.
+
+        The authors' program still matches a lost track up to ``buffer + 2`` frames after it was last seen, since
+        it sweeps out what it removes one update late. Counted in frames, the same holds at any rate of detection.
+        """
+        table = self._table
+        stale = (table.phase == LOST) & (frame_index - table.seen > self._buffer_frames + 2)
+        if stale.any():
+            table.keep(~(stale & (table.lost_at != self._updated_index)))
+
+    def _make_room_for(self, seen: Seen) -> None:
+        if len(seen):
+            if seen.class_ids.min() < 0:
+                raise ValueError(f"class_ids holds {seen.class_ids.min()}, must not be negative")
+            self._table.widen(int(seen.class_ids.max()) + 1)
+
+    def _growth(self, frame_index: int) -> float:
+        """By how many of their own lengths boxes grow on every side for a last match of what is left over.
+
+        Until its second detection a track has no velocity, and a small object is out of its own box within a few
+        frames: it would never be confirmed. Larger boxes as a later stage are the idea of C-BIoU (Yang et al.,
+        WACV 2023). To grow them at the first match already mixes up dense crowds.
+        """
+        if self._updated_index is None:
+            return 0.0
+        unsearched = frame_index - self._updated_index - 1
+        return min(_MOST_GROWTH, self._settings.search_growth_per_s * unsearched / self._fps)
+
+    def _match(self, seen: Seen, *, growth: float) -> tuple[_Indices, _Indices]:
+        """The detection of each track (-1: none), and the confident detections left that may start tracks."""
+        settings, table = self._settings, self._table
+        # A detection at exactly the threshold is neither confident nor weak in the authors' program.
+        confident = seen.confidences > settings.track_confidence
+        match = np.full(len(table), -1)
+        free = confident.copy()
+        if len(table) and len(seen):
+            boxes = kalman.boxes_of(table.states)
+            iou = overlaps(boxes, seen.boxes)
+            fused = self._fused(iou, seen)
+            limit = 1 - settings.match_iou
+            unconfirmed = table.phase == UNCONFIRMED
+            pair(fused, ~unconfirmed, free, match, limit=limit)
+            weak = seen.confidences < settings.track_confidence
+            pair(iou, (table.phase == TRACKED) & (match < 0), weak, match, limit=_WEAK_COST_LIMIT)
+            pair(fused, unconfirmed, free, match, limit=_UNCONFIRMED_COST_LIMIT)
+            if growth > 0:
+                wide = self._fused(overlaps(grown(boxes, growth), grown(seen.boxes, growth)), seen)
+                pair(wide, match < 0, free, match, limit=limit)
+        free &= seen.confidences >= settings.birth_confidence
+        return match, free.nonzero()[0]
+
+    def _fused(self, iou: _Floats, seen: Seen) -> _Floats:
+        return iou * seen.confidences if self._settings.fuse_scores else iou
+
+    def _correct(self, seen: Seen, match: _Indices, frame_index: int) -> None:
+        """Take each matched detection into its track."""
+        table, settings = self._table, self._settings
+        rows = (match >= 0).nonzero()[0]
+        columns = match[rows]
+        states = table.states[rows]
+        kalman.correct(states, seen.measured[columns])
+        table.states[rows] = states
+        phase = table.phase[rows]
+        table.overdue[rows] |= (phase == LOST) & (frame_index - table.seen[rows] > self._buffer_frames + 1)
+        table.started[:] = False
+        table.started[rows] = phase != TRACKED
+        table.phase[rows] = TRACKED
+        table.seen[rows] = frame_index
+        table.confidences[rows] = seen.confidences[columns]
+        votes = table.votes[rows] * settings.class_decay
+        votes[np.arange(len(rows)), seen.class_ids[columns]] += seen.confidences[columns]
+        table.votes[rows] = votes
+
+    def _retire(self, match: _Indices, frame_index: int) -> _Mask:
+        """Mark as lost what was not found; the answer says which tracks live on."""
+        table = self._table
+        missed = match < 0
+        over = (table.phase == LOST) & (frame_index - table.seen > self._buffer_frames + 1)
+        newly_lost = missed & (table.phase == TRACKED)
+        ended = (missed & (table.phase == UNCONFIRMED)) | over | (newly_lost & table.overdue)
+        table.phase[newly_lost] = LOST
+        table.lost_at[newly_lost] = frame_index
+        # While lost, a track keeps its height: a velocity from the last partly hidden boxes would blow it up.
+        table.states[newly_lost, kalman.VELOCITY, 3] = 0
+        return np.asarray(~ended)
+
+    def _start(self, seen: Seen, frame_index: int, *, confirmed: bool) -> None:
+        if not len(seen):
+            return
+        classes = self._table.votes.shape[1]
+        born = TrackTable.new(seen, first_id=self._next_id, frame_index=frame_index, classes=classes)
+        if confirmed:
+            born.phase[:] = TRACKED
+            born.started[:] = True
+        self._next_id += len(seen)
+        self._table.append(born)
+
+    def _duplicates(self, living: _Mask) -> _Mask:
+        """Of a tracked and a lost track at the same place, the one with the shorter past."""
+        table = self._table
+        duplicate = np.zeros(len(table), bool)
+        present = (living & (table.phase != LOST)).nonzero()[0]
+        lost = (living & (table.phase == LOST)).nonzero()[0]
+        if not len(lost) or not len(present):
+            return duplicate
+        boxes = kalman.boxes_of(table.states)
+        pairs = (1 - overlaps(boxes[present], boxes[lost]) < _DUPLICATE_COST_LIMIT).nonzero()
+        a, b = present[pairs[0]], lost[pairs[1]]
+        past = table.seen - table.born
+        lost_is_shorter = past[a] > past[b]
+        duplicate[b[lost_is_shorter]] = True
+        duplicate[a[~lost_is_shorter]] = True
+        return duplicate
+
+    def _listed(self, frame_index: int, *, states: kalman.States | None = None) -> Tracks:
+        table = self._table
+        boxes = kalman.boxes_of(table.states if states is None else states)
+        area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+        tracked = table.phase[: len(boxes)] == TRACKED
+        rows = (tracked & (area > self._settings.min_box_area_px2)).nonzero()[0]
+        votes = table.votes[rows]
+        return Tracks(
+            frame_index=frame_index,
+            ids=table.ids[rows],
+            boxes_xyxy_px=boxes[rows].astype(np.float32),
+            confidences=table.confidences[rows],
+            class_ids=(votes.argmax(axis=1) if votes.size else np.zeros(len(rows))).astype(np.int32),
+            born_frames=table.born[rows],
+            seen_frames=table.seen[rows],
+            started=table.started[rows],
+        )

@@ -1,0 +1,1 @@
+"""Zenoh: session, configuration, the queue between its callbacks and our threads."""

@@ -1,0 +1,1 @@
+"""Why a link does not come up, in one sentence."""

@@ -1,0 +1,267 @@
+"""Says in plain words why there is no link, and who is linked without the rights to be of use.
+
+Zenoh tells a program nothing of this: a connection that is refused is tried again for ever, a message without
+permission is dropped. So a thread looks now and then whether links stand and whose they are, and visits the endpoints
+(`probe`) where none does.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.transport.doctor.certificate import TlsFiles
+from hvt_common.transport.doctor.probe import why_no_link
+from hvt_common.transport.rights import Rights
+from hvt_common.transport.zenoh_config import LinkSettings, configure
+
+__all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit", "why_unlinked"]
+
+_log = logging.getLogger(__name__)
+
+_LOOK_S = 1.0
+PATIENCE_S = 4.0
+_FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
+"""From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
+_SAY_AGAIN_S = 300.0
+_MAX_NAMES = 256
+"""Names that are remembered. Each takes a certificate of the CA, so a fleet of that size comes first."""
+
+
+def why_unlinked(settings: LinkSettings) -> list[str]:
+    """One sentence for each endpoint that we would connect to. Blocks for some seconds an endpoint."""
+    return visit(configure(settings)[0])
+
+
+def control_unanswered(edge: str, *, who: str = "this ground") -> str:
+    """What to tell a user whose question on ``control`` came to nothing while the edge is there.
+
+    The edge itself, or a ground or a router on the way, may have dropped it: all of them check.
+    """
+    return (
+        f"{edge} does not answer on control: {who} may lack the right to command it (hvt-ground keys list shows who "
+        f"has it; add-ground without --watch-only gives it, then copy {edge}.json5 to the edge, and the others that "
+        "changed with it), or the link is full"
+    )
+
+
+class LinkWatch:
+    """A context manager with a thread of its own, which looks after one session until it closes.
+
+    Args:
+        session: the session that was opened with these settings.
+        settings: how it was opened.
+        served: whether a machine of that name has shown life to us, or we to it: an edge that has appeared, a ground
+            that subscribes. Called from the thread.
+        patience_s: a link that is merely slow to come, or to be of use, needs no explanation.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        settings: LinkSettings,
+        *,
+        served: Callable[[str], bool],
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        self._session = session
+        self._patience_s = patience_s
+        self._config = configure(settings)[0]
+        self._file = settings.zenoh_config
+        self._edge = settings.name
+        self._served = served
+        self._rights = Rights.of(self._config)
+        self._trouble = ""
+        self._said_s = 0.0
+        self._two_links = _asked_for_twice(self._config)
+        """Places that are called twice."""
+        self._had_two: set[str] = set()
+        self._halved_s: float | None = None
+        """Since when one link of two has been missing; infinite once that is said."""
+        self._first_seen_s: dict[str, float] = {}
+        self._named: set[str] = set()
+        self._stop = threading.Event()
+        self._using = threading.Lock()
+        """Held while the session is asked: it must not be closed under our hands."""
+        self._thread = threading.Thread(target=self._run, name="hvt-link-watch", daemon=True)
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no link, in a sentence; empty while there is one, or nothing is known."""
+        return self._trouble
+
+    def may_command(self, edge: str) -> bool:
+        """Whether our own configuration lets questions on ``control`` of this edge out at all."""
+        return self._rights.allow_somebody(
+            flow="egress", message="query", key=EdgeKeys(edge).key(Row.CONTROL)
+        )
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop.set()
+        with self._using:
+            pass
+        # A visit in progress asks nothing of the session and ends by itself, within seconds: nobody waits for it.
+        self._thread.join(0.1)
+
+    # The thread
+
+    def _run(self) -> None:
+        linked_s = time.monotonic()
+        next_visit_s, pause_s = linked_s + self._patience_s, _FIRST_PAUSE_S
+        while not self._stop.wait(min(_LOOK_S, self._patience_s)):
+            now_s = time.monotonic()
+            if self._look(now_s):
+                self._trouble = ""
+                next_visit_s, pause_s = now_s + self._patience_s, _FIRST_PAUSE_S
+            elif now_s >= next_visit_s:
+                self._explain()
+                next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
+
+    def _look(self, now_s: float) -> bool:
+        """Whether there is a link; what is wrong with those at its other end is said."""
+        with self._using:
+            if self._stop.is_set():
+                return True
+            try:
+                links = self._session.info.links()
+                if links:
+                    self._look_at(self._names(links), now_s)
+                self._look_for_halves(links, now_s)
+            except zenoh.ZError:  # somebody else closed it
+                return True
+            return bool(links)
+
+    def _names(self, links: list[zenoh.Link]) -> dict[str, bool]:
+        """Who is at the other end of the links, each with whether it is a router."""
+        routers = {str(zid) for zid in self._session.info.routers_zid()}
+        return {link.auth_identifier: str(link.zid) in routers for link in links if link.auth_identifier}
+
+    def _look_for_halves(self, links: list[zenoh.Link], now_s: float) -> None:
+        """Zenoh does not reopen one link before all are lost, and says nothing of one that is refused."""
+        if not self._is_halved(links):
+            self._halved_s = None
+        elif self._halved_s is None:
+            self._halved_s = now_s
+        elif now_s - self._halved_s > self._patience_s:
+            self._halved_s = math.inf
+            _log.warning(
+                "one of the two links is missing: answers and pictures share the other; either the other side takes "
+                "one only (transport.unicast.max_links, an older HVT or a router), or it was lost on the way and "
+                "comes back with the next outage of both"
+            )
+
+    def _is_halved(self, links: list[zenoh.Link]) -> bool:
+        """Whether one of two is missing: to a peer that has had two, or that we called twice.
+
+        One that called us, or that we call by another name than its address, may well have one only.
+        """
+        if not self._two_links:
+            return False
+        standing = Counter(str(link.zid) for link in links)
+        twice = {zid for zid, count in standing.items() if count > 1}
+        if len(self._had_two) < _MAX_NAMES:
+            self._had_two |= twice
+        called = {str(link.zid) for link in links if _bare(str(link.dst)) in self._two_links}
+        return any(zid in self._had_two | called for zid in standing.keys() - twice)
+
+    def _explain(self) -> None:
+        reasons = visit(self._config)
+        if self._stop.is_set() or not reasons:
+            return
+        trouble = "; ".join(reasons)
+        now_s = time.monotonic()
+        if trouble != self._trouble or now_s - self._said_s > _SAY_AGAIN_S:
+            self._said_s = now_s
+            _log.warning("no link: %s", trouble)
+        self._trouble = trouble
+
+    def _look_at(self, names: dict[str, bool], now_s: float) -> None:
+        if not self._rights.enabled:
+            return
+        for name, router in names.items():
+            if name in self._named or len(self._first_seen_s) >= _MAX_NAMES:
+                continue
+            since_s = self._first_seen_s.setdefault(name, now_s)
+            if not self._rights.knows(name):
+                self._say(name, self._stranger(name))
+            elif now_s - since_s > self._patience_s and not router and self._is_hiding(name):
+                self._say(name, self._hidden(name))
+
+    def _is_hiding(self, name: str) -> bool:
+        if self._edge is None and not self._writes(name):
+            return False  # another ground, or a router
+        return not self._served(name)
+
+    def _writes(self, name: str) -> bool:
+        """Whether an edge of that name may send here under its own id."""
+        try:
+            key = EdgeKeys(name).key(Row.STATUS)
+        except UserError:
+            return False
+        return self._rights.allow(name, flow="ingress", message="put", key=key)
+
+    def _stranger(self, name: str) -> str:
+        kind = "add-ground" if self._edge else "add-edge or add-ground"
+        mend = f"hvt-ground keys {kind} {name}, then copy the file here again"
+        lost = "it gets no picture and no answer from here" if self._edge else "what it sends is dropped"
+        return f"{name!r} has a certificate of this CA, but {self._file} does not name it: {lost} ({mend})"
+
+    def _hidden(self, name: str) -> str:
+        if self._edge is not None:
+            return (
+                f"{name!r} is linked, but listens to nothing of {self._edge}: its Zenoh configuration does not name "
+                f"{self._edge} (hvt-ground keys add-edge {self._edge}, then copy {name}.json5 to it), or its --edges "
+                "leaves it out"
+            )
+        return (
+            f"{name!r} is linked, but nothing of edge {name} is seen here: its Zenoh configuration does not name "
+            f"this ground (hvt-ground keys add-ground, then copy {name}.json5 to it), or it runs under another id "
+            "than its certificate says, and all it sends is dropped"
+        )
+
+    def _say(self, name: str, sentence: str) -> None:
+        self._named.add(name)
+        _log.warning("%s", sentence)
+
+
+def visit(config: zenoh.Config) -> list[str]:
+    """One sentence for each endpoint that this configuration connects to. Blocks for some seconds an endpoint."""
+    try:
+        files = TlsFiles.of(config)
+        return [why_no_link(endpoint, files) for endpoint in dict.fromkeys(map(_bare, _connects_to(config)))]
+    except UserError as error:
+        return [str(error)]
+
+
+def _asked_for_twice(config: zenoh.Config) -> set[str]:
+    places = Counter(map(_bare, _connects_to(config)))
+    return {place for place, count in places.items() if count > 1}
+
+
+def _connects_to(config: zenoh.Config) -> list[str]:
+    endpoints = json.loads(config.get_json("connect/endpoints")) or []
+    return (
+        [one for group in endpoints.values() for one in group] if isinstance(endpoints, dict) else endpoints
+    )
+
+
+def _bare(endpoint: str) -> str:
+    """Two links to one place by priority are one place."""
+    return endpoint.partition("#")[0].partition("?")[0]

@@ -1,0 +1,174 @@
+"""A Zenoh session as HVT wants it, and the few things publish and subscribe do with it.
+
+Peers connect to named endpoints only: no multicast, no gossip, no shared memory (byte counts would lie), loopback
+unless told otherwise. Callbacks of Zenoh never block: they copy into an `Inbox`, which has a bound.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import zenoh
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, EdgeKeys, Row
+from hvt_common.transport.doctor.certificate import check_own_keys
+from hvt_common.transport.doctor.diagnose import visit
+from hvt_common.transport.inbox import Inbox, Received, Sink
+from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, configure, without_build_paths
+
+__all__ = [
+    "DEFAULT_ENDPOINT",
+    "Inbox",
+    "LinkSettings",
+    "Received",
+    "ask",
+    "declare_publisher",
+    "open_session",
+    "serve",
+    "subscribe",
+]
+
+_log = logging.getLogger(__name__)
+
+_CLOSE_WITHIN_S = 0.8
+
+
+@contextmanager
+def open_session(settings: LinkSettings) -> Iterator[zenoh.Session]:
+    """A running session; closed within a second on the way out, whatever state the link is in.
+
+    A connecting side does not wait for the other: it goes on trying for as long as the session is open. Raises
+    UserError for endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh's own log is heard.
+    """
+    config, listen = configure(settings)
+    check_own_keys(config, listen=listen, name=settings.name, now_s=time.time())
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise UserError(_open_failure(str(error), listen, config)) from None
+    try:
+        yield session
+    finally:
+        _close(session)
+
+
+def declare_publisher(session: zenoh.Session, row: Row, *, keys: EdgeKeys) -> zenoh.Publisher:
+    """A publisher of one row, delivered as the key table says. ``put`` may block on a ``BLOCK`` row: own a thread."""
+    delivery = DELIVERIES[row]
+    return session.declare_publisher(
+        keys.key(row),
+        encoding=delivery.encoding,
+        congestion_control=getattr(zenoh.CongestionControl, delivery.congestion),
+        priority=getattr(zenoh.Priority, delivery.priority),
+        express=delivery.express,
+        reliability=getattr(zenoh.Reliability, delivery.reliability),
+    )
+
+
+def subscribe(
+    session: zenoh.Session, key_expr: str, *, inbox: Sink, clock: Callable[[], int] = time.time_ns
+) -> zenoh.Subscriber[None]:
+    """Copy every message of the key expression into the inbox, with its time by ``clock``; deletions are ignored."""
+
+    def receive(sample: zenoh.Sample) -> None:
+        received_ns = clock()
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        inbox.put(
+            Received(
+                key=str(sample.key_expr),
+                payload=sample.payload.to_bytes(),
+                attachment=attachment,
+                encoding=str(sample.encoding),
+                received_ns=received_ns,
+            )
+        )
+
+    return session.declare_subscriber(key_expr, receive)
+
+
+def ask(
+    session: zenoh.Session,
+    row: Row,
+    *,
+    keys: EdgeKeys,
+    question: bytes,
+    timeout_s: float,
+    wanted: Callable[[bytes], bool] = lambda _answer: True,
+) -> bytes | None:
+    """The first answer of a queryable row that is ``wanted``; None when there is none in time.
+
+    Blocks for at most ``timeout_s``. Two edges of one id both answer.
+    """
+    delivery = DELIVERIES[row]
+    replies = session.get(
+        keys.key(row),
+        payload=question,
+        timeout=timeout_s,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        congestion_control=getattr(zenoh.CongestionControl, delivery.congestion),
+        priority=getattr(zenoh.Priority, delivery.priority),
+    )
+    for reply in replies:
+        if reply.ok is not None and wanted(data := reply.ok.payload.to_bytes()):
+            return data
+    return None
+
+
+def serve(
+    session: zenoh.Session, row: Row, *, keys: EdgeKeys, answer: Callable[[bytes], bytes | None]
+) -> zenoh.Queryable[None]:
+    """Answer a queryable row: ``answer(question)`` runs in Zenoh's callback and must be quick; None says nothing."""
+    key = keys.key(row)
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            question = b"" if query.payload is None else query.payload.to_bytes()
+            data = answer(question)
+            if data is not None:
+                query.reply(key, data, encoding=MSGPACK_ENCODING)
+
+    return session.declare_queryable(key, reply)
+
+
+def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> str:
+    found = re.search(r"listener bound to ([^\s#]+?)(#\S+)?:? ", text)
+    endpoint = found[1] if found else ", ".join(listen)
+    if "Address already in use" in text:
+        return (
+            f"cannot listen on {endpoint}: the port is in use; stop the other process or choose another port"
+        )
+    if "Cannot assign requested address" in text:
+        return f"cannot listen on {endpoint}: this machine has no such address"
+    if nobody := re.search(r"Unable to connect to any of \[(.+)\]", text):
+        endpoints = ", ".join(re.findall(r"\(([^()]+)\)", nobody[1])) or nobody[1]
+        if "tls/" in endpoints:  # somebody may well answer, and refuse
+            return "no link: " + "; ".join(visit(config))
+        return f"nobody answers at {endpoints}: start a ground or a router there, or connect to where one is"
+    where = f"cannot listen on {endpoint}" if listen else "cannot open the Zenoh session"
+    return f"{where}: {without_build_paths(text)}"
+
+
+def _close(session: zenoh.Session) -> None:
+    """Close without waiting for a link that is dead: Zenoh itself may take 10 s when its queue is stuck."""
+
+    def close() -> None:
+        try:
+            session.close()  # type: ignore[no-untyped-call]
+        except zenoh.ZError as error:
+            _log.debug("closing the session: %s", error)
+
+    closer = threading.Thread(target=close, name="zenoh-close", daemon=True)
+    closer.start()
+    closer.join(_CLOSE_WITHIN_S)
+    if closer.is_alive():
+        _log.warning("the link does not react; leaving without a goodbye")

@@ -1,0 +1,249 @@
+"""Zenoh's configuration: the user's file, our defaults under it, the endpoints on top, all checked."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import json5
+import zenoh
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
+
+__all__ = ["DEFAULT_ENDPOINT", "LinkSettings", "configure", "without_build_paths"]
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+_MAX_CONFIG_BYTES = 1_000_000
+_MAX_LINKS = "transport/unicast/max_links"
+
+_DEFAULTS: Mapping[str, Any] = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    # With it on, two processes of one host move large payloads past the link.
+    "transport/shared_memory/enabled": False,
+    # 26 bytes a message saved; our own headers carry the times.
+    "timestamping/enabled": False,
+    "listen/timeout_ms": 0,
+    "listen/exit_on_failure": True,
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
+    "transport/unicast/open_timeout": 3000,
+    # An outage is noticed after about this long in place of 10 s.
+    "transport/link/tx/lease": 3000,
+    # Small batches and a small socket buffer: back-pressure reaches our own queues, which know what to drop,
+    # after some tenths of a second of video. Four batches hold a keyframe.
+    "transport/link/tx/batch_size": 16384,
+    "transport/link/tx/queue/size/data_high": 4,
+    "transport/link/tx/queue/size/background": 1,
+    "transport/link/tcp/so_sndbuf": 65536,
+    # Without it the kernel lets the buffer of a full TLS link grow to megabytes: seconds of video.
+    "transport/link/tls/so_sndbuf": 65536,
+    "transport/link/rx/max_message_size": 2 * MAX_PAYLOAD_BYTES,
+}
+
+_PRIORITIES = ("1-3", "4-7")
+"""Of two links to one place: answers, status and reports on the first, pictures, stills and tracks on the second."""
+
+_ASKER: Mapping[str, Any] = {
+    "mode": "client",
+    # A client waits for its link when it starts; whoever asks wants to know soon that there is none.
+    "connect/timeout_ms": 3000,
+    "connect/exit_on_failure": True,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """How a process takes part. With neither endpoint here nor in the file, a ground listens, the others connect.
+
+    An ``asker`` only asks: it never listens, and connects as Zenoh's *client*, so that a ground or a router that it
+    connects to passes on what it asks and what is answered.
+    """
+
+    role: Literal["edge", "ground", "asker"]
+    listen: tuple[str, ...] = ()
+    """Such as ``tcp/127.0.0.1:7447``; what is given here replaces what the file says."""
+    connect: tuple[str, ...] = ()
+    zenoh_config: Path | None = None
+    """A JSON5 file of Zenoh's own settings, which go before our defaults."""
+    insecure: bool = False
+    """Allow listening beyond loopback without keys."""
+    links: Literal[1, 2] = 1
+    """How many links to each place that we connect to over TCP or TLS: with two, what is small and urgent does not
+    wait behind pictures in a full socket. ``max_links: 2`` in the file says the same."""
+    name: str | None = None
+    """Who this machine is: the id of an edge, which its certificate has to bear; None for whoever that names."""
+
+
+def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
+    """Zenoh's configuration and the endpoints it will listen on; UserError for what cannot be used."""
+    config, said = _read_config(settings.zenoh_config)
+    for path, value in {**_DEFAULTS, **(_ASKER if settings.role == "asker" else {})}.items():
+        if not _mentions(said, path):
+            config.insert_json5(path, json.dumps(value))
+    listen, connect = settings.listen, settings.connect
+    file_listen = _endpoints(said, "listen")
+    if not (listen or connect or file_listen or _endpoints(said, "connect")):
+        listen = (DEFAULT_ENDPOINT,) if settings.role == "ground" else ()
+        connect = () if settings.role == "ground" else (DEFAULT_ENDPOINT,)
+    for endpoint in (*listen, *connect):
+        _check_endpoint(endpoint)
+    if listen or not file_listen:
+        # Never Zenoh's own default: a peer that listens on every address.
+        _insert_endpoints(config, "listen", listen)
+    effective = listen or file_listen
+    two = settings.role != "asker" and (settings.links == 2 or _max_links(said) > 1)
+    if connect:
+        _insert_endpoints(config, "connect", _split(connect) if two else connect)
+    if settings.links == 2 or (effective and not _mentions(said, _MAX_LINKS)):
+        # Who listens takes what comes. Asking for more than one makes every handshake a kilobyte longer.
+        config.insert_json5(_MAX_LINKS, "2")
+    if settings.role == "ground" and not effective and not _mentions(said, "mode"):
+        # Since Zenoh 1.9 a router does not pass messages between two peers, but it does between a peer and a router.
+        # An edge that listens is served just as well. ("client" would wait at its start, deaf to Ctrl-C.)
+        config.insert_json5("mode", '"router"')
+    for endpoint in effective:
+        _check_reach(endpoint, allowed=settings.insecure or _has_keys(said, endpoint))
+    return config, effective
+
+
+def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:
+    """The user's file as Zenoh reads it, and as plain values."""
+    if path is None:
+        return zenoh.Config(), {}
+    try:
+        if path.stat().st_size > _MAX_CONFIG_BYTES:
+            raise UserError(f"{path}: larger than {_MAX_CONFIG_BYTES} bytes, not a Zenoh configuration")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise UserError(f"{path}: cannot read the Zenoh configuration: {reason}") from None
+    try:
+        said = json5.loads(text)
+    except (ValueError, RecursionError) as error:
+        line, reason = _located(str(error))
+        raise UserError(f"{path}{line}: not JSON5: {reason}") from None
+    if not isinstance(said, dict):
+        raise UserError(
+            f"{path}: a Zenoh configuration is an object in braces, this is a {type(said).__name__}"
+        )
+    try:
+        return zenoh.Config.from_json5(text), said
+    except zenoh.ZError as error:
+        reason = without_build_paths(str(error))
+        raise UserError(f"{path}{_line_of(reason, text)}: Zenoh does not accept it: {reason}") from None
+
+
+def _mentions(said: dict[str, Any], path: str) -> bool:
+    """Whether the user's file says anything at this path, or a value in place of one of its parents."""
+    value: Any = said
+    for part in path.split("/"):
+        if not isinstance(value, dict):
+            return True
+        if part not in value:
+            return False
+        value = value[part]
+    return True
+
+
+def _endpoints(said: dict[str, Any], side: str) -> tuple[str, ...]:
+    """The endpoints of a file: a list, or one list for each of Zenoh's modes."""
+    section = said.get(side)
+    listed = section.get("endpoints") if isinstance(section, dict) else None
+    groups = listed.values() if isinstance(listed, dict) else [listed or []]
+    return tuple(str(endpoint) for group in groups if isinstance(group, list) for endpoint in group)
+
+
+def _max_links(said: dict[str, Any]) -> int:
+    value: Any = said
+    for part in _MAX_LINKS.split("/"):
+        value = value.get(part) if isinstance(value, dict) else None
+    return value if isinstance(value, int) else 1
+
+
+def _split(endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    """Each endpoint once for each range of priorities; one with metadata of its own, or no stream, stays as it is."""
+    split: list[str] = []
+    for endpoint in endpoints:
+        place, hash_sign, settings = endpoint.partition("#")
+        if "?" in place or not place.startswith(("tcp/", "tls/")):
+            split.append(endpoint)
+        else:
+            split += [f"{place}?prio={one}{hash_sign}{settings}" for one in _PRIORITIES]
+    return tuple(split)
+
+
+_ENDPOINT = re.compile(
+    r"(?P<protocol>tcp|tls|udp|quic|ws)/(?P<host>\[[0-9a-fA-F:.%\w]+\]|[\w.-]+):(?P<port>\d{1,5})"
+    r"(\?[!\"$-~]*)?(#[!-~]*)?",
+    re.ASCII,
+)
+
+
+def _check_endpoint(endpoint: str) -> None:
+    found = _ENDPOINT.fullmatch(endpoint)
+    if found is None or not 1 <= int(found["port"]) <= 65535:
+        raise UserError(
+            f"endpoint {endpoint!r} is not usable: PROTOCOL/HOST:PORT is accepted, such as {DEFAULT_ENDPOINT}, "
+            "with tcp, tls, udp, quic or ws and a port of 1 to 65535"
+        )
+
+
+def _insert_endpoints(config: zenoh.Config, side: str, endpoints: tuple[str, ...]) -> None:
+    try:
+        config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
+    except zenoh.ZError as error:  # what stands behind ? and # is Zenoh's to judge
+        reason = without_build_paths(re.sub(r".*msg: \"|\", location: .*", "", str(error)))
+        raise UserError(f"--{side} {' '.join(endpoints)}: Zenoh does not accept it: {reason}") from None
+
+
+def _check_reach(endpoint: str, *, allowed: bool) -> None:
+    found = _ENDPOINT.fullmatch(endpoint)
+    if allowed or (found is not None and _is_loopback(found["host"])) or endpoint.startswith("unixsock"):
+        return
+    raise UserError(
+        f"listening on {endpoint} without keys would let anybody on its network watch and command: listen on "
+        "127.0.0.1 or [::1], give certificates with enable_mtls in --zenoh-config, or accept it with --insecure"
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _has_keys(said: dict[str, Any], endpoint: str) -> bool:
+    """Whether whoever connects must show a certificate."""
+    value: Any = said
+    for part in ("transport", "link", "tls", "enable_mtls"):
+        value = value.get(part) if isinstance(value, dict) else None
+    return value is True and endpoint.startswith(("tls/", "quic/"))
+
+
+def without_build_paths(text: str) -> str:
+    """Zenoh's errors name source files of the machine that built it."""
+    short = re.sub(r" at /\S+?\.rs:\d+\.?", "", text)
+    return re.sub(r",? expected one of `.*", "", " ".join(short.split())).strip()
+
+
+def _located(text: str) -> tuple[str, str]:
+    found = re.match(r"<string>:(\d+) (.*)", text, re.DOTALL)
+    return (f":{found[1]}", " ".join(found[2].split())) if found else ("", " ".join(text.split()))
+
+
+def _line_of(reason: str, text: str) -> str:
+    """``:LINE`` of the field or value that Zenoh's reason quotes, where it stands in the file only once."""
+    found = re.search(r"`(\w+)`", reason)
+    lines = [number for number, line in enumerate(text.splitlines(), 1) if found and found[1] in line]
+    return f":{lines[0]}" if len(lines) == 1 else ""

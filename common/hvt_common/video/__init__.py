@@ -1,0 +1,1 @@
+"""HEVC decoding, still codecs, and what the base shows of a crop."""

@@ -1,0 +1,74 @@
+"""`h264-intra`: one intra slice of x264, whose headers both sides know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from hvt_common.values import Image
+from hvt_common.video.still_codecs.av_still import decoded, encoded
+from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
+from hvt_common.video.still_codecs.h264_syntax import (
+    CHROMA_QP_OFFSET,
+    cabac_data,
+    coded_slice,
+    parameter_sets,
+)
+from hvt_common.video.still_codecs.ladder import MAX_QP, qp_of
+from hvt_common.video.still_codecs.yuv420 import padded_size, to_bgr, to_planar
+
+__all__ = ["H264IntraCodec", "split_payload", "x264_options"]
+
+_SMALL_PX = 128 * 128
+"""Most crops; see `x264_options`."""
+
+
+@dataclass(frozen=True, slots=True)
+class H264IntraCodec:
+    """The payload is one byte with the QP, then the slice's CABAC data."""
+
+    name: str = field(default="h264-intra", init=False)
+    media_type: str = field(default="application/vnd.hvt.h264-intra", init=False)
+    needs_base: bool = field(default=False, init=False)
+
+    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
+        """Code a crop; sizes that are no multiple of 16 are filled up with their last row and column."""
+        qp = qp_of(quality_pct)
+        options = x264_options(f"qp={qp}:ipratio=1:keyint=1", pixels=crop_bgr.shape[0] * crop_bgr.shape[1])
+        (unit,) = encoded([to_planar(crop_bgr)], encoder="libx264", options=options)
+        return CodedCrop(bytes([qp]) + cabac_data(unit, qp=qp, intra=True))
+
+    def decode(
+        self,
+        data: bytes,
+        *,
+        size: tuple[int, int],
+        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
+        base_bgr: Image | None = None,  # noqa: ARG002
+    ) -> Image:
+        """The crop again; the slice cannot say another size, since its parameter sets are made here."""
+        qp, cabac = split_payload(data)
+        whole = padded_size(size)
+        unit = parameter_sets(whole) + coded_slice(cabac, qp=qp, intra=True)
+        return to_bgr(decoded([unit], decoder="h264", size=whole), size=size)
+
+
+def split_payload(data: bytes) -> tuple[int, bytes]:
+    """The QP and the CABAC data; `StillError` where there is no such payload."""
+    if len(data) < 2 or data[0] > MAX_QP:
+        raise StillError(f"no coded slice in {len(data)} bytes")
+    return data[0], data[1:]
+
+
+def x264_options(more: str, *, pixels: int) -> dict[str, str]:
+    """What x264 is asked for: constant QP, squared error as the measure, one thread.
+
+    Measured on 40 crops of drone_carpark: ``subme=7:trellis=2`` gives within 1 % of the bytes of ``slower`` in half
+    its time; deblocking saves 4 %; psychovisual options cost 2 % at equal luma error. On pictures of more than
+    128x128 pixels ``trellis=1`` takes a third of the time off for 1 % more bytes.
+    """
+    trellis = 2 if pixels <= _SMALL_PX else 1
+    fixed = (
+        "threads=1:annexb=1:repeat-headers=1:aq-mode=0:no-psy=1:no-mbtree=1:scenecut=0:bframes=0:ref=1:weightp=0:"
+        f"subme=7:trellis={trellis}:me=dia:merange=4:8x8dct=1:chroma-qp-offset={CHROMA_QP_OFFSET}:deblock=0,0:"
+    )
+    return {"preset": "medium", "tune": "zerolatency", "x264-params": fixed + more}

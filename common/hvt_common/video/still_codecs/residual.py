@@ -1,0 +1,89 @@
+"""`residual`: what the decoded base lacks of the crop, which both sides see alike.
+
+The base crop is the reference picture of one inter-coded H.264 slice. At the edge x264 gets the base crop as its
+first picture, nearly lossless, and the source as its second; only the second's slice data crosses the link. The
+ground writes the base crop as a picture of verbatim samples (I_PCM) in front of it. So x264 chooses block by block:
+the base as it is (next to nothing), the base plus a difference, the base from a little aside, or the source anew.
+
+What the ground adds to its base crop is the decoded difference alone: where nothing was coded the result is the base,
+to the bit. A difference of one level between the two references (rounding on another processor) stays one level: the
+slice data is parsed without them. Another picture is found out by its checksum before anything is painted.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hvt_common.values import Image
+from hvt_common.video.still_codecs.av_still import decoded, encoded
+from hvt_common.video.still_codecs.contract import NO_PARAMETERS, BaseMissingError, CodedCrop, Parameters
+from hvt_common.video.still_codecs.h264_intra import split_payload, x264_options
+from hvt_common.video.still_codecs.h264_syntax import (
+    cabac_data,
+    coded_slice,
+    parameter_sets,
+    verbatim_picture,
+)
+from hvt_common.video.still_codecs.ladder import qp_of
+from hvt_common.video.still_codecs.yuv420 import difference_bgr, filled_outside, padded_size, to_planar
+
+__all__ = ["CHECKSUM", "ResidualCodec"]
+
+CHECKSUM = "b"
+"""The parameter with the CRC-32 of the base crop's pixels."""
+
+_REFERENCE_QP = 4
+"""The base crop in x264: within 0.3 levels of the base itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualCodec:
+    """The payload is one byte with the QP, then the slice's CABAC data."""
+
+    name: str = field(default="residual", init=False)
+    media_type: str = field(default="application/vnd.hvt.residual", init=False)
+    needs_base: bool = field(default=True, init=False)
+
+    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:
+        """Code what ``base_bgr``, of the crop's shape, lacks of the crop."""
+        if base_bgr is None or base_bgr.shape != crop_bgr.shape:
+            raise BaseMissingError(
+                f"a residual of a crop of {crop_bgr.shape} needs a base crop of that shape"
+            )
+        height, width = crop_bgr.shape[:2]
+        base = to_planar(base_bgr)
+        # Beyond the crop there is nothing to say: 8 to 17 % fewer bytes than repeating its edge.
+        source = filled_outside(to_planar(crop_bgr), base, size=(width, height))
+        qp = qp_of(quality_pct)
+        ratio = 2 ** ((qp - _REFERENCE_QP) / 6)
+        options = x264_options(f"qp={qp}:ipratio={ratio:.5f}:keyint=infinite", pixels=width * height)
+        units = encoded([base, source], encoder="libx264", options=options)
+        cabac = cabac_data(b"".join(units), qp=qp, intra=False)
+        return CodedCrop(bytes([qp]) + cabac, {CHECKSUM: _checksum(base_bgr)})
+
+    def decode(
+        self,
+        data: bytes,
+        *,
+        size: tuple[int, int],
+        parameters: Parameters = NO_PARAMETERS,
+        base_bgr: Image | None = None,
+    ) -> Image:
+        """The crop again, on the base crop that the edge had; `BaseMissingError` on any other."""
+        if base_bgr is None or base_bgr.shape != (size[1], size[0], 3):
+            raise BaseMissingError(f"a residual still of {size[0]}x{size[1]} has no base crop of that size")
+        if parameters.get(CHECKSUM) != _checksum(base_bgr):
+            raise BaseMissingError("a residual still builds on another base picture than the one at hand")
+        qp, cabac = split_payload(data)
+        whole, base = padded_size(size), to_planar(base_bgr)
+        units = [parameter_sets(whole) + verbatim_picture(base), coded_slice(cabac, qp=qp, intra=False)]
+        picture = decoded(units, decoder="h264", size=whole)
+        sharper = base_bgr + difference_bgr(picture, base, size=size)
+        return np.asarray(np.clip(np.rint(sharper), 0, 255), np.uint8)
+
+
+def _checksum(image_bgr: Image) -> int:
+    return zlib.crc32(image_bgr.tobytes())

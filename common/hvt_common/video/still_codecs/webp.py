@@ -1,0 +1,60 @@
+"""`webp`: lossy WebP through OpenCV."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+
+from hvt_common.values import Image
+from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
+from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
+from hvt_common.video.still_codecs.ladder import on_ladder
+
+__all__ = ["WebpCodec", "webp_size"]
+
+_QUALITY = ((1, 1), (5, 2), (20, 17), (35, 36), (50, 52), (65, 71), (80, 82), (90, 90), (97, 98), (100, 100))
+"""(quality in percent, WebP's own), at equal Y-PSNR; WebP has nothing as coarse as JPEG below 15."""
+_VP8_START = b"\x9d\x01\x2a"
+
+
+@dataclass(frozen=True, slots=True)
+class WebpCodec:
+    """The payload is a WebP file of one ``VP8`` chunk; transparency, animation and lossless are refused."""
+
+    name: str = field(default="webp", init=False)
+    media_type: str = field(default="image/webp", init=False)
+    needs_base: bool = field(default=False, init=False)
+
+    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
+        """Code a crop of at least one pixel."""
+        quality = round(on_ladder(_QUALITY, quality_pct))
+        return CodedCrop(imencoded(".webp", crop_bgr, [cv2.IMWRITE_WEBP_QUALITY, quality]))
+
+    def decode(
+        self,
+        data: bytes,
+        *,
+        size: tuple[int, int],
+        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
+        base_bgr: Image | None = None,  # noqa: ARG002
+    ) -> Image:
+        """The crop again."""
+        if webp_size(data) != size:
+            raise StillError(f"WebP is not of {size[0]}x{size[1]}")
+        return imdecoded(data, size=size, what="WebP")
+
+
+def webp_size(data: bytes) -> tuple[int, int]:
+    """(width, height) from the header of a simple lossy WebP file; else `StillError`.
+
+    RFC 9649 for the file, RFC 6386 section 9.1 for the picture.
+    """
+    length = int.from_bytes(data[16:20], "little")
+    whole = data[:4] == b"RIFF" and data[8:16] == b"WEBPVP8 " and len(data) == 20 + length + length % 2
+    if not whole or len(data) < 30 or int.from_bytes(data[4:8], "little") + 8 != len(data):
+        raise StillError("not a whole WebP of one lossy picture")
+    if data[20] & 1 or data[23:26] != _VP8_START:
+        raise StillError("WebP is malformed: no keyframe")
+    # The two bits above the 14 ask a player to enlarge; a still is shown as it is.
+    return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(data[28:30], "little") & 0x3FFF

@@ -1,0 +1,274 @@
+"""What is kept, piece by piece over the link, until the ground says that it has it. Time is an argument.
+
+First the facts of a session that is not the present one, then stills by their worth, then video, newest first; video
+first where somebody asked for it. Of several objects some bytes may be on their way; in memory is the one of which
+pieces are being cut. Where the ground does not get on, the object begins again where the ground left off.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+from hvt_common.protocol.messages import PastHave, PastKind
+from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.entry import Entry, Key
+
+__all__ = ["Backfill", "Piece"]
+
+_log = logging.getLogger(__name__)
+
+_SECOND_NS = 1_000_000_000
+_PATIENCE_NS = 2 * _SECOND_NS
+_TRIES, _TRIES_BEGUN = 3, 6
+"""Without getting on: of an object of which the ground has nothing, and of one that it has a part of."""
+_MOST_ANSWERS = 300
+"""Without getting on, before they are no excuse any more: some minutes."""
+_MOST_OBJECTS = 12
+"""On their way at a time; one report of the ground names 16."""
+_MOST_AHEAD_BYTES = 256 * 1024
+"""Of one object, beyond what the ground has said it has."""
+_LEAST_PIECE_BYTES = 600
+"""A smaller one is mostly headers, unless it is the last."""
+_OTHER_RECEIVER_NS = 5 * _SECOND_NS
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Bytes of one object."""
+
+    session_id: int
+    kind: PastKind
+    number: int
+    offset: int
+    total_bytes: int
+    data: bytes
+
+
+@dataclass(slots=True)
+class _Transfer:
+    entry: Entry
+    total_bytes: int
+    since_ns: int
+    """Of the last piece sent or acknowledged."""
+    sent_bytes: int = 0
+    have_bytes: int = 0
+    tries: int = 0
+    answers: int = 0
+    """In which the ground had got no further: it is busy."""
+
+
+class Backfill:
+    """For one thread. ``on_done(entry)`` is called for each object that a ground has whole."""
+
+    def __init__(
+        self, folder: Folder, *, session_id: int, on_done: Callable[[Entry], None] = lambda _entry: None
+    ) -> None:
+        self._folder = folder
+        self._session_id = session_id
+        self._on_done = on_done
+        self._line: OrderedDict[Key, _Transfer] = OrderedDict()
+        self._data: tuple[Key, bytes] | None = None
+        self._informed: set[int] = set()
+        """Sessions whose facts the ground has."""
+        self._asked: set[int] = set()
+        """Sessions whose facts it asked for."""
+        self._aside: set[Key] = set()
+        """What the present ground does not take; another is asked again, and so is any after the next start."""
+        self._acknowledged: dict[Key, int] = {}
+        """What the present ground has said it has of objects that are not done."""
+        self._receiver_id: int | None = None
+        self._heard_ns = 0
+        self.video_first = False
+        """Somebody asked for the video."""
+        self.acknowledged_bytes = 0
+        """That grounds have said they have."""
+        self.given_up = 0
+        """Objects that were put aside because a ground did not take them."""
+
+    @property
+    def in_flight(self) -> int:
+        """Objects of which something is on its way."""
+        return len(self._line)
+
+    # What comes back
+
+    def hear(self, haves: Sequence[PastHave], *, receiver_id: int, now_ns: int) -> None:
+        """Take in what a ground says it has. One ground counts, until it says nothing of it for a while."""
+        if receiver_id != self._receiver_id:
+            if self._receiver_id is not None and now_ns - self._heard_ns < _OTHER_RECEIVER_NS:
+                return
+            self._receiver_id = receiver_id
+            self._informed.clear()
+            self._aside.clear()
+            self._acknowledged.clear()
+        self._heard_ns = now_ns
+        for have in haves:
+            key = (have.session_id, PastKind(have.kind), have.number)
+            transfer = self._line.get(key)
+            if transfer is not None:
+                self._advance(transfer, have.have_bytes, now_ns)
+            elif key in self._aside:
+                self._late(key, have.have_bytes)
+            elif key[1:] == (PastKind.INFO, 0) and not have.have_bytes and self._folder.find(key) is not None:
+                self._informed.discard(have.session_id)
+                self._asked.add(have.session_id)
+
+    def _late(self, key: Key, have_bytes: int) -> None:
+        """The ground had it after all when it was put aside."""
+        entry = self._folder.find(key)
+        data = None if entry is None else self._folder.read(entry)
+        if entry is not None and data is not None and have_bytes == len(data):
+            self._aside.discard(key)
+            self._folder.remove(entry)
+            self._on_done(entry)
+
+    def interrupt(self) -> None:
+        """The link is away: what was on its way is begun again later, where the ground left off."""
+        self._line.clear()
+        self._data = None
+        self._forget()
+
+    def _forget(self) -> None:
+        """Keep nothing of objects that are not here any more."""
+        self._aside = {key for key in self._aside if self._folder.find(key) is not None}
+        here = {key: have for key, have in self._acknowledged.items() if self._folder.find(key) is not None}
+        self._acknowledged = here
+
+    def _advance(self, transfer: _Transfer, have_bytes: int, now_ns: int) -> None:
+        if have_bytes > transfer.total_bytes:
+            return
+        key = transfer.entry.key
+        # By object, not by transfer: after an outage the ground says again what it has said before.
+        self.acknowledged_bytes += max(0, have_bytes - self._acknowledged.get(key, 0))
+        self._acknowledged[key] = have_bytes
+        if have_bytes == transfer.total_bytes:
+            self._done(transfer)
+            return
+        if have_bytes < transfer.have_bytes:  # it was started again, or lost some
+            transfer.sent_bytes = have_bytes
+        elif have_bytes > transfer.have_bytes:
+            transfer.tries, transfer.answers, transfer.since_ns = 0, 0, now_ns
+        elif transfer.answers < _MOST_ANSWERS:  # it is busy: only silence is a try that failed
+            transfer.tries, transfer.answers = 0, transfer.answers + 1
+        transfer.have_bytes = have_bytes
+        transfer.sent_bytes = max(transfer.sent_bytes, have_bytes)
+
+    def _done(self, transfer: _Transfer) -> None:
+        entry = transfer.entry
+        self._leave(entry.key)
+        self._acknowledged.pop(entry.key, None)
+        if entry.kind is PastKind.INFO:
+            self._informed.add(entry.session_id)
+            return
+        self._folder.remove(entry)
+        self._on_done(entry)
+
+    def _leave(self, key: Key) -> None:
+        self._line.pop(key, None)
+        if self._data is not None and self._data[0] == key:
+            self._data = None
+
+    # What goes out
+
+    def next_piece(self, most_bytes: int, *, now_ns: int, round_trip_ns: int) -> Piece | None:
+        """The next piece, of at most so many bytes; None where there is none, or it would be too small."""
+        self._begin_again(now_ns - _PATIENCE_NS - round_trip_ns, now_ns)
+        while (transfer := self._current(now_ns)) is not None:
+            data = self._bytes_of(transfer)
+            if data is None:
+                continue
+            piece = data[transfer.sent_bytes : transfer.sent_bytes + max(0, most_bytes)]
+            ends = transfer.sent_bytes + len(piece) == len(data)
+            if not piece or (len(piece) < _LEAST_PIECE_BYTES and not ends):
+                return None
+            key, offset = transfer.entry.key, transfer.sent_bytes
+            transfer.sent_bytes += len(piece)
+            transfer.since_ns = now_ns
+            return Piece(*key, offset=offset, total_bytes=len(data), data=piece)
+        return None
+
+    def take_back(self, piece: Piece) -> None:
+        """This piece has not been sent after all."""
+        transfer = self._line.get((piece.session_id, piece.kind, piece.number))
+        if transfer is not None:
+            transfer.sent_bytes = min(transfer.sent_bytes, piece.offset)
+
+    def _begin_again(self, before_ns: int, now_ns: int) -> None:
+        """Where the ground has not got on for too long."""
+        for key, transfer in list(self._line.items()):
+            if self._folder.find(key) is None:  # evicted meanwhile
+                self._leave(key)
+            elif transfer.since_ns < before_ns and transfer.sent_bytes > transfer.have_bytes:
+                transfer.tries += 1
+                transfer.sent_bytes, transfer.since_ns = transfer.have_bytes, now_ns
+                if transfer.tries >= (_TRIES_BEGUN if transfer.have_bytes else _TRIES):
+                    self._give_up(transfer)
+
+    def _give_up(self, transfer: _Transfer) -> None:
+        self._leave(transfer.entry.key)
+        self.given_up += 1
+        if self.given_up.bit_count() == 1:
+            _log.warning(
+                "no ground takes %s in %d tries (%d objects so far): it stays on disk for another ground, or for "
+                "the next start",
+                transfer.entry.path,
+                transfer.tries,
+                self.given_up,
+            )
+        if transfer.entry.kind is PastKind.INFO:
+            self._asked.discard(transfer.entry.session_id)
+            self._informed.add(transfer.entry.session_id)  # what follows shows whether it was needed
+        else:  # only a ground that has it, age or want of room may cost an object its place
+            self._forget()
+            self._aside.add(transfer.entry.key)
+
+    def _current(self, now_ns: int) -> _Transfer | None:
+        """The object of which pieces are cut now: one that is not all on its way, or the next one."""
+        for transfer in self._line.values():
+            if transfer.sent_bytes < transfer.total_bytes:
+                ahead = transfer.sent_bytes - transfer.have_bytes
+                return transfer if ahead < _MOST_AHEAD_BYTES else None
+        if len(self._line) >= _MOST_OBJECTS:
+            return None
+        while (entry := next(self._open_entries(), None)) is not None:
+            data = self._folder.read(entry)
+            if data is not None:
+                self._data = (entry.key, data)
+                transfer = self._line[entry.key] = _Transfer(entry, len(data), now_ns)
+                return transfer
+        return None
+
+    def _open_entries(self) -> Iterator[Entry]:
+        """Those that may begin now, in their order."""
+        for session_id in sorted(self._asked - self._informed):
+            info = self._folder.info_of(session_id)
+            if info is None:
+                self._asked.discard(session_id)
+            elif info.key not in self._line:
+                yield info
+        stills, video = self._folder.best_stills(), self._folder.newest_segments()
+        if self.video_first and not self._folder.segments:
+            self.video_first = False
+        for entry in chain(video, stills) if self.video_first else chain(stills, video):
+            if entry.key in self._line or entry.key in self._aside:
+                continue
+            info = self._folder.info_of(entry.session_id)
+            if entry.session_id == self._session_id or entry.session_id in self._informed or info is None:
+                yield entry
+            elif info.key not in self._line:
+                yield info
+
+    def _bytes_of(self, transfer: _Transfer) -> bytes | None:
+        """The object's bytes, read again where another was read since; None where they are gone."""
+        key = transfer.entry.key
+        if self._data is None or self._data[0] != key:
+            data = self._folder.read(transfer.entry)
+            if data is None or len(data) != transfer.total_bytes:
+                self._leave(key)
+                return None
+            self._data = (key, data)
+        return self._data[1]

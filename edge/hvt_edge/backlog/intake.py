@@ -1,0 +1,153 @@
+"""What the disk thread is given: frames and stills in their order, bounded, and words that are never refused.
+
+A disk that is too slow costs frames and stills, and says so. It must not cost a word: a segment that does not end, or
+an outage that the backfill does not hear of, would cost much more. So words are states, not items.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hvt_common.protocol.messages import PastHave, PastKind, PastStill
+from hvt_common.values import AccessUnit
+from hvt_edge.backlog.entry import Key
+
+__all__ = ["EndSegment", "Intake", "KeptStill", "KeptUnit", "News"]
+
+_MOST_HAVES = 64
+"""Of all grounds together, the newest of each object; one report names 16."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeptUnit:
+    """An access unit for the disk."""
+
+    unit: AccessUnit
+    parameter_sets: bytes
+    """The newest keyframe."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeptStill:
+    """A still for the disk."""
+
+    number: int
+    capture_ns: int
+    utility: float
+    still: PastStill
+
+
+@dataclass(frozen=True, slots=True)
+class EndSegment:
+    """The frames before this are an object; it has its place among them."""
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """What has happened since it was asked last."""
+
+    interrupted: bool
+    """The link went: what was on its way is not."""
+    video_first: bool
+    """Somebody asked for the video."""
+    haves: tuple[tuple[int, PastHave], ...]
+    """What grounds say they have, with their receiver ids."""
+
+
+class Intake:
+    """From any thread to one. Holds ``most`` frames and stills, and a word for each of them at the most."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._changed = threading.Condition()
+        self._items: deque[KeptUnit | KeptStill | EndSegment] = deque()
+        self._waiting = 0
+        self._interrupted = self._video_first = self._woken = self._closed = False
+        self._haves: OrderedDict[tuple[int, Key], PastHave] = OrderedDict()
+
+    def __len__(self) -> int:
+        """Frames and stills that wait."""
+        return self._waiting
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing waits and nothing more comes."""
+        with self._changed:
+            return self._closed and not self._items
+
+    # From any thread
+
+    def offer(self, item: KeptUnit | KeptStill) -> bool:
+        """Hand over something to be kept; False where there is no room for it."""
+        with self._changed:
+            if self._closed or self._waiting >= self._most:
+                return False
+            self._items.append(item)
+            self._waiting += 1
+            self._changed.notify()
+        return True
+
+    def end_segment(self) -> None:
+        """The frames offered so far are an object."""
+        with self._changed:
+            if not (self._items and isinstance(self._items[-1], EndSegment)):
+                self._items.append(EndSegment())
+                self._changed.notify()
+
+    def interrupt(self) -> None:
+        """The link went."""
+        with self._changed:
+            self._interrupted = True
+            self._wake()
+
+    def ask_for_video(self) -> None:
+        """Somebody wants the video first."""
+        with self._changed:
+            self._video_first = True
+            self._wake()
+
+    def hear(self, haves: Sequence[PastHave], *, receiver_id: int) -> None:
+        """A ground says what it has; the newest counts, and one that is lost comes again."""
+        with self._changed:
+            for have in haves:
+                key = (receiver_id, (have.session_id, PastKind(have.kind), have.number))
+                self._haves.pop(key, None)
+                self._haves[key] = have
+            while len(self._haves) > _MOST_HAVES:
+                self._haves.popitem(last=False)
+            self._wake()
+
+    def wake(self) -> None:
+        """Let `take` return."""
+        with self._changed:
+            self._wake()
+
+    def close(self) -> None:
+        """Nothing more comes."""
+        with self._changed:
+            self._closed = True
+            self._wake()
+
+    def _wake(self) -> None:
+        self._woken = True
+        self._changed.notify()
+
+    # In the thread that takes
+
+    def take(self, timeout_s: float) -> tuple[News, KeptUnit | KeptStill | EndSegment | None]:
+        """What has happened, and the next item; None where there is none within that time, or something happened."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._items or self._woken, timeout=timeout_s)
+            news = News(
+                self._interrupted,
+                self._video_first,
+                tuple((receiver_id, have) for (receiver_id, _), have in self._haves.items()),
+            )
+            self._interrupted = self._video_first = self._woken = False
+            self._haves.clear()
+            item = self._items.popleft() if self._items else None
+            self._waiting -= item is not None and not isinstance(item, EndSegment)
+            return news, item

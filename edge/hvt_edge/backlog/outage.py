@@ -1,0 +1,55 @@
+"""Whether the link is away, so that what the camera sees is kept instead of sent. Pure: time is an argument.
+
+Two signs: nobody listens any more (Zenoh says so some seconds after the link broke), or a ground that used to report
+is silent (it reports twice a second whatever it hears, so this is noticed much sooner).
+"""
+
+from __future__ import annotations
+
+__all__ = ["SILENCE_NS", "Outage"]
+
+_MS = 1_000_000
+_SECOND_NS = 1_000_000_000
+SILENCE_NS = 1_500 * _MS
+"""Three reports in a row that did not come."""
+_LEFT_NS = 15 * _SECOND_NS
+"""Who is silent for so long on a link that Zenoh still has, has left; others may listen that never report. The same
+as in `hvt_edge.link.pacer`."""
+
+
+class Outage:
+    """For one run of an edge. ``live``: the source is a camera, which waits for nobody."""
+
+    def __init__(self, *, live: bool) -> None:
+        self._live = live
+        self._listened = False
+        self._linked = False
+        self._reported_ns: int | None = None
+        self.heard = False
+        """Whether a ground ever reported on this session: of who never does nobody knows what has arrived."""
+
+    def reported(self, now_ns: int) -> None:
+        """A ground has reported on this session (any thread)."""
+        self._reported_ns = now_ns
+        self.heard = True
+
+    def hears(self, now_ns: int) -> bool:
+        """Whether a ground reports now."""
+        reported_ns = self._reported_ns
+        return reported_ns is not None and now_ns - reported_ns <= SILENCE_NS
+
+    def away(self, now_ns: int, *, linked: bool) -> bool:
+        """Whether the link is away; asked before each frame. ``linked``: somebody listens, by what Zenoh knows.
+
+        Before anybody ever listened, only a live source is kept: a clip plays again.
+        """
+        if not linked:
+            self._linked = False
+            return self._listened or self._live
+        if not self._linked:  # a new path: the silence of before says nothing about it
+            self._linked = self._listened = True
+            self._reported_ns = None
+        reported_ns = self._reported_ns
+        if reported_ns is not None and now_ns - reported_ns > _LEFT_NS:
+            self._reported_ns = reported_ns = None
+        return reported_ns is not None and now_ns - reported_ns > SILENCE_NS

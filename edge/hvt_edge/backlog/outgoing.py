@@ -1,0 +1,78 @@
+"""One piece at a time in a thread of its own: a link that is full for seconds must not hold up the disk."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from hvt_common.runtime.priority import give_way
+from hvt_edge.backlog.backfill import Piece
+
+__all__ = ["Outgoing"]
+
+
+class Outgoing:
+    """Sends what it is given. `put` and `take` from one thread; ``on_done()`` is called in its own after each piece.
+
+    ``send(piece)`` returns the line bytes, 0 where it was not sent; it may block.
+    """
+
+    def __init__(self, send: Callable[[Piece], int], *, on_done: Callable[[], None]) -> None:
+        self._send = send
+        self._on_done = on_done
+        self._changed = threading.Condition()
+        self._piece: Piece | None = None
+        self._done: tuple[Piece, int] | None = None
+        self._closed = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="hvt-past", daemon=True)
+        self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a piece is being sent, or was and nobody has asked what became of it."""
+        return self._piece is not None or self._done is not None
+
+    def put(self, piece: Piece) -> None:
+        """Send this; only where it is not `busy`."""
+        assert not self.busy, "one at a time"
+        with self._changed:
+            self._piece = piece
+            self._changed.notify()
+
+    def take(self) -> tuple[Piece, int] | None:
+        """Return the piece that was sent last and its line bytes, once; None while there is none.
+
+        Raises whatever ``send`` has raised.
+        """
+        with self._changed:
+            if self._error is not None:
+                raise self._error
+            done, self._done = self._done, None
+        return done
+
+    def close(self, timeout_s: float) -> None:
+        """Send no more; what is being sent has so long to go."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join(timeout=timeout_s)
+
+    def _run(self) -> None:
+        give_way()
+        while (piece := self._next()) is not None:
+            try:
+                line_bytes = self._send(piece)
+            except BaseException as error:  # noqa: BLE001 - handed to the disk thread, which hands it on
+                with self._changed:
+                    self._error = error
+                self._on_done()
+                return
+            with self._changed:
+                self._done, self._piece = (piece, line_bytes), None
+            self._on_done()
+
+    def _next(self) -> Piece | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._piece is not None or self._closed)
+            return None if self._closed else self._piece

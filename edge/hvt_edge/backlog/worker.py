@@ -1,0 +1,313 @@
+"""The thread that the disk belongs to: it writes what is kept, and cuts pieces of it when the link has room for them.
+
+What comes to it waits in a bounded line (`intake`). Where that is full the disk is too slow: what comes then is not
+kept, and said once. A disk that is full, cannot be written or is taken out costs one warning and all further keeping;
+what is there already is sent all the same. Pieces leave in a thread of their own (`outgoing`).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from hvt_common.protocol.messages import PastHave, PastKind, pack_past_still
+from hvt_common.runtime.priority import give_way
+from hvt_edge.backlog.backfill import Backfill, Piece
+from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.entry import Entry
+from hvt_edge.backlog.intake import EndSegment, Intake, KeptStill, KeptUnit, News
+from hvt_edge.backlog.outgoing import Outgoing
+
+__all__ = ["KeptStill", "KeptUnit", "Sends", "StoreNumbers", "StoreWorker"]
+
+_log = logging.getLogger(__name__)
+
+_QUEUE = 512
+_TICK_S = 0.02
+_IDLE_S = 0.25
+_CLOSE_S = 5.0
+_LAST_PIECE_S = 1.0
+"""What is being sent when no more is to be sent has so long to go."""
+_TRICKLE_SHARE = 1 / 40
+"""Of the total, where live stills always wait: they must not keep what was admitted before from ever arriving."""
+_SECOND_NS = 1_000_000_000
+
+
+class Sends(Protocol):
+    """How pieces leave the edge."""
+
+    def may_send(self, now_ns: int) -> bool:
+        """Whether the link is there and steady."""
+        ...
+
+    def live_waits(self) -> bool:
+        """Whether a live still waits for room."""
+        ...
+
+    def room_bytes(self, now_ns: int, *, live_waits: bool) -> int:
+        """Payload that a piece may have now."""
+        ...
+
+    def send(self, piece: Piece, *, now_ns: int) -> int:
+        """Send it; return its line bytes, 0 where its room is gone. May block while the link is full."""
+        ...
+
+    @property
+    def round_trip_ns(self) -> int:
+        """Of the link."""
+        ...
+
+    @property
+    def total_bps(self) -> int:
+        """What may be sent in all."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StoreNumbers:
+    """What the store holds and has done."""
+
+    stills: int = 0
+    segments: int = 0
+    """Stretches of video, the one that is being written included."""
+    video_s: float = 0.0
+    disk_bytes: int = 0
+    sent_stills: int = 0
+    sent_video_s: float = 0.0
+    acknowledged_bytes: int = 0
+    evicted_stills: int = 0
+    evicted_segments: int = 0
+    unreadable: int = 0
+    given_up: int = 0
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is kept."""
+        return not (self.stills or self.segments)
+
+
+class StoreWorker:
+    """Opens the folder, keeps, sends, and leaves the folder in order. `check` and `close` raise an error in it.
+
+    ``open_folder()`` and everything on disk runs in the thread. ``on_sent(entry)`` is called for each object that a
+    ground has whole. `close` waits ``close_s`` for the disk.
+    """
+
+    def __init__(
+        self,
+        open_folder: Callable[[], Folder],
+        sends: Sends,
+        *,
+        session_id: int,
+        clock: Callable[[], int],
+        on_sent: Callable[[Entry], None] = lambda _entry: None,
+        close_s: float = _CLOSE_S,
+    ) -> None:
+        self._open_folder = open_folder
+        self._sends = sends
+        self._session_id = session_id
+        self._clock = clock
+        self._on_sent = on_sent
+        self._close_s = close_s
+        self._intake = Intake(_QUEUE)
+        self._outgoing = Outgoing(lambda piece: sends.send(piece, now_ns=clock()), on_done=self._intake.wake)
+        self._folder: Folder | None = None
+        self._backfill: Backfill | None = None
+        self._sent_stills = 0
+        self._sent_ns = 0
+        self._trickle_ns = self._entered_ns = 0
+        self._slow = False
+        self.failed = False
+        """Nothing is kept any more, and why has been said."""
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="hvt-store", daemon=True)
+        self._thread.start()
+
+    # From other threads
+
+    def check(self) -> None:
+        """Raise what has ended the thread, once."""
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def offer(self, item: KeptUnit | KeptStill) -> bool:
+        """Hand over something to be kept; False where it is not, because the disk is too slow or refuses."""
+        self.check()
+        if self.failed:
+            return False
+        if not self._intake.offer(item):
+            if not self._slow:
+                self._slow = True
+                _log.warning("the disk of --store-folder is too slow: some of what is seen now is not kept")
+            return False
+        return True
+
+    def hear(self, haves: Sequence[PastHave], *, receiver_id: int) -> None:
+        """A ground says what it has. One that is not heard comes again."""
+        self._intake.hear(haves, receiver_id=receiver_id)
+
+    def end_segment(self) -> None:
+        """The link is back: what was kept may be sent."""
+        self._intake.end_segment()
+
+    def interrupt(self) -> None:
+        """The link is away: what was on its way is not."""
+        self._intake.interrupt()
+
+    def video_first(self) -> None:
+        """Somebody asked for the video."""
+        self._intake.ask_for_video()
+
+    @property
+    def waiting(self) -> int:
+        """Frames and stills that are not on disk yet."""
+        return len(self._intake)
+
+    @property
+    def numbers(self) -> StoreNumbers:
+        """What is kept and what was done."""
+        folder, backfill = self._folder, self._backfill
+        if folder is None or backfill is None:
+            return StoreNumbers()
+        return StoreNumbers(
+            stills=folder.stills,
+            segments=folder.segments + folder.open_segments,
+            video_s=folder.span_ns / _SECOND_NS,
+            disk_bytes=folder.disk_bytes,
+            sent_stills=self._sent_stills,
+            sent_video_s=self._sent_ns / _SECOND_NS,
+            acknowledged_bytes=backfill.acknowledged_bytes,
+            evicted_stills=folder.evicted_stills,
+            evicted_segments=folder.evicted_segments,
+            unreadable=folder.damaged,
+            given_up=backfill.given_up,
+        )
+
+    def send_no_more(self) -> None:
+        """Let nothing go out from now on, so that an account can be closed; what comes is kept all the same."""
+        self._outgoing.close(_LAST_PIECE_S)
+
+    def close(self) -> None:
+        """Write what waits, end the files, join the thread. A disk that hangs costs what waits, and a warning."""
+        self._intake.close()
+        self._thread.join(timeout=self._close_s)
+        if self._thread.is_alive():
+            _log.warning(
+                "the disk of --store-folder takes longer than %g s: %d frames and stills that wait for it are not "
+                "kept",
+                self._close_s,
+                self.waiting,
+            )
+        self._outgoing.close(self._close_s)
+        self.check()
+
+    # In the thread
+
+    def _run(self) -> None:
+        give_way()
+        try:
+            self._open()
+            try:
+                self._work()
+            finally:
+                if self._folder is not None:
+                    self._folder.close()
+        except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
+            self._error = error
+
+    def _open(self) -> None:
+        try:
+            folder = self._open_folder()
+        except OSError as error:
+            self._fail(error)
+            return
+        self._backfill = Backfill(folder, session_id=self._session_id, on_done=self._note_done)
+        self._folder = folder
+
+    def _work(self) -> None:
+        while not self._intake.ended:
+            folder, backfill = self._folder, self._backfill
+            news, item = self._intake.take(self._patience_s())
+            if folder is None or backfill is None:
+                continue
+            self._note(news, backfill)
+            if isinstance(item, EndSegment):
+                folder.end_segment()
+            elif item is not None:
+                self._keep(folder, item)
+            else:
+                self._enter(folder)
+                self._send_piece(backfill)
+
+    def _patience_s(self) -> float:
+        busy = self._folder is not None and (self._folder.stills or self._folder.segments)
+        return _TICK_S if busy else _IDLE_S
+
+    def _note(self, news: News, backfill: Backfill) -> None:
+        if news.interrupted:
+            backfill.interrupt()
+        if news.video_first:
+            backfill.video_first = True
+        for receiver_id, have in news.haves:
+            backfill.hear([have], receiver_id=receiver_id, now_ns=self._clock())
+
+    def _keep(self, folder: Folder, item: KeptUnit | KeptStill) -> None:
+        if self.failed:
+            return
+        try:
+            if isinstance(item, KeptUnit):
+                folder.add_unit(item.unit, parameter_sets=item.parameter_sets)
+            else:
+                folder.add_still(
+                    item.number, pack_past_still(item.still), utility=item.utility, capture_ns=item.capture_ns
+                )
+        except OSError as error:
+            self._fail(error)
+            folder.end_segment()
+
+    def _enter(self, folder: Folder) -> None:
+        """Another edge has the folder: it may have been the one before this, which has ended by now."""
+        now_ns = self._clock()
+        if folder.locked_out and now_ns - self._entered_ns >= _SECOND_NS:
+            self._entered_ns = now_ns
+            try:
+                folder.enter()
+            except OSError as error:
+                self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self.failed = True
+        _log.warning(
+            "what is seen while the link is away cannot be kept any more (%s): free the disk, name another "
+            "--store-folder, or give --store 0",
+            error.strerror or error,
+        )
+
+    def _send_piece(self, backfill: Backfill) -> None:
+        done = self._outgoing.take()
+        if done is not None and not done[1]:
+            backfill.take_back(done[0])  # and wait a moment: others send
+            return
+        now_ns = self._clock()
+        if done is not None:
+            pause_ns = 8 * _SECOND_NS * done[1] / (_TRICKLE_SHARE * self._sends.total_bps)
+            self._trickle_ns = now_ns + round(pause_ns)
+        if self._outgoing.busy or not self._sends.may_send(now_ns):
+            return
+        live_waits = self._sends.live_waits()
+        if live_waits and now_ns < self._trickle_ns:
+            return
+        room_bytes = self._sends.room_bytes(now_ns, live_waits=live_waits)
+        piece = backfill.next_piece(room_bytes, now_ns=now_ns, round_trip_ns=self._sends.round_trip_ns)
+        if piece is not None:
+            self._outgoing.put(piece)
+
+    def _note_done(self, entry: Entry) -> None:
+        if entry.kind is PastKind.STILL:
+            self._sent_stills += 1
+        self._sent_ns += entry.span_ns
+        self._on_sent(entry)

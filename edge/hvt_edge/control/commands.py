@@ -1,0 +1,308 @@
+"""What a ground may ask of the edge on ``control``: a keyframe, a still, the tracks, another budget or method.
+
+Runs in the link's callbacks: each answer is made at once, from what is at hand, and nothing that is asked costs more
+than the cutting of a crop. Whoever asks is not trusted: arguments have bounds, and requests a rate.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, TrackNow, fitted_text
+from hvt_common.units import bitrate_text
+from hvt_edge.backlog.stage import Keep
+from hvt_edge.config import LEAST_FPS, REGIMES, EdgeConfig
+from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.stills.on_demand import OnDemand
+from hvt_edge.stills.on_demand_crop import Ask, RefusedError
+from hvt_edge.stills.policy.registry import method
+from hvt_edge.stills.scheduler import Chooser
+from hvt_edge.video.least_rate import least_base_bps
+from hvt_edge.video.reconfigure import Renewal
+
+__all__ = ["Commands", "Served"]
+
+_SECOND_NS = 1_000_000_000
+_MOST_REQUESTS = 32
+"""In a second, from all grounds together."""
+_REST_NS = 2 * _SECOND_NS
+"""Between two changes of the budget: each costs a keyframe and the opening of an encoder."""
+_MOST_BPS = 1_000_000_000
+_QUALITIES_PCT = (5, 95)
+_MOST_AGO_MS = 3_600_000
+_U32 = 2**32 - 1
+_FAR_PX = 32767
+_REASON_BYTES = 200
+
+Arguments = Mapping[str, int | float | str]
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """The parts of a running edge that commands reach."""
+
+    on_demand: OnDemand
+    renewal: Renewal
+    chooser: Chooser
+    base_size: tuple[int, int]
+    keep: Keep | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Said:
+    """What an accepted command answers beside yes."""
+
+    still_ask: int = -1
+    frame_index: int = -1
+    tracks: tuple[TrackNow, ...] = ()
+
+
+class Commands:
+    """Answers one session's requests; may be called from any thread.
+
+    Args:
+        config: the settings at the start.
+        session_id: of this run.
+        keyframes: the plan that a change of rates waits for.
+        clock: Unix nanoseconds, for the rate of requests.
+        window_ns: the time that the budget's windows go by, which keyframes are planned in.
+    """
+
+    def __init__(
+        self,
+        config: EdgeConfig,
+        *,
+        session_id: int,
+        keyframes: KeyframePlan,
+        clock: Callable[[], int],
+        window_ns: Callable[[], int],
+    ) -> None:
+        self._config = config
+        self._started_with = config
+        self._session_id = session_id
+        self._keyframes = keyframes
+        self._clock = clock
+        self._window_ns = window_ns
+        self._served: Served | None = None
+        self._lock = threading.Lock()
+        self._request_times: deque[int] = deque(maxlen=_MOST_REQUESTS)
+        self._changed_ns: int | None = None
+        self.highest_budget_bps = config.budget_bps
+        """Of all that were in force."""
+        self._commands: dict[str, Callable[[Arguments], _Said]] = {
+            Command.KEYFRAME: self._keyframe,
+            Command.STILL: self._still,
+            Command.STILL_FATE: self._still_fate,
+            Command.TRACKS: self._tracks,
+            Command.SET_BUDGET: self._set_budget,
+            Command.SET_METHOD: self._set_method,
+            Command.SEND_PAST: self._send_past,
+        }
+
+    @property
+    def config(self) -> EdgeConfig:
+        """The settings as they are now: budget, method and share may have been changed by a command."""
+        return self._config
+
+    def serve(self, served: Served) -> None:
+        """All parts are there; before, only keyframes are served."""
+        self._served = served
+
+    def answer(self, request: ControlRequest) -> ControlAnswer:
+        """Do it or say why not; never raises for what a ground may send."""
+        try:
+            with self._lock:
+                said = self._obey(request)
+        except (RefusedError, UserError) as refusal:
+            return self._answer(_Said(), reason=fitted_text(str(refusal), _REASON_BYTES))
+        return self._answer(said)
+
+    def _answer(self, said: _Said, *, reason: str = "") -> ControlAnswer:
+        return ControlAnswer(
+            session_id=self._session_id,
+            accepted=not reason,
+            reason=reason,
+            still_ask=said.still_ask,
+            frame_index=said.frame_index,
+            tracks=said.tracks,
+        )
+
+    def _obey(self, request: ControlRequest) -> _Said:
+        if request.session_id not in (0, self._session_id):
+            raise RefusedError("that session has ended")
+        self._check_rate()
+        command = self._commands.get(request.command)
+        if command is None:
+            raise RefusedError(f"this edge does not serve {request.command!r}")
+        return command(request.arguments)
+
+    def _check_rate(self) -> None:
+        now_ns, times = self._clock(), self._request_times
+        if len(times) == _MOST_REQUESTS and now_ns - times[0] < _SECOND_NS:
+            raise RefusedError(f"too many requests: at most {_MOST_REQUESTS} a second are served")
+        times.append(now_ns)
+
+    # The commands
+
+    def _keyframe(self, arguments: Arguments) -> _Said:
+        _Reader("keyframe", arguments).end()
+        refusal = self._keyframes.request(self._window_ns())
+        if refusal is not None:
+            raise RefusedError(refusal)
+        return _Said()
+
+    def _still(self, arguments: Arguments) -> _Said:
+        number, frame_index = self._parts().on_demand.ask(_ask(arguments))
+        return _Said(still_ask=number, frame_index=frame_index)
+
+    def _still_fate(self, arguments: Arguments) -> _Said:
+        reader = _Reader("still-fate", arguments)
+        number = reader.needed("ask", 0, _U32)
+        reader.end()
+        self._parts().on_demand.fate(number)
+        return _Said()
+
+    def _tracks(self, arguments: Arguments) -> _Said:
+        _Reader("tracks", arguments).end()
+        frame_index, tracks = self._parts().on_demand.tracks()
+        return _Said(frame_index=frame_index, tracks=tracks)
+
+    def _set_budget(self, arguments: Arguments) -> _Said:
+        reader = _Reader("set-budget", arguments)
+        bps = reader.needed("bps", 1, _MOST_BPS)
+        reader.end()
+        self._change(replace(self._config, budget=bps))
+        return _Said()
+
+    def _set_method(self, arguments: Arguments) -> _Said:
+        reader = _Reader("set-method", arguments)
+        name = reader.text("method")
+        reader.end()
+        chooser = self._parts().chooser
+        before, policy = method(self._config.method), method(name)
+        if policy.name == before.name:
+            return _Said()
+        if "R0" in (policy.name, before.name):
+            raise RefusedError(
+                "R0 codes the video in another way from the first frame on: start the edge with it"
+            )
+        self._change(
+            replace(self._config, method=policy.name, tune=(), video_share=self._share_for(policy.video_only))
+        )
+        chooser.set_method(policy)
+        return _Said()
+
+    def _send_past(self, arguments: Arguments) -> _Said:
+        _Reader("send-past", arguments).end()
+        keep = self._parts().keep
+        if keep is None:
+            raise RefusedError("this edge keeps nothing while its link is away (--store 0)")
+        if not keep.send_video():
+            raise RefusedError("nothing is kept that was not sent")
+        return _Said()
+
+    # Changes of the rates
+
+    def _change(self, config: EdgeConfig) -> None:
+        served, before = self._parts(), self._config
+        if (config.budget, config.video_share) != (before.budget, before.video_share):
+            now_ns = self._clock()
+            if self._changed_ns is not None and now_ns - self._changed_ns < _REST_NS:
+                raise RefusedError("the rates were changed a moment ago: wait two seconds")
+            _check_base(config, served.base_size)
+            self._changed_ns = now_ns
+            served.renewal.change(config)
+            self._keyframes.renew(self._window_ns())
+        self._config = config
+        self.highest_budget_bps = max(self.highest_budget_bps, config.budget_bps)
+
+    def _share_for(self, video_only: bool) -> float | str | None:  # noqa: FBT001 - one caller
+        """The base's share for a method of that kind: with no stills it is all, else what the edge began with."""
+        if video_only:
+            return 1.0
+        began = self._started_with
+        return REGIMES["low"].video_share if method(began.method).video_only else began.video_share
+
+    def _parts(self) -> Served:
+        if self._served is None:
+            raise RefusedError("this edge is still starting: ask again")
+        return self._served
+
+
+def _check_base(config: EdgeConfig, size: tuple[int, int]) -> None:
+    """As `hvt_edge.config.check_rate`, in words for whoever asks from afar."""
+    fps = LEAST_FPS if config.auto_fps else config.tick_fps
+    least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
+    if config.base_bps < least_bps:
+        raise RefusedError(
+            f"{bitrate_text(config.budget_bps)} would leave {bitrate_text(config.base_bps)} for video, and "
+            f"{size[0]}x{size[1]} at {fps:g} fps takes at least {bitrate_text(least_bps)}"
+        )
+
+
+def _ask(arguments: Arguments) -> Ask:
+    reader = _Reader("still", arguments)
+    track = reader.optional("track", 0, _U32)
+    box = [reader.optional(name, -_FAR_PX, _FAR_PX) for name in ("x", "y", "w", "h")]
+    at_ms = reader.optional("at_ms", -_MOST_AGO_MS, 0)
+    frame = reader.optional("frame", 0, _U32)
+    quality_pct = reader.optional("quality", *_QUALITIES_PCT)
+    reader.end()
+    given = [side for side in box if side is not None]
+    if len(given) not in (0, 4):
+        raise RefusedError("a box takes x, y, w and h, all four")
+    if track is not None and given:
+        raise RefusedError("a still is of a track or of a box, not of both")
+    if at_ms is not None and frame is not None:
+        raise RefusedError("a still is of a frame or of a time, not of both")
+    return Ask(
+        track_id=track,
+        box_xywh_px=(given[0], given[1], given[2], given[3]) if given else None,
+        frame_index=frame,
+        ago_ms=None if at_ms is None else -at_ms,
+        quality_pct=quality_pct,
+    )
+
+
+class _Reader:
+    """Takes a command's arguments one by one; what is left at the end is one too many."""
+
+    def __init__(self, command: str, arguments: Arguments) -> None:
+        self._command = command
+        self._left: dict[str, Any] = dict(arguments)
+
+    def optional(self, name: str, low: int, high: int) -> int | None:
+        """A whole number within the bounds; None where it is not given."""
+        value = self._left.pop(name, None)
+        if value is None:
+            return None
+        if not isinstance(value, int | float) or not math.isfinite(value) or not low <= value <= high:
+            raise RefusedError(
+                f"{self._command}: {name} is a whole number from {low} to {high}, not {value!r:.24}"
+            )
+        return int(value)
+
+    def needed(self, name: str, low: int, high: int) -> int:
+        """As `optional`, and must be given."""
+        value = self.optional(name, low, high)
+        if value is None:
+            raise RefusedError(f"{self._command}: {name} is missing")
+        return value
+
+    def text(self, name: str) -> str:
+        """A word that must be given."""
+        value = self._left.pop(name, None)
+        if not isinstance(value, str):
+            raise RefusedError(f"{self._command}: {name} is missing, or not a word")
+        return value
+
+    def end(self) -> None:
+        """Refuse what was not taken."""
+        if self._left:
+            raise RefusedError(f"{self._command} takes no {next(iter(self._left))!r:.24}")

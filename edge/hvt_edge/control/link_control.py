@@ -1,0 +1,123 @@
+"""What the link carries, decided in one place: pace, rate, what is sent again, and what is kept for later."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from hvt_common.protocol.messages import Feedback
+from hvt_common.values import Still
+from hvt_edge.backlog.stage import Keep, Stills
+from hvt_edge.config import EdgeConfig
+from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.unacknowledged import Unacknowledged
+from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.video.reconfigure import Renewal
+
+__all__ = ["LinkFollower", "wait_for_ground"]
+
+_MOST_WAIT_NS = 100_000_000
+"""A frame that would wait longer for the budget's window is dropped before it is encoded."""
+
+
+class LinkFollower:
+    """One for each run: `hear` in the link's thread, `overdue_stills` in the stills', all else in the frame loop.
+
+    ``pacer`` is None without ``--adapt``, ``unacked`` in lockstep: when reports come must not decide there on what is
+    sent. `attach` before the first frame; reports may come before that.
+    """
+
+    def __init__(
+        self, pacer: Pacer | None, unacked: Unacknowledged | None, *, keyframes: KeyframePlan
+    ) -> None:
+        self.pacer = pacer
+        self.unacked = unacked
+        self.keep: Keep | None = None
+        """Who keeps what the link cannot carry away; None where nobody does."""
+        self._keyframes = keyframes
+        self._linked: Callable[[], bool] = lambda: False
+        self._sender: Sender | None = None
+        self._renewal: Renewal | None = None
+
+    def attach(
+        self,
+        *,
+        linked: Callable[[], bool],
+        sender: Sender,
+        renewal: Renewal,
+        stills: Stills,
+        keep: Keep | None,
+    ) -> None:
+        """What it decides for. ``linked()`` tells whether a ground listens."""
+        self._linked, self._sender, self._renewal, self.keep = linked, sender, renewal, keep
+        if keep is not None:
+            keep.attend(stills)
+
+    def before_frame(self, now_ns: int) -> None:
+        """What the link carries decides on budget, base rate, keyframe, and on whether anything is sent at all."""
+        linked = self._linked()
+        away = self.keep is not None and self.keep.follow(now_ns, linked=linked)
+        if self.pacer is None:
+            return
+        back = self.pacer.link(linked, now_ns=now_ns)
+        assert self._renewal is not None, "attached before the first frame"
+        if away:  # what is kept keeps the quality that the link had
+            self._renewal.hold(now_ns)
+        if away or not linked:  # nothing is carried anywhere
+            return
+        if self._renewal.follow(now_ns) or back:
+            self._keyframes.renew(now_ns)
+
+    def admits(self, now_ns: int) -> bool:
+        """Whether a frame may be coded now; what is held back would only wait and grow old."""
+        if self.pacer is None:
+            return True
+        assert self._sender is not None, "attached before the first frame"
+        return self.pacer.admits_base(now_ns) and self._sender.base_wait_ns(now_ns) <= _MOST_WAIT_NS
+
+    def text(self) -> str:
+        """What is kept, for the status line; empty where nothing is."""
+        return "" if self.keep is None else self.keep.text()
+
+    def finish(self, *, stop: threading.Event, note: Callable[[str], None]) -> None:
+        """After the last frame of a recorded source: send what was kept."""
+        if self.keep is not None:
+            self.keep.finish(follow=self._after_last, stop=stop, note=note)
+
+    def _after_last(self, now_ns: int) -> None:
+        self.before_frame(now_ns)
+        self.admits(now_ns)  # which gives up what is lost: nothing else would, without frames
+
+    def hear(self, feedback: Feedback, *, now_ns: int) -> None:
+        """A ground reports on this session (any thread)."""
+        self._keyframes.note_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)
+        if self.pacer is not None:
+            self.pacer.hear(feedback, now_ns=now_ns)
+        if self.unacked is not None:
+            self.unacked.hear(feedback, now_ns=now_ns)
+        if self.keep is not None:
+            self.keep.hear(feedback, now_ns=now_ns)
+
+    def overdue_stills(self, now_ns: int) -> Sequence[tuple[Still, float]]:
+        """Stills that seem to be lost, with their utility, most useful first."""
+        if self.unacked is None:
+            return ()
+        round_trip_ns = 0 if self.pacer is None else self.pacer.round_trip_ns
+        return self.unacked.overdue_stills(now_ns, round_trip_ns=round_trip_ns)
+
+
+def wait_for_ground(
+    linked: Callable[[], bool], config: EdgeConfig, *, stop: threading.Event, note: Callable[[str], None]
+) -> None:
+    """Until somebody listens, or for ``--wait``: a recorded source can wait for its audience."""
+    if linked():
+        return
+    deadline_s = time.monotonic() + config.wait
+    note(f"{config.edge_id}: waiting up to {config.wait:g} s for a ground (--wait)")
+    while not linked() and not stop.is_set():
+        if time.monotonic() >= deadline_s:
+            note(f"{config.edge_id}: no ground yet; playing on, one may join at any time")
+            return
+        stop.wait(0.02)

@@ -1,0 +1,106 @@
+"""What grounds report back, in the order and at the pace in which the edge takes it in."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+from hvt_common.protocol.messages import Feedback, StillResult
+
+__all__ = ["FeedbackInbox"]
+
+_MAX_RESULTS = 1024
+
+
+class FeedbackInbox:
+    """Filled from Zenoh's callback, emptied by the frame loop.
+
+    In real time results are taken as they come. In lockstep the loop waits until the ground has done with frame
+    ``n - k`` and all stills of it, and takes exactly those: when a result counts follows from the input alone, and
+    the same input gives the same stills.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._results: deque[StillResult] = deque(maxlen=_MAX_RESULTS)
+        self._last_frame_index = -1
+        self._answered: dict[int, None] = {}  # in the order in which they came
+        self._known: dict[tuple[int, int, bool], None] = {}
+        self._done_sequence = -1
+        self._base_messages = 0
+        self._roi_messages = 0
+        self.received_ns: int | None = None
+        """When the last report came, this side's clock."""
+
+    def receive(self, feedback: Feedback, *, now_ns: int) -> None:
+        """Take in one report (any thread)."""
+        with self._changed:
+            self.received_ns = now_ns
+            self._last_frame_index = max(self._last_frame_index, feedback.last_frame_index)
+            self._base_messages = max(self._base_messages, feedback.base_messages)
+            self._roi_messages = max(self._roi_messages, feedback.roi_messages)
+            for result in feedback.stills:
+                self._note(result)
+            # A ground may answer what was never asked.
+            while len(self._answered) > 2 * _MAX_RESULTS:
+                del self._answered[next(iter(self._answered))]
+            while len(self._known) > 2 * _MAX_RESULTS:
+                del self._known[next(iter(self._known))]
+            self._changed.notify_all()
+
+    def _note(self, result: StillResult) -> None:
+        """Keep a result that is news: one for each track of a still, and one that asks for the still again.
+
+        What one ground could not show another may have classified, so an opinion does not silence a request.
+        """
+        sequence = result.still_sequence
+        key = (sequence, -1 if result.again else result.track_id, result.again)
+        if sequence > self._done_sequence and key not in self._known:
+            self._known[key] = self._answered[sequence] = None
+            self._results.append(result)
+
+    def take(self) -> list[StillResult]:
+        """Return and forget all results so far."""
+        with self._changed:
+            results = list(self._results)
+            self._results.clear()
+            return results
+
+    def take_up_to(self, sequence: int) -> list[StillResult]:
+        """Return and forget the results of stills up to this one, in their order; more for these come too late."""
+        with self._changed:
+            self._done_sequence = max(self._done_sequence, sequence)
+            self._answered = dict.fromkeys(one for one in self._answered if one > self._done_sequence)
+            self._known = dict.fromkeys(one for one in self._known if one[0] > self._done_sequence)
+            ready = sorted(
+                (one for one in self._results if one.still_sequence <= sequence),
+                key=lambda one: (one.still_sequence, one.again, one.track_id),
+            )
+            self._results = deque(
+                (one for one in self._results if one.still_sequence > sequence), maxlen=_MAX_RESULTS
+            )
+            return ready
+
+    def wait_for(self, *, frame_index: int, stills: set[int], timeout_s: float) -> bool:
+        """Wait until a ground is done with this frame and has answered these stills; False after the time-out."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._last_frame_index >= frame_index and stills <= self._answered.keys(), timeout_s
+            )
+
+    def wait_for_end(
+        self, *, base: int, roi: int, frame_index: int, still_sequence: int, timeout_s: float
+    ) -> bool:
+        """Wait until a ground has all there is; False after the time-out.
+
+        Either it has received so many messages of each, or, where it joined late, it is done with this frame and has
+        answered this still (-1 for none).
+        """
+
+        def complete() -> bool:
+            counted = self._base_messages >= base and self._roi_messages >= roi
+            answered = still_sequence < 0 or still_sequence in self._answered
+            return counted or (self._last_frame_index >= frame_index >= 0 and answered)
+
+        with self._changed:
+            return self._changed.wait_for(complete, timeout_s)

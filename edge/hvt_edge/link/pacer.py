@@ -1,0 +1,316 @@
+"""What is on its way and not yet reported, and whether more may follow: no queue is to stand in kernel or router.
+
+A message is expected to be reported when a link of the present rate would have carried it and all before it (the
+*own time*), a round trip and a report later. While one is overdue, or while more than `_MOST_BACKLOG_NS` of own bytes
+wait for such a link, frames are dropped before they are encoded, and stills wait. So after an outage the picture is
+live at once: there is nothing to catch up with.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+from hvt_common.protocol.messages import Feedback
+from hvt_edge.link.rate_control import LeastDelay, Progress, RateController
+from hvt_edge.link.receivers import Followed
+
+__all__ = ["Flight", "Pacer"]
+
+_MS = 1_000_000
+_SECOND_NS = 1_000_000_000
+_MOST_BACKLOG_NS = 250 * _MS
+_STILL_BACKLOG_NS = 50 * _MS
+"""A still goes when what was sent before it has (nearly) left: the next base frame finds the link free."""
+_SLACK_NS = 75 * _MS
+_LEAST_HELD_NS, _FIRST_HELD_NS, _MOST_HELD_NS = 50 * _MS, 150 * _MS, 300 * _MS
+_GIVEN_UP_NS = _SECOND_NS
+"""A message so long overdue is lost, if reports come and name none newer for as long."""
+_SILENCE_NS = 2 * _SECOND_NS
+_PROBE_NS = _SECOND_NS
+"""In silence one frame goes out in so long: a ground that has forgotten the session hears nothing else."""
+_START_NS, _START_HOLD_NS = _SECOND_NS // 2, 2 * _SECOND_NS
+"""So much goes out from a keyframe on before the first report; then it is waited for, so long. A thin link that is
+overrun at once does not let the ground ask what the session is. Who never reports gets everything after that."""
+_FORGET_NS = 15 * _SECOND_NS
+"""A receiver so long silent has left, where Zenoh still has the link: its lease is shorter."""
+_MOST_RECORDS = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """One base message on its way."""
+
+    sequence: int
+    sent_ns: int
+    own_ns: int
+    """From sending until it has left, on a link of the present rate."""
+    line_bytes: int
+    up_to_bytes: int
+    """Line bytes of everything sent so far, this message included."""
+    messages: int
+    """Base messages sent so far."""
+
+
+class Flight:
+    """The account of what is on its way. Pure: time is an argument; bounded in memory."""
+
+    def __init__(self) -> None:
+        self._base: deque[Sent] = deque(maxlen=_MOST_RECORDS)
+        self._stills: deque[tuple[int, int, int]] = deque(maxlen=_MOST_RECORDS)
+        """(sequence, time of sending, line bytes)."""
+        self._backlog_bytes = 0.0
+        self._drained_ns = 0
+        self._total_bytes = 0
+        self._messages = 0
+        self._last = (-1, -1)
+
+    @property
+    def oldest(self) -> Sent | None:
+        """The base message that has been on its way for longest."""
+        return self._base[0] if self._base else None
+
+    @property
+    def size_bytes(self) -> int:
+        """Line bytes of base and stills that no report has named yet."""
+        return sum(one.line_bytes for one in self._base) + sum(size for _, _, size in self._stills)
+
+    def sent_base(self, sequence: int, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
+        """A base message goes out."""
+        self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
+        self._messages += 1
+        self._last = (sequence, self._last[1])
+        own_ns = self.backlog_ns(now_ns=now_ns, rate_bps=rate_bps)
+        self._base.append(Sent(sequence, now_ns, own_ns, line_bytes, self._total_bytes, self._messages))
+
+    def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
+        """A still goes out."""
+        self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
+        self._last = (self._last[0], sequence)
+        self._stills.append((sequence, now_ns, line_bytes))
+
+    def sent_other(self, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
+        """A message goes out that no report names."""
+        self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
+
+    def backlog_ns(self, *, now_ns: int, rate_bps: int) -> int:
+        """How long a link of this rate has still to do with what was sent."""
+        self._drain(now_ns, rate_bps)
+        return round(8 * _SECOND_NS * self._backlog_bytes / rate_bps)
+
+    def acknowledge(self, base_sequence: int, still_sequence: int) -> Sent | None:
+        """Take off what has arrived; return the newest base message of it, None where there is none.
+
+        Messages before it have arrived too or are lost. Numbers that were never sent mean nothing.
+        """
+        if base_sequence > self._last[0] or still_sequence > self._last[1]:
+            return None
+        newest: Sent | None = None
+        while self._base and self._base[0].sequence <= base_sequence:
+            newest = self._base.popleft()
+        latest_ns = -(2**63) if newest is None else newest.sent_ns - 2 * _SECOND_NS
+        while self._stills and (self._stills[0][0] <= still_sequence or self._stills[0][1] < latest_ns):
+            self._stills.popleft()
+        self._backlog_bytes = min(self._backlog_bytes, self.size_bytes)
+        return newest
+
+    def refill(self) -> None:
+        """The link is slower than was thought: all that is not reported still waits."""
+        self._backlog_bytes = max(self._backlog_bytes, self.size_bytes)
+
+    def clear(self) -> None:
+        """What is on its way is lost."""
+        self._base.clear()
+        self._stills.clear()
+        self._backlog_bytes = 0.0
+
+    def _add(self, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
+        self._drain(now_ns, rate_bps)
+        self._backlog_bytes += line_bytes
+        self._total_bytes += line_bytes
+
+    def _drain(self, now_ns: int, rate_bps: int) -> None:
+        # Two threads send, with times that may differ a little: never back.
+        elapsed_ns = max(0, now_ns - self._drained_ns)
+        self._drained_ns = max(self._drained_ns, now_ns)
+        self._backlog_bytes = max(0.0, self._backlog_bytes - rate_bps * elapsed_ns / 8 / _SECOND_NS)
+
+
+class Pacer:
+    """Hears reports, keeps the rate, and says what may go. Thread-safe; time is an argument.
+
+    It follows one receiver (`hvt_edge.link.receivers`): the pace of one that is itself badly connected must not be
+    everybody's.
+    """
+
+    def __init__(self, controller: RateController) -> None:
+        self._controller = controller
+        self._flight = Flight()
+        self._lock = threading.Lock()
+        self._followed = Followed()
+        self._held_ns = _FIRST_HELD_NS
+        self._round_trip = LeastDelay(15 * _SECOND_NS)
+        self._round_trip_ns = _SECOND_NS // 2
+        self._last_sent_ns = 0
+        self._linked: bool | None = None
+        self._started_ns: int | None = None
+        """When the first keyframe went out since somebody is there."""
+        self.ignored = 0
+        """Reports that were old, of another receiver, or named what was never sent."""
+
+    @property
+    def rate_bps(self) -> int:
+        """The total that may be sent, line bits a second."""
+        return self._controller.rate_bps
+
+    @property
+    def steady_bps(self) -> int:
+        """The rate that x265 should be opened for a share of."""
+        return self._controller.steady_bps
+
+    @property
+    def round_trip_ns(self) -> int:
+        """From sending to hearing of it, at its shortest; half a second until one was measured."""
+        return self._round_trip_ns
+
+    @property
+    def settled(self) -> bool:
+        """Whether the rate is the ceiling."""
+        return self._controller.settled
+
+    @property
+    def backoffs(self) -> int:
+        """How often the rate was lowered."""
+        return self._controller.backoffs
+
+    def set_ceiling(self, ceiling_bps: int, *, floor_bps: int | None = None) -> None:
+        """Another ``--budget``, while running; ``floor_bps`` is the ``--min-budget`` that goes with it."""
+        with self._lock:
+            self._controller.set_ceiling(ceiling_bps, floor_bps=floor_bps)
+
+    # What goes out
+
+    def sent_base(self, sequence: int, line_bytes: int, *, now_ns: int, keyframe: bool = False) -> None:
+        """A base message goes out."""
+        with self._lock:
+            self._last_sent_ns = now_ns
+            if keyframe and self._started_ns is None:
+                self._started_ns = now_ns
+            self._flight.sent_base(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
+
+    def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int) -> None:
+        """A still goes out."""
+        with self._lock:
+            self._flight.sent_still(sequence, line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
+
+    def sent_other(self, line_bytes: int, *, now_ns: int) -> None:
+        """Status, tracks or a still that was sent before go out: no report tells of it."""
+        with self._lock:
+            self._flight.sent_other(line_bytes, now_ns=now_ns, rate_bps=self.rate_bps)
+
+    # What comes back
+
+    def hear(self, feedback: Feedback, *, now_ns: int) -> None:
+        """Take in one report of this session."""
+        with self._lock:
+            if not self._follow(feedback, now_ns):
+                self.ignored += 1
+                return
+            sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
+            if sent is None:
+                return
+            self._note_times(sent, 1000 * feedback.base_held_us, now_ns)
+            backoffs = self.backoffs
+            self._controller.on_progress(
+                Progress(
+                    now_ns=now_ns,
+                    sent_ns=sent.sent_ns,
+                    arrived_ns=feedback.send_ns - 1000 * feedback.base_held_us,
+                    own_ns=sent.own_ns,
+                    arrived_bytes=sent.up_to_bytes,
+                    messages=sent.messages,
+                    lost=feedback.lost,
+                )
+            )
+            if self.backoffs > backoffs:
+                self._flight.refill()
+
+    def link(self, there: bool, *, now_ns: int) -> bool:  # noqa: FBT001 - it is the news itself
+        """Whether anybody can be reached at all; True where that has just come back."""
+        with self._lock:
+            before, self._linked = self._linked, there
+            if there and not before:
+                self._started_ns = None
+            if before and not there:
+                self._flight.clear()
+                if self._followed.receiver_id is not None:
+                    self._controller.on_silence(now_ns)
+                self._leave()
+            return before is False and there and self.backoffs > 0
+
+    # What may go
+
+    def admits_base(self, now_ns: int) -> bool:
+        """Whether a frame may be encoded and sent now."""
+        with self._lock:
+            if self._followed.receiver_id is None:
+                return self._may_start(now_ns)
+            if now_ns - self._followed.heard_ns > _FORGET_NS and self._linked:
+                self._leave()
+                self._controller.forget_silence()
+                return True
+            if now_ns - self._followed.heard_ns > _SILENCE_NS:
+                self._controller.on_silence(now_ns)
+                return now_ns - self._last_sent_ns >= _PROBE_NS
+            if min(self._overdue_ns(now_ns), now_ns - self._followed.progress_ns) > _GIVEN_UP_NS:
+                self._controller.on_silence(now_ns)
+                self._flight.clear()
+            return self._is_open(now_ns, _MOST_BACKLOG_NS)
+
+    def admits_still(self, now_ns: int) -> bool:
+        """Whether a still may go now."""
+        with self._lock:
+            if self._followed.receiver_id is None:
+                return self._may_start(now_ns)
+            return now_ns - self._followed.heard_ns <= _SILENCE_NS and self._is_open(
+                now_ns, _STILL_BACKLOG_NS
+            )
+
+    def _may_start(self, now_ns: int) -> bool:
+        if not self._linked or self._started_ns is None:
+            return True  # nothing is known, or nothing leaves
+        return not _START_NS <= now_ns - self._started_ns < _START_NS + _START_HOLD_NS
+
+    def _is_open(self, now_ns: int, most_backlog_ns: int) -> bool:
+        slack_ns = _SLACK_NS + 5 * self._held_ns // 4
+        backlog_ns = self._flight.backlog_ns(now_ns=now_ns, rate_bps=self.rate_bps)
+        return backlog_ns <= most_backlog_ns and self._overdue_ns(now_ns) <= slack_ns
+
+    def _overdue_ns(self, now_ns: int) -> int:
+        oldest = self._flight.oldest
+        return 0 if oldest is None else now_ns - oldest.sent_ns - oldest.own_ns - self._round_trip_ns
+
+    def _follow(self, feedback: Feedback, now_ns: int) -> bool:
+        """Whether this report is the newest of the receiver that counts."""
+        kind = self._followed.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns)
+        if kind == "first":
+            self._forget_path()
+        return kind is not None
+
+    def _leave(self) -> None:
+        self._followed.forget()
+        self._forget_path()
+
+    def _forget_path(self) -> None:
+        self._held_ns = _FIRST_HELD_NS
+        self._round_trip = LeastDelay(15 * _SECOND_NS)
+        self._round_trip_ns = _SECOND_NS // 2
+        self._controller.forget_path()
+
+    def _note_times(self, sent: Sent, held_ns: int, now_ns: int) -> None:
+        # Quickly up, slowly down: what is expected is the longest of the usual.
+        held_ns = min(max(held_ns, _LEAST_HELD_NS), _MOST_HELD_NS)
+        self._held_ns = max((9 * self._held_ns + held_ns) // 10, min(held_ns, 2 * self._held_ns))
+        self._followed.note_progress(now_ns)
+        self._round_trip_ns = self._round_trip.add(max(0, now_ns - sent.sent_ns), now_ns=now_ns)

@@ -1,0 +1,98 @@
+"""The tracks channel at the edge: which steps are told to the ground, and which tracks of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
+
+import numpy as np
+
+from hvt_common.protocol.messages import TrackStepEncoder
+from hvt_common.values import Tracks
+from hvt_edge.perception.analyzer import Seen
+
+__all__ = ["TrackReportSettings", "TrackReporter", "TrackSender"]
+
+_SECOND_NS: Final = 1_000_000_000
+_EARLY: Final = 0.95
+"""Steps come a little early or late: one that is due nearly is due."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackReportSettings:
+    """How much is told."""
+
+    most_per_s: float = 3.0
+    """Steps a second of capture time at most."""
+    most_bps: int = 12_000
+    """Payload bits a second at most: in a crowd steps come less often."""
+    fresh_frames: int = 5
+    """A track whose last detection is older than so many ticks is left out."""
+    refresh_ns: int = _SECOND_NS
+    """So often, in capture time, a step stands by itself: a lost one hurts no longer."""
+
+
+class TrackSender(Protocol):
+    """Where steps go: `hvt_edge.link.transmitter.Sender`."""
+
+    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
+        """Send ``make(at_ns)``, made for the moment at which the budget has room; by that a few bytes may differ."""
+        ...
+
+
+class TrackReporter:
+    """Tells the ground of the tracks at decision steps."""
+
+    def __init__(
+        self, sender: TrackSender, *, session_id: int, settings: TrackReportSettings = TrackReportSettings()
+    ) -> None:
+        self._sender = sender
+        self._settings = settings
+        self._encoder = TrackStepEncoder(session_id=session_id, refresh_ns=settings.refresh_ns)
+        self._last_ns: int | None = None
+        self._last_bytes = 0
+        self.steps = 0
+        """Sent so far."""
+        self.boxes = 0
+
+    def report(self, seen: Seen, *, now_ns: int) -> bool:
+        """Send this step's tracks if it is a decision step and one is due; tell whether it was sent.
+
+        A step without tracks is sent too: that nothing is there is news. ``now_ns`` is the time windows go by.
+        """
+        capture_ns = seen.frame.capture_ns
+        if not seen.detected or not self._due(capture_ns):
+            return False
+        self._last_ns = capture_ns
+        tracks = _fresh(seen.tracks, most_frames=self._settings.fresh_frames)
+        step = self._encoder.encode(tracks, capture_ns=capture_ns)
+        self._last_bytes = len(step.pack())
+        self._sender.tracks(
+            lambda at_ns: replace(step, send_delay_ns=at_ns - capture_ns).pack(), now_ns=now_ns
+        )
+        self.steps += 1
+        self.boxes += len(tracks)
+        return True
+
+    def _due(self, capture_ns: int) -> bool:
+        if self._last_ns is None:
+            return True
+        pause_s = max(1 / self._settings.most_per_s, 8 * self._last_bytes / self._settings.most_bps)
+        return capture_ns - self._last_ns >= _SECOND_NS * pause_s * _EARLY
+
+
+def _fresh(tracks: Tracks, *, most_frames: int) -> Tracks:
+    kept = np.flatnonzero(tracks.frame_index - tracks.seen_frames <= most_frames)
+    if len(kept) == len(tracks):
+        return tracks
+    return Tracks(
+        frame_index=tracks.frame_index,
+        ids=tracks.ids[kept],
+        boxes_xyxy_px=tracks.boxes_xyxy_px[kept],
+        confidences=tracks.confidences[kept],
+        class_ids=tracks.class_ids[kept],
+        born_frames=tracks.born_frames[kept],
+        seen_frames=tracks.seen_frames[kept],
+        started=tracks.started[kept],
+    )

@@ -1,0 +1,380 @@
+"""The one place where bytes leave the edge: header, ledger and budget of every message in one step.
+
+Thread-safe: base frames and stills may come from two threads. ``now_ns`` is the time that windows go by: the wall
+clock in real time, media time in lockstep, so that the same input gives the same stills. It is also the time of
+sending that goes on the wire, so that the ground's ledger sees the very same windows.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row
+from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.protocol.messages import (
+    AlsoShown,
+    BaseHeader,
+    Flags,
+    PastHeader,
+    PastStill,
+    RoiHeader,
+    Status,
+    fitted_text,
+)
+from hvt_common.values import AccessUnit, Still
+from hvt_edge.backlog.backfill import Piece
+from hvt_edge.link.budget import RollingBudget
+from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.unacknowledged import Unacknowledged
+
+__all__ = [
+    "BASE_ATTACHMENT_BYTES",
+    "PLAIN_ENCODING",
+    "STATUS_BYTES",
+    "STILL_ATTACHMENT_BYTES",
+    "Outlet",
+    "Sender",
+    "base_overhead_bps",
+]
+
+BASE_ATTACHMENT_BYTES = 48
+"""What a `BaseHeader` takes at most."""
+STILL_ATTACHMENT_BYTES = 100
+"""About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
+`Sender.still_room_bytes` of one that is counts its own header."""
+STATUS_BYTES = 320
+"""What a `Status` takes."""
+PAST_ATTACHMENT_BYTES = 48
+"""What a `PastHeader` takes at most."""
+_LEAST_PIECE_BYTES, _MOST_PIECE_BYTES = 1_000, 12_000
+_PIECE_S = 0.05
+"""So long the link is busy with a piece at most, so that a frame or a live still need not wait for it."""
+_SECOND_NS = 1_000_000_000
+_GROWTH_BYTES = 16
+"""By how much metadata may grow when it is made for a later moment: its two times."""
+
+
+PLAIN_ENCODING = "application/octet-stream"
+"""Of formats that only HVT reads; one byte on the wire."""
+_OWN_TYPES = "application/vnd.hvt."
+
+
+class Outlet(Protocol):
+    """Where bytes go: the link, or in the study nowhere."""
+
+    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+        """Hand over one message; may block while the link is full."""
+        ...
+
+
+def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
+    """What headers, framing and ``status`` take of ``base_bps``: the encoder gets the rest."""
+    payload = round(base_bps / 8 / fps)
+    key = EdgeKeys(edge_id).key(Row.BASE)
+    encoding = DELIVERIES[Row.BASE].encoding
+    per_frame = BASE_ATTACHMENT_BYTES + overhead_bytes(
+        payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding
+    )
+    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Row.STATUS))
+    return 8 * (per_frame * fps + per_second)
+
+
+def _encoding(still: Still) -> str:
+    """What Zenoh is told of the payload: its media type, if there is any program beside HVT that could read it.
+
+    Spelling a type of our own out would cost up to 34 bytes a still, and the header names the codec anyway.
+    """
+    return PLAIN_ENCODING if still.media_type.startswith(_OWN_TYPES) else still.media_type
+
+
+class Sender:
+    """Sends access units, stills, tracks and status, and accounts for each.
+
+    ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` is told of all
+    that goes out, and holds stills while the link is busy. ``unacked`` keeps what no report has named yet.
+    """
+
+    def __init__(
+        self,
+        outlet: Outlet,
+        *,
+        ledger: Ledger,
+        budget: RollingBudget,
+        edge_id: str,
+        session_id: int,
+        lockstep: bool,
+        wait_until: Callable[[int], None],
+        pacer: Pacer | None = None,
+        unacked: Unacknowledged | None = None,
+    ) -> None:
+        self._outlet = outlet
+        self._pacer = pacer
+        self._unacked = unacked
+        self._ledger = ledger
+        self._budget = budget
+        self._keys = EdgeKeys(edge_id)
+        self._session_id = session_id
+        self._flags = Flags.LOCKSTEP if lockstep else Flags(0)
+        self._wait_until = wait_until
+        self._lock = threading.Lock()
+        self.base_sequence = -1
+        """Of the last access unit sent; -1 before the first."""
+        self.still_sequence = -1
+
+    def base(self, unit: AccessUnit, *, now_ns: int, after_hole: bool = False) -> int:
+        """Send one access unit as soon as the budget's window has room for it; return its line bytes.
+
+        ``after_hole``: frames that it builds on were not sent. A number is left out, so that nobody shows it.
+        """
+        line_bytes = self._line_bytes(Row.BASE, unit.data, BASE_ATTACHMENT_BYTES)
+        with self._lock:
+            at_ns = self._budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
+            self.base_sequence += 2 if after_hole else 1
+            header = BaseHeader(
+                session_id=self._session_id,
+                sequence=self.base_sequence,
+                frame_index=unit.frame_index,
+                capture_ns=unit.capture_ns,
+                send_delay_ns=at_ns - unit.capture_ns,
+                flags=self._flags | ((Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0),
+            )
+            attachment = header.pack(unit.data)
+            line_bytes = self._count(Row.BASE, Channel.BASE, unit.data, attachment, at_ns=at_ns)
+            self._budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
+            if self._pacer is not None:
+                self._pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
+            if self._unacked is not None:
+                self._unacked.sent_base(self.base_sequence, unit, now_ns=at_ns)
+        self._wait_until(at_ns)
+        self._outlet.put(Row.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Row.BASE].encoding)
+        return line_bytes
+
+    def still_room_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
+        """Payload that a still with the header of this one may take now, whatever data it holds itself.
+
+        True to the byte: all that differs between still and still is counted (names, parameters, further tracks,
+        media type). Without a still it is an estimate for one with the usual names. Not ``paced`` it is what the
+        budget has room for, whether or not the link is free at this moment.
+        """
+        with self._lock:
+            room = self._budget.still_room(now_ns)
+        if paced and self._pacer is not None and not self._pacer.admits_still(now_ns):
+            return 0
+        if still is None:
+            return self._payload_bytes(room, STILL_ATTACHMENT_BYTES, DELIVERIES[Row.ROI].encoding)
+        attachment_bytes = len(self._still_header(still, send_ns=now_ns).pack())
+        return self._payload_bytes(room, attachment_bytes, _encoding(still))
+
+    def most_still_bytes(self) -> int:
+        """About the payload of the largest still that the budget ever admits."""
+        return self._payload_bytes(
+            self._budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Row.ROI].encoding
+        )
+
+    def still(self, still: Still, *, now_ns: int, utility: float = 0.0) -> None:
+        """Send one still that `still_room_bytes` admitted at this very time; of one sent before, a second copy.
+
+        Where another thread has taken the room since, it waits until there is room again, as everything does.
+        """
+        encoding = _encoding(still)
+        with self._lock:
+            again = still.sequence <= self.still_sequence
+            self.still_sequence = max(self.still_sequence, still.sequence)
+            at_ns = self._still_at_ns(still, encoding, now_ns)
+            attachment = self._still_header(still, send_ns=at_ns).pack(still.data)
+            line_bytes = self._count(
+                Row.ROI, Channel.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
+            )
+            self._budget.record_still(line_bytes, now_ns=at_ns)
+            if self._pacer is not None and again:  # its number stands for the first copy, or for later stills
+                self._pacer.sent_other(line_bytes, now_ns=at_ns)
+            elif self._pacer is not None:
+                self._pacer.sent_still(still.sequence, line_bytes, now_ns=at_ns)
+            if self._unacked is not None:
+                self._unacked.sent_still(still, utility=utility, now_ns=at_ns)
+        self._wait_until(at_ns)
+        self._outlet.put(Row.ROI, still.data, attachment=attachment, encoding=encoding)
+
+    def kept_base(self, unit: AccessUnit, *, now_ns: int) -> None:
+        """An access unit is kept for later: it has used up its share, and left nothing of it to a still."""
+        line_bytes = self._line_bytes(Row.BASE, unit.data, BASE_ATTACHMENT_BYTES)
+        with self._lock:
+            self._budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, kept=True)
+
+    def kept_still(self, still: Still, *, now_ns: int, counted: bool = True) -> PastStill:
+        """The still as it would have gone out, for the store; ``counted``: its share of the budget is taken."""
+        header = self._still_header(still, send_ns=now_ns, stored=True)
+        attachment, encoding = header.pack(still.data), _encoding(still)
+        if counted:
+            line_bytes = self._line_bytes(Row.ROI, still.data, len(attachment), encoding=encoding)
+            with self._lock:
+                self._budget.record_still(line_bytes, now_ns=now_ns)
+        return PastStill(attachment, encoding, still.data)
+
+    @property
+    def unacked(self) -> Unacknowledged | None:
+        """What no report has named yet."""
+        return self._unacked
+
+    @property
+    def round_trip_ns(self) -> int:
+        """Of the link; half a second where it is not measured."""
+        return _SECOND_NS // 2 if self._pacer is None else self._pacer.round_trip_ns
+
+    @property
+    def total_bps(self) -> int:
+        """The budget as it is now."""
+        return self._budget.total_bps
+
+    def past_room_bytes(self, now_ns: int, *, reserve: float) -> int:
+        """Payload that a piece of what was kept may have now; ``reserve``: see `RollingBudget.past_room`."""
+        with self._lock:
+            room = self._budget.past_room(now_ns, reserve=reserve)
+        if self._pacer is not None and not self._pacer.admits_still(now_ns):
+            return 0
+        around = PAST_ATTACHMENT_BYTES + overhead_bytes(
+            room, PAST_ATTACHMENT_BYTES, key=self._keys.key(Row.PAST), encoding=DELIVERIES[Row.PAST].encoding
+        )
+        most = min(_MOST_PIECE_BYTES, max(_LEAST_PIECE_BYTES, round(_PIECE_S * self.total_bps / 8)))
+        return min(most, max(0, room - around))
+
+    def past(self, piece: Piece, *, now_ns: int) -> int:
+        """Send a piece that `past_room_bytes` admitted at this very time; return its line bytes.
+
+        0: another thread has taken the room since, and it was not sent.
+        """
+        header = PastHeader(
+            session_id=piece.session_id,
+            kind=piece.kind,
+            number=piece.number,
+            offset=piece.offset,
+            total_bytes=piece.total_bytes,
+            send_ns=now_ns,
+        )
+        attachment = header.pack(piece.data)
+        with self._lock:
+            wanted_bytes = self._line_bytes(Row.PAST, piece.data, len(attachment))
+            if wanted_bytes > self._budget.past_room(now_ns, reserve=0.0):
+                return 0
+            line_bytes = self._count(Row.PAST, Channel.PAST, piece.data, attachment, at_ns=now_ns)
+            self._budget.record_past(line_bytes, now_ns=now_ns)
+            if self._pacer is not None:
+                self._pacer.sent_other(line_bytes, now_ns=now_ns)
+        self._outlet.put(Row.PAST, piece.data, attachment=attachment, encoding=DELIVERIES[Row.PAST].encoding)
+        return line_bytes
+
+    def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
+        """Send the edge's own tracks of one decision step, made for the moment at which they may go."""
+        self._metadata(Row.TRACKS, make, now_ns=now_ns)
+
+    def status(self, make: Callable[[int], Status], *, now_ns: int) -> None:
+        """Send the once-a-second report, made for the moment at which it may go.
+
+        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment.
+        """
+        self._metadata(Row.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns)
+
+    def set_base(self, base_bps: int, fps: float, *, now_ns: int) -> None:
+        """The base stream's share of the budget and its rate of frames, from the keyframe that comes next."""
+        with self._lock:
+            self._budget.set_base(base_bps, fps, now_ns=now_ns)
+
+    def set_total(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
+        """The total budget from now on; see `RollingBudget.set_total`."""
+        with self._lock:
+            self._budget.set_total(total_bps, base_bps, fps, now_ns=now_ns)
+
+    def base_wait_ns(self, now_ns: int) -> int:
+        """How long an average base frame would wait for the budget's window, were it sent now."""
+        with self._lock:
+            line_bytes = round(self._budget.base_step_bytes)
+            return max(0, self._budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
+
+    def takes_ns(self, line_bytes: int) -> int:
+        """How long so many line bytes take the whole budget."""
+        with self._lock:
+            return 8 * _SECOND_NS * line_bytes // self._budget.total_bps
+
+    def keyframe_fits(self, line_bytes: int, *, now_ns: int) -> bool:
+        """Tell whether a keyframe of so many line bytes leaves the budget whole."""
+        with self._lock:
+            return self._budget.keyframe_fits(line_bytes, now_ns=now_ns)
+
+    def fate(self, fate: str, reason: str) -> None:
+        """Note what became of a candidate: ``sent``, ``deferred`` or ``dropped``, and why."""
+        assert fate in ("sent", "deferred", "dropped")
+        with self._lock:
+            self._ledger.record_fate(fate, reason)  # type: ignore[arg-type]
+
+    def _metadata(self, row: Row, make: Callable[[int], bytes], *, now_ns: int) -> None:
+        """Send what belongs to neither stream as soon as the budget's window has room for it."""
+        with self._lock:
+            size_bytes = _GROWTH_BYTES + self._line_bytes(row, make(now_ns), 0)
+            at_ns = self._budget.earliest_ns(size_bytes, now_ns=now_ns)
+            payload = make(at_ns)
+            line_bytes = self._count(row, Channel.META, payload, b"", at_ns=at_ns)
+            self._budget.record_metadata(line_bytes, now_ns=at_ns)
+            if self._pacer is not None:
+                self._pacer.sent_other(line_bytes, now_ns=at_ns)
+        self._wait_until(at_ns)
+        self._outlet.put(row, payload, encoding=DELIVERIES[row].encoding)
+
+    def _still_header(self, still: Still, *, send_ns: int, stored: bool = False) -> RoiHeader:
+        return RoiHeader(
+            session_id=self._session_id,
+            sequence=still.sequence,
+            frame_index=still.frame_index,
+            capture_ns=still.capture_ns,
+            send_delay_ns=send_ns - still.capture_ns,
+            flags=int(self._flags | Flags.STORED if stored else self._flags),
+            track_id=still.track_id,
+            box_source_px=still.box_source_px,
+            crop_source_px=still.crop_source_px,
+            class_name=fitted_text(still.class_name, 64),
+            confidence=still.confidence,
+            reason=fitted_text(still.reason, 48),
+            codec=still.codec,
+            quality_pct=still.quality_pct,
+            parameters=still.parameters,
+            also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in still.also),
+        )
+
+    def _still_at_ns(self, still: Still, encoding: str, now_ns: int) -> int:
+        """When it may go: now, unless its room is gone."""
+        attachment_bytes = len(self._still_header(still, send_ns=now_ns).pack())
+        line_bytes = self._line_bytes(Row.ROI, still.data, attachment_bytes, encoding=encoding)
+        if self._budget.has_room(line_bytes, now_ns=now_ns):
+            return now_ns
+        return self._budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
+
+    def _payload_bytes(self, room_bytes: int, attachment_bytes: int, media_type: str) -> int:
+        """What of so many line bytes is left for a still's payload."""
+        around = attachment_bytes + overhead_bytes(
+            room_bytes, attachment_bytes, key=self._keys.key(Row.ROI), encoding=media_type
+        )
+        return max(0, room_bytes - around)
+
+    def _count(
+        self, row: Row, channel: Channel, payload: bytes, attachment: bytes, *, at_ns: int, encoding: str = ""
+    ) -> int:
+        line_bytes = self._line_bytes(row, payload, len(attachment), encoding=encoding)
+        self._ledger.count(
+            channel,
+            payload_bytes=len(payload),
+            attachment_bytes=len(attachment),
+            overhead_bytes=line_bytes - len(payload) - len(attachment),
+            at_ns=at_ns,
+        )
+        return line_bytes
+
+    def _line_bytes(self, row: Row, payload: bytes, attachment_bytes: int, *, encoding: str = "") -> int:
+        """Payload, attachment and what the transport adds."""
+        overhead = overhead_bytes(
+            len(payload),
+            attachment_bytes,
+            key=self._keys.key(row),
+            encoding=encoding or DELIVERIES[row].encoding,
+        )
+        return len(payload) + attachment_bytes + overhead

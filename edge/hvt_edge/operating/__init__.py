@@ -1,0 +1,1 @@
+"""What changes in flight: everybody reads it, one owner writes it."""

@@ -1,0 +1,123 @@
+"""What the edge sees: its own decoded stream or the camera's own frames, and the tracks on every tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from hvt_common.inference.detect import Detector
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
+from hvt_common.video.hevc import BaseDecoder
+
+__all__ = ["Seen", "Sight", "SightSettings"]
+
+
+@dataclass(frozen=True, slots=True)
+class SightSettings:
+    """``candidates`` says on which pixels the detector runs and the tracker follows the camera.
+
+    Of the source means before it is coded, at the finer of its two sizes: a source that the base enlarges is
+    looked at enlarged, for so the ground's detector sees it, and who looks at fewer pixels finds less.
+    """
+
+    detect_every: int = 5
+    """Ticks from one detection to the next; see `Sight.see` for streams that code fewer ticks than that."""
+    candidates: Literal["decoded", "source"] = "decoded"
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One tick with all that is known of it."""
+
+    frame: Frame
+    base_bgr: Image | None
+    """The decoded base frame: what the ground has. None at a tick that is not coded."""
+    tracks: Tracks
+    detected: bool
+    """A decision step: the detector ran at this tick."""
+
+    @property
+    def coded(self) -> bool:
+        """Whether the base stream shows this tick. Only then can the ground apply a still to its picture."""
+        return self.base_bgr is not None
+
+
+class _Decoder(Protocol):
+    def decode(self, data: bytes) -> Image | None: ...
+
+
+class Sight:
+    """Decodes the edge's own access units, detects on every n-th tick and tracks on each."""
+
+    def __init__(
+        self,
+        detector: Detector,
+        tracker: ByteTracker,
+        *,
+        view: View,
+        settings: SightSettings = SightSettings(),
+        decoder: _Decoder | None = None,
+    ) -> None:
+        self._detector = detector
+        self._tracker = tracker
+        self._view = view
+        self._settings = settings
+        self._decoder = decoder or BaseDecoder()
+        self._detected_index: int | None = None
+        self._coded_index: int | None = None
+        self._coded_gap = 1
+
+    def see(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool = False) -> Seen:
+        """Take in the next tick; ``unit`` is None where it is not coded.
+
+        Detection is due ``detect_every`` ticks after the last one. With candidates of the decoded stream that can
+        only be a coded tick. With candidates of the source it waits for a coded tick too, as long as those are no
+        further apart than ``detect_every``; where they are, detection runs at its own pace and at each coded tick
+        besides, so that stills are always chosen by what that very picture shows. With ``hurry`` detection waits
+        for a later tick; decoding never does.
+        """
+        base_bgr = None if unit is None else self._decode(frame.index, unit)
+        pixels = frame.base_bgr if self._settings.candidates == "source" else base_bgr
+        if hurry or not self._due(frame.index, coded=unit is not None):
+            tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
+            return Seen(frame, base_bgr, tracks, detected=False)
+        self._detected_index = frame.index
+        detections = self._detect(frame, base_bgr)
+        tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
+        return Seen(frame, base_bgr, tracks, detected=True)
+
+    def _decode(self, index: int, unit: AccessUnit) -> Image:
+        base_bgr = self._decoder.decode(unit.data)
+        assert base_bgr is not None, "the edge decodes what it has just encoded"
+        if self._coded_index is not None:
+            self._coded_gap = index - self._coded_index
+        self._coded_index = index
+        return base_bgr
+
+    def _due(self, index: int, *, coded: bool) -> bool:
+        """Whether the detector is to run at this tick. By counts of ticks alone, never by a clock."""
+        every, last = self._settings.detect_every, self._detected_index
+        rested = last is None or index - last >= every
+        since_coded = 0 if self._coded_index is None else index - self._coded_index
+        sparse = max(self._coded_gap, since_coded) > every
+        if coded:
+            return rested or sparse
+        return rested and sparse and self._settings.candidates == "source"
+
+    def _detect(self, frame: Frame, base_bgr: Image | None) -> Detections:
+        if self._settings.candidates == "decoded":
+            assert base_bgr is not None, "detection on the decoded stream is due at coded ticks only"
+            return self._detector.detect(base_bgr)
+        if self._view.enlarges:
+            return self._detector.detect(frame.base_bgr)
+        found = self._detector.detect(frame.source_bgr)
+        width, height = self._view.base_size
+        boxes = self._view.to_base(found.boxes_xyxy_px)
+        # With --fit crop the source shows more than the base does; what lies outside is no candidate.
+        limits = np.array([width, height, width, height], np.float32)
+        boxes = np.clip(boxes, 0, limits)
+        inside = (boxes[:, 2] - boxes[:, 0] > 1) & (boxes[:, 3] - boxes[:, 1] > 1)
+        return Detections(boxes[inside], found.confidences[inside], found.class_ids[inside])

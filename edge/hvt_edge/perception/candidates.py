@@ -1,0 +1,359 @@
+"""Candidates: the tracks of one decision step, each with what the edge remembers of it.
+
+Methods and suppression see nothing else, so that they can be pure functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+
+import cv2
+import numpy as np
+
+from hvt_common.values import Boxes, Image, Tracks, View
+from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
+from hvt_edge.perception.base_loss import BaseLoss, measure_loss
+from hvt_edge.perception.crop import PADDING, crop_box
+
+__all__ = ["Belief", "Candidate", "TrackMemory", "sharpness"]
+
+Box = tuple[float, float, float, float]
+
+_BORDER_PX = 2.0
+"""A box this near to the edge of the picture counts as cut off by it (base pixels)."""
+_LEAVING_SHARE = 0.95
+_SHARPNESS_SIDE_PX = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What the ground's classifier said of a track, as it came back by ``feedback``."""
+
+    class_name: str
+    confidence: float
+    entropy_nats: float
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A track at a decision step."""
+
+    frame_index: int
+    track_id: int
+    box_base_px: Box
+    """Clipped to the picture."""
+    box_source_px: Box
+    class_id: int
+    class_name: str
+    confidence: float
+    """Of the detection matched last, 0…1."""
+    area_share: float
+    """Box area over base frame area."""
+    crop_area_px: float
+    """Pixels that a still of it would code: padded, clipped, bounded in side. The input of the cost estimate."""
+    born_frame: int
+    started: bool = False
+    """Created, or found again after being lost, since the step before."""
+    frames_since_start: int = 0
+    detected: bool = True
+    """A detection of this very frame was matched; False while the box is only predicted."""
+    touches_border: bool = False
+    border_s: float = 0.0
+    """For how long it has touched the border without a break."""
+    leaving: bool = False
+    """Touches the border, and less of it shows than before."""
+    covered_share: float = 0.0
+    """The largest share of the box that another track in front of it covers; in front is what reaches lower down."""
+    sent_count: int = 0
+    last_sent_frame: int | None = None
+    last_sent_ns: int | None = None
+    last_sent_area_px: float | None = None
+    """Box area in source pixels at the last still."""
+    last_sent_sharpness: float | None = None
+    last_sent_at_border: bool = False
+    last_refused_ns: int | None = None
+    """When the still stage last gave no still (`TrackMemory.record_refused`)."""
+    posterior: Belief | None = None
+    sharpness: Callable[[], float] | None = field(default=None, compare=False, repr=False)
+    """Measures the source crop when called; None where no picture was at hand."""
+    loss: Callable[[], BaseLoss] | None = field(default=None, compare=False, repr=False)
+    """Measures, once, what the base shows of the crop against the source, at the base's own grid where that is the
+    coarser; None where a picture was not at hand."""
+
+    @property
+    def area_px(self) -> float:
+        """Box area in source pixels."""
+        x1, y1, x2, y2 = self.box_source_px
+        return max(0.0, x2 - x1) * max(0.0, y2 - y1)
+
+
+def sharpness(crop_bgr: Image) -> float:
+    """Variance of the Laplacian at a fixed size: higher is sharper. 0.1 ms.
+
+    The crop is brought to 64 by 64 pixels first, so that an object that comes nearer and shows more detail
+    scores higher.
+    """
+    grey = cv2.cvtColor(crop_bgr, cv2.COLOR_BGR2GRAY)
+    small = cv2.resize(grey, (_SHARPNESS_SIDE_PX, _SHARPNESS_SIDE_PX), interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(small, cv2.CV_32F).var())
+
+
+@dataclass(slots=True)
+class _History:
+    """All that is kept of one track."""
+
+    seen_ns: int
+    start_frame: int
+    border_since_ns: int | None = None
+    border_area_px: float = 0.0
+    sent_count: int = 0
+    sent_frame: int | None = None
+    sent_ns: int | None = None
+    sent_area_px: float | None = None
+    sent_sharpness: float | None = None
+    sent_at_border: bool = False
+    refused_ns: int | None = None
+    belief: Belief | None = None
+
+
+class TrackMemory:
+    """Remembers of each track when it started, what was sent of it and what the ground said.
+
+    Bounded: a track that has not been seen for ``forget_s`` is forgotten, and beyond ``max_tracks`` those seen
+    longest ago go first.
+    """
+
+    def __init__(
+        self,
+        *,
+        padding: float = PADDING,
+        max_side_px: int = MAX_SIDE_PX,
+        forget_s: float = 30.0,
+        max_tracks: int = 4096,
+    ) -> None:
+        self._padding = padding
+        self._max_side_px = max_side_px
+        self._forget_ns = round(forget_s * 1e9)
+        self._max_tracks = max_tracks
+        self._histories: dict[int, _History] = {}
+        self._last_step_frame = -1
+
+    def __len__(self) -> int:
+        return len(self._histories)
+
+    def observe(self, tracks: Tracks, *, now_ns: int) -> None:
+        """Note which tracks there are; call it on every frame, so that no start between two steps is missed."""
+        for track_id, started in zip(tracks.ids.tolist(), tracks.started.tolist(), strict=True):
+            history = self._histories.get(track_id)
+            if history is None:
+                # New to us is a start as well: the tracker may list a track later than it made it.
+                history = _History(seen_ns=now_ns, start_frame=tracks.frame_index)
+                self._histories[track_id] = history
+            elif started:
+                history.start_frame = tracks.frame_index
+            history.seen_ns = now_ns
+        self._forget(now_ns)
+
+    def record_sent(
+        self,
+        track_id: int,
+        *,
+        frame_index: int,
+        now_ns: int,
+        area_px: float,
+        sharpness: float | None = None,
+        at_border: bool = False,
+    ) -> None:
+        """Note that a still went out; ``frame_index`` is the frame it shows, ``area_px`` its box in source pixels."""
+        history = self._histories.get(track_id)
+        if history is None:
+            return
+        history.sent_count += 1
+        history.sent_frame = frame_index
+        history.sent_ns = now_ns
+        history.sent_area_px = area_px
+        history.sent_sharpness = sharpness
+        history.sent_at_border = at_border
+
+    def record_refused(self, track_id: int, *, now_ns: int) -> None:
+        """Note that the still stage had no still for it; suppression then lets it rest for a while."""
+        history = self._histories.get(track_id)
+        if history is not None:
+            history.refused_ns = now_ns
+
+    def record_feedback(
+        self, track_id: int, *, class_name: str, confidence: float, entropy_nats: float
+    ) -> None:
+        """Note what the ground's classifier made of the track; unknown tracks are ignored."""
+        history = self._histories.get(track_id)
+        if history is not None:
+            history.belief = Belief(class_name, confidence, entropy_nats)
+
+    def candidates(
+        self,
+        tracks: Tracks,
+        *,
+        view: View,
+        class_names: Sequence[str],
+        now_ns: int,
+        source_bgr: Image | None = None,
+        base_bgr: Image | None = None,
+    ) -> list[Candidate]:
+        """One candidate a track, ordered by id.
+
+        ``source_bgr`` and ``base_bgr``, the decoded base frame of the same index, are only read if someone asks for
+        sharpness or loss.
+        """
+        self.observe(tracks, now_ns=now_ns)
+        picture = _picture(view)
+        boxes_base = np.clip(tracks.boxes_xyxy_px, picture[:2] * 2, picture[2:] * 2).astype(np.float32)
+        boxes_source = view.to_source(boxes_base)
+        covered = _covered_shares(boxes_base)
+        result = []
+        for row, track_id in enumerate(tracks.ids.tolist()):
+            history = self._histories[track_id]
+            result.append(
+                self._candidate(
+                    tracks,
+                    row,
+                    history,
+                    box_base_px=tuple(boxes_base[row].tolist()),
+                    box_source_px=tuple(boxes_source[row].tolist()),
+                    covered_share=covered[row],
+                    view=view,
+                    picture=picture,
+                    class_names=class_names,
+                    now_ns=now_ns,
+                    source_bgr=source_bgr,
+                    base_bgr=base_bgr,
+                )
+            )
+        self._last_step_frame = tracks.frame_index
+        return result
+
+    def _candidate(
+        self,
+        tracks: Tracks,
+        row: int,
+        history: _History,
+        *,
+        box_base_px: Box,
+        box_source_px: Box,
+        covered_share: float,
+        view: View,
+        picture: Box,
+        class_names: Sequence[str],
+        now_ns: int,
+        source_bgr: Image | None,
+        base_bgr: Image | None,
+    ) -> Candidate:
+        class_id = int(tracks.class_ids[row])
+        crop = crop_box(box_source_px, padding=self._padding, source_size=view.source_size)
+        coded = coded_size(crop, max_side_px=self._max_side_px)
+        touches, leaving = _note_border(history, box_base_px, picture=picture, now_ns=now_ns)
+        width, height = box_base_px[2] - box_base_px[0], box_base_px[3] - box_base_px[1]
+        return Candidate(
+            frame_index=tracks.frame_index,
+            track_id=int(tracks.ids[row]),
+            box_base_px=box_base_px,
+            box_source_px=box_source_px,
+            class_id=class_id,
+            class_name=class_names[class_id] if 0 <= class_id < len(class_names) else str(class_id),
+            confidence=float(tracks.confidences[row]),
+            area_share=width * height / (view.base_size[0] * view.base_size[1]),
+            crop_area_px=float(coded[0] * coded[1]),
+            born_frame=int(tracks.born_frames[row]),
+            started=history.start_frame > self._last_step_frame,
+            frames_since_start=tracks.frame_index - history.start_frame,
+            detected=bool(tracks.seen_frames[row] == tracks.frame_index),
+            touches_border=touches,
+            border_s=0.0 if history.border_since_ns is None else (now_ns - history.border_since_ns) / 1e9,
+            leaving=leaving,
+            covered_share=covered_share,
+            sent_count=history.sent_count,
+            last_sent_frame=history.sent_frame,
+            last_sent_ns=history.sent_ns,
+            last_sent_area_px=history.sent_area_px,
+            last_sent_sharpness=history.sent_sharpness,
+            last_sent_at_border=history.sent_at_border,
+            last_refused_ns=history.refused_ns,
+            posterior=history.belief,
+            sharpness=None if source_bgr is None else _sharpness_of(source_bgr, crop),
+            loss=None
+            if source_bgr is None or base_bgr is None
+            else _loss_of(source_bgr, base_bgr, crop_source_px=crop, view=view),
+        )
+
+    def _forget(self, now_ns: int) -> None:
+        oldest_ns = now_ns - self._forget_ns
+        for track_id in [key for key, history in self._histories.items() if history.seen_ns < oldest_ns]:
+            del self._histories[track_id]
+        if len(self._histories) > self._max_tracks:
+            by_age = sorted(self._histories, key=lambda key: (self._histories[key].seen_ns, key))
+            for track_id in by_age[: len(by_age) - self._max_tracks]:
+                del self._histories[track_id]
+
+
+def _picture(view: View) -> Box:
+    """Where the source lies inside the base frame, base pixels; letterbox borders are not picture."""
+    x1, y1, x2, y2 = view.to_base(np.array([[0, 0, *view.source_size]], np.float32))[0].tolist()
+    return max(x1, 0.0), max(y1, 0.0), min(x2, float(view.base_size[0])), min(y2, float(view.base_size[1]))
+
+
+def _note_border(history: _History, box_base_px: Box, *, picture: Box, now_ns: int) -> tuple[bool, bool]:
+    """(touches the border, is leaving); a track leaves while less of it shows than at best since it touched."""
+    low_x, low_y, high_x, high_y = picture
+    x1, y1, x2, y2 = box_base_px
+    near = _BORDER_PX
+    if x1 - low_x > near and y1 - low_y > near and high_x - x2 > near and high_y - y2 > near:
+        history.border_since_ns, history.border_area_px = None, 0.0
+        return False, False
+    if history.border_since_ns is None:
+        history.border_since_ns = now_ns
+    area = (x2 - x1) * (y2 - y1)
+    history.border_area_px = max(history.border_area_px, area)
+    return True, area < _LEAVING_SHARE * history.border_area_px
+
+
+def _covered_shares(boxes_base_px: Boxes) -> list[float]:
+    """Of each box, the largest share that one other box covers which reaches lower down, hence stands in front.
+
+    Seen from straight above nothing is in front; boxes there hardly overlap either.
+    """
+    if not len(boxes_base_px):
+        return []
+    x1, y1, x2, y2 = boxes_base_px.T
+    shares = []
+    for row, area in enumerate(((x2 - x1) * (y2 - y1)).tolist()):
+        width = np.minimum(x2, x2[row]) - np.maximum(x1, x1[row])
+        height = np.minimum(y2, y2[row]) - np.maximum(y1, y1[row])
+        shared = np.maximum(width, 0) * np.maximum(height, 0)
+        shared[y2 <= y2[row]] = 0
+        shares.append(min(1.0, float(shared.max()) / area) if area > 0 else 0.0)
+    return shares
+
+
+def _sharpness_of(source_bgr: Image, crop_source_px: tuple[int, int, int, int]) -> Callable[[], float]:
+    x1, y1, x2, y2 = crop_source_px
+    return lambda: sharpness(source_bgr[y1:y2, x1:x2])
+
+
+def _loss_of(
+    source_bgr: Image, base_bgr: Image, *, crop_source_px: tuple[int, int, int, int], view: View
+) -> Callable[[], BaseLoss]:
+    """Measures what coding lost, not what the size of the base loses: detectors there see its grid and no finer."""
+    x1, y1, x2, y2 = crop_source_px
+    shrink = max(1.0, 1 / view.scale, max(x2 - x1, y2 - y1) / MAX_SIDE_PX)
+    size = (max(1, round((x2 - x1) / shrink)), max(1, round((y2 - y1) / shrink)))
+
+    @cache
+    def loss() -> BaseLoss:
+        crop = source_bgr[y1:y2, x1:x2]
+        if size != (x2 - x1, y2 - y1):
+            crop = np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
+        shown = base_crop(base_bgr, view=view, crop_source_px=crop_source_px, size=size)
+        return measure_loss(crop, shown)
+
+    return loss

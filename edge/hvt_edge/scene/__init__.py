@@ -1,7 +1,0 @@
-"""The procedurally drawn aerial scene of ``--source demo``, with exact ground truth."""
-
-from hvt_edge.scene.look import Look
-from hvt_edge.scene.scene import Scene
-from hvt_edge.scene.truth import Truth, write_truth
-
-__all__ = ["Look", "Scene", "Truth", "write_truth"]

@@ -1,0 +1,100 @@
+"""A V4L2 camera through OpenCV."""
+
+from __future__ import annotations
+
+import re
+import stat
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_edge.source.live import Shot, SignalLost
+
+__all__ = ["CameraGrabber"]
+
+_WISH = (1920, 1080)
+"""Asked of the camera; it answers with the nearest it has. Stills live on what exceeds the base size."""
+
+_READ_MS = 2000
+
+
+class CameraGrabber:
+    """One V4L2 device.
+
+    Args:
+        path: /dev/videoN.
+        fps: asked of the camera.
+    """
+
+    def __init__(self, path: str, *, fps: float) -> None:
+        self.name = path
+        self._fps = fps
+        self._capture: cv2.VideoCapture | None = None
+
+    def open(self) -> None:
+        """Open the device.
+
+        Raises:
+            UserError: if it is missing, no camera, busy or not permitted.
+        """
+        path = Path(self.name)
+        if not path.exists():
+            have = ", ".join(sorted(str(found) for found in Path("/dev").glob("video*"))) or "none"
+            raise UserError(f"camera {self.name} does not exist; devices here: {have}")
+        # By number: a name like /dev/v4l/by-id/… is a link to it, and OpenCV takes a negative one for "any camera".
+        number = re.fullmatch(r"video(\d+)", path.resolve().name)
+        if number is None or not stat.S_ISCHR(path.stat().st_mode):
+            raise UserError(f"camera {self.name} is no video device; accepted is /dev/videoN")
+        capture = _quietly_opened(int(number[1]))
+        if not capture.isOpened():
+            raise UserError(
+                f"camera {self.name} cannot be opened: it is no V4L2 camera, in use, or not permitted"
+            )
+        # Uncompressed 1080p does not fit USB 2; a camera without MJPEG keeps its own format.
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, _WISH[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, _WISH[1])
+        capture.set(cv2.CAP_PROP_FPS, self._fps)
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        self._capture = capture
+
+    def reopen(self) -> None:
+        """Open again after `SignalLost`."""
+        self.close()
+        try:
+            self.open()
+        except UserError as error:
+            raise SignalLost(str(error)) from error
+
+    def grab(self) -> Shot:
+        """The next frame, at most the read timeout from now."""
+        capture = self._capture
+        if capture is None or not capture.grab():
+            raise SignalLost("the camera delivers no frame")
+
+        def shot() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+            kept, image = capture.retrieve()
+            if not kept:
+                raise SignalLost("the camera's frame cannot be decoded")
+            return np.asarray(image, np.uint8)
+
+        return shot
+
+    def close(self) -> None:
+        """Let go of the device."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+
+def _quietly_opened(number: int) -> cv2.VideoCapture:
+    """The capture, opened or not, without OpenCV's own lines on stderr."""
+    wishes = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.VideoCapture(number, cv2.CAP_V4L2, wishes)
+    finally:
+        cv2.utils.logging.setLogLevel(level)

@@ -1,0 +1,102 @@
+"""A folder of numbered images as a source: VisDrone (0000001.jpg), UAVDT (img000001.jpg) and their like."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.units import exact_rate
+from hvt_common.values import Fit, Frame, Image
+from hvt_edge.source.contract import Source
+from hvt_edge.source.resample import BaseSize, Resizer, base_frame_count, capture_time_ns, hold
+
+__all__ = ["FolderSource", "sequence_files"]
+
+_log = logging.getLogger(__name__)
+
+_ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff"})
+
+
+def sequence_files(folder: Path) -> list[Path]:
+    """The images of a folder in natural order (img2 before img10); hidden files and subfolders are not looked at."""
+    files = [
+        file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS and not file.name.startswith(".")
+    ]
+    return sorted((file for file in files if file.is_file()), key=lambda file: _natural(file.name))
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", name.lower())
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+
+class FolderSource(Source):
+    """Images in natural order, one every 1 / ``source_fps`` seconds; another size is fitted into the first one's.
+
+    An image that cannot be read is skipped with a warning and the one before is shown in its place, so that the time
+    of the others does not shift.
+    """
+
+    live = False
+
+    def __init__(
+        self,
+        spec: str,
+        *,
+        size: BaseSize,
+        fps: float,
+        fit: Fit,
+        max_frames: int | None = None,
+        source_fps: float | None = None,
+    ) -> None:
+        self._files = sequence_files(Path(spec))
+        if not self._files:
+            endings = ", ".join(sorted(ending[1:] for ending in _ENDINGS))
+            raise UserError(f"source folder {spec!r} holds no images; accepted endings are {endings}")
+        first = next((image for image in map(_read, self._files) if image is not None), None)
+        if first is None:
+            raise UserError(
+                f"source folder {spec!r} holds {len(self._files)} image files, none of which can be read"
+            )
+        self._first = first
+        self.fps = fps
+        self._period_s = 1 / exact_rate(fps if source_fps is None else source_fps)
+        self._resizer = Resizer((first.shape[1], first.shape[0]), size, fit=fit)
+        self.view = self._resizer.view
+        whole = base_frame_count(len(self._files) * self._period_s, fps=exact_rate(fps))
+        self.frame_count = whole if max_frames is None else min(whole, max_frames)
+
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        """The sequence from its beginning."""
+        rate = exact_rate(self.fps)
+        places = ((place * self._period_s, place) for place in range(len(self._files)))
+        shown, image = -1, self._first
+        for index, place in hold(places, fps=rate, tail_s=self._period_s):
+            if index == self.frame_count:
+                return
+            if place != shown:
+                image, shown = self._readable(place, held=image), place
+            yield self._resizer.frame(
+                image, index=index, capture_ns=capture_time_ns(index, fps=rate, start_ns=start_ns)
+            )
+
+    def _readable(self, place: int, *, held: Image) -> Image:
+        image = _read(self._files[place])
+        if image is None:
+            _log.warning(
+                "%s cannot be read as an image; the one before is shown in its place", self._files[place]
+            )
+        return held if image is None else image
+
+
+def _read(file: Path) -> Image | None:
+    """The image as BGR, 8 bits; None if it cannot be decoded."""
+    data = np.fromfile(file, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    return None if image is None else np.asarray(image, np.uint8)

@@ -1,0 +1,156 @@
+"""What cannot be paused: a reader thread that keeps only the latest frame of a camera or a network stream."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.values import Fit, Frame, Image
+from hvt_edge.source.contract import Source
+from hvt_edge.source.resample import BaseSize, Gate, Resizer
+
+__all__ = ["Grabber", "LiveSource", "Shot", "SignalLost"]
+
+_log = logging.getLogger(__name__)
+
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
+_JOIN_S = 1.5
+
+Shot = Callable[[], Image]
+"""A grabbed frame that is converted to BGR only if it is wanted."""
+
+
+class SignalLost(Exception):  # noqa: N818 - an event, not a fault of the program
+    """The device or the stream stopped; opening it again may help."""
+
+
+class Grabber(Protocol):
+    """A device that delivers frames as they happen. Used from one thread at a time; no call blocks for ever."""
+
+    name: str
+
+    def open(self) -> None:
+        """Open for the first time: raises UserError where there is nothing."""
+
+    def reopen(self) -> None:
+        """Open again after `SignalLost`; raises `SignalLost` if that fails."""
+
+    def grab(self) -> Shot:
+        """Wait for the next frame; raises `SignalLost`."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the device."""
+
+
+class LiveSource(Source):
+    """A camera or stream, resampled to the base rate by `Gate`; slow consumers lose frames, never gain delay.
+
+    Frames are not repeated when the camera is slower than the base rate. After a loss of signal the source is opened
+    again, with growing pauses, until it is closed.
+
+    Args:
+        clock: of the capture times, Unix nanoseconds; must not go back, or the source is silent for as long.
+
+    Attributes:
+        dropped: frames that the consumer was too slow to take.
+    """
+
+    live = True
+    frame_count = None
+
+    def __init__(
+        self,
+        grabber: Grabber,
+        *,
+        size: BaseSize,
+        fps: float,
+        fit: Fit,
+        max_frames: int | None = None,
+        clock: Callable[[], int] | None = None,
+    ) -> None:
+        self.fps, self._limit = fps, max_frames
+        self._clock = clock or SteadyClock()
+        self._grabber = grabber
+        grabber.open()
+        try:
+            first = grabber.grab()()
+        except SignalLost as error:
+            grabber.close()
+            raise UserError(f"source {grabber.name} opens but delivers no picture ({error})") from error
+        self._resizer = Resizer((first.shape[1], first.shape[0]), size, fit=fit)
+        self.view = self._resizer.view
+        self.dropped = 0
+        self._news = threading.Condition()
+        self._latest: tuple[int, Image] | None = None
+        self._failure: BaseException | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hvt-source", daemon=True)
+        self._thread.start()
+
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:  # noqa: ARG002 - a camera has its own time
+        """Frames as they come, until the source is closed; ``capture_ns`` is the clock's when one was grabbed."""
+        index = 0
+        while index != self._limit:
+            with self._news:
+                self._news.wait_for(lambda: self._latest or self._stop.is_set())
+                item, self._latest = self._latest, None
+            if self._failure is not None:
+                raise self._failure
+            if item is None or self._stop.is_set():
+                return
+            yield self._resizer.frame(item[1], index=index, capture_ns=item[0])
+            index += 1
+
+    def close(self) -> None:
+        """Stop the reader and join it; it answers within its read timeout."""
+        self._end()
+        self._thread.join(_JOIN_S)
+        if self._thread.is_alive():
+            _log.warning("%s did not answer within %g s and is left behind", self._grabber.name, _JOIN_S)
+
+    def _end(self) -> None:
+        with self._news:
+            self._stop.set()
+            self._news.notify_all()
+
+    def _run(self) -> None:
+        gate = Gate(self.fps)
+        try:
+            while not self._stop.is_set():
+                try:
+                    shot = self._grabber.grab()
+                    capture_ns = self._clock()
+                    if gate.accept(capture_ns):
+                        self._offer(capture_ns, shot())
+                except SignalLost as error:
+                    self._recover(error)
+        except BaseException as error:  # noqa: BLE001 - handed to the consumer, which raises it
+            self._failure = error
+        finally:
+            self._grabber.close()
+            self._end()
+
+    def _offer(self, capture_ns: int, image: Image) -> None:
+        with self._news:
+            self.dropped += self._latest is not None
+            self._latest = (capture_ns, image)
+            self._news.notify_all()
+
+    def _recover(self, error: SignalLost) -> None:
+        """Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop."""
+        wait_s = _FIRST_WAIT_S
+        _log.warning("%s stopped (%s); opening it again", self._grabber.name, error)
+        while not self._stop.wait(wait_s):
+            try:
+                self._grabber.reopen()
+            except SignalLost as again:
+                wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+                _log.warning("%s is still away (%s); next try in %g s", self._grabber.name, again, wait_s)
+            else:
+                _log.warning("%s is back", self._grabber.name)
+                return

@@ -1,0 +1,91 @@
+"""Where frames come from: the first stage of the edge. One function opens every kind of source."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from hvt_common.errors import UserError
+from hvt_common.values import Fit
+from hvt_edge.source.camera import CameraGrabber
+from hvt_edge.source.contract import Source
+from hvt_edge.source.demo import DemoSource
+from hvt_edge.source.folder import FolderSource
+from hvt_edge.source.live import LiveSource
+from hvt_edge.source.resample import BaseSize
+from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber
+from hvt_edge.source.video import VideoSource
+
+__all__ = ["Source", "check_shape", "open_source"]
+
+_ACCEPTED = "a video file, a folder of images, rtsp://…, http://…, udp://…, /dev/videoN or demo"
+
+
+def open_source(
+    spec: str,
+    *,
+    size: BaseSize,
+    fps: float,
+    fit: Fit = "letterbox",
+    seed: int = 0,
+    max_frames: int | None = None,
+    source_fps: float | None = None,
+    clock: Callable[[], int] | None = None,
+) -> Source:
+    """Open a source of base frames.
+
+    Args:
+        spec: path of a video file or an image folder, a stream's URL, a V4L2 device, or ``demo``.
+        size: (width, height) of the base frames in pixels, even, 64…8192, or how they follow from the source's.
+        fps: base rate in frames a second, above 0, at most 240.
+        fit: what happens to a source of another aspect ratio; see `View.fitted`.
+        seed: of the demo scene.
+        max_frames: end after so many base frames.
+        source_fps: the rate at which the images of a folder were taken (default: the base rate), or a rate that
+            overrides a video file's own time stamps. Live sources and the demo ignore it.
+        clock: of a live source's capture times, Unix nanoseconds without steps; None for one of its own.
+
+    Raises:
+        UserError: if nothing usable is there, or size or rate are impossible.
+    """
+    check_shape(size=size, fps=fps, source_fps=source_fps)
+    if spec == "demo":
+        return DemoSource(size=size, fps=fps, fit=fit, seed=seed, max_frames=max_frames)
+    scheme = urlsplit(spec).scheme if "://" in spec else ""
+    if scheme in LIVE_SCHEMES:
+        stream = StreamGrabber(spec)
+        stream.open()
+        if not stream.holds_a_clip:
+            return LiveSource(stream, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock)
+        stream.close()
+    elif scheme:
+        raise UserError(f"source {spec!r} has the unknown scheme {scheme!r}; accepted is {_ACCEPTED}")
+    if spec.startswith("/dev/"):
+        camera = CameraGrabber(spec, fps=fps)
+        return LiveSource(camera, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock)
+    if not scheme and not Path(spec).exists():
+        raise UserError(f"source {spec!r} does not exist; accepted is {_ACCEPTED}")
+    kind = FolderSource if not scheme and Path(spec).is_dir() else VideoSource
+    return kind(spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps)
+
+
+def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
+    """Refuse sizes and rates that no base stream can have.
+
+    Raises:
+        UserError: names the value and what is accepted.
+    """
+    wide, high = (64, 64) if callable(size) else size
+    # HEVC codes 4:2:0 pictures in even sizes only.
+    if wide % 2 or high % 2 or not (64 <= wide <= 8192 and 64 <= high <= 8192):
+        raise UserError(
+            f"size {wide}x{high} is impossible: width and height must be even and between 64 and 8192"
+        )
+    if not (math.isfinite(fps) and 0 < fps <= 240):
+        raise UserError(f"fps {fps:g} is impossible: accepted is above 0 and at most 240 frames a second")
+    if source_fps is not None and not (math.isfinite(source_fps) and 0 < source_fps <= 1000):
+        raise UserError(
+            f"source-fps {source_fps:g} is impossible: accepted is above 0 and at most 1000 frames a second"
+        )

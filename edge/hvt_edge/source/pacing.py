@@ -1,0 +1,21 @@
+"""The pace at which the frames of a recorded clip are taken in."""
+
+from __future__ import annotations
+
+import threading
+
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.values import Frame
+
+__all__ = ["realtime_admits"]
+
+_SECOND_NS = 1_000_000_000
+
+
+def realtime_admits(frame: Frame, *, clock: SteadyClock, fps: float, stop: threading.Event) -> bool:
+    """Wait until the frame of a recorded clip is due; False where it is so late that the next is due already."""
+    early_ns = frame.capture_ns - clock()
+    if early_ns > 0:
+        stop.wait(early_ns / _SECOND_NS)
+        return True
+    return -early_ns < _SECOND_NS / fps

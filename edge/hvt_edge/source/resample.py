@@ -1,0 +1,178 @@
+"""Resampling in time and space: any frame rate and any picture size to those of the base stream. Pure functions.
+
+In time the rule is *hold*: the base frame of instant k / fps shows the latest source frame at or before it. Nothing
+is blended; a slower source is repeated, a faster one loses frames. In space the picture is scaled by one factor on
+both axes and centred: whole between black borders (letterbox) or filling the frame (crop); see `View`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from fractions import Fraction
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from hvt_common.values import Fit, Frame, Image, View
+
+__all__ = [
+    "BaseSize",
+    "Gate",
+    "Resizer",
+    "base_frame_count",
+    "capture_time_ns",
+    "hold",
+    "into_canvas",
+]
+
+_T = TypeVar("_T")
+
+BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
+"""(width, height) of the base frames, or how they follow from those of the source."""
+
+
+def capture_time_ns(index: int, *, fps: Fraction, start_ns: int) -> int:
+    """Media time of base frame ``index`` as Unix time in nanoseconds, rounded once."""
+    return start_ns + round(index * 1_000_000_000 / fps)
+
+
+def base_frame_count(duration_s: Fraction, *, fps: Fraction) -> int:
+    """How many instants k / fps lie in a clip of that duration, the first at 0."""
+    return -int(-duration_s * fps // 1)
+
+
+def hold(
+    stamped: Iterable[tuple[Fraction, _T]],
+    *,
+    fps: Fraction,
+    tail_s: Fraction,
+    slack_s: Fraction = Fraction(0),
+) -> Iterator[tuple[int, _T]]:
+    """Bring frames with times to the base rate.
+
+    Args:
+        stamped: (seconds, frame) in order; the first is the clip's zero. A frame that does not come after its
+            predecessor replaces it.
+        fps: base rate.
+        tail_s: how long the last frame is shown.
+        slack_s: how much too late a time stamp may be and still count as on time: the container's tick, because
+            Matroska rounds times to milliseconds and 2/30 s becomes 0.067 s.
+
+    Yields:
+        (index, frame) for index 0, 1, 2 … without a gap: the latest frame at or before index / fps.
+    """
+    slack = min(slack_s, 1 / (4 * fps))
+    index = 0
+    zero: Fraction | None = None
+    shown: tuple[Fraction, _T] | None = None
+    for time_s, frame in stamped:
+        zero = time_s if zero is None else zero
+        elapsed = time_s - zero - slack
+        while shown is not None and index / fps < elapsed:
+            yield index, shown[1]
+            index += 1
+        shown = (elapsed + slack, frame)
+    if shown is None:
+        return
+    end_s = shown[0] + tail_s - slack
+    while index / fps < end_s or index == 0:
+        yield index, shown[1]
+        index += 1
+
+
+class Gate:
+    """Which frames of a live camera to take so that the base rate is kept on average, whatever the jitter.
+
+    A camera slower than the base rate is taken whole; nothing is repeated.
+    """
+
+    def __init__(self, fps: float) -> None:
+        self._period_ns = round(1e9 / fps)
+        self._due_ns: int | None = None
+        # A frame a little early is taken, or a 30 fps camera at 15 fps would slip to every third frame.
+        self._early_ns = self._period_ns // 4
+
+    def accept(self, capture_ns: int) -> bool:
+        """Whether the frame taken at that time is wanted; call it once for each frame, in order."""
+        if self._due_ns is not None and capture_ns < self._due_ns - self._early_ns:
+            return False
+        late = self._due_ns is None or capture_ns > self._due_ns + self._period_ns
+        self._due_ns = (capture_ns if late or self._due_ns is None else self._due_ns) + self._period_ns
+        return True
+
+
+class Resizer:
+    """Makes base frames out of source pictures of one size.
+
+    Attributes:
+        view: the map from source to base pixels. Pictures follow it to within half a pixel of the base, because
+            borders and cuts lie on whole pixels.
+    """
+
+    def __init__(self, source_size: tuple[int, int], base_size: BaseSize, *, fit: Fit) -> None:
+        settled = base_size(source_size) if callable(base_size) else base_size
+        self.view = View.fitted(source_size, settled, fit=fit)
+        self._fit = fit
+        self._last: tuple[Image, Image] | None = None
+
+    def frame(self, source_bgr: Image, *, index: int, capture_ns: int) -> Frame:
+        """The base frame of a picture, which is first fitted to the source size if it has another. Both read-only.
+
+        The same picture again, as the same object, is not resized again.
+        """
+        if self._last is None or self._last[0] is not source_bgr:
+            whole = into_canvas(source_bgr, self.view.source_size)
+            whole.flags.writeable = False
+            base = self._resized(whole)
+            base.flags.writeable = False
+            self._last, self._whole = (source_bgr, base), whole
+        return Frame(index=index, capture_ns=capture_ns, source_bgr=self._whole, base_bgr=self._last[1])
+
+    def _resized(self, source: Image) -> Image:
+        if self.view.source_size == self.view.base_size:
+            return source
+        return _letterboxed(source, self.view) if self._fit == "letterbox" else _cropped(source, self.view)
+
+
+def into_canvas(picture: Image, size: tuple[int, int]) -> Image:
+    """The picture centred whole in a black canvas of that (width, height); itself where it fits exactly."""
+    high, wide = picture.shape[:2]
+    if (wide, high) == size:
+        return picture
+    return _letterboxed(picture, View.fitted((wide, high), size, fit="letterbox"))
+
+
+def _letterboxed(source: Image, view: View) -> Image:
+    (wide, high), (base_wide, base_high) = view.source_size, view.base_size
+    inner = (min(base_wide, round(wide * view.scale)), min(base_high, round(high * view.scale)))
+    scaled = _scaled(source, (max(inner[0], 1), max(inner[1], 1)))
+    if inner == view.base_size:
+        return scaled
+    base = np.zeros((base_high, base_wide, 3), np.uint8)
+    left, top = (base_wide - scaled.shape[1]) // 2, (base_high - scaled.shape[0]) // 2
+    base[top : top + scaled.shape[0], left : left + scaled.shape[1]] = scaled
+    return base
+
+
+def _cropped(source: Image, view: View) -> Image:
+    (wide, high), (base_wide, base_high) = view.source_size, view.base_size
+    if view.scale > 1:  # cut on the finer grid, which is the base's here
+        grown = _scaled(
+            source, (max(base_wide, round(wide * view.scale)), max(base_high, round(high * view.scale)))
+        )
+        left, top = (grown.shape[1] - base_wide) // 2, (grown.shape[0] - base_high) // 2
+        return np.ascontiguousarray(grown[top : top + base_high, left : left + base_wide])
+    cut = (min(wide, max(1, round(base_wide / view.scale))), min(high, max(1, round(base_high / view.scale))))
+    left, top = (wide - cut[0]) // 2, (high - cut[1]) // 2
+    return _scaled(source[top : top + cut[1], left : left + cut[0]], view.base_size)
+
+
+def _scaled(picture: Image, size: tuple[int, int]) -> Image:
+    """Averaged when it shrinks, so that nothing aliases; cubic when it grows."""
+    high, wide = picture.shape[:2]
+    if (wide, high) == size:
+        return np.ascontiguousarray(picture)
+    shrinks = size[0] < wide or size[1] < high
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8)

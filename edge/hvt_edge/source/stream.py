@@ -1,0 +1,105 @@
+"""Network streams (RTSP, HTTP, UDP, TCP, SRT) through PyAV."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import av
+import av.error
+
+from hvt_common.errors import UserError
+from hvt_edge.source.live import Shot, SignalLost
+from hvt_edge.source.video import upright_bgr, without_password
+
+__all__ = ["LIVE_SCHEMES", "StreamGrabber"]
+
+LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "http", "https", "udp", "rtp", "tcp", "srt"})
+
+_OPEN_S = 10.0
+_REOPEN_S = 2.5
+_READ_S = 2.0  # also how long closing may take
+
+_OPTIONS = {
+    "rtsp_transport": "tcp",  # over UDP a camera's keyframes lose packets on the first busy switch
+    "fflags": "nobuffer",
+    "flags": "low_delay",
+    "analyzeduration": "2000000",
+}
+
+
+class StreamGrabber:
+    """Decodes a stream as it arrives, without frame threading, which would hold frames back.
+
+    Args:
+        url: of the stream; a password in it is never printed.
+        open_s: how long the first opening may take.
+    """
+
+    def __init__(self, url: str, *, open_s: float = _OPEN_S) -> None:
+        self.name = without_password(url)
+        self._url, self._open_s = url, open_s
+        self._container: Any = None
+        self._frames: Iterator[av.VideoFrame] = iter(())
+
+    def open(self) -> None:
+        """Open for the first time; does nothing where it is open already.
+
+        Raises:
+            UserError: if there is no video within ``open_s``.
+        """
+        if self._container is None:
+            self._start(self._open_s)
+
+    @property
+    def holds_a_clip(self) -> bool:
+        """Whether what is open has a known duration: a file behind an address, not a live stream."""
+        return bool(self._container.duration)
+
+    def reopen(self) -> None:
+        """Open again after `SignalLost`."""
+        self.close()
+        try:
+            self._start(_REOPEN_S)
+        except UserError as error:
+            raise SignalLost(str(error)) from error
+
+    def grab(self) -> Shot:
+        """The next frame, at most the read timeout from now."""
+        try:
+            frame = next(self._frames, None)
+        except (av.error.FFmpegError, OSError) as error:
+            raise SignalLost(_cause(error)) from error
+        if frame is None:
+            raise SignalLost("it ended")
+        return lambda: upright_bgr(frame)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._frames = iter(())
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+
+    def _start(self, open_s: float) -> None:
+        container = _open(self._url, open_s=open_s)
+        stream = next(iter(container.streams.video), None)
+        if stream is None:
+            container.close()
+            raise UserError(f"source {self.name} holds no video stream")
+        stream.thread_type = "SLICE"
+        self._container, self._frames = container, container.decode(stream)
+
+
+def _open(url: str, *, open_s: float) -> Any:
+    try:
+        return av.open(url, options=_OPTIONS, timeout=(open_s, _READ_S))
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        name = without_password(url)
+        raise UserError(f"source {name} cannot be opened within {open_s:g} s ({_cause(error)})") from error
+
+
+def _cause(error: Exception) -> str:
+    if isinstance(error, av.error.ExitError):
+        return "no answer in time"
+    return str(getattr(error, "strerror", None) or error)

@@ -1,1 +1,0 @@
-"""The kinds of sources, one file each, behind the contract that `hvt_edge.source` hands out."""

@@ -1,0 +1,116 @@
+"""A crop taken out of its frame, with all that coding it takes: whoever waits for room keeps no whole frames.
+
+A 4K frame takes 25 MB, its crops a few kilobytes each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from hvt_common.values import Image, Still
+from hvt_common.video.still_codecs import StillCodec, psnr_y_db
+
+__all__ = ["Cut", "Rival", "crop_of", "inner_box"]
+
+Box = tuple[float, float, float, float]
+Crop = tuple[int, int, int, int]
+Place = tuple[slice, slice]
+"""(rows, columns)."""
+
+_BT601 = np.array([[0.114, 0.587, 0.299]], np.float32)
+_FAR_OFF_SHARE = 0.5
+"""With half of the crop's own variance in the difference to the base, there is little in the base to build on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """How far the base is from the source at a crop, and so how far a still may be."""
+
+    places: tuple[Place, ...]
+    """The boxes in the crop, without their padding."""
+    limits: tuple[float, ...]
+    """Sums of squared differences that a still must stay below."""
+    psnr_y_db: float
+    """Of the base crop, luma, over the whole crop."""
+    error_share: float
+    """Its squared luma error over the variance of the crop's luma: 1 is no better than one flat grey."""
+
+    @classmethod
+    def of(cls, base_crop: Image, *, crop: Image, places: tuple[Place, ...], min_gain_db: float) -> Rival:
+        """``min_gain_db`` is by how much a still must be closer than the base."""
+        share = 10 ** (-min_gain_db / 10)
+        limits = tuple(share * error for error in _errors(base_crop, crop, places))
+        _, spread = cv2.meanStdDev(cv2.transform(crop.astype(np.float32), _BT601))
+        error = limits[1] / share / (crop.shape[0] * crop.shape[1])
+        return cls(
+            places=places,
+            limits=limits,
+            psnr_y_db=psnr_y_db(base_crop, crop),
+            error_share=error / max(1.0, float(spread[0, 0]) ** 2),
+        )
+
+    def loses_to(self, still: Image, *, crop: Image) -> bool:
+        """Whether the still is closer to the source: colour and luma, over the crop and over each box."""
+        errors = _errors(still, crop, self.places)
+        return all(mine < limit for mine, limit in zip(errors, self.limits, strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """One crop, ready to be coded."""
+
+    draft: Still
+    """The still as it will be, but for sequence, quality and data."""
+    crop_bgr: Image
+    """Of the source, at the size at which it is coded."""
+    base_crop_bgr: Image | None
+    """What the decoded base frame of the same tick shows of it, at that size; None where there is none."""
+    rival: Rival | None
+    """None where the base was not at hand."""
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of the pixels."""
+        return self.crop_bgr.nbytes + (0 if self.base_crop_bgr is None else self.base_crop_bgr.nbytes)
+
+    @property
+    def base_far_off(self) -> bool:
+        """Whether the base shows something else here, so that a codec may do better without it."""
+        return self.rival is not None and self.rival.error_share > _FAR_OFF_SHARE
+
+    def recoded(self, codec: StillCodec, *, reason: str) -> Cut:
+        """The same crop for another codec, without the base; the still must be closer than the base all the same."""
+        draft = replace(self.draft, reason=reason, codec=codec.name, media_type=codec.media_type)
+        return Cut(draft=draft, crop_bgr=self.crop_bgr, base_crop_bgr=None, rival=self.rival)
+
+
+def crop_of(source_bgr: Image, crop_px: Crop, size: tuple[int, int]) -> Image:
+    """The pixels of a crop at ``size`` (width, height), never larger than the crop; a copy."""
+    x1, y1, x2, y2 = crop_px
+    crop = source_bgr[y1:y2, x1:x2]
+    if size != (x2 - x1, y2 - y1):
+        return np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return crop.copy()
+
+
+def inner_box(box_source_px: Box, crop_px: Crop, size: tuple[int, int]) -> Place:
+    """The box without its padding as (rows, columns) of the coded crop; never empty."""
+    ranges = []
+    for axis in (1, 0):
+        scale = size[axis] / (crop_px[axis + 2] - crop_px[axis])
+        start = min(max(0, round((box_source_px[axis] - crop_px[axis]) * scale)), size[axis] - 1)
+        end = round((box_source_px[axis + 2] - crop_px[axis]) * scale)
+        ranges.append(slice(start, min(max(end, start + 1), size[axis])))
+    return ranges[0], ranges[1]
+
+
+def _errors(image: Image, crop: Image, places: tuple[Place, ...]) -> tuple[float, ...]:
+    """Sums of squared differences: colour and luma, over the crop and over each box in it."""
+    # Luma of the difference, not difference of the lumas: rounded to bytes these would be off by up to 5 %.
+    colour = cv2.subtract(image, crop, dtype=cv2.CV_32F)
+    luma = cv2.transform(colour, _BT601)
+    parts = [part[place] for place in places for part in (colour, luma)]
+    return tuple(cv2.norm(one, cv2.NORM_L2SQR) for one in (colour, luma, *parts))

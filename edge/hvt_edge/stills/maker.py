@@ -1,0 +1,188 @@
+"""The still stage: crop of the untouched source frame, coded to fit its admission, and better than the base.
+
+Two promises hold for every still that leaves here: it is never larger than its admission, and, where the decoded
+base frame is at hand, it is closer to the source than what the base shows of the same place: in colour and in luma,
+over the padded crop and over each box alone (mean squared error, hence PSNR). Where both promises cannot be kept
+there is no still, and the reason is said.
+
+A codec that builds on the base (``residual``) is used where the base frame of the same tick is at hand. The fallback
+codec takes its place where there is none, and where the base is so far off that it comes out smaller for the
+same picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from hvt_common.values import Frame, Image, Still, View
+from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
+from hvt_common.video.still_codecs import JpegCodec, StillCodec, psnr_y_db
+from hvt_edge.perception.crop import PADDING
+from hvt_edge.stills.crop_job import Cut, Rival, crop_of, inner_box
+from hvt_edge.stills.fidelity import Fitted, Fitter, NoStill
+from hvt_edge.stills.merging import union_crop
+from hvt_edge.stills.policy.base import Request
+
+__all__ = ["NoStill", "Room", "StillMaker"]
+
+Room = Callable[[Still], int]
+"""How many payload bytes a still with this header may take now; what it holds as data does not count."""
+
+_TRIES = 3
+"""Of fitting payload and parameters into one admission: parameters hardly change in size."""
+
+
+@dataclass(frozen=True, slots=True)
+class StillMaker:
+    """Makes stills with one set of settings; frozen, without state."""
+
+    codec: StillCodec = field(default_factory=JpegCodec)
+    fallback: StillCodec | None = None
+    """Needs no base; must be given where ``codec`` needs one, and is not used where it does not."""
+    quality_pct: int = 65
+    """Asked for; less where the admission is smaller, more where the base is already better."""
+    fidelity_db: float = 0.0
+    """Luma PSNR to reach with the fewest bytes, in place of ``quality_pct``; 0: the quality is fixed."""
+    floor_pct: int = 35
+    """Never below it: what is worse than that tells a classifier little. A codec that builds on the base has no
+    floor, because the base stays."""
+    ceiling_pct: int = 90
+    """The most that is spent on being better than the base."""
+    min_gain_db: float = 0.1
+    """By how much the still must be closer than the base; covers how others round when they count."""
+    padding: float = PADDING
+    max_side_px: int = MAX_SIDE_PX
+
+    def __post_init__(self) -> None:
+        assert self.fallback is not None or not self.codec.needs_base, f"{self.codec.name} needs a fallback"
+        assert not (self.codec.needs_base and self.without_base.needs_base), (
+            "the fallback serves without a base"
+        )
+
+    @property
+    def without_base(self) -> StillCodec:
+        """The codec of stills that show the same whatever base frames the ground has."""
+        if not self.codec.needs_base:
+            return self.codec
+        assert self.fallback is not None, "checked at the start"
+        return self.fallback
+
+    def cut(
+        self, frame: Frame, request: Request, *, view: View, base_bgr: Image | None = None
+    ) -> Cut | NoStill:
+        """Take the request's crop out of ``frame``, which is the frame the request was made at.
+
+        ``base_bgr`` is the decoded base frame of the same index; without it the second promise is not checked.
+        """
+        lead = request.candidate
+        assert frame.index == lead.frame_index, "a still shows the frame that its box belongs to"
+        crop_px = union_crop(request, padding=self.padding, source_size=view.source_size)
+        size = coded_size(crop_px, max_side_px=self.max_side_px)
+        if base_bgr is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
+            return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
+        crop = crop_of(frame.source_bgr, crop_px, size)
+        seen = rival = None
+        if base_bgr is not None:
+            seen = base_crop(base_bgr, view=view, crop_source_px=crop_px, size=size)
+            boxes = (one.box_source_px for one in (lead, *request.also))
+            places = tuple(inner_box(box, crop_px, size) for box in boxes)
+            rival = Rival.of(seen, crop=crop, places=places, min_gain_db=self.min_gain_db)
+            if 0 < self.fidelity_db <= rival.psnr_y_db:
+                return NoStill("base_good")
+        codec = self.without_base if seen is None else self.codec
+        draft = Still(
+            sequence=0,
+            frame_index=frame.index,
+            capture_ns=frame.capture_ns,
+            track_id=lead.track_id,
+            box_source_px=lead.box_source_px,
+            crop_source_px=crop_px,
+            class_name=lead.class_name,
+            confidence=lead.confidence,
+            reason=request.reason,
+            codec=codec.name,
+            quality_pct=self.quality_pct,
+            data=b"",
+            media_type=codec.media_type,
+            parameters={}
+            if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1])
+            else {"w": size[0], "h": size[1]},
+            also=tuple((one.track_id, one.box_source_px) for one in request.also),
+        )
+        return Cut(draft=draft, crop_bgr=crop, base_crop_bgr=seen, rival=rival)
+
+    def code(self, cut: Cut, *, sequence: int, room: Room) -> Still | NoStill:
+        """Code a crop so that ``room``, asked of the very still that comes out, holds its data."""
+        draft = replace(cut.draft, sequence=sequence)
+        if cut.base_crop_bgr is None or not self.codec.needs_base:
+            made = self._fitted(self.without_base, cut, draft, room)
+            return made if isinstance(made, NoStill) else made[0]
+        built = self._fitted(self.codec, cut, draft, room)
+        if isinstance(built, NoStill):
+            made = self._fitted(self.without_base, cut, draft, room) if cut.base_far_off else built
+            return made if isinstance(made, NoStill) else made[0]
+        return (self._cheaper(*built, cut, draft) if cut.base_far_off else None) or built[0]
+
+    def make(
+        self,
+        frame: Frame,
+        request: Request,
+        *,
+        sequence: int,
+        view: View,
+        limit_bytes: int,
+        base_bgr: Image | None = None,
+    ) -> Still | NoStill:
+        """`cut` and `code` in one; ``limit_bytes`` bounds the payload alone."""
+        cut = self.cut(frame, request, view=view, base_bgr=base_bgr)
+        if isinstance(cut, NoStill):
+            return cut
+        return self.code(cut, sequence=sequence, room=lambda _: limit_bytes)
+
+    def _fitted(
+        self, codec: StillCodec, cut: Cut, draft: Still, room: Room
+    ) -> tuple[Still, Fitted] | NoStill:
+        """As asked, with this codec, or the best below that for which there is room."""
+        fitter = self._fitter(codec)
+        draft = _of_codec(draft, codec)
+        limit_bytes = room(draft)
+        for _ in range(_TRIES):
+            fitted = fitter.best(cut, limit_bytes=limit_bytes)
+            if isinstance(fitted, NoStill):
+                return fitted
+            still = _filled(draft, fitted)
+            excess_bytes = len(still.data) - room(still)  # the codec's parameters have taken their part
+            if excess_bytes <= 0:
+                return still, fitted
+            limit_bytes = min(limit_bytes, len(still.data)) - excess_bytes
+        return NoStill("too_large")
+
+    def _cheaper(self, built: Still, fitted: Fitted, cut: Cut, draft: Still) -> Still | None:
+        """The fallback's still, where it shows no less than the one built on the base, in fewer bytes."""
+        codec = self.without_base
+        psnr_db = psnr_y_db(fitted.shown_bgr, cut.crop_bgr)
+        smaller = self._fitter(codec).smallest(cut, psnr_db=psnr_db, limit_bytes=len(built.data))
+        return None if smaller is None else _filled(_of_codec(draft, codec), smaller)
+
+    def _fitter(self, codec: StillCodec) -> Fitter:
+        return Fitter(
+            codec,
+            quality_pct=self.quality_pct,
+            fidelity_db=self.fidelity_db,
+            floor_pct=1 if codec.needs_base else self.floor_pct,
+            ceiling_pct=self.ceiling_pct,
+        )
+
+
+def _filled(draft: Still, fitted: Fitted) -> Still:
+    return replace(
+        draft,
+        quality_pct=fitted.quality_pct,
+        data=fitted.data,
+        parameters={**draft.parameters, **fitted.parameters},
+    )
+
+
+def _of_codec(draft: Still, codec: StillCodec) -> Still:
+    return replace(draft, codec=codec.name, media_type=codec.media_type)

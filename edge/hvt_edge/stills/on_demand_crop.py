@@ -1,0 +1,145 @@
+"""From what somebody asks for to the crop of the frame that shows it, or to the sentence that says why not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from hvt_common.values import Boxes, Still, View
+from hvt_common.video.base_crop import coded_size
+from hvt_edge.perception.crop import MIN_SIDE_PX, crop_box
+from hvt_edge.perception.frame_ring import FrameRing, KeptFrame
+from hvt_edge.stills.crop_job import Cut, crop_of
+from hvt_edge.stills.maker import StillMaker
+
+__all__ = ["ASKED", "Ask", "RefusedError", "box_of", "cut_for", "frame_for", "shrunk"]
+
+ASKED = "asked"
+"""The reason that such a still carries on the wire and in the ledger."""
+
+Box = tuple[float, float, float, float]
+Crop = tuple[int, int, int, int]
+
+
+class RefusedError(Exception):
+    """What is asked for cannot be had; the text is one plain sentence for whoever asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A track or a box, or neither for the whole frame; at a frame or so long ago, or neither for the newest."""
+
+    track_id: int | None = None
+    """The edge's."""
+    box_xywh_px: tuple[int, int, int, int] | None = None
+    """Left, top, width and height in source pixels."""
+    frame_index: int | None = None
+    ago_ms: int | None = None
+    """Before the newest frame."""
+    quality_pct: int | None = None
+    """At most so good; None for the quality of all stills."""
+
+
+def frame_for(ask: Ask, ring: FrameRing) -> KeptFrame:
+    """The frame that is asked for, or the nearest that is kept; raises `RefusedError` where it is gone or to come."""
+    newest = ring.newest
+    if newest is None:
+        raise RefusedError("there is no frame yet, or none is kept (--ring)")
+    if ask.frame_index is not None:
+        if ask.frame_index > newest.frame_index:
+            raise RefusedError(f"frame {ask.frame_index} is yet to come: the newest is {newest.frame_index}")
+        kept, wanted = ring.near_index(ask.frame_index), f"frame {ask.frame_index}"
+    else:
+        ago_ms = ask.ago_ms or 0
+        kept = ring.near_time(newest.capture_ns - ago_ms * 1_000_000)
+        wanted = f"the frame of {ago_ms / 1000:g} s ago"
+    if kept is None:
+        raise RefusedError(f"{wanted} is not held: frames go back {ring.reach_s():.1f} s")
+    return kept
+
+
+def cut_for(ask: Ask, kept: KeptFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]) -> Cut:
+    """Take what is asked for out of that frame; raises `RefusedError` where it is not in it."""
+    height, width = kept.source_bgr.shape[:2]
+    box: Box
+    if ask.track_id is not None:
+        row = _row(kept, ask.track_id)
+        box = box_of(
+            np.clip(view.to_source(kept.tracks.boxes_xyxy_px), 0, (width, height, width, height)), row
+        )
+        crop = crop_box(box, padding=maker.padding, source_size=(width, height))
+        if box[2] - box[0] < 1 or box[3] - box[1] < 1:
+            raise RefusedError(f"track {ask.track_id} is outside the picture at frame {kept.frame_index}")
+        class_id = int(kept.tracks.class_ids[row])
+        name, confidence = class_names[class_id], float(kept.tracks.confidences[row])
+    else:
+        crop = _inside(ask.box_xywh_px or (0, 0, width, height), (width, height))
+        box, name, confidence = (*map(float, crop),), "", 0.0  # type: ignore[assignment]
+    size = coded_size(crop, max_side_px=maker.max_side_px)
+    codec = maker.codec
+    draft = Still(
+        sequence=0,
+        frame_index=kept.frame_index,
+        capture_ns=kept.capture_ns,
+        track_id=-1 if ask.track_id is None else ask.track_id,
+        box_source_px=box,
+        crop_source_px=crop,
+        class_name=name,
+        confidence=confidence,
+        reason=ASKED,
+        codec=codec.name,
+        quality_pct=maker.quality_pct,
+        data=b"",
+        media_type=codec.media_type,
+        parameters=_size_parameters(crop, size),
+    )
+    pixels = crop_of(kept.source_bgr, crop, size)
+    return Cut(draft=draft, crop_bgr=pixels, base_crop_bgr=None, rival=None)
+
+
+def _row(kept: KeptFrame, track_id: int) -> int:
+    rows = np.flatnonzero(kept.tracks.ids == track_id)
+    if len(rows):
+        return int(rows[0])
+    known = kept.tracks.ids.tolist()
+    listed = ", ".join(map(str, known[:12])) + (" and more" if len(known) > 12 else "")
+    raise RefusedError(
+        f"there is no track {track_id} at frame {kept.frame_index}: the edge's own tracks there are "
+        f"{listed or 'none'}"
+    )
+
+
+def shrunk(cut: Cut, shrink: float) -> Cut:
+    """The same crop, coded with its sides so much shorter."""
+    height, width = cut.crop_bgr.shape[:2]
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    if size == (width, height):
+        return cut
+    pixels = np.asarray(cv2.resize(cut.crop_bgr, size, interpolation=cv2.INTER_AREA), np.uint8)
+    parameters = {**cut.draft.parameters, **_size_parameters(cut.draft.crop_source_px, size)}
+    return replace(cut, draft=replace(cut.draft, parameters=parameters), crop_bgr=pixels)
+
+
+def _size_parameters(crop: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:
+    if size == (crop[2] - crop[0], crop[3] - crop[1]):
+        return {}
+    return {"w": size[0], "h": size[1]}
+
+
+def _inside(box_xywh_px: tuple[int, int, int, int], size: tuple[int, int]) -> Crop:
+    x, y, w, h = box_xywh_px
+    if x < 0 or y < 0 or w < 1 or h < 1 or x + w > size[0] or y + h > size[1]:
+        raise RefusedError(
+            f"box {x},{y},{w},{h} is not inside the frame of {size[0]}x{size[1]} source pixels (x,y,w,h)"
+        )
+    if min(w, h) < MIN_SIDE_PX:
+        raise RefusedError(f"box {x},{y},{w},{h} is too small: {MIN_SIDE_PX} pixels a side at least")
+    return x, y, x + w, y + h
+
+
+def box_of(boxes: Boxes, row: int) -> Box:
+    """One row as plain numbers."""
+    x1, y1, x2, y2 = (float(one) for one in boxes[row])
+    return x1, y1, x2, y2

@@ -1,0 +1,81 @@
+"""What a method is: a pure function from the candidates of a step to wishes for stills, most wanted first.
+
+To add one: a frozen dataclass with its parameters in a file of its own, and one row in `registry`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from hvt_edge.perception.candidates import Candidate
+from hvt_edge.stills.policy.cost import CostEstimate
+
+__all__ = ["STILL_OVERHEAD_BYTES", "Method", "Request", "Step", "ranked"]
+
+STILL_OVERHEAD_BYTES = 180.0
+"""With the usual names: 91 of header and 83 of framing and TCP for JPEG, 18 more for a residual's parameters."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What every method may know of the moment beside the candidates."""
+
+    frame_index: int
+    now_ns: int
+    fps: float
+    """Frames a second of the base stream."""
+    base_size: tuple[int, int]
+    """(width, height) in base pixels."""
+    cost: CostEstimate
+    """What a still is expected to cost, learnt from those already sent."""
+    room_bytes: float
+    """What the rolling budget would admit now."""
+    still_overhead_bytes: float = STILL_OVERHEAD_BYTES
+    """Line bytes that a still takes beside its payload: header, framing, transport."""
+    from_source: bool = False
+    """Whether candidates were detected on the source (``--candidates source``): the base may not show them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A wish for a still of one candidate."""
+
+    candidate: Candidate
+    reason: str
+    """In a word or two, for the ledger, the wire and the viewer."""
+    score: float
+    """The queue sends the highest first; comparable within one method only."""
+    also: tuple[Candidate, ...] = ()
+    """Neighbours that the same still shows (`hvt_edge.stills.merging`), by track id; never ``candidate`` itself."""
+
+
+class Method(Protocol):
+    """A scheduling policy."""
+
+    @property
+    def name(self) -> str:
+        """As ``--method`` and the tables say it."""
+        ...
+
+    @property
+    def video_only(self) -> bool:
+        """True where no still is ever wanted, so that the base stream may take the whole budget."""
+        ...
+
+    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
+        """The wishes of this step, most wanted first, at most one a track; the same for the same input."""
+        ...
+
+
+def ranked(
+    candidates: Iterable[Candidate], *, score: Callable[[Candidate], float | None], reason: str
+) -> list[Request]:
+    """Requests for those with a score, highest first; ties go to the older track, whatever the order they came in."""
+    wanted = [
+        Request(candidate, reason, value)
+        for candidate in candidates
+        if (value := score(candidate)) is not None
+    ]
+    return sorted(wanted, key=lambda request: (-request.score, request.candidate.track_id))

@@ -1,0 +1,149 @@
+"""M6: stills by expected gain per byte on the line.
+
+    gain = P(the still helps) · [ (1 - k) · P(wrong before) + k · P(wrong after the last still) · better ]
+    score = 1000 · gain / (expected payload + what a still takes beside it)
+
+``gain`` is the chance that the class which the ground shows of a track becomes right by a still of it now, and ``k``
+fades with the time since the last still. docs/methods.md says what the terms are and where their numbers come from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from hvt_common.inference.class_names import MOVING, same_kind
+from hvt_edge.perception.candidates import Candidate
+from hvt_edge.stills.policy.base import Request, Step, ranked
+
+__all__ = ["ExpectedGain"]
+
+_SIDE_PX = 32.0
+"""The size at which ``size_weight`` adds nothing."""
+_MOST_LOGIT = 50.0
+"""Surer than that nothing is; keeps the exponential finite whatever weights a user tries."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedGain:
+    """Highest expected gain per byte first, from ``min_gain`` on, as many as ``look_ahead`` times the room holds.
+
+    Wishes beyond the room are for neighbours that may share a still, and for the queue.
+    """
+
+    bias: float = 0.5
+    confidence_weight: float = 6.0
+    lost_weight: float = 2.3
+    """Of the detail that the base has lost, for candidates detected on the decoded base."""
+    lost_weight_source: float = 6.5
+    """The same for candidates from the source, which the base may not show at all."""
+    size_weight: float = 0.65
+    """For each doubling of the side, from 32 base pixels on; smaller objects count less."""
+    unknown_lost: float = 0.5
+    """Taken for the lost detail where no base picture was at hand."""
+    readable_px: float = 4.0
+    """Side in source pixels at which a perfect still is of use every second time."""
+    readable_confidence: float = 0.22
+    """Of a detection on the source: how surely a still would show it too; 1 - exp(-confidence / it)."""
+    sharp_half: float = 20.0
+    """Sharpness (variance of the Laplacian) at which it is half as useful."""
+    border_share: float = 0.2
+    """What a cut-off object takes from the use of its still."""
+    covered_share: float = 0.3
+    """What an object that is wholly covered by another would take from it."""
+    fade_s: float = 60.0
+    """Time constant with which the effect of a still wears off; 0 forgets at once."""
+    unanswered: float = 0.3
+    """P(wrong after the last still) while the ground has not answered."""
+    disagreement: float = 0.35
+    """At least so much where ground and edge name different kinds."""
+    again: float = 0.1
+    """The use of another still of the same view, against the first."""
+    min_gain: float = 0.02
+    """Nothing below it is sent: about twice the rate at which a still spoils a class that was right."""
+    look_ahead: float = 3.0
+    name: str = field(default="M6", init=False)
+    video_only: bool = field(default=False, init=False)
+
+    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
+        """Best first; always at least the best one, so that it waits for its room."""
+        gains = {one.track_id: self.gain(one, step) for one in candidates}
+        wanted = ranked(
+            (one for one in candidates if gains[one.track_id] >= self.min_gain),
+            score=lambda one: 1000 * gains[one.track_id] / _line_bytes(one, step),
+            reason="gain",
+        )
+        spent = 0.0
+        for count, request in enumerate(wanted):
+            spent += _line_bytes(request.candidate, step)
+            if spent > self.look_ahead * step.room_bytes:
+                return wanted[: max(count, 1)]
+        return wanted
+
+    def gain(self, candidate: Candidate, step: Step) -> float:
+        """Chance that a still now sets the class right that the ground shows; 0…1."""
+        faded = self._faded(candidate, now_ns=step.now_ns)
+        before = faded * self.doubt(candidate, from_source=step.from_source)
+        after = (1 - faded) * self._doubt_left(candidate) * self._better(candidate)
+        wrong = before + after
+        # Sharpness has to look at pixels: only where it can matter.
+        return wrong * self.use(candidate, from_source=step.from_source) if wrong >= self.min_gain else 0.0
+
+    def doubt(self, candidate: Candidate, *, from_source: bool) -> float:
+        """P(wrong before any still): the ground misses the object on the base, or calls it something else."""
+        weight = self.lost_weight_source if from_source else self.lost_weight
+        lost = self.unknown_lost if candidate.loss is None else candidate.loss().detail_lost
+        x1, y1, x2, y2 = candidate.box_base_px
+        side_px = math.sqrt(max(1.0, (x2 - x1) * (y2 - y1)))
+        logit = (
+            self.bias
+            - self.confidence_weight * candidate.confidence
+            + weight * lost
+            + self.size_weight * math.log2(side_px / _SIDE_PX)
+        )
+        return 1 / (1 + math.exp(-min(_MOST_LOGIT, max(-_MOST_LOGIT, logit))))
+
+    def use(self, candidate: Candidate, *, from_source: bool) -> float:
+        """P(the still helps): whether anything is to be read from the source crop."""
+        side_px = math.sqrt(max(1.0, candidate.area_px))
+        use = side_px / (side_px + self.readable_px)
+        if from_source and self.readable_confidence > 0:
+            use *= 1 - math.exp(-candidate.confidence / self.readable_confidence)
+        use *= 1 - min(1.0, self.covered_share) * candidate.covered_share
+        if candidate.touches_border:
+            use *= 1 - min(1.0, self.border_share)
+        if candidate.sharpness is not None and self.sharp_half > 0:
+            sharp = candidate.sharpness()
+            use *= sharp / (sharp + self.sharp_half)
+        return use
+
+    def _faded(self, candidate: Candidate, *, now_ns: int) -> float:
+        """``1 - k``: 1 where nothing was sent yet."""
+        if candidate.last_sent_ns is None or self.fade_s <= 0:
+            return 1.0
+        return 1 - math.exp(-max(0, now_ns - candidate.last_sent_ns) / 1e9 / self.fade_s)
+
+    def _doubt_left(self, candidate: Candidate) -> float:
+        """P(wrong after the last still): ``1 - exp(-H)`` of the ground's entropy, more where the two disagree."""
+        belief = candidate.posterior
+        if belief is None:
+            return min(1.0, self.unanswered)
+        doubt = 1 - math.exp(-max(0.0, belief.entropy_nats))
+        known = MOVING not in (belief.class_name, candidate.class_name)
+        if known and not same_kind(belief.class_name, candidate.class_name):
+            doubt = max(doubt, min(1.0, self.disagreement))
+        return doubt
+
+    def _better(self, candidate: Candidate) -> float:
+        """0…1: how much more than the last still another would show; 1 for twice the side, or whole at last."""
+        if candidate.last_sent_at_border and not candidate.touches_border:
+            return 1.0
+        if not candidate.last_sent_area_px or candidate.area_px <= 0:
+            return min(1.0, self.again)
+        grown = math.log2(candidate.area_px / candidate.last_sent_area_px) / 2
+        return min(1.0, max(self.again, grown))
+
+
+def _line_bytes(candidate: Candidate, step: Step) -> float:
+    return step.cost.of(candidate) + step.still_overhead_bytes

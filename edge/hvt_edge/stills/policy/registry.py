@@ -1,0 +1,101 @@
+"""Every method by name: the one table that ``--method``, its help and the study read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+from hvt_common.errors import UserError
+from hvt_edge.stills.policy.base import Method
+from hvt_edge.stills.policy.m0 import VideoOnly
+from hvt_edge.stills.policy.m1 import Periodic
+from hvt_edge.stills.policy.m2 import OnStart
+from hvt_edge.stills.policy.m3 import Uncertain
+from hvt_edge.stills.policy.m4 import Small
+from hvt_edge.stills.policy.m5 import Utility
+from hvt_edge.stills.policy.m6 import ExpectedGain
+from hvt_edge.stills.policy.r0 import TracksFirst
+from hvt_edge.stills.policy.selectors import SELECTORS, SelectorMethod
+
+__all__ = ["METHODS", "MethodEntry", "method", "tuning"]
+
+
+@dataclass(frozen=True, slots=True)
+class MethodEntry:
+    """A row of the table."""
+
+    make: Callable[..., Method]
+    help: str
+    parameters: Mapping[str, float]
+    """Name and default of what may be tuned."""
+
+
+def _entry(make: type[Any], text: str) -> MethodEntry:
+    defaults = make()
+    tunable: dict[str, float] = {one.name: getattr(defaults, one.name) for one in fields(make) if one.init}
+    return MethodEntry(make, text, MappingProxyType(tunable))
+
+
+_SELECTOR_HELP = {
+    "permissive": "pilot: up to 3 detections a frame, small first, then least confident",
+    "conf_size_top1": "pilot: 1 road user a frame, small first, then least confident",
+    "strict_small_only": "pilot: 1 road user a frame, small first, larger ones only where nothing is small",
+    "balanced_top2": "pilot: up to 2 road users a frame, by doubt, then smallness",
+}
+
+METHODS: Mapping[str, MethodEntry] = MappingProxyType(
+    {
+        "M0": _entry(VideoOnly, "video only: no stills"),
+        "M1": _entry(Periodic, "every track each 15 frames, most overdue first"),
+        "M2": _entry(OnStart, "when a track begins or is found again"),
+        "M3": _entry(Uncertain, "tracks of low confidence: detector's, or classifier's once known"),
+        "M4": _entry(Small, "tracks that are small in the frame"),
+        "M5": _entry(Utility, "most utility per byte: uncertain, small, not refined lately"),
+        "M6": _entry(ExpectedGain, "most expected gain per byte, from what the base lost of each track"),
+        "R0": _entry(TracksFirst, "video only, active tracks quantised better (--roi-depth)"),
+        **{
+            row.name: MethodEntry(
+                partial(SelectorMethod, row), _SELECTOR_HELP[row.name], MappingProxyType({})
+            )
+            for row in SELECTORS
+        },
+    }
+)
+
+
+def method(name: str, **parameters: float) -> Method:
+    """The method of that name (case does not matter), with parameters other than its defaults.
+
+    Raises `UserError` for an unknown name, an unknown parameter, or a value that is not a finite number from 0.
+    """
+    entry = METHODS.get({known.casefold(): known for known in METHODS}.get(name.casefold(), ""))
+    if entry is None:
+        raise UserError(f"method {name!r} is not known: choose one of {', '.join(METHODS)}")
+    for key, value in parameters.items():
+        if key not in entry.parameters:
+            known = ", ".join(entry.parameters) or "none"
+            raise UserError(f"method {name} has no parameter {key!r}: it has {known}")
+        if not math.isfinite(value) or value < 0:
+            raise UserError(f"parameter {key} of method {name} is {value!r}: write a number from 0")
+    return entry.make(**parameters)
+
+
+def tuning(texts: Iterable[str]) -> dict[str, float]:
+    """What ``--tune KEY=VALUE`` says, for `method`; each text may hold several, with commas between.
+
+    Raises `UserError` for what is not of that form; whether the method has such a parameter, `method` says.
+    """
+    parameters: dict[str, float] = {}
+    for part in (part.strip() for text in texts for part in text.split(",")):
+        key, equals, value = part.partition("=")
+        try:
+            parameters[key.strip()] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals or not key.strip().isidentifier():
+            raise UserError(f"--tune {part!r} is not accepted: write KEY=VALUE, such as min_gain=0.05")
+    return parameters

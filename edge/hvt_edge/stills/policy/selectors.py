@@ -1,0 +1,119 @@
+"""The pilot's four selectors on raw detections, with their published parameters.
+
+A selector filters the detections of one frame and keeps the best few by a score of smallness and doubt. *Small* is a
+yes or no, and `strict_small_only` falls back to what is not small where nothing is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.inference.class_names import same_kind
+from hvt_common.values import Boxes
+from hvt_edge.perception.candidates import Candidate
+from hvt_edge.stills.policy.base import Request, Step
+
+__all__ = ["SELECTORS", "Selector", "SelectorMethod", "select"]
+
+_ROAD_USERS = ("car", "truck", "bus", "person")
+
+
+@dataclass(frozen=True, slots=True)
+class Selector:
+    """One row of the pilot's table."""
+
+    name: str
+    min_confidence: float
+    per_frame: int
+    min_side_px: float
+    """Of the box, width and height alike, base pixels."""
+    kinds: tuple[str, ...] | None
+    """Class words in the sense of `hvt_common.inference.class_names`; None is every class."""
+    small_share: float
+    """A box that takes less of the frame is small."""
+    small_weight: float
+    doubt_weight: float
+    """The order is ``small_weight · small + doubt_weight · (1 - confidence)``, highest first."""
+
+
+SELECTORS: tuple[Selector, ...] = (
+    Selector("permissive", 0.20, 3, 0, None, 0.015, 2, 1),
+    Selector("conf_size_top1", 0.40, 1, 12, _ROAD_USERS, 0.015, 2, 1),
+    Selector("strict_small_only", 0.50, 1, 12, _ROAD_USERS, 0.020, 10, 1e-6),
+    Selector("balanced_top2", 0.40, 2, 12, _ROAD_USERS, 0.015, 1, 2),
+)
+
+
+def select(
+    selector: Selector,
+    boxes_xyxy_px: Boxes,
+    confidences: npt.ArrayLike,
+    class_names: Sequence[str],
+    frame_area_px: float,
+) -> npt.NDArray[np.int64]:
+    """Indices of the detections of one frame that the selector keeps, best first; ties keep the detections' order.
+
+    ``boxes_xyxy_px`` is (N, 4) in base pixels, ``class_names`` the N names of the detections' classes.
+    """
+    confidence = np.asarray(confidences, np.float64).reshape(-1)
+    kept, score, _ = _judge(selector, boxes_xyxy_px, confidence, class_names, frame_area_px)
+    indices = np.flatnonzero(kept)
+    best = np.argsort(-score[indices], kind="stable")[: selector.per_frame]
+    return indices[best].astype(np.int64)
+
+
+def _judge(
+    selector: Selector,
+    boxes_xyxy_px: Boxes,
+    confidence: npt.NDArray[np.float64],
+    class_names: Sequence[str],
+    frame_area_px: float,
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """Per detection: passes the filters, score, is small."""
+    boxes = np.asarray(boxes_xyxy_px, np.float64).reshape(-1, 4)
+    width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
+    small = width * height / frame_area_px < selector.small_share
+    allowed = {name: _allows(selector, name) for name in set(class_names)}
+    kept = np.array([allowed[name] for name in class_names], np.bool_)
+    kept &= (width >= selector.min_side_px) & (height >= selector.min_side_px)
+    kept &= confidence >= selector.min_confidence
+    return kept, selector.small_weight * small + selector.doubt_weight * (1 - confidence), small
+
+
+def _allows(selector: Selector, class_name: str) -> bool:
+    return selector.kinds is None or any(same_kind(class_name, kind) for kind in selector.kinds)
+
+
+@dataclass(frozen=True, slots=True)
+class SelectorMethod:
+    """A selector as a method: it sees the candidates that a detection of this very frame backs."""
+
+    selector: Selector
+
+    @property
+    def name(self) -> str:
+        """The selector's name."""
+        return self.selector.name
+
+    @property
+    def video_only(self) -> bool:
+        """Selectors always want stills."""
+        return False
+
+    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
+        """At most ``per_frame`` requests; nothing on frames between detections."""
+        seen = sorted((one for one in candidates if one.detected), key=lambda one: one.track_id)
+        boxes = np.array([one.box_base_px for one in seen], np.float32).reshape(-1, 4)
+        confidence = np.array([one.confidence for one in seen], np.float64)
+        names = [one.class_name for one in seen]
+        area = float(step.base_size[0] * step.base_size[1])
+        chosen = select(self.selector, boxes, confidence, names, area)
+        _, score, small = _judge(self.selector, boxes, confidence, names, area)
+        return [
+            Request(seen[index], "small" if small[index] else "low confidence", float(score[index]))
+            for index in chosen.tolist()
+        ]

@@ -1,0 +1,68 @@
+"""From a budget in line bits to the bits that x265 is given."""
+
+from __future__ import annotations
+
+from hvt_edge.link.transmitter import base_overhead_bps
+from hvt_edge.video.x265 import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
+
+__all__ = ["PULSE_VBV_S", "encoder_settings", "least_base_bps", "payload_bps"]
+
+# The fullest rolling second over the target, keyframes on demand included, from 300 kbps up (see encode).
+_PEAK = 1.14
+_TIGHT_VBV_S = 0.1
+_TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
+PULSE_VBV_S = 0.5
+"""Whole-frame pulses need a deep VBV: with 0.15 s nothing is left of them (docs/base-stream.md)."""
+_KEYFRAME_EVERY_S = 5.0
+"""x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
+So much is asked for less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
+
+
+def encoder_settings(
+    *,
+    size: tuple[int, int],
+    fps: float,
+    preset: str,
+    total_bps: int,
+    base_bps: int,
+    edge_id: str,
+    side_data: bool = False,
+    pulses: bool = False,
+) -> EncoderSettings:
+    """What to ask of x265 so that the base stream stays within B_v, and its fullest second within B_tot.
+
+    Where stills have a share, they yield to the base's peaks. Where video takes (nearly) the whole budget, as in M0,
+    nothing can yield: the VBV is made tighter and the target lowered by the peak that is left.
+
+    ``fps`` is the rate of coded frames: with fewer of them less goes into headers, and the VBV holds one at least.
+    ``side_data`` is needed by any `RegionPlan`, ``pulses`` by those of whole frames (`PulsePlan`), which make the VBV
+    deeper: what then does not fit the budget's window waits.
+    """
+    tight = base_bps * _PEAK > total_bps
+    line_bps = min(base_bps, total_bps / _TIGHT_PEAK) if tight else base_bps
+    payload_bps = line_bps - _beside_bps(line_bps, size=size, fps=fps, edge_id=edge_id)
+    return EncoderSettings(
+        size=size,
+        fps=fps,
+        bitrate_bps=max(1, round(payload_bps)),
+        preset=preset,
+        vbv_s=max(PULSE_VBV_S if pulses else _TIGHT_VBV_S if tight else VBV_S, 1 / fps),
+        side_data=side_data or pulses,
+    )
+
+
+def least_base_bps(size: tuple[int, int], fps: float, *, edge_id: str) -> int:
+    """The lowest B_v at which x265 can still follow its target."""
+    payload_bps = minimum_bps(size, fps)
+    return round(payload_bps + _beside_bps(payload_bps, size=size, fps=fps, edge_id=edge_id))
+
+
+def payload_bps(base_bps: int, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
+    """About what x265 gets of B_v; never below 1."""
+    return max(1.0, base_bps - _beside_bps(base_bps, size=size, fps=fps, edge_id=edge_id))
+
+
+def _beside_bps(line_bps: float, *, size: tuple[int, int], fps: float, edge_id: str) -> float:
+    """What of the base's rate is not x265's to spend: headers, framing, ``status``, and its debt of keyframes."""
+    debt_bps = 8 * keyframe_floor_bytes(size) / _KEYFRAME_EVERY_S
+    return base_overhead_bps(line_bps, fps=fps, edge_id=edge_id) + debt_bps

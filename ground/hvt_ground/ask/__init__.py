@@ -1,7 +1,0 @@
-"""Asking edges for more: a still, a keyframe, another budget or method. For people and for programs."""
-
-from __future__ import annotations
-
-from hvt_ground.ask.api import AskedStill, EdgeClient, EdgeTrack, RefusedError, RemoteEdge
-
-__all__ = ["AskedStill", "EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge"]

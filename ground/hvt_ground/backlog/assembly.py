@@ -1,0 +1,264 @@
+"""Puts together again what an edge kept while the link was away: pieces in, whole objects and acknowledgements out.
+
+Pure, and bounded whatever comes. Of an object is held what has come without a hole from its beginning: a piece beyond
+that is not kept, and the edge hears how far it got. Where room is short the object that has waited longest for its
+next piece goes; its edge begins it again. What has been delivered is remembered, so that a repetition is acknowledged
+and nothing more.
+
+An object is acknowledged when it is where it belongs, and not before: its edge forgets it then. While it is being
+worked on, all of it but the last byte is said to be here. So an edge that asks again hears that somebody is there,
+and what it asks with is one byte.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field, replace
+
+from hvt_common.protocol.messages import (
+    MAX_PAST_BYTES,
+    Flags,
+    Info,
+    PastHave,
+    PastHeader,
+    PastKind,
+    PastUnit,
+    RoiHeader,
+    WireError,
+    parse_past_still,
+    parse_past_units,
+)
+
+__all__ = ["PastAssembly", "PastContent", "PastKey", "StoredStill", "past_content"]
+
+PastKey = tuple[int, str, int]
+"""Session id, kind, number."""
+
+_MAX_UNSAID = 512
+_MAX_REFUSALS = 256
+_PATIENCE = 3
+"""An object that is unusable so often is unusable for good: it is acknowledged, so that it does not take the link."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredStill:
+    """A still that was kept, as it would have come on ``roi``."""
+
+    header: RoiHeader
+    """Carries the flag `STORED`."""
+    data: bytes
+    encoding: str
+
+
+PastContent = Info | StoredStill | tuple[PastUnit, ...]
+"""What an object holds: the facts of its session, a still, or a stretch of the base stream."""
+
+
+@dataclass(slots=True)
+class _Open:
+    total_bytes: int
+    data: bytearray = field(default_factory=bytearray)
+    handed: bool = False
+    """It is complete, and whoever has it has not said yet what came of it."""
+
+    @property
+    def size_bytes(self) -> int:
+        """What it takes, here or where it was handed to."""
+        return self.total_bytes if self.handed else len(self.data)
+
+
+class PastAssembly:
+    """Of one edge. Not safe for threads.
+
+    Args:
+        max_objects: how many may be in progress.
+        max_bytes: how many bytes they, and those handed out and not settled yet, may have in all; at least one
+            object of the largest size.
+        remember: how many delivered objects are known again.
+    """
+
+    def __init__(
+        self, *, max_objects: int = 64, max_bytes: int = 4 * MAX_PAST_BYTES, remember: int = 8192
+    ) -> None:
+        if max_objects < 1 or max_bytes < MAX_PAST_BYTES or remember < 1:
+            raise ValueError(f"bounds are too small: {max_objects=}, {max_bytes=}, {remember=}")
+        self._max_objects = max_objects
+        self._max_bytes = max_bytes
+        self._remember = remember
+        self._open: OrderedDict[PastKey, _Open] = OrderedDict()
+        self._done: OrderedDict[PastKey, int] = OrderedDict()
+        self._refusals: OrderedDict[PastKey, int] = OrderedDict()
+        self._unsaid: OrderedDict[PastKey, int] = OrderedDict()
+        self.refused = 0
+        """Objects that were complete and unusable."""
+
+    @property
+    def size_bytes(self) -> int:
+        """What the objects in progress and those handed out have."""
+        return sum(entry.size_bytes for entry in self._open.values())
+
+    @property
+    def in_progress(self) -> int:
+        """How many objects there are of which some is held or handed out."""
+        return len(self._open)
+
+    def piece(self, header: PastHeader, payload: bytes, *, may_finish: bool = True) -> bytes | None:
+        """Take a piece; the object's bytes where it is the last one that was missing, to be `settle`d later.
+
+        With ``may_finish`` False a piece that would complete its object is not taken, and will come again.
+
+        Raises:
+            WireError: the piece cannot be one.
+        """
+        _check(header, payload)
+        key = _key(header)
+        if self._done.get(key) == header.total_bytes:
+            self._done.move_to_end(key)
+            self._say(key, header.total_bytes)
+            return None
+        entry = self._entry(key, header.total_bytes)
+        if entry.handed:
+            self._say_busy(key, entry, header.total_bytes)
+            return None
+        fresh = payload[len(entry.data) - header.offset :] if header.offset <= len(entry.data) else b""
+        finishes = len(entry.data) + len(fresh) == header.total_bytes
+        if fresh and (may_finish or not finishes) and self._make_room(key, len(fresh)):
+            entry.data += fresh
+        if len(entry.data) == header.total_bytes:
+            entry.handed, whole = True, bytes(entry.data)
+            entry.data = bytearray()
+            self._say_busy(key, entry, header.total_bytes)
+            return whole
+        self._say(key, len(entry.data))
+        if not entry.data:
+            del self._open[key]
+        return None
+
+    def settle(self, key: PastKey, *, usable: bool) -> None:
+        """Say what came of an object that was handed out: it is where it belongs, or nothing could be made of it."""
+        entry = self._open.get(key)
+        if entry is None or not entry.handed:
+            return
+        del self._open[key]
+        self.refused += not usable
+        if usable:
+            self._finish(key, entry.total_bytes)
+            return
+        times = self._refusals.pop(key, 0) + 1
+        if times >= _PATIENCE:
+            self._finish(key, entry.total_bytes)
+            return
+        self._refusals[key] = times
+        _trim(self._refusals, _MAX_REFUSALS)
+        self._say(key, 0)
+
+    def drop(self, key: PastKey) -> None:
+        """Forget an object that was handed out and cannot be taken: another ground may, or this one later."""
+        entry = self._open.get(key)
+        if entry is not None and entry.handed:
+            del self._open[key]
+            self._unsaid.pop(key, None)
+
+    def drop_handed(self) -> int:
+        """Forget objects that were handed out to somebody who is gone: the edge sends them again. How many."""
+        handed = [key for key, entry in self._open.items() if entry.handed]
+        for key in handed:
+            del self._open[key]
+            self._say(key, 0)
+        return len(handed)
+
+    def want_info(self, session_id: int) -> None:
+        """Ask for the facts of a session: without them nothing can be made of its objects."""
+        self._say((session_id, PastKind.INFO, 0), 0)
+
+    @property
+    def unsaid(self) -> int:
+        """How many acknowledgements the edge has not heard yet."""
+        return len(self._unsaid)
+
+    def take_haves(self, most: int) -> tuple[PastHave, ...]:
+        """Return and forget up to ``most`` acknowledgements that the edge has not heard yet, oldest first."""
+        taken = [self._unsaid.popitem(last=False) for _ in range(min(most, len(self._unsaid)))]
+        return tuple(
+            PastHave(session_id=session_id, kind=kind, number=number, have_bytes=have)
+            for (session_id, kind, number), have in taken
+        )
+
+    def _entry(self, key: PastKey, total_bytes: int) -> _Open:
+        """The object's entry, now the newest; a new one where there is none or it was of another size."""
+        entry = self._open.get(key)
+        if entry is None or (entry.total_bytes != total_bytes and not entry.handed):
+            entry = self._open[key] = _Open(total_bytes)
+        self._open.move_to_end(key)
+        return entry
+
+    def _make_room(self, key: PastKey, more_bytes: int) -> bool:
+        """Whether there is room for so much more of this object, which may cost others theirs."""
+        while len(self._open) > self._max_objects or self.size_bytes + more_bytes > self._max_bytes:
+            victim = next((one for one, entry in self._open.items() if one != key and not entry.handed), None)
+            if victim is None:
+                return False
+            del self._open[victim]
+        return True
+
+    def _finish(self, key: PastKey, total_bytes: int) -> None:
+        self._refusals.pop(key, None)
+        if key[1] != PastKind.INFO:  # one that was forgotten here has to come through again
+            self._done[key] = total_bytes
+            self._done.move_to_end(key)
+            _trim(self._done, self._remember)
+        self._say(key, total_bytes)
+
+    def _say_busy(self, key: PastKey, entry: _Open, total_bytes: int) -> None:
+        """Of another object of the same name nothing is here."""
+        self._say(key, entry.total_bytes - 1 if entry.total_bytes == total_bytes else 0)
+
+    def _say(self, key: PastKey, have_bytes: int) -> None:
+        self._unsaid[key] = have_bytes
+        _trim(self._unsaid, _MAX_UNSAID)
+
+
+def past_content(key: PastKey, data: bytes, *, edge: str) -> PastContent:
+    """What the bytes of a whole object hold; raises `WireError` and nothing else, for any bytes whatever."""
+    session_id, kind, number = key
+    if kind == PastKind.INFO:
+        return _info(session_id, data, edge=edge)
+    if kind == PastKind.STILL:
+        return _still(session_id, number, data)
+    units = parse_past_units(data)
+    if units[0].frame_index != number:
+        raise WireError(f"past video {number} begins with frame {units[0].frame_index}")
+    return units
+
+
+def _info(session_id: int, data: bytes, *, edge: str) -> Info:
+    info = Info.parse(data)
+    if info.session_id != session_id or info.edge != edge:
+        raise WireError("the facts of a past session are those of another")
+    return info
+
+
+def _still(session_id: int, number: int, data: bytes) -> StoredStill:
+    kept = parse_past_still(data)
+    header = RoiHeader.parse(kept.attachment, kept.payload)
+    if header.session_id != session_id or header.sequence != number:
+        raise WireError(f"past still {number} is another one inside")
+    return StoredStill(replace(header, flags=header.flags | Flags.STORED), kept.payload, kept.encoding)
+
+
+def _check(header: PastHeader, payload: bytes) -> None:
+    if not payload or header.offset + len(payload) > header.total_bytes:
+        raise WireError(
+            f"a piece of {len(payload)} bytes at {header.offset} is none of an object of {header.total_bytes}"
+        )
+    if header.kind == PastKind.INFO and (header.number or header.total_bytes > Info.MAX_BYTES):
+        raise WireError("a piece of a session's facts has a number, or is of too many")
+
+
+def _key(header: PastHeader) -> PastKey:
+    return header.session_id, header.kind, header.number
+
+
+def _trim(ring: OrderedDict[PastKey, int], most: int) -> None:
+    while len(ring) > most:
+        ring.popitem(last=False)

@@ -1,0 +1,149 @@
+"""Looks at what was kept of one session: boxes in stretches of its video, and stills of one that is over.
+
+With the models of now, borrowed while it looks, for it is done in the thread that sees: neither the tracks of now nor
+a detector's memory are touched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Protocol
+
+import numpy as np
+
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import Detector
+from hvt_common.protocol.messages import Info
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.values import Image
+from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.events.events import Event, Overlay
+from hvt_ground.events.history import History
+from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.stills.classify import StillReader
+from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.stage import Moment, StillStage
+
+__all__ = ["FIRST_TRACK_ID", "Lender", "PastLook", "Watch"]
+
+FIRST_TRACK_ID = 1_000_001
+"""Tracks of kept video are others than those of the session, and told apart by their numbers."""
+
+Emit = Callable[[Event], None]
+
+
+class Lender(Protocol):
+    """Where models come from."""
+
+    def borrow(self) -> AbstractContextManager[tuple[Detector, Classifier | None]]:
+        """A set that may be used meanwhile, by turns with what else is done in the thread that sees."""
+        ...
+
+
+class Watch:
+    """Detects and tracks along one stretch of video."""
+
+    def __init__(
+        self, detector: Detector, tracker: ByteTracker, *, first_id: int, detect_every: int, emit: Emit
+    ) -> None:
+        self._detector = detector
+        self._tracker = tracker
+        self._first_id = first_id
+        self._detect_every = detect_every
+        self._emit = emit
+        self._detected: int | None = None
+        self.next_id = first_id
+
+    def see(self, frame_index: int, capture_ns: int, image_bgr: Image) -> None:
+        """Take the next frame; frames rise."""
+        if self._detected is None or frame_index - self._detected >= self._detect_every:
+            self._detected = frame_index
+            found = self._detector.detect(image_bgr)
+            tracks = self._tracker.update(found, frame_index=frame_index, image_bgr=image_bgr)
+        else:
+            tracks = self._tracker.predict(frame_index=frame_index, image_bgr=image_bgr)
+        ids = tracks.ids + (self._first_id - 1)
+        self.next_id = max(self.next_id, int(ids.max(initial=0)) + 1)
+        names = tuple(self._detector.class_names[class_id] for class_id in tracks.class_ids)
+        self._emit(
+            Overlay(
+                frame_index=frame_index,
+                capture_ns=capture_ns,
+                track_ids=ids,
+                boxes_base_px=tracks.boxes_xyxy_px,
+                base_classes=names,
+                classes=names,
+                confidences=tracks.confidences,
+                refined=np.zeros(len(tracks), np.bool_),
+                stored=True,
+            )
+        )
+
+
+class PastLook:
+    """Of one session. For one thread at a time.
+
+    Args:
+        info: of the session.
+        models: lends detector and classifier.
+        tracker_of: makes a tracker for one stretch.
+        reader_of: makes of detector and classifier what names stills.
+        detect_every: ticks from one detection to the next, at least.
+    """
+
+    def __init__(
+        self,
+        info: Info,
+        *,
+        models: Lender,
+        tracker_of: Callable[[], ByteTracker],
+        reader_of: Callable[[Detector, Classifier | None], StillReader],
+        detect_every: int,
+    ) -> None:
+        self._info = info
+        self._models = models
+        self._tracker_of = tracker_of
+        self._reader_of = reader_of
+        self._detect_every = detect_every
+        self._next_id = FIRST_TRACK_ID
+
+    @contextmanager
+    def watch(self, emit: Emit) -> Iterator[Watch]:
+        """What follows one stretch of video."""
+        with self._models.borrow() as (detector, _):
+            watch = Watch(
+                detector,
+                self._tracker_of(),
+                first_id=self._next_id,
+                detect_every=self._detect_every,
+                emit=emit,
+            )
+            try:
+                yield watch
+            finally:
+                self._next_id = watch.next_id
+
+    def read(self, still: ReceivedStill, *, emit: Emit) -> None:
+        """Decode, name and give out a still of a session that is over: no track of it is here to be matched."""
+        info = self._info
+        with self._models.borrow() as (detector, classifier):
+            reader = self._reader_of(detector, classifier)
+            names, edge_classes = unified_names(detector.class_names, info.class_names)
+            stage = StillStage(
+                reader,
+                Refiner(
+                    "replace", fps=info.fps, detector_classes=names, classifier_classes=reader.class_names
+                ),
+                history=History(),
+                fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_ticks=1)),
+                view=info.view,
+                wants_base=False,
+                gap_ticks=1,
+                emit=emit,
+            )
+            header = still.header
+            moment = Moment(header.frame_index, header.capture_ns, picture_index=header.frame_index)
+            stage.take([still], moment)
+            stage.end(moment)

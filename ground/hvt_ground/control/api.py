@@ -1,0 +1,333 @@
+"""The Python API for asking edges.
+
+    from hvt_ground.control import EdgeClient
+
+    with EdgeClient.connect("tcp/127.0.0.1:7447") as edges:
+        crop = edges["uav-1"].still(track=17, at_s=-3)
+        crop.save("crop.png")
+
+It connects to a ground or to a router, which pass on what is asked and what is answered, so that a still crosses the
+link of the edge once. An edge that listens itself can be connected to as well; its stills then cross its link twice
+while one is waited for.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+import cv2
+import zenoh
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.channels import EdgeKeys, Row, parse_key, selector
+from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, Info, RoiHeader, WireError
+from hvt_common.transport.doctor.diagnose import control_unanswered
+from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.session import ask, open_session, subscribe
+from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.values import Image
+from hvt_common.video.still_codecs import StillError
+from hvt_ground.control.unanswered import Asker, who_is_seen_by_way_of
+from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
+
+__all__ = ["AskedStill", "EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge"]
+
+_ANSWER_S = 2.0
+_LOOK_S = 0.3
+_FATE_S = 2.0
+"""So often the edge is asked what became of a still that does not come."""
+_INBOX_MESSAGES = 64
+_JPEG_QUALITY_PCT = 95
+_SUFFIXES = (".jpg", ".jpeg", ".png")
+
+_Answer = TypeVar("_Answer")
+
+
+class RefusedError(UserError):
+    """The edge says no; the text is its reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeTrack:
+    """What the edge tracks now."""
+
+    track_id: int
+    """The edge's own; a ground numbers its tracks itself."""
+    class_name: str
+    confidence: float
+    box_source_px: tuple[float, float, float, float]
+    """x1, y1, x2, y2."""
+
+
+@dataclass(frozen=True, slots=True)
+class AskedStill:
+    """A still that was asked for."""
+
+    edge: str
+    header: RoiHeader
+    """All that came with it: frame, capture time, track, box, crop, codec, quality."""
+    data: bytes
+    """As it came over the link."""
+    image_bgr: Image
+    """(height, width, 3) uint8; smaller than the crop where that is longer than 512 pixels or the budget is thin."""
+
+    def save(self, path: Path | str) -> None:
+        """Write it as JPEG or PNG, by the suffix; a JPEG that came as one is written as it came.
+
+        Raises:
+            UserError: for another suffix, or where the file cannot be written.
+        """
+        path = Path(path)
+        check_suffix(path)
+        data = self.data
+        if path.suffix.lower() == ".png" or self.header.codec != "jpeg":
+            options = [] if path.suffix.lower() == ".png" else [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY_PCT]
+            data = cv2.imencode(path.suffix.lower(), self.image_bgr, options)[1].tobytes()
+        try:
+            path.write_bytes(data)
+        except OSError as error:
+            raise UserError(f"{path} cannot be written ({error.strerror}): name a file that can") from None
+
+
+def check_suffix(path: Path) -> None:
+    """Raise `UserError` for a picture format that is not written."""
+    if path.suffix.lower() not in _SUFFIXES:
+        raise UserError(f"{path} is not a picture that can be written: name it {', '.join(_SUFFIXES)}")
+
+
+class RemoteEdge:
+    """One edge, at the other end of the link.
+
+    Every method raises `UserError` where it does not answer, or our own keys do not let us ask, and `RefusedError`
+    where it says no.
+    """
+
+    def __init__(self, session: zenoh.Session, edge: str, *, asker: Asker | None = None) -> None:
+        self.name = edge
+        self._session = session
+        self._keys = EdgeKeys(edge)
+        self._asker = asker or Asker()
+
+    def info(self) -> Info:
+        """What the edge says of its session."""
+        answer = self._ask(Row.INFO, b"")
+        if answer is None:
+            raise UserError(self._absent())
+        return self._parsed(Info.parse, answer)
+
+    def tracks(self) -> list[EdgeTrack]:
+        """What it tracks now, by its own ids: 64 tracks at most."""
+        names = self.info().class_names
+        return [
+            EdgeTrack(
+                one.track_id,
+                names[one.class_id] if one.class_id < len(names) else str(one.class_id),
+                one.confidence,
+                one.box_source_px,
+            )
+            for one in self.command(Command.TRACKS).tracks
+        ]
+
+    def keyframe(self) -> None:
+        """Ask for a keyframe."""
+        self.command(Command.KEYFRAME)
+
+    def set_budget(self, bps: int) -> None:
+        """Set the total budget, line bits a second."""
+        self.command(Command.SET_BUDGET, {"bps": bps})
+
+    def set_method(self, method: str) -> None:
+        """Set who gets a still: a name of ``hvt-edge --method``."""
+        self.command(Command.SET_METHOD, {"method": method})
+
+    def still(
+        self,
+        *,
+        track: int | None = None,
+        box: tuple[int, int, int, int] | None = None,
+        at_s: float | None = None,
+        frame: int | None = None,
+        quality_pct: int | None = None,
+        timeout_s: float = 15.0,
+    ) -> AskedStill:
+        """Ask for a still of the untouched source frame, and wait for it.
+
+        Args:
+            track: the edge's id of a track (`tracks`).
+            box: x, y, width and height in source pixels; with neither, the whole frame.
+            at_s: when, in seconds before the edge's newest frame, as ``-3``.
+            frame: or at which frame, by its index; with neither, the newest.
+            quality_pct: 5 to 95; less where the budget has no room for it. None: the edge's ``--jpeg-quality``.
+            timeout_s: how long to wait.
+
+        Raises:
+            RefusedError: the edge refused it, or gave it up.
+            UserError: it did not answer, or the still did not come in time.
+        """
+        arguments = _still_arguments(track=track, box=box, at_s=at_s, frame=frame, quality_pct=quality_pct)
+        until_s = time.monotonic() + timeout_s
+        self._check_may_command()
+        info = self.info()
+        inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest")
+        subscriber = subscribe(self._session, self._keys.key(Row.ROI), inbox=inbox)
+        try:
+            answer = self.command(Command.STILL, arguments)
+            header, item = self._wait(inbox, answer, until_s=until_s, timeout_s=timeout_s)
+        finally:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+        received = ReceivedStill(header, item.payload, item.encoding)
+        try:
+            image = decode_still(received, base_bgr=None, view=info.view)
+        except StillError as error:
+            raise UserError(f"{self.name} sent a still that cannot be decoded: {error}") from None
+        return AskedStill(self.name, header, item.payload, image)
+
+    def command(
+        self, command: str, arguments: Mapping[str, int | float | str] | None = None
+    ) -> ControlAnswer:
+        """Send any command of docs/wire.md; return the answer where it is accepted."""
+        self._check_may_command()
+        answer = self._commanded(command, arguments or {})
+        if answer is None:
+            present = self._ask(Row.INFO, b"") is not None
+            raise UserError(control_unanswered(self.name, who="this key") if present else self._absent())
+        return answer
+
+    def _wait(
+        self, inbox: Inbox, answer: ControlAnswer, *, until_s: float, timeout_s: float
+    ) -> tuple[RoiHeader, Received]:
+        """The still of that number; in between the edge is asked whether it is still to come."""
+        ask_s = time.monotonic() + _FATE_S
+        while (now_s := time.monotonic()) < until_s:
+            item = inbox.get(timeout_s=min(_LOOK_S, until_s - now_s))
+            header = None if item is None else _header(item)
+            if item is not None and header is not None and _is_answer(header, answer):
+                return header, item
+            if now_s >= ask_s:
+                try:
+                    self._commanded(Command.STILL_FATE, {"ask": answer.still_ask})
+                except RefusedError:
+                    raise
+                except UserError:
+                    pass  # an answer that cannot be used, as no answer: the still itself may come all the same
+                ask_s = now_s + _FATE_S
+        raise UserError(
+            f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: "
+            "the budget or the link is full"
+        )
+
+    def _commanded(self, command: str, arguments: Mapping[str, int | float | str]) -> ControlAnswer | None:
+        """The answer where the edge accepts; None where there is none in time."""
+        try:
+            question = ControlRequest(session_id=0, command=command, arguments=arguments).pack()
+        except ValueError as error:
+            raise UserError(f"{command}: {error}") from None
+        data = self._ask(Row.CONTROL, question)
+        if data is None:
+            return None
+        answer = self._parsed(ControlAnswer.parse, data)
+        if not answer.accepted:
+            raise RefusedError(f"{self.name} refuses: {answer.reason}")
+        return answer
+
+    def _check_may_command(self) -> None:
+        if refusal := self._asker.refusal(self.name):
+            raise UserError(refusal)
+
+    def _ask(self, row: Row, question: bytes) -> bytes | None:
+        try:
+            return ask(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
+        except zenoh.ZError:
+            return None
+
+    def _absent(self) -> str:
+        return (
+            f"edge {self.name!r} does not answer: is it flying, and does this link reach it?"
+            f"{who_is_seen_by_way_of(self._session)}"
+        )
+
+    def _parsed(self, parse: Callable[[bytes], _Answer], data: bytes) -> _Answer:
+        try:
+            return parse(data)
+        except WireError as error:
+            raise UserError(f"the answer of {self.name} cannot be used: {error}") from None
+
+
+class EdgeClient:
+    """The edges that can be reached from one place; a context manager. ``client["uav-1"]`` is one of them."""
+
+    def __init__(
+        self, session: zenoh.Session, *, asker: Asker | None = None, stack: ExitStack | None = None
+    ) -> None:
+        self._session = session
+        self._asker = asker
+        self._stack = stack or ExitStack()
+
+    @classmethod
+    def connect(cls, *endpoints: str, zenoh_config: Path | None = None) -> EdgeClient:
+        """Connect to a ground or a router, such as ``tcp/127.0.0.1:7447``, where one listens unless told otherwise.
+
+        Raises:
+            UserError: where nobody answers within three seconds, or a setting cannot be used.
+        """
+        stack = ExitStack()
+        settings = LinkSettings(role="asker", connect=endpoints, zenoh_config=zenoh_config)
+        return cls(stack.enter_context(open_session(settings)), asker=Asker.of(settings), stack=stack)
+
+    def nobody(self) -> str:
+        """What to tell a user where `names` is empty."""
+        return f"no edge is there{who_is_seen_by_way_of(self._session)}"
+
+    def names(self) -> list[str]:
+        """The edges that are there now."""
+        replies = self._session.liveliness().get(selector(Row.ALIVE), timeout=_ANSWER_S)
+        keys = [parse_key(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None]
+        return sorted({key[0] for key in keys if key is not None})
+
+    def __getitem__(self, edge: str) -> RemoteEdge:
+        return RemoteEdge(self._session, edge, asker=self._asker)
+
+    def close(self) -> None:
+        """Leave the link."""
+        self._stack.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _still_arguments(
+    *,
+    track: int | None,
+    box: tuple[int, int, int, int] | None,
+    at_s: float | None,
+    frame: int | None,
+    quality_pct: int | None,
+) -> dict[str, int]:
+    arguments: dict[str, int | None] = {"track": track, "frame": frame, "quality": quality_pct}
+    if box is not None:
+        arguments |= dict(zip(("x", "y", "w", "h"), box, strict=True))
+    if at_s is not None:
+        arguments["at_ms"] = round(at_s * 1000)
+    return {name: value for name, value in arguments.items() if value is not None}
+
+
+def _header(item: Received) -> RoiHeader | None:
+    try:
+        return RoiHeader.parse(item.attachment, item.payload)
+    except WireError:
+        return None
+
+
+def _is_answer(header: RoiHeader, answer: ControlAnswer) -> bool:
+    return header.session_id == answer.session_id and header.parameters.get("ask") == answer.still_ask

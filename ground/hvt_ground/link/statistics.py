@@ -1,0 +1,156 @@
+"""What the receiver tells the edge: the newest message of each stream, when it came, how old; stills missing.
+
+Reports cost the way back: they come so often that together they take `_SHARE` of what arrives, within bounds, and
+only when something new has arrived; in a pause the usual ones, twice a second, go on.
+"""
+
+from __future__ import annotations
+
+import statistics
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
+
+__all__ = ["REPORT_LINE_BYTES", "Measured", "Reception"]
+
+_MS = 1_000_000
+_SECOND_NS = 1_000_000_000
+REPORT_LINE_BYTES = 180
+"""What a report without results takes on the line."""
+_SHARE = 0.03
+_LEAST_NS, _MOST_NS = 100 * _MS, 500 * _MS
+_RATE_OVER_NS = 2 * _SECOND_NS
+_MOST_DELAYS = 256
+_HELD_US = 2**32 - 1
+_MISSED_NS = 6 * _SECOND_NS
+"""A still that has not come for so long does not come any more: reports need not name it for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What a report says of the link."""
+
+    base_sequence: int
+    base_held_us: int
+    still_sequence: int
+    missing_stills: tuple[int, ...]
+    """Below it, in their order."""
+    delay_p50_ms: float | None
+    """Of the base messages since the last report."""
+
+
+class Reception:
+    """Of one session. ``now_ns`` is one clock without steps in all calls.
+
+    Safe for threads: messages come in one, and a still that was read in another is reported at once.
+    """
+
+    def __init__(self, *, lockstep: bool = False) -> None:
+        self._lock = threading.Lock()
+        self._lockstep = lockstep
+        self._base_sequence = self._still_sequence = -1
+        self._from_start = False
+        self._missing: dict[int, int] = {}
+        """Sequence → when it was first missed."""
+        self._arrived_ns = 0
+        self._sizes: deque[tuple[int, int]] = deque()
+        self._size_bytes = 0
+        self._delays_ms: deque[float] = deque(maxlen=_MOST_DELAYS)
+        self._news = False
+        self._reported_ns: int | None = None
+
+    def base(
+        self, header: BaseHeader, *, size_bytes: int, arrived_ns: int, delay_ms: float | None = None
+    ) -> None:
+        """An access unit of this session has arrived; ``delay_ms`` from capture, where clocks allow to say."""
+        with self._lock:
+            if header.sequence > self._base_sequence:
+                self._base_sequence, self._arrived_ns = header.sequence, arrived_ns
+            self._from_start |= header.sequence == 0
+            if delay_ms is not None:
+                self._delays_ms.append(delay_ms)
+            self._note(size_bytes, arrived_ns)
+
+    def still(self, sequence: int, *, size_bytes: int, arrived_ns: int) -> None:
+        """A still of this session has arrived."""
+        with self._lock:
+            self._missing.pop(sequence, None)
+            if sequence > self._still_sequence:
+                self._miss(self._still_sequence + 1, sequence, at_ns=arrived_ns)
+                self._still_sequence = sequence
+            self._note(size_bytes, arrived_ns)
+
+    def past(self, *, size_bytes: int, arrived_ns: int) -> None:
+        """A piece of what was kept while the link was away has arrived."""
+        with self._lock:
+            self._note(size_bytes, arrived_ns)
+
+    def stored_still(self, sequence: int) -> None:
+        """A still that never came on ``roi`` came afterwards, with what was kept."""
+        with self._lock:
+            self._missing.pop(sequence, None)
+
+    def due(self, now_ns: int) -> bool:
+        """Whether a report should go out."""
+        with self._lock:
+            if self._reported_ns is None:
+                return True
+            since_ns = now_ns - self._reported_ns
+            return since_ns >= _MOST_NS or (self._news and since_ns >= self._interval_ns(now_ns))
+
+    def interval_ns(self, now_ns: int) -> int:
+        """Between two reports while messages arrive."""
+        with self._lock:
+            return self._interval_ns(now_ns)
+
+    def _interval_ns(self, now_ns: int) -> int:
+        if self._lockstep:
+            return _MOST_NS
+        self._forget(now_ns)
+        arriving = self._size_bytes / _RATE_OVER_NS
+        if arriving <= 0:
+            return _MOST_NS
+        return min(_MOST_NS, max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving))))
+
+    def take(self, now_ns: int) -> Measured:
+        """What to report now; delays begin anew."""
+        with self._lock:
+            delays = list(self._delays_ms)
+            self._delays_ms.clear()
+            self._news = False
+            self._reported_ns = now_ns
+            held_us = max(0, now_ns - self._arrived_ns) // 1000 if self._base_sequence >= 0 else 0
+            return Measured(
+                base_sequence=self._base_sequence,
+                base_held_us=min(held_us, _HELD_US),
+                still_sequence=self._still_sequence,
+                missing_stills=self._missing_now(now_ns),
+                delay_p50_ms=statistics.median(delays) if delays else None,
+            )
+
+    def _miss(self, first: int, end: int, *, at_ns: int) -> None:
+        """Those from ``first`` up to ``end`` have not come; of many, the newest count.
+
+        What was sent before this ground was there is not missed.
+        """
+        if self._still_sequence < 0 and not self._from_start:
+            return
+        self._missing |= dict.fromkeys(range(max(first, end - MAX_MISSING_STILLS), end), at_ns)
+        while len(self._missing) > MAX_MISSING_STILLS:
+            del self._missing[next(iter(self._missing))]
+
+    def _missing_now(self, now_ns: int) -> tuple[int, ...]:
+        self._missing = {one: at_ns for one, at_ns in self._missing.items() if now_ns - at_ns <= _MISSED_NS}
+        return tuple(self._missing)
+
+    def _note(self, size_bytes: int, arrived_ns: int) -> None:
+        self._sizes.append((arrived_ns, size_bytes))
+        self._size_bytes += size_bytes
+        self._news = True
+        self._forget(arrived_ns)
+
+    def _forget(self, now_ns: int) -> None:
+        while self._sizes and (self._sizes[0][0] <= now_ns - _RATE_OVER_NS or len(self._sizes) > 4096):
+            self._size_bytes -= self._sizes.popleft()[1]

@@ -1,0 +1,1 @@
+"""Decoded base in, tracks out: the pipeline, and the worker that it runs in."""

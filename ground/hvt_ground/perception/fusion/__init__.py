@@ -1,0 +1,1 @@
+"""One list of tracks out of base, edge and stills."""

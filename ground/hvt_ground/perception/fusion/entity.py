@@ -1,0 +1,111 @@
+"""One object as the ground believes in it, and the witnesses that it has; see `fuse`."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.events.events import Origin
+
+__all__ = ["Entity", "Vote", "Witness"]
+
+_Floats = npt.NDArray[np.float64]
+
+_NEW_VELOCITY = 0.6
+"""Weight of the newest velocity against those before: two boxes of a small object give a rough one."""
+_NEW_CONFIDENCE = 0.2
+MISSED_STEPS = 2
+"""So many steps in a row that do not list a track end the edge's knowledge of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """A box that somebody else saw at one tick, and how the object moves beyond what the camera does."""
+
+    box: _Floats
+    """(4,) float64 x1 y1 x2 y2, base pixels."""
+    frame_index: int
+    confidence: float
+    velocity: _Floats = field(default_factory=lambda: np.zeros(2))
+    """(2,) float64, base pixels a tick."""
+    steps: int = 1
+    """How often it has been seen."""
+
+    def seen_again(self, box: _Floats, frame_index: int, confidence: float, *, path: CameraPath) -> Witness:
+        """The same object at a later tick."""
+        ticks = frame_index - self.frame_index
+        stood = path.carry(self.box[None], start=self.frame_index, end=frame_index)[0]
+        newest = (_centre(box) - _centre(stood)) / max(1, ticks)
+        share = 1.0 if self.steps == 1 else _NEW_VELOCITY
+        velocity = share * newest + (1 - share) * self.velocity
+        return Witness(box, frame_index, confidence, velocity, self.steps + 1)
+
+
+@dataclass(slots=True)
+class Vote:
+    """The class that one side has settled on."""
+
+    class_id: int = -1
+    confidence: float = 0.0
+    """Smoothed over its detections."""
+
+    def hear(self, class_id: int, confidence: float) -> None:
+        """Take the side's present class."""
+        share = 1.0 if self.class_id < 0 else _NEW_CONFIDENCE
+        self.confidence += share * (confidence - self.confidence)
+        self.class_id = class_id
+
+
+@dataclass(slots=True, eq=False)
+class Entity:
+    """An id that never changes, and who knows of it."""
+
+    born: int
+    id: int = 0
+    """0 until it is listed for the first time."""
+    own_id: int | None = None
+    edge_id: int | None = None
+    afar: Witness | None = None
+    """Of the edge, or of a still where the edge has never listed it."""
+    own_vote: Vote = field(default_factory=Vote)
+    far_vote: Vote = field(default_factory=Vote)
+    missed: int = 0
+    """Steps in a row that have not listed it."""
+    still_frame: int = -1
+    """Of the newest still that showed it."""
+    apart: int = 0
+    """Steps in a row at which its two witnesses lay apart."""
+    own_then: tuple[_Floats, int] | None = None
+    """(2,) the centre of our own box at the tick of a step, and that tick."""
+    correction: tuple[_Floats, int] | None = None
+    """(4,) what to add to our own box, and the frame of the still that showed it."""
+    last_frame: int = -1
+    """The newest at which anybody saw it."""
+
+    def is_live_afar(self, tick: int, *, patience: int) -> bool:
+        """Whether the edge's knowledge of it, or a still's, holds at this tick."""
+        if self.afar is None or tick - self.afar.frame_index > patience:
+            return False
+        return self.edge_id is None or self.missed < MISSED_STEPS
+
+    def origin(self, own_ids: Container[int | None], tick: int, *, patience: int) -> Origin | None:
+        """Who knows of it; ``own_ids`` are our tracks at this tick. None where nobody does (any more)."""
+        far = self.is_live_afar(tick, patience=patience)
+        if self.own_id is not None and self.own_id in own_ids:
+            return "edge+base" if far and self.edge_id is not None else "base"
+        if not far:
+            return None
+        return "still" if self.edge_id is None else "edge"
+
+    def part_from_own(self) -> None:
+        """Forget our track, which is another object."""
+        self.own_id, self.own_vote = None, Vote()
+        self.apart, self.own_then, self.correction = 0, None, None
+
+
+def _centre(box: _Floats) -> _Floats:
+    return (box[:2] + box[2:]) / 2

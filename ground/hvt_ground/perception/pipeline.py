@@ -1,0 +1,305 @@
+"""What the ground sees: the base stream, the edge's own tracks and the stills, as one list of tracks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hvt_common.inference.detect import Detector
+from hvt_common.protocol.messages import StillResult
+from hvt_common.runtime.distinct import DistinctIds
+from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.tracking.camera_motion import CameraMotion
+from hvt_common.values import Image, Tracks, View
+from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.events.events import Event, Overlay
+from hvt_ground.events.history import History
+from hvt_ground.perception.fusion.fuse import Fused, Fusion
+from hvt_ground.perception.stills.classify import StillReader
+from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.stills.refine import Refiner, Shown
+from hvt_ground.perception.stills.stage import Carried, Moment, StillStage
+
+__all__ = ["GroundSight", "Picture", "ReceivedStill", "SightParts"]
+
+_SECOND_NS = 1_000_000_000
+_FARTHEST_S = 5
+"""A step further ahead of all that is known is not believed: nothing that comes after it could be shown."""
+_GAP_S = 1.0
+"""For how long the base stream may leave out ticks and still tell where tracks were between."""
+
+
+_HISTORY_FRAMES = 45
+_MOST_HISTORY_BYTES = 256 * 2**20
+
+
+def _history_bytes(base_size: tuple[int, int]) -> int:
+    """For pictures that residual stills may build on: three seconds at 15 fps, as far as memory allows."""
+    return min(_MOST_HISTORY_BYTES, _HISTORY_FRAMES * 3 * base_size[0] * base_size[1])
+
+
+def _lent_nothing() -> None:
+    """What there is to release where nothing was lent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A decoded base frame."""
+
+    frame_index: int
+    capture_ns: int
+    reference_ns: int
+    """The moment on our clock that latency counts from: capture, or in lockstep the receiving."""
+    image_bgr: Image
+
+
+@dataclass(frozen=True, slots=True)
+class SightParts:
+    """What the eyes of one session are made of; none of it may be shared with another session."""
+
+    detector: Detector
+    tracker: ByteTracker
+    reader: StillReader
+    refiner: Refiner[Carried]
+    """Over the unified names of the fused list."""
+    fusion: Fusion
+    path: CameraPath
+    """The one that ``fusion`` moves boxes by."""
+    camera: CameraMotion | None
+    """None where the camera's motion is not followed."""
+    release: Callable[[], None] = _lent_nothing
+    """Called when the session has ended: its models may serve another."""
+
+
+class GroundSight:
+    """One session's eyes. Used by one thread; ``emit`` takes the events.
+
+    Args:
+        parts: detector, tracker, fusion and so on.
+        view: between source and base pixels.
+        fps: ticks a second.
+        detect_every: ticks from one detection to the next, at least.
+        wants_base: whether the reader looks at the base frame of a still.
+        emit: takes the events.
+    """
+
+    def __init__(
+        self,
+        parts: SightParts,
+        *,
+        view: View,
+        fps: float,
+        detect_every: int,
+        emit: Callable[[Event], None],
+        wants_base: bool = False,
+    ) -> None:
+        self._parts = parts
+        self._detect_every = detect_every
+        self._tick_ns = _SECOND_NS / fps
+        self._farthest = round(_FARTHEST_S * fps)
+        self._emit = emit
+        self._history = History(max_bytes=_history_bytes(view.base_size))
+        self._stills = StillStage(
+            parts.reader,
+            parts.refiner,
+            history=self._history,
+            fusion=parts.fusion,
+            view=view,
+            wants_base=wants_base,
+            gap_ticks=max(1, round(_GAP_S * fps)),
+            emit=emit,
+        )
+        self._detected_frame: int | None = None
+        self._camera_frame: int | None = None
+        self._leaves_out = False
+        """Whether there are ticks without a picture."""
+        self._now = Moment()
+        self._picture_ns = 0
+        self._own: Tracks | None = None
+        self._listed_tick = -1
+        self._track_ids = DistinctIds()
+        self.detections_run = 0
+        self.steps_used = 0
+        """Reports of the edge's tracks that were taken in."""
+
+    @property
+    def tracks(self) -> int:
+        """Distinct tracks so far, whoever saw them."""
+        return self._track_ids.count
+
+    @property
+    def refined(self) -> int:
+        """Distinct tracks on whose class a still has spoken."""
+        return self._parts.refiner.counters.tracks_refined
+
+    @property
+    def class_changes(self) -> int:
+        """Stills after which the class that is shown was another."""
+        return self._parts.refiner.counters.class_changes
+
+    @property
+    def stills_dropped(self) -> Counter[str]:
+        """Stills of which nothing could be made, by reason; ``base_missing`` were asked for again."""
+        return self._stills.dropped
+
+    @property
+    def outcomes(self) -> Counter[str]:
+        """What became of each object in the others."""
+        return self._stills.outcomes
+
+    def see(self, picture: Picture, *, hurry: bool) -> None:
+        """Take the next frame; with ``hurry`` detection waits for a later one."""
+        index = picture.frame_index
+        self._history.add_frame(index, picture.image_bgr)
+        self._follow_camera(picture)
+        own = self._own = self._track(picture, hurry=hurry)
+        self._picture_ns = picture.capture_ns
+        ahead = self._now.frame_index > index
+        shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
+        self._now = Moment(*shown_at, picture_index=index)
+        self._parts.fusion.take_own(own)
+        self._show(own, picture.capture_ns)
+
+    def edge_step(self, step: Tracks, *, capture_ns: int | None = None) -> None:
+        """Take what the edge's tracker listed at one tick: ids and class ids the edge's, boxes in base pixels.
+
+        A step of a tick that is newer than all that was shown is shown at once: the base stream may leave that tick
+        out. ``capture_ns`` is that tick's; None reckons it from the newest picture.
+        """
+        tick = step.frame_index
+        if tick - max(self._now.frame_index, self._now.picture_index) > self._farthest or self._own is None:
+            return
+        own = self._own_at(tick)
+        if not self._parts.fusion.take_step(step, own=own):
+            return
+        self.steps_used += 1
+        if tick > self._now.frame_index:
+            at_ns = self._capture_ns(tick) if capture_ns is None else capture_ns
+            self._now = Moment(tick, at_ns, self._now.picture_index)
+            self._show(own, at_ns)
+            return
+        self._carry_merges()
+        self._history.revise_tracks(self._parts.fusion.listed(own).tracks)
+        self._stills.look_again(self._now)
+
+    def read(self, stills: Sequence[ReceivedStill]) -> None:
+        """Take stills, in the order in which they came; those of one frame are looked at together."""
+        self._stills.take(stills, self._now)
+        self._carry_merges()
+
+    def list_at(self, frame_index: int) -> Overlay:
+        """What would be shown at a tick, from all that is known now; changes nothing.
+
+        The tick must not lie before the newest decoded frame (`ValueError`). Nothing known is an empty list.
+        """
+        if frame_index < self._now.picture_index:
+            raise ValueError(f"tick {frame_index} lies before the newest frame, {self._now.picture_index}")
+        fused = self._parts.fusion.listed(self._own_at(frame_index))
+        shown = self._parts.refiner.preview(fused.tracks)
+        return _overlay(fused, shown, self._capture_ns(frame_index))
+
+    def take_results(self) -> list[StillResult]:
+        """Return and forget what the edge wants to hear of its stills."""
+        return self._stills.take_results()
+
+    def end(self) -> None:
+        """The session is over: what still waits is given out as unmatched, and what is large is let go of.
+
+        A ground goes on for days, and its edges come and go.
+        """
+        self._stills.end(self._now)
+        self._history.clear()
+        self._parts.release()
+
+    # The base stream
+
+    def _track(self, picture: Picture, *, hurry: bool) -> Tracks:
+        index, image = picture.frame_index, picture.image_bgr
+        due = self._detected_frame is None or index - self._detected_frame >= self._detect_every
+        if hurry or not due:
+            return self._parts.tracker.predict(frame_index=index, image_bgr=image)
+        self._detected_frame = index
+        self.detections_run += 1
+        found = self._parts.detector.detect(image)
+        return self._parts.tracker.update(found, frame_index=index, image_bgr=image)
+
+    def _follow_camera(self, picture: Picture) -> None:
+        """Estimate the camera's motion, but only where boxes have to be moved along between pictures."""
+        camera, parts = self._parts.camera, self._parts
+        last = self._now.picture_index
+        self._leaves_out = self._leaves_out or (last >= 0 and picture.frame_index > last + 1)
+        if camera is None or not (self._leaves_out or parts.fusion.knows_from_afar):
+            self._camera_frame = None
+            return
+        if self._camera_frame is None:
+            camera.reset()
+        affine = camera.step(picture.image_bgr)
+        if self._camera_frame is not None:
+            parts.path.add(affine, start=self._camera_frame, end=picture.frame_index)
+        self._camera_frame = picture.frame_index
+
+    def _own_at(self, tick: int) -> Tracks:
+        """Our tracker's list at a tick: as it was, or moved on from the newest frame."""
+        own = self._own
+        if own is None:
+            return _nothing(tick)
+        if tick > own.frame_index:
+            ahead = self._parts.tracker.extrapolated(frame_index=tick)
+            boxes = ahead.boxes_xyxy_px.astype(np.float64)
+            moved = self._parts.path.carry(boxes, start=own.frame_index, end=tick)
+            return replace(ahead, boxes_xyxy_px=moved.astype(np.float32))
+        before = self._parts.fusion.own_at(tick)
+        return _nothing(tick) if before is None else replace(before, frame_index=tick)
+
+    def _capture_ns(self, tick: int) -> int:
+        return self._picture_ns + round((tick - self._now.picture_index) * self._tick_ns)
+
+    # The list
+
+    def _show(self, own: Tracks, capture_ns: int) -> None:
+        """Put the list at the tick of ``own`` on record and, where nothing newer has been shown, give it out."""
+        self._carry_merges()
+        fused = self._parts.fusion.listed(own)
+        self._history.revise_tracks(fused.tracks)
+        self._track_ids.add(fused.tracks.ids.tolist())
+        self._stills.look_again(self._now)
+        if own.frame_index > self._listed_tick:
+            self._listed_tick = own.frame_index
+            self._emit(_overlay(fused, self._parts.refiner.shown(fused.tracks), capture_ns))
+
+    def _carry_merges(self) -> None:
+        for kept_id, gone_id in self._parts.fusion.take_merged():
+            self._parts.refiner.merge(kept_id, gone_id)
+            self._history.rename_track(kept_id, gone_id)
+
+
+def _overlay(fused: Fused, shown: Shown, capture_ns: int) -> Overlay:
+    tracks = fused.tracks
+    return Overlay(
+        frame_index=tracks.frame_index,
+        capture_ns=capture_ns,
+        track_ids=tracks.ids,
+        boxes_base_px=tracks.boxes_xyxy_px,
+        base_classes=shown.base_classes,
+        classes=shown.classes,
+        confidences=shown.confidences,
+        refined=shown.refined,
+        origins=fused.origins,
+    )
+
+
+def _nothing(tick: int) -> Tracks:
+    none = np.empty(0, np.int64)
+    return Tracks(
+        frame_index=tick,
+        ids=none,
+        boxes_xyxy_px=np.empty((0, 4), np.float32),
+        confidences=np.empty(0, np.float32),
+        class_ids=np.empty(0, np.int32),
+        born_frames=none,
+        seen_frames=none,
+        started=np.empty(0, np.bool_),
+    )

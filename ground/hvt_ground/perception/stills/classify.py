@@ -1,0 +1,262 @@
+"""What a still shows: a classifier on the crop, or the detector again on the picture with the stills pasted in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.boxes import iou
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import Detector, OnnxDetector
+from hvt_common.values import Boxes, Detections, Image, Posterior, View
+from hvt_ground.perception.stills.composite import composite
+
+__all__ = [
+    "Box",
+    "CropReader",
+    "Decoded",
+    "NoReader",
+    "Reading",
+    "Readings",
+    "Redetection",
+    "StillReader",
+    "object_crops",
+]
+
+Box = tuple[float, float, float, float]
+"""x1 y1 x2 y2."""
+
+_SAME_OBJECT_IOU = 0.4
+"""A detection on the composite that overlaps an object's box less is of something else."""
+_NEW_OBJECT_IOU = 0.2
+"""A detection that overlaps a named object more is not of a new one: a second box of the same, most often."""
+_INSIDE_SHARE = 0.9
+"""How much of a new object's box must lie inside a still: elsewhere the picture is the old one."""
+
+_PADDING = 0.15
+"""Of an object's width and height on each side, as the edge pads a crop."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A decoded still and where it belongs."""
+
+    image_bgr: Image
+    crop_source_px: tuple[int, int, int, int]
+    box_base_px: Box
+    frame_index: int
+    also_boxes_base_px: tuple[Box, ...] = ()
+    """Of the further objects that it shows, in the order of the header's ``also``."""
+
+    @property
+    def boxes_base_px(self) -> tuple[Box, ...]:
+        """The lead object's box, then those of the others."""
+        return (self.box_base_px, *self.also_boxes_base_px)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What is said of one object in a still."""
+
+    posterior: Posterior | None = None
+    """None is no opinion."""
+    box_base_px: Box | None = None
+    """Where the object was found at the still's frame; None where the reader does not look for boxes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """What is said of all stills of one frame."""
+
+    objects: tuple[tuple[Reading, ...], ...]
+    """For each still, in order: the lead object's reading, then one for each ``also`` box."""
+    found: Detections = field(default_factory=Detections.none)
+    """Objects that were seen inside a still and are none of the named ones; base pixels, class ids of the reader's
+    ``class_names``. Some may be tracks that the caller knows already."""
+
+
+class StillReader(Protocol):
+    """Names what stills show."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Of the posteriors, and of ``found``."""
+        ...
+
+    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:
+        """One reading for every object of every still.
+
+        All stills are of one frame, ``base_bgr`` is that frame decoded, where it is still at hand.
+        """
+        ...
+
+
+def _silent(stills: Sequence[Decoded]) -> Readings:
+    return Readings(tuple((Reading(),) * len(still.boxes_base_px) for still in stills))
+
+
+class NoReader:
+    """Shows stills and says nothing of them: what a ground without any model does."""
+
+    class_names: tuple[str, ...] = ("object",)
+
+    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:  # noqa: ARG002
+        """Nothing."""
+        return _silent(stills)
+
+
+class CropReader:
+    """An image classifier on the crop alone, all objects of a frame's stills in one call."""
+
+    def __init__(self, classifier: Classifier, *, view: View) -> None:
+        self._classifier = classifier
+        self._view = view
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The classifier's."""
+        return self._classifier.class_names
+
+    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:  # noqa: ARG002
+        """The classifier's posteriors; it finds neither boxes nor new objects."""
+        crops = [crop for still in stills for crop in object_crops(still, view=self._view)]
+        answers = iter(self._classifier.classify(crops))
+        return Readings(tuple(tuple(Reading(next(answers)) for _ in still.boxes_base_px) for still in stills))
+
+
+class Redetection:
+    """Pastes the stills into the decoded frame at their places and detects on the composite, once a frame.
+
+    The detector sees the objects sharp and in their surroundings, which is what it was trained on. Where its input is
+    larger than the base, so is the composite, and the stills keep their detail.
+
+    Args:
+        detector: What is run; its confidence is the least at which a class or a box is believed.
+        view: Between source and base pixels.
+        new_confidence: Least confidence of an object that nobody has named.
+    """
+
+    def __init__(self, detector: Detector, *, view: View, new_confidence: float = 0.5) -> None:
+        self._detector = detector
+        self._view = view
+        self._new_confidence = new_confidence
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The detector's."""
+        return self._detector.class_names
+
+    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:
+        """Class and box of what is detected at each object's place; no opinion where nothing is."""
+        if base_bgr is None or not stills:
+            return _silent(stills)
+        found = self._detect(stills, base_bgr)
+        named = np.array([box for still in stills for box in still.boxes_base_px], np.float32)
+        overlaps = iou(named, found.boxes_xyxy_px)
+        answers = iter(self._readings(found, overlaps))
+        return Readings(
+            tuple(tuple(next(answers) for _ in still.boxes_base_px) for still in stills),
+            self._new(found, overlaps, stills),
+        )
+
+    def _detect(self, stills: Sequence[Decoded], base_bgr: Image) -> Detections:
+        """On the composite; base pixels."""
+        zoom = self._zoom((base_bgr.shape[1], base_bgr.shape[0]))
+        found = self._detector.detect(composite(base_bgr, stills, view=self._view, zoom=zoom))
+        boxes = (found.boxes_xyxy_px / zoom).astype(np.float32)
+        return Detections(boxes, found.confidences, found.class_ids)
+
+    def _zoom(self, base_size: tuple[int, int]) -> float:
+        """As large as the network would make the base picture, and no finer than the source.
+
+        Objects keep the size that the network sees on the base stream. To enlarge them beyond it, a part of the
+        picture at a time, made classes worse.
+        """
+        if not isinstance(self._detector, OnnxDetector):
+            return 1.0
+        width, height = self._detector.input_size(base_size)
+        return max(1.0, min(width / base_size[0], height / base_size[1], 1 / self._view.scale))
+
+    def _readings(self, found: Detections, overlaps: npt.NDArray[np.float64]) -> list[Reading]:
+        """For each row of ``overlaps`` (an object), what the detections (columns) at its place say."""
+        if not len(found):
+            return [Reading()] * len(overlaps)
+        owners = overlaps.argmax(axis=0)
+        readings = []
+        for row, overlap in enumerate(overlaps):
+            at_place = np.flatnonzero((overlap >= _SAME_OBJECT_IOU) & (owners == row))
+            if not len(at_place):
+                readings.append(Reading())
+                continue
+            # The best box, not the most confident: that is right more often, since a
+            # neighbour's detection may be more confident than the object's own.
+            best = int(at_place[np.argmax(overlap[at_place])])
+            readings.append(Reading(self._posterior(found, best, at_place), _box(found.boxes_xyxy_px[best])))
+        return readings
+
+    def _posterior(self, found: Detections, best: int, others: npt.NDArray[np.intp]) -> Posterior:
+        """Over the classes that were seen at an object's place; what is left of 1 is spread evenly over the rest.
+
+        A detector gives one class to a box. Another class with a box of its own at the same place is a second
+        opinion: it counts with its score, but for no more than ``best``, which names the object.
+        """
+        names, score = self.class_names, float(found.confidences[best])
+        scores = np.zeros(len(names), np.float64)
+        np.maximum.at(scores, found.class_ids[others], np.minimum(found.confidences[others], score))
+        unseen = scores == 0
+        if unseen.any():
+            scores[unseen] = max(0.0, 1 - scores.sum()) / unseen.sum()
+        probabilities = (scores / scores.sum()).astype(np.float32)
+        named = int(found.class_ids[best])
+        known = probabilities[probabilities > 0]
+        entropy = max(0.0, float(-(known * np.log(known)).sum()))
+        return Posterior(names[named], float(probabilities[named]), entropy, probabilities)
+
+    def _new(
+        self, found: Detections, overlaps: npt.NDArray[np.float64], stills: Sequence[Decoded]
+    ) -> Detections:
+        """Confident detections that lie inside a still and on no named object."""
+        crops = self._view.to_base(np.array([still.crop_source_px for still in stills], np.float32))
+        inside = _share_inside(found.boxes_xyxy_px, crops).max(axis=1) >= _INSIDE_SHARE
+        unnamed = overlaps.max(axis=0) < _NEW_OBJECT_IOU
+        new = inside & unnamed & (found.confidences >= self._new_confidence)
+        return Detections(found.boxes_xyxy_px[new], found.confidences[new], found.class_ids[new])
+
+
+def object_crops(still: Decoded, *, view: View) -> list[Image]:
+    """The picture of each object in a still, the lead's first: its box with the still's padding.
+
+    A still of one object is that picture already.
+    """
+    if not still.also_boxes_base_px:
+        return [still.image_bgr]
+    height, width = still.image_bgr.shape[:2]
+    x1, y1, x2, y2 = still.crop_source_px
+    boxes = view.to_source(np.array(still.boxes_base_px, np.float32)).astype(np.float64)
+    sides = boxes[:, 2:] - boxes[:, :2]
+    grown = boxes + np.hstack([-sides, sides]) * _PADDING
+    pixels = (grown - [x1, y1, x1, y1]) * ([width / (x2 - x1), height / (y2 - y1)] * 2)
+    first = np.clip(np.floor(pixels[:, :2]), 0, [width - 1, height - 1]).astype(int)
+    last = np.clip(np.ceil(pixels[:, 2:]), first + 1, [width, height]).astype(int)
+    return [
+        still.image_bgr[top:bottom, left:right]
+        for (left, top), (right, bottom) in zip(first.tolist(), last.tolist(), strict=True)
+    ]
+
+
+def _share_inside(boxes: Boxes, areas: Boxes) -> npt.NDArray[np.float64]:
+    """(N, M): how much of each of N boxes lies in each of M areas, 0…1."""
+    first = np.maximum(boxes[:, None, :2], areas[None, :, :2])
+    last = np.minimum(boxes[:, None, 2:], areas[None, :, 2:])
+    shared = np.clip(last - first, 0, None).prod(axis=2)
+    whole = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None).prod(axis=1)
+    return np.asarray(shared / whole[:, None], np.float64)
+
+
+def _box(box: npt.NDArray[np.float32]) -> Box:
+    x1, y1, x2, y2 = box.tolist()
+    return x1, y1, x2, y2

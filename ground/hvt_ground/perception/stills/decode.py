@@ -1,0 +1,75 @@
+"""From a still as it came to a picture: undone by its codec, on the base frame where it builds on one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.messages import RoiHeader
+from hvt_common.values import Image, View
+from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop
+from hvt_common.video.still_codecs import BaseMissingError, StillError, still_codec
+
+__all__ = ["ReceivedStill", "decode_still", "needs_base"]
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedStill:
+    """A still as it came, its header checked."""
+
+    header: RoiHeader
+    data: bytes
+    media_type: str
+
+
+def needs_base(header: RoiHeader) -> bool:
+    """Whether the still builds on the decoded base frame of its own index; False for a codec that is not known."""
+    try:
+        return still_codec(header.codec).needs_base
+    except UserError:
+        return False
+
+
+def decode_still(still: ReceivedStill, *, base_bgr: Image | None, view: View) -> Image:
+    """The crop at the size at which it was coded, BGR.
+
+    ``base_bgr`` is the decoded base frame of the still's own index, None where it is not at hand; only codecs that
+    need it look at it.
+
+    Raises:
+        BaseMissingError: the still builds on a base frame that is not at hand, or not the one that the edge had.
+        StillError: it cannot be decoded, whatever the base; also a codec that is not known.
+    """
+    header = still.header
+    size = _coded_size(header, view=view)
+    try:
+        codec = still_codec(header.codec)
+    except UserError as error:
+        raise StillError(str(error)) from None
+    if not codec.needs_base:
+        return codec.decode(still.data, size=size, parameters=header.parameters)
+    if base_bgr is None:
+        raise BaseMissingError(f"it builds on frame {header.frame_index}, which is not at hand")
+    crop = base_crop(base_bgr, view=view, crop_source_px=header.crop_source_px, size=size)
+    return codec.decode(still.data, size=size, parameters=header.parameters, base_bgr=crop)
+
+
+def _coded_size(header: RoiHeader, *, view: View) -> tuple[int, int]:
+    """(width, height) as announced. A still may be shrunk, never be larger than what it shows."""
+    x1, y1, x2, y2 = header.crop_source_px
+    size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
+    inside = x2 <= view.source_size[0] and y2 <= view.source_size[1]
+    width, height = size
+    if not (inside and isinstance(width, int) and isinstance(height, int)):
+        raise StillError(f"crop {header.crop_source_px} is not of this source")
+    if not (0 < width <= x2 - x1 and 0 < height <= y2 - y1):
+        raise StillError(f"size {width}x{height} is larger than what it shows")
+    if abs(width * (y2 - y1) - height * (x2 - x1)) > max(x2 - x1, y2 - y1):
+        # Both sides are shrunk by one factor, each rounded to a pixel. A needle of a picture would cost the base
+        # crop the area of the whole frame for each of its pixels.
+        raise StillError(f"size {width}x{height} is not the shape of what it shows")
+    if max(width, height) > MAX_SIDE_PX:
+        raise StillError(
+            f"size {width}x{height} is larger than any still, whose sides are up to {MAX_SIDE_PX}"
+        )
+    return width, height

@@ -1,0 +1,334 @@
+"""Refinement: the class of a ground track is what its stills say.
+
+A still names a frame and a box of the edge. Which of the ground's own tracks that is, is decided by `match`
+at that very frame (`Tracks` of the frame, from the history), never by position on the screen of now: a lost
+base packet must not refine the wrong object. What cannot be decided yet is held, and given out as unmatched
+when it never will be.
+
+``replace`` is the paper's rule: the newest still's prediction is the class. ``fuse`` multiplies what all
+stills of the track say (see `Belief`). Frames are the only clock here; `History` satisfies `TrackLog`.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from typing import Generic, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from hvt_common.values import Tracks
+from hvt_ground.perception.stills.match import Candidate, Matcher, Wanted
+from hvt_ground.perception.stills.posterior import Belief, Labels, Reading
+from hvt_ground.perception.stills.resolved import Outcome, Settled, Shown, StillSeen
+
+__all__ = ["Counters", "Mode", "Outcome", "Refiner", "Settled", "Shown", "StillSeen", "TrackLog"]
+
+Mode = Literal["replace", "fuse"]
+
+MAX_HELD = 256
+MAX_BELIEFS = 1024
+_REMEMBERED_STILLS = 4096
+
+P = TypeVar("P")
+
+
+class TrackLog(Protocol):
+    """The ground's tracks by frame; every decoded frame has an entry, with or without tracks in it."""
+
+    @property
+    def oldest_tracked(self) -> int | None:
+        """Frame index of the oldest entry."""
+
+    @property
+    def newest_tracked(self) -> int | None:
+        """Frame index of the newest entry."""
+
+    def tracks(self, frame_index: int) -> Tracks | None:
+        """The tracks of that frame; None if it is lost, gone, or not tracked yet."""
+
+
+@dataclass(slots=True)
+class Counters:
+    """Totals of one session."""
+
+    offered: int = 0
+    replayed: int = 0
+    """Offered again under a sequence number that was here before, and ignored."""
+    matched: int = 0
+    """Including those superseded."""
+    unmatched: int = 0
+    late: int = 0
+    """Among the unmatched: those whose outcome is late."""
+    tracks_refined: int = 0
+    """Distinct tracks of the ground on whose class a still has spoken."""
+    class_changes: int = 0
+    """Stills after which the class shown was another than before."""
+
+
+def _unknown(_edge_track_id: int) -> None:
+    """Where the edge tells nothing of its tracks."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Held(Generic[P]):
+    still: StillSeen[P]
+    last_frame: int
+    """It waits no longer once the stream is past this frame."""
+
+
+class Refiner(Generic[P]):
+    """Holds stills until their track is known, and the classes that came of them. One for each session.
+
+    Args:
+        mode: ``replace`` or ``fuse``.
+        fps: frames a second of the base stream; turns the seconds below into frames.
+        detector_classes: names of ``Tracks.class_ids``.
+        classifier_classes: names of ``Posterior.probabilities``.
+        hold_s: how long a still waits for its frame to be tracked.
+        confirm_s: how long after its frame a track that was detected then, but not confirmed, may appear.
+        forget_s: how long after its last frame a track's class is remembered; more than a lost track may
+            take to be found again.
+        iou: the least overlap of a still's box with a track's. Half is the usual threshold of detection
+            benchmarks; boxes of two neighbours of one size and shape rarely reach it both.
+    """
+
+    def __init__(
+        self,
+        mode: Mode,
+        *,
+        fps: float,
+        detector_classes: tuple[str, ...],
+        classifier_classes: tuple[str, ...],
+        hold_s: float = 3.0,
+        confirm_s: float = 1.0,
+        forget_s: float = 10.0,
+        iou: float = 0.5,
+    ) -> None:
+        self.counters = Counters()
+        self._mode = mode
+        self._labels = Labels(detector_classes, classifier_classes)
+        self._hold_frames = round(hold_s * fps)
+        self._confirm_frames = round(confirm_s * fps)
+        self._forget_frames = round(forget_s * fps)
+        self._matcher = Matcher(iou=iou, owned_frames=self._forget_frames)
+        self._held: dict[tuple[int, int], _Held[P]] = {}  # by still sequence and part, oldest offer first
+        self._seen: OrderedDict[tuple[int, int], None] = OrderedDict()
+        self._beliefs: OrderedDict[int, Belief] = OrderedDict()  # by ground track id, longest unseen first
+
+    def offer(self, still: StillSeen[P], *, now_frame: int) -> list[Settled[P]]:
+        """Take a still; returns what had to make room for it (almost always nothing).
+
+        ``now_frame`` is the newest frame that was decoded. A part of a still that was here before is ignored.
+        """
+        if still.key in self._seen:
+            self.counters.replayed += 1
+            return []
+        self.counters.offered += 1
+        self._seen[still.key] = None
+        if len(self._seen) > _REMEMBERED_STILLS:
+            self._seen.popitem(last=False)
+        self._held[still.key] = _Held(still, now_frame + self._hold_frames)
+        if len(self._held) <= MAX_HELD:
+            return []
+        oldest = next(iter(self._held))
+        return [self._unmatched(self._held.pop(oldest).still, "overflow")]
+
+    def settle(
+        self, log: TrackLog, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
+    ) -> list[Settled[P]]:
+        """Match what can be matched and give up what never will be, oldest frame first.
+
+        Call it after each frame was tracked, with the newest frame that was decoded. ``known_as`` gives the ground's
+        track for one of the edge, where the edge itself has told.
+        """
+        by_frame: dict[int, list[_Held[P]]] = {}
+        for held in self._held.values():
+            by_frame.setdefault(held.still.frame_index, []).append(held)
+        settled: list[Settled[P]] = []
+        for frame_index in sorted(by_frame):
+            settled += self._settle_frame(by_frame[frame_index], log, now_frame, known_as)
+        for done in settled:
+            del self._held[done.still.key]
+        return settled
+
+    def end(self) -> list[Settled[P]]:
+        """Give out all that still waits, as unmatched: the stream or its session is over."""
+        ended = [self._unmatched(held.still, "ended") for held in self._held.values()]
+        self._held.clear()
+        return ended
+
+    def merge(self, kept_id: int, gone_id: int) -> None:
+        """Two tracks have turned out to be one: what is believed of the one that is gone holds for the other.
+
+        Where both were refined, the track that stays keeps its own belief.
+        """
+        belief = self._beliefs.pop(gone_id, None)
+        if belief is not None:
+            self._beliefs.setdefault(kept_id, belief)
+        self._matcher.merge(kept_id, gone_id)
+
+    def shown(self, tracks: Tracks) -> Shown:
+        """The classes to show for the tracks of one frame; frames must not go back."""
+        for track_id in tracks.ids.tolist():
+            belief = self._beliefs.get(track_id)
+            if belief is not None:
+                self._touch(track_id, belief, tracks.frame_index)
+        self._forget(tracks.frame_index)
+        return self.preview(tracks)
+
+    def preview(self, tracks: Tracks) -> Shown:
+        """The classes that would be shown for these tracks; changes nothing, so any frame may be asked for."""
+        base_classes = tuple(self._labels.detector[class_id] for class_id in tracks.class_ids)
+        classes = list(base_classes)
+        confidences = tracks.confidences.astype(np.float32)  # a copy
+        refined = np.zeros(len(tracks), np.bool_)
+        for row, track_id in enumerate(tracks.ids.tolist()):
+            belief = self._beliefs.get(track_id)
+            if belief is None:
+                continue
+            reading = self._read(belief, tracks, row)
+            classes[row], confidences[row], refined[row] = reading.class_name, reading.confidence, True
+        return Shown(base_classes, tuple(classes), confidences, refined)
+
+    # One frame's stills.
+
+    def _settle_frame(
+        self, held: list[_Held[P]], log: TrackLog, now_frame: int, known_as: Callable[[int], int | None]
+    ) -> list[Settled[P]]:
+        frame_index = held[0].still.frame_index
+        tracks = log.tracks(frame_index)
+        if tracks is None:
+            return self._settle_untracked(held, log, now_frame, known_as)
+        found = self._match(held, tracks, log)
+        newest = log.newest_tracked
+        settled: list[Settled[P]] = []
+        for waiting in sorted(held, key=lambda waiting: waiting.still.key):
+            candidate = found[waiting.still.key]
+            if candidate.tracks is not None:
+                settled.append(self._speak(waiting.still, candidate.tracks, candidate.row))
+            elif now_frame > waiting.last_frame or (
+                newest is not None and newest >= frame_index + self._confirm_frames
+            ):
+                outcome: Outcome = "ambiguous" if candidate.ambiguous else "no track"
+                settled.append(self._unmatched(waiting.still, outcome))
+        return settled
+
+    def _settle_untracked(
+        self,
+        held: Iterable[_Held[P]],
+        log: TrackLog,
+        now_frame: int,
+        known_as: Callable[[int], int | None],
+    ) -> list[Settled[P]]:
+        """Tracks come in the order of frames: once a later frame is there, an absent one never will be."""
+        settled: list[Settled[P]] = []
+        for waiting in held:
+            oldest, newest, frame_index = log.oldest_tracked, log.newest_tracked, waiting.still.frame_index
+            outcome: Outcome | None = None
+            if oldest is not None and frame_index < oldest:
+                outcome = "late"
+            elif newest is not None and frame_index < newest:
+                outcome = "frame lost"
+            elif now_frame > waiting.last_frame:
+                outcome = "late"
+            if outcome is not None:
+                named = self._by_name(waiting.still, log, known_as) if waiting.still.stored else None
+                settled.append(named or self._unmatched(waiting.still, outcome))
+        return settled
+
+    def _by_name(
+        self, still: StillSeen[P], log: TrackLog, known_as: Callable[[int], int | None]
+    ) -> Settled[P] | None:
+        """Let a still of long ago speak on the track that its edge track is known as now; None where it is not."""
+        edge_id = still.edge_track_id
+        if edge_id < 0 or log.newest_tracked is None:
+            return None
+        track_id, tracks = known_as(edge_id), log.tracks(log.newest_tracked)
+        if track_id is None:
+            track_id = self._matcher.known_as(edge_id)
+        if track_id is None or tracks is None or track_id not in tracks.ids:
+            return None
+        return self._speak(still, tracks, int(np.flatnonzero(tracks.ids == track_id)[0]))
+
+    def _match(self, held: list[_Held[P]], tracks: Tracks, log: TrackLog) -> dict[Hashable, Candidate]:
+        wanted = [
+            Wanted(
+                key=waiting.still.key,
+                edge_track_id=waiting.still.edge_track_id,
+                box_base_px=waiting.still.box_base_px,
+                class_name=waiting.still.class_name,
+            )
+            for waiting in held
+        ]
+        newest = log.newest_tracked or 0
+        last = min(tracks.frame_index + self._confirm_frames, newest)
+        later = (log.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
+        return self._matcher.match(
+            wanted, tracks, later=(t for t in later if t is not None), class_names=self._labels.detector
+        )
+
+    def _speak(self, still: StillSeen[P], tracks: Tracks, row: int) -> Settled[P]:
+        """Let a still speak on the class of a track."""
+        track_id = int(tracks.ids[row])
+        belief = self._beliefs.get(track_id)
+        if belief is None:
+            before = self._labels.detector[tracks.class_ids[row]]
+            belief = self._beliefs[track_id] = Belief(tracks.frame_index)
+            self.counters.tracks_refined += 1
+            if len(self._beliefs) > MAX_BELIEFS:
+                self._beliefs.popitem(last=False)
+        else:
+            before = self._read(belief, tracks, row).class_name
+        newest = belief.hear(
+            still.posterior, self._labels, order=(still.frame_index, still.sequence), news=still.news
+        )
+        self._touch(track_id, belief, still.frame_index)
+        after = self._read(belief, tracks, row)
+        self.counters.matched += 1
+        self.counters.class_changes += after.class_name != before
+        return Settled(
+            still=still,
+            outcome="matched" if newest or self._mode == "fuse" else "superseded",
+            track_id=track_id,
+            class_before=before,
+            class_after=after.class_name,
+            confidence=after.confidence,
+            entropy_nats=after.entropy_nats,
+        )
+
+    def _unmatched(self, still: StillSeen[P], outcome: Outcome) -> Settled[P]:
+        self.counters.unmatched += 1
+        self.counters.late += outcome == "late"
+        said = still.posterior
+        return Settled(
+            still=still,
+            outcome=outcome,
+            track_id=None,
+            class_before=still.class_name,
+            class_after=said.class_name,
+            confidence=said.confidence,
+            entropy_nats=said.entropy_nats,
+        )
+
+    # What is believed of each track.
+
+    def _read(self, belief: Belief, tracks: Tracks, row: int) -> Reading:
+        if self._mode == "replace":
+            return belief.newest()
+        return belief.fused(
+            self._labels, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
+        )
+
+    def _touch(self, track_id: int, belief: Belief, frame_index: int) -> None:
+        belief.last_frame = max(belief.last_frame, frame_index)
+        self._beliefs.move_to_end(track_id)
+
+    def _forget(self, now_frame: int) -> None:
+        """Drop what is believed of tracks that ended; the longest unseen stand first."""
+        while self._beliefs:
+            track_id, belief = next(iter(self._beliefs.items()))
+            if now_frame - belief.last_frame <= self._forget_frames:
+                return
+            del self._beliefs[track_id]

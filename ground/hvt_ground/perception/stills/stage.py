@@ -1,0 +1,333 @@
+"""Stills at the ground: each waits for its base frame, is decoded, read, matched to its track, shown and answered."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hvt_common.protocol.messages import Flags, RoiHeader, StillResult, fitted_text
+from hvt_common.values import Image, Posterior, View
+from hvt_common.video.base_crop import base_crop
+from hvt_common.video.still_codecs import BaseMissingError, StillError, psnr_y_db, still_codec
+from hvt_ground.events.events import Event, Notice, Refinement
+from hvt_ground.events.history import FilledLog, History
+from hvt_ground.perception.fusion.fuse import Fusion
+from hvt_ground.perception.stills.classify import Box, Decoded, Reading, StillReader
+from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
+from hvt_ground.perception.stills.refine import Refiner, Settled, StillSeen
+
+__all__ = ["Carried", "Moment", "StillStage"]
+
+SAME_DB, OTHER_DB = 38.0, 26.0
+"""Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
+_MOST_SPOILT, _SPOILT_TICKS = 32, 150
+"""After so many undecodable stills in so many ticks the next are dropped unseen until the time is over."""
+MAX_WAITING = 64
+"""Stills that wait for their base frame; beyond, the oldest is read without it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """How far the ground is."""
+
+    frame_index: int = 0
+    """The newest tick of which anything is known; what happens now is shown there."""
+    capture_ns: int = 0
+    picture_index: int = -1
+    """The newest decoded frame; -1 before the first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """What a still brings along while it waits for its track, for one of the objects that it shows."""
+
+    received: ReceivedStill
+    decoded: Decoded
+    track_id: int
+    """The edge's."""
+    box_base_px: Box
+    found_base_px: Box | None
+    """Where the reader found the object."""
+    base_crop_bgr: Image | None
+
+
+class StillStage:
+    """One session's stills. Used by one thread; ``emit`` takes the events.
+
+    Args:
+        reader: names what stills show.
+        refiner: matches them to tracks.
+        history: the pictures and tracks by frame.
+        fusion: learns where stills show objects.
+        view: between source and base pixels.
+        wants_base: whether ``reader`` looks at the base frame; then all stills wait for theirs, not only residuals.
+        gap_ticks: how many ticks the base stream may leave out and still say where tracks were between.
+        emit: takes the events.
+    """
+
+    def __init__(
+        self,
+        reader: StillReader,
+        refiner: Refiner[Carried],
+        *,
+        history: History,
+        fusion: Fusion,
+        view: View,
+        wants_base: bool,
+        gap_ticks: int,
+        emit: Callable[[Event], None],
+    ) -> None:
+        self._reader = reader
+        self._refiner = refiner
+        self._history = history
+        self._log = FilledLog(history, within=gap_ticks)
+        self._gap_ticks = gap_ticks
+        self._fusion = fusion
+        self._view = view
+        self._wants_base = wants_base
+        self._emit = emit
+        self._waiting: list[ReceivedStill] = []
+        self._results: list[StillResult] = []
+        self._spoilt: deque[int] = deque(maxlen=_MOST_SPOILT)
+        """When the last ones came that could not be decoded, in ticks."""
+        self.dropped: Counter[str] = Counter()
+        """Stills of which nothing could be made, by reason."""
+        self.outcomes: Counter[str] = Counter()
+        """What became of each object in the others."""
+
+    def take(self, stills: Sequence[ReceivedStill], now: Moment) -> None:
+        """Take stills in the order in which they came; those whose base frame may still come wait for it."""
+        self._waiting += stills
+        self.look_again(now)
+
+    def look_again(self, now: Moment) -> None:
+        """Read what need not wait any longer, and settle what can be: call it after each picture and each step."""
+        ready = [still for still in self._waiting if not self._may_wait(still.header, now)]
+        if ready:
+            self._waiting = [still for still in self._waiting if self._may_wait(still.header, now)]
+        surplus = len(self._waiting) - MAX_WAITING
+        if surplus > 0:
+            ready, self._waiting = ready + self._waiting[:surplus], self._waiting[surplus:]
+        self._read(ready, now)
+        for settled in self._refiner.settle(
+            self._log, now_frame=now.frame_index, known_as=self._fusion.known_as
+        ):
+            self._settled(settled, now)
+
+    def end(self, now: Moment) -> None:
+        """The session is over: what still waits is given out as it is."""
+        ready, self._waiting = self._waiting, []
+        self._read(ready, now)
+        for settled in self._refiner.end():
+            self._settled(settled, now)
+
+    def take_results(self) -> list[StillResult]:
+        """Return and forget what the edge wants to hear of its stills."""
+        results, self._results = self._results, []
+        return results
+
+    # From bytes to readings
+
+    def _may_wait(self, header: RoiHeader, now: Moment) -> bool:
+        """Whether its picture may yet come. A residual is nothing without it; others wait for the next tick only."""
+        if header.frame_index <= now.picture_index:
+            return False
+        return needs_base(header) or (self._wants_base and header.frame_index >= now.frame_index)
+
+    def _read(self, stills: Sequence[ReceivedStill], now: Moment) -> None:
+        by_frame: dict[int, list[tuple[ReceivedStill, Decoded]]] = {}
+        for still in stills:
+            decoded = self._decode(still, now)
+            if decoded is not None:
+                by_frame.setdefault(still.header.frame_index, []).append((still, decoded))
+        for frame_index, pairs in by_frame.items():
+            # Of an outage there may be no picture, and the last one before it is not the same place any more.
+            stored = any(still.header.flags & Flags.STORED for still, _ in pairs)
+            base_bgr = self._history.frame_before(frame_index, within=0 if stored else self._gap_ticks)
+            readings = self._reader.read([decoded for _, decoded in pairs], base_bgr)
+            for (still, decoded), objects in zip(pairs, readings.objects, strict=True):
+                self._offer(still, decoded, objects, base_bgr, now)
+            if len(readings.found):
+                known = self._log.tracks(frame_index)
+                if known is not None:
+                    self._fusion.take_found(readings.found, known=known)
+
+    def _out_of_patience(self, now: Moment) -> bool:
+        """Whether so many stills could not be decoded lately that somebody sends them on purpose.
+
+        Each costs a line in the recording and, from libjpeg, one on stderr.
+        """
+        spoilt = self._spoilt
+        return len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_TICKS
+
+    def _decode(self, still: ReceivedStill, now: Moment) -> Decoded | None:
+        header = still.header
+        if self._out_of_patience(now):
+            self.dropped["undecodable"] += 1
+            self._answer(header, header.track_id, None)
+            return None
+        try:
+            base_bgr = self._history.frame(header.frame_index)
+            image = decode_still(still, base_bgr=base_bgr, view=self._view)
+        except BaseMissingError as error:
+            self.dropped["base_missing"] += 1
+            self._notice(now, f"still {header.sequence} is asked for again: {error}")
+            self._answer(header, header.track_id, None, again=True)
+            return None
+        except StillError as error:
+            self.dropped["undecodable"] += 1
+            self._spoilt.append(now.frame_index)
+            self._notice(now, f"still {header.sequence} cannot be decoded: {error}")
+            for track_id, _ in _shown(header):
+                self._answer(header, track_id, None)
+            return None
+        boxes = [self._to_base(box) for _, box in _shown(header)]
+        return Decoded(image, header.crop_source_px, boxes[0], header.frame_index, tuple(boxes[1:]))
+
+    # From readings to tracks
+
+    def _offer(
+        self,
+        still: ReceivedStill,
+        decoded: Decoded,
+        objects: Sequence[Reading],
+        base_bgr: Image | None,
+        now: Moment,
+    ) -> None:
+        header = still.header
+        crop = None if base_bgr is None else _cut(base_bgr, header.crop_source_px, view=self._view)
+        news = self._news(decoded)
+        shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
+        for part, ((track_id, _), box, reading) in enumerate(shown):
+            carried = Carried(still, decoded, track_id, box, reading.box_base_px, crop)
+            self._answer(header, track_id, reading.posterior)
+            if reading.posterior is None:
+                self.outcomes["unread"] += 1
+                name = header.class_name
+                self._emit(self._refinement(carried, now, None, name, name, header.confidence))
+                continue
+            seen = StillSeen(
+                sequence=header.sequence,
+                frame_index=header.frame_index,
+                capture_ns=header.capture_ns,
+                edge_track_id=track_id,
+                box_base_px=box,
+                class_name=header.class_name,
+                posterior=reading.posterior,
+                carried=carried,
+                news=news,
+                part=part,
+                stored=bool(header.flags & Flags.STORED),
+            )
+            for settled in self._refiner.offer(seen, now_frame=now.frame_index):
+                self._settled(settled, now)
+
+    def _news(self, decoded: Decoded) -> float:
+        """How much a still shows that the base did not, 0…1.
+
+        A detector that names the same pixels twice has not seen them twice. On a base near the source the many
+        votes of the track are worth more than one more of a still.
+        """
+        base_bgr = self._history.frame(decoded.frame_index)
+        if base_bgr is None:
+            return 1.0
+        height, width = decoded.image_bgr.shape[:2]
+        seen = base_crop(
+            base_bgr, view=self._view, crop_source_px=decoded.crop_source_px, size=(width, height)
+        )
+        nearness_db = psnr_y_db(seen, decoded.image_bgr)
+        return float(np.clip((SAME_DB - nearness_db) / (SAME_DB - OTHER_DB), 0.0, 1.0))
+
+    def _settled(self, settled: Settled[Carried], now: Moment) -> None:
+        self.outcomes[settled.outcome] += 1
+        carried, track_id = settled.still.carried, settled.track_id
+        if track_id is not None:
+            self._name_track(settled.still, track_id)
+            if carried.found_base_px is not None and not settled.still.stored:
+                frame_index = settled.still.frame_index
+                self._fusion.take_box(track_id, carried.found_base_px, frame_index=frame_index)
+        before, after = settled.class_before, settled.class_after
+        self._emit(self._refinement(carried, now, track_id, before, after, settled.confidence))
+
+    def _refinement(
+        self, carried: Carried, now: Moment, track_id: int | None, before: str, after: str, confidence: float
+    ) -> Refinement:
+        header = carried.received.header
+        stored = bool(header.flags & Flags.STORED)
+        # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. What
+        # was kept while the link was away tells of then, and nobody looked on.
+        return Refinement(
+            frame_index=header.frame_index if stored else now.frame_index,
+            capture_ns=header.capture_ns if stored else now.capture_ns,
+            still_sequence=header.sequence,
+            track_id=track_id,
+            edge_track_id=carried.track_id,
+            box_base_px=carried.box_base_px,
+            still=carried.received.data,
+            media_type=still_codec(header.codec).media_type,  # not what Zenoh said: that is nobody's word
+            base_crop_bgr=carried.base_crop_bgr,
+            class_before=before,
+            class_after=after,
+            confidence=confidence,
+            reason=header.reason,
+            quality_pct=header.quality_pct,
+            still_bgr=carried.decoded.image_bgr,
+            crop_base_px=self._to_base(header.crop_source_px),
+            stored=stored,
+        )
+
+    # What goes back and what is told
+
+    def _answer(
+        self, header: RoiHeader, track_id: int, posterior: Posterior | None, *, again: bool = False
+    ) -> None:
+        """The edge hears of every still and every track in it, so that it waits for none in vain.
+
+        No name is no opinion. A still that is asked for again is answered once, for all that it shows.
+        """
+        self._results.append(
+            StillResult(
+                still_sequence=header.sequence,
+                track_id=track_id,
+                class_name=fitted_text(posterior.class_name, 64) if posterior else "",
+                confidence=posterior.confidence if posterior else 0.0,
+                entropy_nats=min(20.0, posterior.entropy_nats) if posterior else 0.0,
+                ground_track_id=-1,  # until it has settled
+                again=again,
+            )
+        )
+
+    def _name_track(self, still: StillSeen[Carried], ground_track_id: int) -> None:
+        """Add the track that a still refined to its answer, if that has not been reported yet."""
+        for place, result in enumerate(self._results):
+            if (result.still_sequence, result.track_id) == (still.sequence, still.edge_track_id):
+                self._results[place] = replace(result, ground_track_id=ground_track_id)
+
+    def _to_base(self, box_source_px: Sequence[float]) -> Box:
+        x1, y1, x2, y2 = self._view.to_base(np.array([box_source_px], np.float32))[0].tolist()
+        return x1, y1, x2, y2
+
+    def _notice(self, now: Moment, text: str) -> None:
+        self._emit(Notice(now.frame_index, now.capture_ns, "warning", text))
+
+
+def _shown(header: RoiHeader) -> list[tuple[int, Box]]:
+    """Edge track and box, source pixels, of each object in a still, the lead's first."""
+    return [
+        (header.track_id, header.box_source_px),
+        *((one.track_id, one.box_source_px) for one in header.also),
+    ]
+
+
+def _cut(base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View) -> Image | None:
+    """The same padded box of the base frame, whole pixels, clipped; None where nothing of it is inside."""
+    x1, y1, x2, y2 = view.to_base(np.array([crop_source_px], np.float32))[0]
+    height, width = base_bgr.shape[:2]
+    left, top = max(0, int(np.floor(x1))), max(0, int(np.floor(y1)))
+    right, bottom = min(width, int(np.ceil(x2))), min(height, int(np.ceil(y2)))
+    if right <= left or bottom <= top:
+        return None
+    return base_bgr[top:bottom, left:right].copy()

@@ -1,0 +1,338 @@
+"""When things are seen: beside the receiving thread, so that decoding never waits for detection.
+
+In real time what comes too fast is passed over, newest first; in lockstep nothing is, and the order is always the
+same: the same input gives the same tracks.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
+
+from hvt_common.runtime.priority import give_way
+from hvt_common.values import Tracks
+from hvt_ground.perception.pipeline import Picture, ReceivedStill
+
+__all__ = ["Eyes", "LockstepEyes", "RealtimeEyes"]
+
+_WAITING_PICTURES = 24
+"""How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
+_BEHIND_PICTURES = 1
+_STILLS_AT_ONCE = 16
+_WAITING_STILLS = 256
+_WAITING_STILL_BYTES = 32 * 2**20
+_WAITING_STEPS = 8
+"""Reports of the edge's tracks: the newest count, each says all."""
+_LATER = 4096
+"""Pieces of work that can wait."""
+_AT_LEISURE = 8
+"""Those that come after them: each holds a stretch of video."""
+_LATER_S = 0.25
+"""On a machine that never comes to rest it still gets one step in so long."""
+_STEP_LAG = 2
+"""In lockstep a step counts from so many ticks on. It is sent right before the next access unit, which may overtake
+it by microseconds: this is what makes the order the same in every run."""
+_FINISH_S = 1.5
+_LEAVE_S = 1.0
+_AHEAD = 2
+
+See = Callable[[Picture, bool], None]
+"""Called with a picture, and whether to hurry."""
+Step = Callable[[Tracks, int], None]
+"""Called with what the edge tracked at one tick, and that tick's capture time."""
+Read = Callable[[Sequence[ReceivedStill]], None]
+Work = Generator[None, None, object]
+"""Done step by step."""
+
+
+class Eyes(Protocol):
+    """Where the receiving thread hands over what is to be seen."""
+
+    untracked: int
+    """Pictures that were passed over."""
+    dropped: Counter[str]
+    """Stills that were passed over, by reason."""
+
+    @property
+    def idle(self) -> bool:
+        """Nothing waits, and nothing is in hand."""
+        ...
+
+    def picture(self, picture: Picture) -> None:
+        """Hand over a decoded frame."""
+        ...
+
+    def step(self, tracks: Tracks, capture_ns: int) -> None:
+        """Hand over what the edge tracked at one tick."""
+        ...
+
+    def still(self, still: ReceivedStill) -> None:
+        """Hand over a still."""
+        ...
+
+    def later(self, work: Work) -> bool:
+        """Hand over work that can wait, done step by step while nothing else is to be seen; False: no room."""
+        ...
+
+    def at_leisure(self, work: Work) -> bool:
+        """Hand over work that gives way even to what is done `later`, between any two steps; False: no room."""
+        ...
+
+    @property
+    def has_room(self) -> bool:
+        """Whether `later` takes another."""
+        ...
+
+    def close(self) -> bool:
+        """Finish what waits, for a second or two; False where the thread did not come back."""
+        ...
+
+    def raise_error(self) -> None:
+        """Raise what went wrong while seeing."""
+        ...
+
+
+class RealtimeEyes:
+    """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still."""
+
+    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
+        self._see = see
+        self._step = step
+        self._read = read
+        self.untracked = 0
+        self.dropped: Counter[str] = Counter()
+        self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
+        self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
+        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
+        self._later: deque[Work] = deque()
+        self._leisure: deque[Work] = deque()
+        self._later_s = 0.0
+        """When some of it was done last."""
+        self._wake = threading.Event()
+        self._ending = threading.Event()
+        self._given_up = threading.Event()
+        self._in_hand = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name=f"hvt-sight-{name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def idle(self) -> bool:
+        """Nothing waits, and nothing is in hand."""
+        # What is in hand is asked for last: it is taken from what waits, and never put back.
+        return not (self._has_news() or self._later or self._leisure or self._in_hand)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether `later` takes another."""
+        return len(self._later) < _LATER
+
+    def _has_news(self) -> bool:
+        return bool(self._steps) or not (self._pictures.empty() and self._stills.empty())
+
+    def picture(self, picture: Picture) -> None:
+        """Queue a frame; where the queue is full the oldest goes untracked."""
+        while True:
+            try:
+                self._pictures.put_nowait(picture)
+                break
+            except queue.Full:
+                try:
+                    self._pictures.get_nowait()
+                    self.untracked += 1
+                except queue.Empty:
+                    continue
+        self._wake.set()
+
+    def step(self, tracks: Tracks, capture_ns: int) -> None:
+        """Queue a report of tracks; where the queue is full the oldest goes."""
+        self._steps.append((tracks, capture_ns))
+        self._wake.set()
+
+    def still(self, still: ReceivedStill) -> None:
+        """Queue a still; where the queue is full it is dropped."""
+        waiting_bytes = sum(len(one.data) for one in tuple(self._stills.queue))
+        try:
+            if waiting_bytes + len(still.data) <= _WAITING_STILL_BYTES:
+                self._stills.put_nowait(still)
+            else:
+                self.dropped["overflow"] += 1
+        except queue.Full:
+            self.dropped["overflow"] += 1
+        self._wake.set()
+
+    def later(self, work: Work) -> bool:
+        """Queue work that can wait."""
+        if not self.has_room:
+            return False
+        self._later.append(work)
+        self._wake.set()
+        return True
+
+    def at_leisure(self, work: Work) -> bool:
+        """Queue work that can wait for long."""
+        if len(self._leisure) >= _AT_LEISURE:
+            return False
+        self._leisure.append(work)
+        self._wake.set()
+        return True
+
+    def close(self) -> bool:
+        """Finish what waits, for a second or two."""
+        self._ending.set()
+        self._wake.set()
+        self._thread.join(_FINISH_S)
+        self._given_up.set()
+        self._thread.join(_LEAVE_S)
+        self.dropped["ended"] += self._stills.qsize()
+        self.untracked += self._pictures.qsize()
+        return not self._thread.is_alive()
+
+    def raise_error(self) -> None:
+        """Raise what ended the thread."""
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _run(self) -> None:
+        give_way()
+        try:
+            while not self._given_up.is_set():
+                self._wake.wait(0.2)
+                self._wake.clear()
+                self._in_hand = True
+                self._work_off()
+                self._in_hand = False
+                if self._ending.is_set() and self.idle:
+                    return
+        except BaseException as error:  # noqa: BLE001 - handed to the receiving thread, which ends the process
+            self._error = error
+        finally:
+            for waiting in (self._later, self._leisure):
+                while waiting:  # whatever one in the middle holds is let go of here
+                    waiting.popleft().close()
+
+    def _work_off(self) -> None:
+        """See all pictures that came before the stills taken here, then the edge's tracks, then read the stills."""
+        stills: list[ReceivedStill] = []
+        while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
+            stills.append(self._stills.get_nowait())
+        # Those that come meanwhile are not among them, or on a slow machine stills would wait for ever.
+        for _ in range(self._pictures.qsize()):
+            if self._given_up.is_set():
+                break
+            try:
+                picture = self._pictures.get_nowait()
+            except queue.Empty:
+                break
+            self._see(picture, self._pictures.qsize() > _BEHIND_PICTURES)
+        while self._steps and not self._given_up.is_set():
+            self._step(*self._steps.popleft())
+        if stills:
+            self._read(stills)
+        self._work_later()
+        if self._has_news():
+            self._wake.set()
+
+    def _work_later(self) -> None:
+        """Do what can wait, until something comes that cannot."""
+        while (waiting := self._later or self._leisure) and not self._given_up.is_set():
+            if self._has_news() and time.monotonic() - self._later_s < _LATER_S:
+                return
+            try:
+                next(waiting[0])
+            except StopIteration:
+                waiting.popleft()
+            self._later_s = time.monotonic()
+
+
+class LockstepEyes:
+    """Sees one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
+
+    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
+        self._see = see
+        self._step = step
+        self._read = read
+        self.untracked = 0
+        self.dropped: Counter[str] = Counter()
+        self._pending: deque[Future[None]] = deque()
+        self._early: list[ReceivedStill] = []
+        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
+        self._newest_frame = -1
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-sight-{name}")
+
+    @property
+    def idle(self) -> bool:
+        """Nothing waits, and nothing is in hand."""
+        return all(future.done() for future in self._pending)
+
+    def picture(self, picture: Picture) -> None:
+        """See a frame, and read the stills of it that overtook it on the link."""
+        self._take_steps(before=picture.frame_index - _STEP_LAG + 1)
+        self._newest_frame = picture.frame_index
+        self._submit(self._worker.submit(self._see, picture, False))
+        known = [one for one in self._early if one.header.frame_index <= self._newest_frame]
+        if known:
+            self._early = [one for one in self._early if one.header.frame_index > self._newest_frame]
+            self._submit(self._worker.submit(self._read, known))
+
+    def step(self, tracks: Tracks, capture_ns: int) -> None:
+        """Take in a report of tracks before the frame that comes so many ticks later."""
+        self._steps.append((tracks, capture_ns))
+
+    def still(self, still: ReceivedStill) -> None:
+        """Read a still once its frame has been seen."""
+        if still.header.frame_index <= self._newest_frame:
+            self._submit(self._worker.submit(self._read, [still]))
+            return
+        self._early.append(still)
+        if len(self._early) > _WAITING_STILLS:
+            self._early.pop(0)
+            self.dropped["overflow"] += 1
+
+    @property
+    def has_room(self) -> bool:
+        """Always: it is done before the next is seen."""
+        return True
+
+    def later(self, work: Work) -> bool:
+        """Do it after what was handed over before."""
+        self._submit(self._worker.submit(_exhaust, work))
+        return True
+
+    def at_leisure(self, work: Work) -> bool:
+        """Likewise: here nothing gives way to anything."""
+        return self.later(work)
+
+    def close(self) -> bool:
+        """Finish what waits."""
+        try:
+            self._take_steps(before=None)
+            while self._pending:
+                self._pending.popleft().result()
+        finally:
+            self._worker.shutdown()
+            self.dropped["ended"] += len(self._early)
+        return True
+
+    def raise_error(self) -> None:
+        """Errors come out of `picture`, `still` and `close`."""
+
+    def _take_steps(self, *, before: int | None) -> None:
+        while self._steps and (before is None or self._steps[0][0].frame_index < before):
+            self._submit(self._worker.submit(self._step, *self._steps.popleft()))
+
+    def _submit(self, future: Future[None]) -> None:
+        self._pending.append(future)
+        while len(self._pending) > _AHEAD:
+            self._pending.popleft().result()
+
+
+def _exhaust(work: Work) -> None:
+    for _ in work:
+        pass

@@ -1,0 +1,158 @@
+"""``hvt-ground keys``: a CA for the fleet, keys for each machine, and the Zenoh configurations that go with them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.reporting import say
+from hvt_ground.pki.roster import Ground, Roster, Router
+from hvt_ground.pki.zenoh_files import KEYS_FOLDER, edge_file, ground_file, router_file
+
+if TYPE_CHECKING:
+    from hvt_ground.pki.authority import Authority
+
+__all__ = ["run"]
+
+_DIR = Path("hvt-keys")
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; see {self.prog} --help")
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run ``hvt-ground keys …``; `UserError` where the user can mend something."""
+    arguments = _parser().parse_args(argv)
+    try:  # only now: a ground that uses no keys needs no cryptography
+        from hvt_ground.pki.authority import Authority  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"the package {error.name!r} is missing: install HVT with its extra, 'hvt[ground]'"
+        ) from None
+    folder: Path = arguments.dir
+    if arguments.command == "new-ca":
+        Authority.create(folder)
+        say(
+            f"{folder}/ca.pem is the fleet's CA; {folder}/ca.key signs for all of it: keep it on this machine"
+        )
+        return 0
+    authority = Authority.open(folder)
+    before = Roster.read(folder)
+    if arguments.command == "list":
+        _list(before, authority)
+        return 0
+    name: str = arguments.name
+    if arguments.command == "renew":
+        authority.issue(name, hosts=arguments.host or _hosts_of(before, name))
+        say(f"{name}: copy {name}.pem and {name}.key from {folder} to the machine")
+        return 0
+    after = _changed(before, arguments)
+    if arguments.command == "remove":
+        authority.forget(name)
+        (folder / f"{name}.json5").unlink(missing_ok=True)
+    else:
+        authority.issue(name, hosts=arguments.host)
+    after.write(folder)
+    changed = _write_files(after, folder, keys_folder=arguments.keys_folder)
+    if arguments.command != "remove":
+        say(f"{name}: copy ca.pem, {name}.pem, {name}.key and {name}.json5 from {folder} to the machine")
+    if others := ", ".join(f"{one}.json5" for one in changed if one != name):
+        say(f"changed with it, copy again and restart what uses them: {others}")
+    return 0
+
+
+def _changed(roster: Roster, arguments: argparse.Namespace) -> Roster:
+    name: str = arguments.name
+    if arguments.command == "add-edge":
+        return roster.with_edge(name)
+    if arguments.command != "remove":
+        _refuse_known(roster, name, kind=arguments.command.removeprefix("add-"))
+    if arguments.command == "add-router":
+        return roster.with_router(Router(name, tuple(arguments.host)))
+    if arguments.command == "add-ground":
+        command = not arguments.watch_only
+        return roster.with_ground(Ground(name, tuple(arguments.host), command=command, edges=arguments.edges))
+    return roster.without(name)
+
+
+def _refuse_known(roster: Roster, name: str, *, kind: str) -> None:
+    """A key that is only to be renewed must not come with other rights, or without its host names."""
+    if roster.names.get(name) == kind:
+        raise UserError(
+            f"{name!r} is in this fleet already: hvt-ground keys renew {name} makes a new key with the same rights; "
+            "for other rights remove it first"
+        )
+
+
+def _hosts_of(roster: Roster, name: str) -> tuple[str, ...]:
+    """Where others connect to a machine of the roster."""
+    if name not in roster.names:
+        raise UserError(f"{name!r} is not in this fleet: hvt-ground keys list shows who is")
+    machines: list[Ground | Router] = [*roster.grounds, *roster.routers]
+    return next((one.hosts for one in machines if one.name == name), ())
+
+
+def _write_files(roster: Roster, folder: Path, *, keys_folder: str) -> list[str]:
+    """The names of those whose file is new or another than before."""
+    files = {name: edge_file(name, roster, folder=keys_folder) for name in roster.edges}
+    files |= {one.name: ground_file(one, roster, folder=keys_folder) for one in roster.grounds}
+    files |= {one.name: router_file(one, roster, folder=keys_folder) for one in roster.routers}
+    changed = []
+    for name, text in files.items():
+        path = folder / f"{name}.json5"
+        try:
+            if path.exists() and path.read_text(encoding="utf-8") == text:
+                continue
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise UserError(f"{path} cannot be written ({error.strerror})") from None
+        changed.append(name)
+    return changed
+
+
+def _list(roster: Roster, authority: Authority) -> None:
+    rights = {
+        one.name: f"{'watches and commands' if one.command else 'watches'} {one.edges}"
+        for one in roster.grounds
+    }
+    for name, kind in roster.names.items():
+        print(
+            f"{kind:<7} {name:<20} key until {authority.valid_until(name)}  {rights.get(name, '')}".rstrip()
+        )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="hvt-ground keys", description=__doc__)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    new_ca = commands.add_parser("new-ca", help="make the CA of a fleet, once")
+    add_edge = commands.add_parser("add-edge", help="a key for an edge; NAME is its --edge-id")
+    add_ground = commands.add_parser("add-ground", help="a key for a ground")
+    add_router = commands.add_parser("add-router", help="a key for a router between them")
+    renew = commands.add_parser(
+        "renew", help="a new key for a machine of the fleet, with the rights that it has"
+    )
+    remove = commands.add_parser("remove", help="take all rights from a machine, such as one that is lost")
+    listing = commands.add_parser("list", help="who belongs to the fleet, and until when")
+    for one in (new_ca, add_edge, add_ground, add_router, renew, remove, listing):
+        one.add_argument("--dir", type=Path, default=_DIR, help=f"folder of the fleet's keys [{_DIR}]")
+    for one in (add_edge, add_ground, add_router, renew, remove):
+        one.add_argument("name", metavar="NAME")
+        one.add_argument(
+            "--keys-folder", default=KEYS_FOLDER, help=f"where the keys lie on the machines [{KEYS_FOLDER}]"
+        )
+    for one in (add_edge, add_ground, add_router, renew):
+        one.add_argument(
+            "--host",
+            action="append",
+            default=[],
+            required=one is add_router,
+            help="name or address that others connect to, where this machine listens; repeatable",
+        )
+    add_ground.add_argument("--edges", default="*", help="which edges it may watch, for example 'uav-*' [*]")
+    add_ground.add_argument("--watch-only", action="store_true", help="without the right to command")
+    return parser

@@ -1,0 +1,1 @@
+"""One edge's flight: subscriptions, its receiver, its receiver reports, its sessions."""

@@ -1,0 +1,221 @@
+"""The ground's end of the link: what it subscribes to, asks and reports. Knows Zenoh; knows nothing of frames."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from hvt_common.protocol.channels import EdgeKeys, Row, matches, parse_key, selector
+from hvt_common.protocol.messages import Command, ControlRequest, Feedback, Info, WireError
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.transport.doctor.diagnose import control_unanswered
+from hvt_common.transport.flood import FloodWatch
+from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.session import ask, declare_publisher, subscribe
+
+__all__ = ["MAX_EDGES", "EdgePort", "GroundLink"]
+
+_log = logging.getLogger(__name__)
+
+MAX_EDGES = 64
+"""More edge ids than this are not served: each costs a thread, and ids cost a sender nothing. One that shows its
+token takes the place of one that has neither a token nor a session."""
+_INBOX_MESSAGES = 1024
+_INBOX_SHARE = 0.75
+"""Of the inbox for one row: reports by the thousand do not keep pictures out."""
+_MOST_PER_S = 2000
+"""Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
+_SUBSCRIBED = (Row.BASE, Row.ROI, Row.TRACKS, Row.PAST, Row.STATUS)
+_ASK_S = 1.0
+_UNANSWERED = 3
+"""So many questions on control in a row without an answer are no accident."""
+
+
+class EdgePort:
+    """One edge as the link knows it: its messages in order of arrival, its presence, and a way to talk to it."""
+
+    def __init__(self, session: zenoh.Session, edge: str, *, clock: Callable[[], int]) -> None:
+        self.edge = edge
+        self._clock = clock
+        self.inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest", share=_INBOX_SHARE)
+        self._flood = FloodWatch(most_per_s=_MOST_PER_S)
+        self.present = threading.Event()
+        """Set while the edge's liveliness token is there."""
+        self.in_use: Callable[[], bool] = lambda: False
+        """Whether there is more to this edge than messages under its name: a session, or one that has ended."""
+        self._unanswered = 0
+        self._session = session
+        self._keys = EdgeKeys(edge)
+        self._feedback = declare_publisher(session, Row.FEEDBACK, keys=self._keys)
+
+    def ask_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
+        """Return the session's facts with the times of asking and hearing (ns); None without an answer in time.
+
+        With ``session_id`` only that one's answer counts: two edges may bear the same id.
+        """
+        asked_ns = self._clock()
+        heard_ns = 0
+        found: Info | None = None
+
+        def wanted(data: bytes) -> bool:
+            nonlocal heard_ns, found
+            heard_ns = self._clock()
+            try:
+                info = Info.parse(data)
+            except WireError as error:
+                _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
+                return False
+            found = info if session_id in (None, info.session_id) else None
+            return found is not None
+
+        try:
+            ask(self._session, Row.INFO, keys=self._keys, question=b"", timeout_s=_ASK_S, wanted=wanted)
+        except zenoh.ZError as error:
+            _log.warning("%s: it could not be asked for info: %s", self.edge, error)
+        return None if found is None else (found, asked_ns, heard_ns)
+
+    def put(self, item: Received, row: Row) -> None:
+        """Take a message in; what finds no room is dropped."""
+        self.inbox.put(item)
+        if self._flood.note(row, now_ns=item.received_ns) is not None:
+            _log.warning(
+                "%s: more than %d messages a second on %s, far more than an edge sends: somebody else publishes "
+                "in its name (docs/security.md has keys against that); what finds no room is dropped",
+                self.edge,
+                _MOST_PER_S,
+                row,
+            )
+
+    def request_keyframe(self) -> None:
+        """Ask for a keyframe; does not wait for the answer, which is the keyframe."""
+        request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
+        answered = threading.Event()
+        handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(
+            lambda _reply: answered.set(), lambda: self._note_control(answered=answered.is_set())
+        )
+        try:
+            self._session.get(self._keys.key(Row.CONTROL), handler, payload=request.pack(), timeout=_ASK_S)
+        except zenoh.ZError as error:
+            _log.debug("%s: keyframe request not sent: %s", self.edge, error)
+
+    def _note_control(self, *, answered: bool) -> None:
+        """Say once that nothing is answered: a question without the right to ask is dropped in silence."""
+        self._unanswered = 0 if answered else self._unanswered + 1
+        if self._unanswered == _UNANSWERED and self.present.is_set():
+            _log.warning("%s", control_unanswered(self.edge))
+
+    def report(self, feedback: Feedback) -> None:
+        """Publish a receiver report."""
+        try:
+            self._feedback.put(feedback.pack())
+        except zenoh.ZError as error:
+            _log.debug("%s: feedback not sent: %s", self.edge, error)
+
+    def close(self) -> None:
+        """No more comes, and nothing goes out."""
+        self.inbox.close()
+        with suppress(zenoh.ZError):  # the session may be closed
+            self._feedback.undeclare()  # type: ignore[no-untyped-call]
+
+
+class GroundLink:
+    """Sorts what comes by edge. `ports` grows as edges appear.
+
+    Args:
+        session: of this ground.
+        edges: the pattern of ``--edges``.
+        clock: of the times of arrival, Unix nanoseconds; one of its own by default.
+    """
+
+    def __init__(self, session: zenoh.Session, *, edges: str, clock: Callable[[], int] | None = None) -> None:
+        self._session = session
+        self._clock = clock or SteadyClock()
+        self._edges = edges
+        self._lock = threading.Lock()
+        self._ports: dict[str, EdgePort] = {}
+        self.foreign = 0
+        """Messages under keys that are none of ours, or of more edges than are served."""
+        self._refused = False
+        for row in _SUBSCRIBED:
+            subscribe(session, selector(row, edges=edges), inbox=self, clock=self._clock)
+        self._presence = session.liveliness().declare_subscriber(
+            selector(Row.ALIVE, edges=edges), self._on_presence, history=True
+        )
+
+    def ports(self) -> list[EdgePort]:
+        """All edges that are served; one that never had a session may leave again."""
+        with self._lock:
+            return list(self._ports.values())
+
+    def sees(self, edge: str) -> bool:
+        """Whether this edge has shown itself, by its token or a message."""
+        with self._lock:
+            return edge in self._ports
+
+    def put(self, item: Received) -> None:
+        """Take a message from Zenoh's callback."""
+        parsed = parse_key(item.key)
+        port = self._port(item.key)
+        if port is not None and parsed is not None:
+            port.put(item, parsed[1])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for port in self.ports():
+            port.inbox.close()
+        if self.foreign:
+            _log.warning("%d messages under keys that are not ours were skipped", self.foreign)
+
+    def _port(self, key: str, *, alive: bool = False) -> EdgePort | None:
+        parsed = parse_key(key)
+        if parsed is None or not matches(parsed[0], edges=self._edges):
+            self.foreign += 1
+            return None
+        edge = parsed[0]
+        with self._lock:
+            port = self._ports.get(edge)
+            if port is None:
+                if len(self._ports) >= MAX_EDGES and not (alive and self._make_room()):
+                    self.foreign += 1
+                    self._say_refused(edge)
+                    return None
+                port = self._ports[edge] = EdgePort(self._session, edge, clock=self._clock)
+            return port
+
+    def _make_room(self) -> bool:
+        """Leave one that is not there and never was more than a name."""
+        for edge, port in self._ports.items():
+            if not port.present.is_set() and not port.in_use():
+                del self._ports[edge]
+                port.close()
+                return True
+        return False
+
+    def _say_refused(self, edge: str) -> None:
+        if not self._refused:
+            self._refused = True
+            _log.warning(
+                "%s is not served: there are %d edge ids already, and more are not taken; narrow --edges, or see who "
+                "invents names (docs/security.md has keys against that)",
+                edge,
+                MAX_EDGES,
+            )
+
+    def _on_presence(self, sample: zenoh.Sample) -> None:
+        port = self._port(str(sample.key_expr), alive=sample.kind == zenoh.SampleKind.PUT)
+        if port is None:
+            return
+        if sample.kind == zenoh.SampleKind.PUT:  # the enums of the bindings fail `is`
+            port.present.set()
+        else:
+            port.present.clear()

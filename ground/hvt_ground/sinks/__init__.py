@@ -1,0 +1,1 @@
+"""Where events go: recordings, live views, tables."""

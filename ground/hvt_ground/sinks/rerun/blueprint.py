@@ -1,0 +1,142 @@
+"""The screen a recording opens as, and the names of what is on it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from hvt_ground.sinks.rerun.gallery import CANVAS
+
+__all__ = [
+    "BITRATE",
+    "CAPTIONS",
+    "EVENTS",
+    "LATENCY",
+    "OVERFLOW",
+    "PATCHES",
+    "REFINED",
+    "SESSION",
+    "STILLS",
+    "TOLD",
+    "TRACKS",
+    "TRACK_COUNT",
+    "VIDEO",
+    "Front",
+    "screen",
+]
+
+VIDEO = "/base/video"
+TRACKS = "/base/tracks"
+REFINED = "/base/refined"
+TOLD = "/base/told"
+PATCHES = "/base/patches"
+STILLS = "/stills"
+CAPTIONS = "/stills/captions"
+OVERFLOW = "/stills/more"
+BITRATE = "/link/bitrate"
+LATENCY = "/link/latency"
+TRACK_COUNT = "/link/tracks"
+EVENTS = "/events"
+SESSION = "/session"
+
+_PAPER = (14, 17, 22)
+"""Background behind pictures."""
+
+Front = Literal["tracks", "enhanced"]
+"""The tab that lies in front."""
+
+
+def screen(
+    *, base_size: tuple[int, int], fps: float, budget_bps: float, clocked: bool, live: bool, front: Front
+) -> rrb.Blueprint:
+    """Video with boxes, plots below; gallery of stills, session facts and events to the right.
+
+    The video has a second tab: with the stills in their places, and boxes only of tracks that a still has spoken on.
+
+    Args:
+        base_size: (width, height) of the base stream in pixels.
+        fps: The base stream's rate; the viewer plays a frame timeline at it.
+        budget_bps: The budget in all; sets the height of the bitrate plot.
+        clocked: Whether latencies are known; without them their plot is left out.
+        live: Follow the newest data, rather than play from the beginning.
+        front: Which of the two tabs of the video is seen first.
+    """
+    left = rrb.Vertical(_videos(base_size, front), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
+    right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.35, 0.62, 0.93])
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right, column_shares=[1.72, 1.0]),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(
+            state="collapsed",
+            timeline="frame",
+            fps=fps,
+            play_state="following" if live else "playing",
+            loop_mode="off" if live else "all",
+        ),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _videos(base_size: tuple[int, int], front: Front) -> rrb.Tabs:
+    return rrb.Tabs(
+        _video(base_size, "Base stream and tracks", without=(f"{PATCHES}/**",)),
+        # Boxes say which objects a still has spoken on; thin and without words, for the picture is the matter.
+        _video(base_size, "Enhanced: stills in their places", without=(TRACKS, TOLD), bare=REFINED),
+        active_tab=0 if front == "tracks" else 1,
+    )
+
+
+def _video(
+    base_size: tuple[int, int], name: str, *, without: tuple[str, ...], bare: str | None = None
+) -> rrb.Spatial2DView:
+    style = rr.Boxes2D.from_fields(radii=rr.Radius.ui_points(0.5), show_labels=False)
+    return rrb.Spatial2DView(
+        origin="/base",
+        contents=["/base/**", *(f"- {path}" for path in without)],
+        name=name,
+        background=_PAPER,
+        visual_bounds=rrb.VisualBounds2D(x_range=[0, base_size[0]], y_range=[0, base_size[1]]),
+        defaults=[rr.EncodedImage.from_fields(media_type="image/jpeg")],
+        overrides={bare: style} if bare is not None else None,
+    )
+
+
+def _gallery() -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(
+        origin=STILLS,
+        contents=[f"{STILLS}/**", f"- {OVERFLOW}/**"],
+        name="Base crop | still",
+        background=_PAPER,
+        visual_bounds=rrb.VisualBounds2D(x_range=[0, CANVAS[0]], y_range=[0, CANVAS[1]]),
+        defaults=[rr.EncodedImage.from_fields(media_type="image/jpeg")],
+    )
+
+
+def _plots(budget_bps: float, *, clocked: bool) -> rrb.Horizontal:
+    # Nearly twice the budget: room for the legend, and an overshoot is seen to be one.
+    plots = [_plot(BITRATE, "Link, kbit/s", rrb.ScalarAxis(range=(0.0, 1.8 * budget_bps / 1000)))]
+    if clocked:
+        plots.append(_plot(LATENCY, "Latency, ms"))
+    plots.append(_plot(TRACK_COUNT, "Tracks"))
+    return rrb.Horizontal(*plots, column_shares=[1.5, *[1.0] * (len(plots) - 1)])
+
+
+def _plot(origin: str, name: str, axis_y: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
+    corner = rrb.Corner2D.RightBottom if origin == TRACK_COUNT else rrb.Corner2D.LeftTop
+    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=corner, axis_y=axis_y)
+
+
+def _session() -> rrb.TextDocumentView:
+    return rrb.TextDocumentView(origin=SESSION, name="Session")
+
+
+def _events() -> rrb.TextLogView:
+    return rrb.TextLogView(
+        origin=EVENTS,
+        name="Events",
+        columns=rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["body"]),
+    )

@@ -1,0 +1,1 @@
+"""The .rrd file itself: whole at every moment, bounded, complete at its end."""

@@ -1,0 +1,141 @@
+"""A Rerun recording on disk that is whole at every moment, and small.
+
+Rerun stores chunks: a table of rows of one entity. A chunk costs about 1.3 kB before its first value and a quarter
+of a kB for each further column, as much as half an access unit at 300 kbps; so rows must be gathered. A recording
+that gathers in memory loses what it gathered when the process is killed. `RrdFile` does both: each row is
+appended at once as a chunk of its own (the *journal*, at the end of the file), and when the journal's rows have
+become `FOLD_BYTES`, the same rows are written again as one chunk a table, over the journal (*folding*).
+
+What is on disk is a plain RRD stream without a footer: the SDK keeps a footer's manifest in memory for as long as
+it records (a footer costs 1.6 kB a chunk, too). `rrd_footer` adds one at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import Chunk
+
+from hvt_common.errors import UserError
+from hvt_ground.sinks.rerun.rrd.release import release_recordings, send_blueprint
+
+__all__ = ["RrdEncoder", "RrdFile"]
+
+_STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
+_MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
+_END = 0
+
+
+class RrdEncoder:
+    """Turns chunks into the messages of an RRD stream of one recording, LZ4-compressed by the SDK."""
+
+    def __init__(self, *, application_id: str, recording_id: str, name: str) -> None:
+        self._application_id = application_id
+        self._recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
+        # Rows are timed by frame and capture time; the SDK's own two timelines would cost bytes and mean nothing.
+        self._recording.set_log_time_enabled(False)
+        self._recording.set_log_tick_enabled(False)
+        self._stream = rr.binary_stream(self._recording)
+        self._recording.send_recording_name(name)
+        self.header = b""
+        """The twelve bytes every RRD stream begins with; known after the first message."""
+
+    def blueprint(self, blueprint: rrb.Blueprint) -> bytes:
+        """The blueprint, made active when the recording is opened."""
+        send_blueprint(self._recording, blueprint, application_id=self._application_id)
+        return self._messages()
+
+    def chunks(self, chunks: Sequence[Chunk]) -> bytes:
+        """The chunks as messages, in order."""
+        self._recording.send_chunks(chunks)
+        return self._messages()
+
+    def close(self) -> None:
+        """Release the SDK's stream; nothing is lost, since every call returned its bytes."""
+        self._recording.disconnect()
+        self._stream.read()  # its own farewell, or the SDK warns that it was dropped
+        del self._stream, self._recording
+        release_recordings()
+
+    def _messages(self) -> bytes:
+        """What the SDK encoded since the last call, without the stream's header and footer."""
+        stream = self._stream.read() or b""
+        self.header = self.header or stream[:_STREAM_HEADER_BYTES]
+        end = at = _STREAM_HEADER_BYTES
+        while at < len(stream):
+            kind, length = _MESSAGE_HEADER.unpack_from(stream, at)
+            if kind == _END:
+                break
+            at += _MESSAGE_HEADER.size + length
+            end = at
+        return stream[_STREAM_HEADER_BYTES:end]
+
+
+class RrdFile:
+    """The file: folded messages, then the journal. Each call has written its bytes when it returns."""
+
+    def __init__(self, path: Path) -> None:
+        """Create or overwrite ``path``; `UserError` where that cannot be."""
+        self.path = path
+        self._file = _created(path)
+        self._folded_bytes = 0
+        self.size_bytes = 0
+
+    def append(self, data: bytes) -> None:
+        """Add to the journal; `UserError` when the disk refuses."""
+        self._write(data, at=self.size_bytes)
+
+    def fold(self, data: bytes) -> None:
+        """Replace the journal by ``data``, which says the same in fewer bytes, and begin a new journal."""
+        self._write(data, at=self._folded_bytes)
+        self._folded_bytes = self.size_bytes
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _write(self, data: bytes, *, at: int) -> None:
+        try:
+            end = at
+            while data:
+                written = os.pwrite(self._file, data, end)
+                end += written
+                data = data[written:]
+            if end < self.size_bytes:
+                os.ftruncate(self._file, end)
+        except OSError as error:
+            raise UserError(
+                f"recording {self.path} cannot be written any further: {error.strerror}"
+            ) from error
+        self.size_bytes = end
+
+
+def _created(path: Path) -> int:
+    """A file descriptor of a new, empty file."""
+    if path.is_dir():
+        raise UserError(
+            f"recording {path} is a folder: give the name of a file in it, such as {path / 'flight.rrd'}"
+        )
+    if not path.parent.is_dir():
+        raise UserError(f"recording {path} cannot be created: its folder {path.parent} does not exist")
+    try:
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise UserError(f"recording {path} cannot be created: {error.strerror}") from error

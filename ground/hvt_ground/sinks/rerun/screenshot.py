@@ -1,0 +1,117 @@
+"""A picture of a recording's screen, without a screen: ``python -m hvt_ground.sinks.rerun.screenshot FILE.rrd``.
+
+Needs what the viewer needs: a Vulkan driver (Mesa's software one will do; Debian: mesa-vulkan-drivers) and, for HEVC,
+``ffmpeg`` on the PATH (5.1 or later).
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rerun.experimental import ViewerClient
+
+from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.units import parse_size
+from hvt_ground.sinks.rerun.live_view import free_port, listening, viewer_environment, viewer_program
+
+__all__ = ["main", "screenshot"]
+
+_START_S = 30.0
+_MENU_PX = 37
+
+
+def screenshot(
+    recording: Path, *, frame: int, out: Path, size: tuple[int, int] = (1920, 1080), settle_s: float = 4.0
+) -> None:
+    """Open ``recording`` in a headless viewer, go to ``frame``, and write its screen as PNG.
+
+    Args:
+        recording: An .rrd file.
+        frame: Value of the ``frame`` timeline.
+        out: The PNG to write.
+        size: (width, height) of the window in pixels; the picture is lower by the menu bar.
+        settle_s: How long the viewer may decode and lay out before the picture is taken.
+
+    Raises:
+        UserError: the file or a part that the viewer needs is missing, or the viewer does not start.
+    """
+    if not recording.is_file():
+        raise UserError(f"recording {recording} does not exist: give an .rrd file")
+    if shutil.which("ffmpeg") is None:
+        raise UserError("ffmpeg is not on the PATH: the viewer needs it to show HEVC")
+    port = free_port()
+    with tempfile.TemporaryDirectory(prefix="hvt-viewer-") as runtime:
+        command = [str(viewer_program()), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
+        command += ["--port", str(port), "--window-size", f"{size[0]}x{size[1]}"]
+        environment = {"XDG_RUNTIME_DIR": runtime} | viewer_environment()
+        process = subprocess.Popen(  # noqa: S603  # the SDK's own program, no shell
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        try:
+            _wait_until_listening(process, port)
+            png = _picture(port, recording, frame=frame, settle_s=settle_s)
+        finally:
+            process.terminate()
+            process.wait(timeout=10)
+    out.write_bytes(_without_menu(png))
+
+
+def _picture(port: int, recording: Path, *, frame: int, settle_s: float) -> bytes:
+    client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+    client.open(str(recording.resolve()))
+    deadline = time.monotonic() + _START_S
+    while not any(r.timelines for r in client.get_state().recordings):
+        if time.monotonic() > deadline:
+            raise UserError(f"recording {recording} holds nothing that the viewer can show")
+        time.sleep(0.1)
+    client.set_time("frame", sequence=frame, play_state="paused")
+    time.sleep(settle_s)
+    return client.take_screenshot()
+
+
+def _without_menu(png: bytes) -> bytes:
+    """Cut the menu bar: it tells of the machine that took the picture (a software renderer, a container)."""
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise UserError("the headless viewer returned no picture")
+    _, cut = cv2.imencode(".png", picture[_MENU_PX:])
+    return cut.tobytes()
+
+
+def _wait_until_listening(process: subprocess.Popen[bytes], port: int) -> None:
+    deadline = time.monotonic() + _START_S
+    while not listening(port):
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise UserError("the headless viewer did not start: it needs a Vulkan driver, software will do")
+        time.sleep(0.1)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="hvt_ground.sinks.rerun.screenshot", description="A picture of a recording's screen."
+    )
+    parser.add_argument("recording", type=Path, help="an .rrd file")
+    parser.add_argument("--frame", type=int, default=0, help="value of the frame timeline (default 0)")
+    parser.add_argument("--out", type=Path, required=True, help="the PNG to write")
+    parser.add_argument("--size", default="1920x1080", help="window in pixels (default 1920x1080)")
+    given = parser.parse_args(argv)
+    size = parse_size(given.size, name="--size")
+    screenshot(given.recording, frame=given.frame, out=given.out, size=size)
+    return 0
+
+
+def _main(argv: Sequence[str] | None = None) -> int:
+    return exit_with_sentence(main, program="hvt_ground.sinks.rerun.screenshot", argv=argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(_main())

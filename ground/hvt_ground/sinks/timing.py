@@ -1,0 +1,151 @@
+"""Write when each message was captured, sent, received and shown: one line a message, each whole once it is written.
+
+The columns, in this order (times are Unix nanoseconds, 0 where there is none):
+
+- ``kind``: base, roi, tracks, status; past-still, past-base, past-info for a piece of what the edge kept in an outage
+- ``sequence``: the message's own number; ``frame_index``: of the frame it is about, -1 where it is about none
+- ``capture_ns``, ``send_ns``: by the edge's clock; ``received_ns``, ``shown_ns``: by this one
+- ``shown_ns``: when it was decoded and recorded (base), read by the classifier (roi), or taken in; 0: never, or
+  a piece of the past that did not complete an object, or one of no use
+- ``line_bytes``: what it cost on the line, headers of Zenoh, TCP and IP included
+- ``clock_offset_ns``: the edge's clock less this one, as known then: the delay of a message is
+  ``received_ns - (capture_ns - clock_offset_ns)``
+- ``edge``, ``session``: whose it is
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.ledger import overhead_bytes
+from hvt_common.transport.inbox import Received
+
+__all__ = ["COLUMNS", "SessionTiming", "TimingTable"]
+
+COLUMNS = (
+    "kind",
+    "sequence",
+    "frame_index",
+    "capture_ns",
+    "send_ns",
+    "received_ns",
+    "shown_ns",
+    "line_bytes",
+    "clock_offset_ns",
+    "edge",
+    "session",
+)
+_MOST_UNREAD = 512
+"""Stills whose line waits until they are read; more than the session's own queue holds."""
+
+
+class TimingTable:
+    """The file, for all sessions of this ground. Any thread may write; killing the process loses no line.
+
+    Raises:
+        UserError: it cannot be created, or (from `line`) written any further.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
+        try:
+            self._file: int | None = os.open(path, flags, 0o644)
+        except OSError as error:
+            raise UserError(
+                f"--timing {path} cannot be written ({error.strerror}): name a file that can"
+            ) from None
+        self.line(COLUMNS)
+
+    def line(self, values: Iterable[object]) -> None:
+        """Append one line; after `close` nothing."""
+        text = ",".join(map(str, values)) + "\n"
+        with self._lock:
+            if self._file is None:  # a receiver that did not end in time still speaks
+                return
+            try:
+                os.write(self._file, text.encode("ascii"))
+            except OSError as error:
+                raise UserError(
+                    f"--timing {self._path} cannot be written any further: {error.strerror}"
+                ) from error
+
+    def close(self) -> None:
+        """After the last session has ended."""
+        with self._lock:
+            if self._file is not None:
+                os.close(self._file)
+                self._file = None
+
+
+class SessionTiming:
+    """The lines of one session. ``clock`` gives Unix nanoseconds, ``offset_ns`` the edge's clock less this one."""
+
+    def __init__(
+        self,
+        table: TimingTable,
+        *,
+        edge: str,
+        session_id: int,
+        clock: Callable[[], int],
+        offset_ns: Callable[[], int],
+    ) -> None:
+        self._table = table
+        self._whose = (edge, f"{session_id:016x}")
+        self._clock = clock
+        self._offset_ns = offset_ns
+        self._lock = threading.Lock()
+        self._unread: dict[int, tuple[object, ...]] = {}
+
+    def message(
+        self,
+        kind: str,
+        item: Received,
+        *,
+        sequence: int,
+        send_ns: int,
+        frame_index: int = -1,
+        capture_ns: int = 0,
+        shown: bool = True,
+    ) -> None:
+        """A message that has been dealt with; ``shown``: something was made of it."""
+        facts = self._facts(kind, item, sequence, frame_index, capture_ns, send_ns)
+        self._write(facts, shown_ns=self._clock() if shown else 0)
+
+    def still(
+        self, item: Received, *, sequence: int, frame_index: int, capture_ns: int, send_ns: int
+    ) -> None:
+        """A still that came; its line is written when it has been read."""
+        with self._lock:
+            self._unread[sequence] = self._facts("roi", item, sequence, frame_index, capture_ns, send_ns)
+            if len(self._unread) > _MOST_UNREAD:
+                self._write(self._unread.pop(next(iter(self._unread))), shown_ns=0)
+
+    def read(self, sequences: Iterable[int]) -> None:
+        """These stills have been read."""
+        now_ns = self._clock()
+        with self._lock:
+            for sequence in sequences:
+                if (facts := self._unread.pop(sequence, None)) is not None:
+                    self._write(facts, shown_ns=now_ns)
+
+    def close(self) -> None:
+        """What was not read, never will be."""
+        with self._lock:
+            for facts in self._unread.values():
+                self._write(facts, shown_ns=0)
+            self._unread.clear()
+
+    def _facts(self, kind: str, item: Received, *numbers: int) -> tuple[object, ...]:
+        size, extra = len(item.payload), len(item.attachment)
+        line = size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding)
+        return (kind, *numbers, item.received_ns, line)
+
+    def _write(self, facts: tuple[object, ...], *, shown_ns: int) -> None:
+        *numbers, line_bytes = facts
+        self._table.line((*numbers, shown_ns, line_bytes, self._offset_ns(), *self._whose))

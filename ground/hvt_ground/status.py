@@ -1,0 +1,127 @@
+"""What a ground says of a session: the JSON for programs, the table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hvt_common.units import bitrate_text
+from hvt_ground.session.session import GroundSession
+
+__all__ = ["summary", "table"]
+
+
+def summary(session: GroundSession, *, unusable: int, past_recordings: Sequence[Path] = ()) -> dict[str, Any]:
+    """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do.
+
+    ``unusable`` counts messages of the edge that were skipped, over all its sessions; ``past_recordings`` are of
+    sessions that it kept things of, and that were over when they came.
+    """
+    info, sight, counters = session.info, session.sight, session.counters
+    account = session.ledger.summary(session.duration_s)
+    worst = account.worst_window_bps
+    unread = sight.outcomes.get("unread", 0)
+    past = session.past
+    came = session.stills_received + past.stills
+    waiting = came - sum(sight.outcomes.values()) - sum(session.stills_dropped.values())
+    return {
+        "edge": info.edge,
+        "session": f"{info.session_id:016x}",
+        "method": info.method,
+        "pace": info.pace,
+        "frames": session.frames_received,
+        "frames_decoded": session.frames_decoded,
+        "frames_untracked": session.frames_untracked,
+        "duration_s": round(session.duration_s, 3),
+        "base_bytes": account.base_bytes,
+        "roi_bytes": account.roi_bytes,
+        "past_bytes": account.past_bytes,
+        "meta_bytes": account.meta_bytes,
+        "overhead_bytes": account.overhead_bytes,
+        "total_bps": account.total_bps,
+        "base_bps": account.base_bps,
+        "roi_bps": account.roi_bps,
+        "budget_bps": info.budget_bps,
+        "budget_base_bps": info.base_bps,
+        "worst_window_bps": {"base": worst.base, "roi": worst.roi, "total": worst.total},
+        "stills": {
+            "received": session.stills_received,
+            "deferred": waiting,
+            "dropped": sum(session.stills_dropped.values()),
+            "unread": unread,
+            "reasons": {
+                "received": account.fates["received"],
+                "dropped": dict(session.stills_dropped),
+                "outcomes": dict(sight.outcomes),
+            },
+            "mean_bytes": round(account.roi_bytes / session.stills_received)
+            if session.stills_received
+            else 0,
+        },
+        "past": {
+            "stills": past.stills,
+            "frames": past.frames,
+            "frames_left_out": past.left_out,
+            "video_s": round(past.video_s, 3),
+            "recordings": [str(path) for path in past_recordings],
+        },
+        "tracks": sight.tracks,
+        "tracks_refined": sight.refined,
+        "class_changes": sight.class_changes,
+        "detections_run": sight.detections_run,
+        "gaps": counters.gaps,
+        "lost": counters.lost,
+        "corrupt": counters.corrupt,
+        "duplicates": counters.duplicates + counters.replayed,
+        "unusable_messages": unusable,
+        "keyframe_requests": counters.keyframe_requests,
+        "latency_ms": session.overlay_latency.as_dict(),
+        "receive_latency_ms": session.receive_latency.as_dict(),
+        "recording": str(session.recording) if session.recording is not None else None,
+        "recording_bytes": session.recorder.size_bytes if session.recorder is not None else 0,
+    }
+
+
+def table(content: dict[str, Any]) -> list[tuple[str, str]]:
+    """The same as rows of name and value."""
+    stills, worst, latency = content["stills"], content["worst_window_bps"], content["latency_ms"]
+    share = (
+        f"{content['total_bps'] / max(1, content['budget_bps']):.0%} of {bitrate_text(content['budget_bps'])}"
+    )
+    outcomes = ", ".join(f"{name} {count}" for name, count in sorted(stills["reasons"]["outcomes"].items()))
+    lossless = (
+        "no gaps" if not content["gaps"] else f"{content['gaps']} gaps, {content['lost']} messages lost"
+    )
+    rows = [
+        ("session", f"{content['session']}, {content['method']}"),
+        ("frames", f"{content['frames_decoded']} decoded in {content['duration_s']:.1f} s, {lossless}"),
+        (
+            "total",
+            f"{bitrate_text(content['total_bps'])}, {share}; fullest window {bitrate_text(worst['total'])}",
+        ),
+        ("base", f"{bitrate_text(content['base_bps'])}; fullest window {bitrate_text(worst['base'])}"),
+        (
+            "stills",
+            f"{stills['received']}, {bitrate_text(content['roi_bps'])}"
+            + (f" ({outcomes})" if outcomes else ""),
+        ),
+        (
+            "tracks",
+            f"{content['tracks']}, {content['tracks_refined']} refined, {content['class_changes']} class changes",
+        ),
+        ("keyframes", f"{content['keyframe_requests']} asked for"),
+    ]
+    past = content["past"]
+    if past["stills"] or past["frames"]:
+        rows.append(
+            ("outages", f"{past['stills']} stills and {past['video_s']:.1f} s of video came afterwards")
+        )
+    rows += [("former session", path) for path in past["recordings"]]
+    if latency["p50"] is not None:
+        since = "receiving" if content["pace"] == "lockstep" else "capture"
+        spread = f"p50 {latency['p50']:.0f} ms, p95 {latency['p95']:.0f}, max {latency['max']:.0f}"
+        rows.append(("latency", f"{since} to overlay: {spread}"))
+    if content["recording"]:
+        rows.append(("recording", f"{content['recording']}, {content['recording_bytes'] / 1e6:.2f} MB"))
+    return rows

@@ -1,0 +1,38 @@
+"""What a fuzzing target is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from random import Random
+
+from lab.fuzz.mutate import Bytes, Mutator
+
+__all__ = ["Target", "raw_bytes"]
+
+
+def raw_bytes(data: bytes, rng: Random, raw: Bytes) -> bytes:
+    """The input has no structure that a mutation should keep."""
+    return raw(data)
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """One way in. ``run`` takes any bytes and raises nothing that the code under it does not promise.
+
+    What it promises (`WireError`, `StillError`, `UserError`, None) is caught inside ``run``; everything else that
+    comes out is a finding.
+    """
+
+    name: str
+    run: Callable[[bytes], None]
+    seeds: Callable[[], Sequence[bytes]]
+    """From the real encoders."""
+    mutate: Mutator = raw_bytes
+    share: int = 10
+    """Of the inputs of a run over all targets."""
+    short: int = 2000
+    """Inputs in the normal tests: what takes some tenths of a second."""
+    most_bytes: int = 4096
+    most_growth_mb: int = 64
+    """By so much one input may raise the process's peak of memory."""

@@ -1,0 +1,209 @@
+"""Every message of the wire, with its checksum kept right."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from random import Random
+
+import numpy as np
+
+import messages
+from flight import tracks_at
+from hvt_common.protocol.channels import parse_key
+from hvt_common.protocol.messages import (
+    BaseHeader,
+    ControlAnswer,
+    ControlRequest,
+    Feedback,
+    Flags,
+    Info,
+    Message,
+    PastHeader,
+    PastStill,
+    PastUnit,
+    RoiHeader,
+    Status,
+    TrackStep,
+    TrackStepDecoder,
+    TrackStepEncoder,
+    WireError,
+    pack_past_still,
+    pack_past_units,
+    parse_past_still,
+    parse_past_units,
+)
+from lab.fuzz.contract import Target
+from lab.fuzz.mutate import Bytes, each_part, plain, resealed, sealed_values
+from lab.fuzz.parts import joined, parted
+
+__all__ = ["ROI", "TARGETS", "feedback"]
+
+_NOW = 1_790_000_000_000_000_000
+
+ROI = replace(messages.ROI, flags=int(Flags.STORED), parameters={})
+REQUESTS = tuple(
+    ControlRequest(session_id=0, command=command, arguments=arguments)
+    for command, arguments in (
+        ("keyframe", {}),
+        ("still", {"track": 5, "at_ms": -500, "quality": 80}),
+        ("still", {"x": 100, "y": 80, "w": 64.0, "h": 48, "frame": 3}),
+        ("still-fate", {"ask": 1}),
+        ("tracks", {}),
+        ("set-budget", {"bps": 500_000}),
+        ("set-method", {"method": "M5"}),
+        ("send-past", {}),
+    )
+)
+
+
+def feedback(**changes: object) -> Feedback:
+    """A receiver report with something in every field."""
+    return replace(messages.FEEDBACK, **changes)  # type: ignore[arg-type]
+
+
+_UNITS = tuple(PastUnit(n, _NOW + n * 66_666_667, n == 0, bytes([n]) * (20 + n)) for n in range(6))
+
+
+def _parsed(message: type[Message]) -> Callable[[bytes], None]:
+    """Parse it; what parses can be sent again and means the same."""
+
+    def run(data: bytes) -> None:
+        try:
+            value = message.parse(data)
+        except WireError:
+            return
+        if isinstance(value, Info):
+            value.view.to_base(np.zeros((1, 4), np.float32))
+        if len(data) <= message.MAX_BYTES - 64:  # short floats come back long
+            assert message.parse(value.pack()) == value
+
+    return run
+
+
+def _with_payload(message: type[Message]) -> Callable[[bytes], None]:
+    """Attachment and payload: bytes that are not those of the checksum never parse."""
+
+    def run(data: bytes) -> None:
+        attachment, payload = parted(data, least=2)[:2]
+        with contextlib.suppress(WireError):
+            value = message.parse(attachment, payload)
+            assert message.parse(value.pack(payload), payload) == value
+
+    return run
+
+
+def _sealed_to_payload(data: bytes, rng: Random, raw: Bytes) -> bytes:
+    """An attachment and its payload, either changed, and mostly sealed together again."""
+    attachment, payload = parted(data, least=2)[:2]
+    if rng.random() < 0.3:
+        payload = raw(payload)
+    changed = sealed_values(attachment, rng, raw) if rng.random() < 0.8 else attachment
+    if rng.random() < 0.85:
+        changed = resealed(changed[:-5], payload)
+    return joined([changed, payload])
+
+
+def _track_steps(data: bytes) -> None:
+    decoder = TrackStepDecoder()
+    for part in parted(data):
+        with contextlib.suppress(WireError):
+            step = TrackStep.parse(part)
+            tracks = decoder.decode(step)
+            if tracks is not None:
+                assert np.isfinite(tracks.boxes_xyxy_px).all()
+                assert len(tracks.ids) == len(set(tracks.ids.tolist())) <= 1024
+        ahead = decoder.predicted(frame_index=2**32 - 1)
+        assert ahead is None or np.isfinite(ahead.boxes_xyxy_px).all()
+
+
+def _step_seeds() -> list[bytes]:
+    seeds = []
+    for count, refresh_ns in ((3, 0), (6, 1_000_000_000), (40, 1_000_000_000)):
+        encoder = TrackStepEncoder(session_id=5, refresh_ns=refresh_ns)
+        steps = [
+            encoder.encode(
+                tracks_at(
+                    tick, {n + 1: (20.0 * n + tick, 10.0, 20.0 * n + 16 + tick, 30.0) for n in range(count)}
+                ),
+                capture_ns=_NOW + tick * 66_666_667,
+            ).pack()
+            for tick in (1, 2, 5)
+        ]
+        seeds += [joined(steps), joined(steps[:1])]
+    return seeds
+
+
+def _past_still(data: bytes) -> None:
+    with contextlib.suppress(WireError):
+        still = parse_past_still(data)
+        assert parse_past_still(pack_past_still(still)) == still
+        with contextlib.suppress(WireError):
+            RoiHeader.parse(still.attachment, still.payload)
+
+
+def _past_units(data: bytes) -> None:
+    with contextlib.suppress(WireError):
+        units = parse_past_units(data)
+        assert parse_past_units(pack_past_units(units)) == units
+
+
+def _key(data: bytes) -> None:
+    text = data.decode("utf-8", "surrogateescape")
+    found = parse_key(text)
+    assert found is None or f"hvt/{found[0]}/{found[1]}" == text
+
+
+def _message(name: str, message: type[Message], seeds: Sequence[Message], *, share: int = 40) -> Target:
+    return Target(
+        name,
+        _parsed(message),
+        lambda: [one.pack() for one in seeds],
+        mutate=sealed_values,
+        share=share,
+        most_bytes=message.MAX_BYTES + 64,
+    )
+
+
+def _streamed(name: str, message: type[Message], seed: Message) -> Target:
+    payload = b"\0\0\0\1 payload"
+    return Target(
+        name,
+        _with_payload(message),
+        lambda: [joined([seed.pack(payload), payload])],
+        mutate=_sealed_to_payload,
+        share=40,
+        most_bytes=message.MAX_BYTES + 256,
+    )
+
+
+def _past_still_seeds() -> list[bytes]:
+    payload = plain(Random(1))(b"\xff\xd8\xff" + bytes(40))
+    return [pack_past_still(PastStill(ROI.pack(payload), "image/jpeg", payload))]
+
+
+TARGETS = (
+    _streamed("base-header", BaseHeader, messages.BASE),
+    _streamed("roi-header", RoiHeader, ROI),
+    _streamed("past-header", PastHeader, messages.PAST),
+    _message("status", Status, [messages.STATUS]),
+    _message("info", Info, [messages.INFO]),
+    _message("control-request", ControlRequest, REQUESTS),
+    _message("control-answer", ControlAnswer, [messages.ANSWER]),
+    _message("feedback", Feedback, [feedback(), feedback(stills=(), past=(), missing_stills=())]),
+    Target(
+        "track-steps",
+        _track_steps,
+        _step_seeds,
+        mutate=each_part(sealed_values),
+        share=60,
+        short=250,
+        most_bytes=6000,
+    ),
+    Target("past-still", _past_still, _past_still_seeds, share=40),
+    Target(
+        "past-units", _past_units, lambda: [pack_past_units(_UNITS), pack_past_units(_UNITS[:1])], share=40
+    ),
+    Target("key", _key, lambda: [b"hvt/uav-1/base", b"hvt/a/alive", b"hvt//roi"], share=30, most_bytes=256),
+)

@@ -1,0 +1,30 @@
+"""Model files: the walk before the runtime, and the runtime."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
+from lab.fuzz.contract import Target
+from lab.fuzz.scratch import scratch
+from onnx_models import colour_classifier, constant_model
+
+__all__ = ["TARGETS"]
+
+
+def _model(data: bytes) -> None:
+    path = scratch() / "m.onnx"
+    path.write_bytes(data)
+    with contextlib.suppress(UserError):
+        open_model(path, settings=ModelSettings(threads=1))
+
+
+def _seeds() -> list[bytes]:
+    small = constant_model(scratch() / "seed.onnx", np.ones((1, 2), np.float32), metadata={"names": "['a']"})
+    return [small.read_bytes(), colour_classifier(scratch() / "seed.onnx").read_bytes()]
+
+
+TARGETS = (Target("model-file", _model, _seeds, share=8, short=150, most_bytes=2000),)

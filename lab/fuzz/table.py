@@ -1,0 +1,39 @@
+"""All targets by name."""
+
+from __future__ import annotations
+
+from hvt_common.protocol.channels import parse_key
+from lab.fuzz import (
+    ground_target,
+    message_targets,
+    model_target,
+    picture_targets,
+    stage_targets,
+    text_targets,
+)
+from lab.fuzz.contract import Target
+
+__all__ = ["PLANTED", "TARGETS"]
+
+
+def _planted(data: bytes) -> None:
+    parse_key(data.decode("latin-1"))
+    if b"t" in data:
+        raise ValueError("this one is here to be found")
+
+
+PLANTED = Target("planted", _planted, lambda: [b"hv", b"HVT"], share=0, most_bytes=16)
+"""A bug, for the fuzzer's own test."""
+
+TARGETS = {
+    target.name: target
+    for target in (
+        *message_targets.TARGETS,
+        *stage_targets.TARGETS,
+        *picture_targets.TARGETS,
+        *text_targets.TARGETS,
+        *ground_target.TARGETS,
+        *model_target.TARGETS,
+        PLANTED,
+    )
+}

@@ -1,0 +1,133 @@
+"""Runs hvt-edge and hvt-ground as real processes over a bad link, and gathers what became of it."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from lab.link.measures import Outcome
+from lab.link.netns import Namespaces
+from lab.link.relay import Relay
+from lab.link.script import Length, Scenario, Script, Transport
+from lab.link.sides import GROUND_HOST, Sides
+from lab.link.started import Started
+from lab.link.store_left import store_left
+from lab.link.timing import read_timing
+from lab.link.tunnel import Tunnel
+from lab.link.watch import Watch
+from processes import eventually, free_ports
+
+__all__ = ["CARRIERS", "Carrier", "Run", "run"]
+
+Carrier = Literal["relay", "netns", "tun"]
+CARRIERS: tuple[Carrier, ...] = ("relay", "netns", "tun")
+
+_START_S = 150.0
+_TAKES_IN_S = 2.5
+"""How long the ground may take in what is on its way when the edge has ended."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is to be run."""
+
+    scenario: Scenario
+    source: str
+    """As ``--source`` takes it; must last as long as the script."""
+    folder: Path
+    """Where everything is left."""
+    length: Length = "full"
+    lasts: str | None = None
+    """Another length than the scenario's."""
+    carrier: Carrier = "relay"
+    seed: int = 0
+    edge_arguments: Sequence[str] = ()
+    ground_arguments: Sequence[str] = field(default=())
+
+    @property
+    def script(self) -> Script:
+        """What the link will do."""
+        script = self.scenario.script(self.length, seed=self.seed, lasts=self.lasts)
+        return script.without_delay() if self.carrier == "netns" else script
+
+    @property
+    def transport(self) -> Transport:
+        """What edge and ground speak over it; a shaped veth is there for the kernel's TCP."""
+        return "tcp" if self.carrier == "netns" else self.scenario.transport
+
+
+def run(asked: Run) -> Outcome:
+    """Run one scenario from start to end; nothing is left running.
+
+    Raises:
+        UnavailableError: the carrier is netns or tun, and there is none to be had.
+        AssertionError: edge or ground did not come up.
+    """
+    asked.folder.mkdir(parents=True, exist_ok=True)
+    script, timing = asked.script, asked.folder / "timing.csv"
+    for old in (timing, *asked.folder.glob("run*.rrd")):
+        old.unlink(missing_ok=True)
+    shutil.rmtree(asked.folder / "store", ignore_errors=True)
+    kind, (port,) = asked.transport, free_ports(1)
+    with _carrier(asked, script, target_port=port) as link, ExitStack() as stack:
+        if isinstance(link, Sides):
+            sides, open_to_all = {side: link.prefix(side) for side in link.names}, ["--insecure"]
+            listen = connect = f"{kind}/{GROUND_HOST}:{port}"
+        else:
+            sides, open_to_all = {"edge": [], "ground": []}, []
+            listen, connect = f"{kind}/127.0.0.1:{port}", f"{kind}/127.0.0.1:{link.port}"
+        ground = stack.enter_context(Started("ground", asked.folder, [
+            *sides["ground"], sys.executable, "-m", "hvt_ground.cli", "--timing", str(timing), "--listen", listen,
+            *open_to_all, "--record", str(asked.folder / "run.rrd"), *asked.ground_arguments,
+        ]))  # fmt: skip
+        ground.until("listening on", within_s=_START_S)
+        edge = stack.enter_context(Started("edge", asked.folder, [
+            *sides["edge"], sys.executable, "-m", "hvt_edge.cli", "--connect", connect, "--wait", "60s",
+            "--source", asked.source, "--budget", asked.scenario.budget,
+            "--store-folder", str(asked.folder / "store"), *asked.edge_arguments,
+        ]))  # fmt: skip
+        eventually(lambda: _playing(edge, timing), within_s=_START_S, what="a first frame reaches the ground")
+        began_s = link.begin()
+        with Watch({"edge": edge.process.pid, "ground": ground.process.pid}) as watch:
+            _wait(began_s + script.lasts_s, edge, ground)
+        watch.save(asked.folder / "resources.csv")
+        codes = {"edge": edge.end()}
+        # Not --once: a ground with it leaves in an outage that is longer than its patience.
+        _wait(time.time() + _TAKES_IN_S, ground)
+        codes["ground"] = ground.end()
+    return Outcome(
+        scenario=asked.scenario.name,
+        script=script,
+        began_s=began_s,
+        arrivals=read_timing(timing),
+        edge=edge.left(),
+        ground=ground.left(),
+        samples=watch.samples,
+        exit_codes=codes,
+        said={"edge": edge.said, "ground": ground.said},
+        kept=store_left(asked.folder / "store"),
+    )
+
+
+def _carrier(asked: Run, script: Script, *, target_port: int) -> Relay | Sides:
+    if asked.carrier == "netns":
+        return Namespaces(script)
+    if asked.carrier == "tun":
+        return Tunnel(script, seed=asked.seed)
+    return Relay(script, protocol=asked.transport, target_port=target_port, seed=asked.seed)
+
+
+def _playing(edge: Started, timing: Path) -> bool:
+    assert edge.alive, f"the edge ended early:\n{edge.said}"
+    return bool(read_timing(timing))
+
+
+def _wait(until_s: float, *processes: Started) -> None:
+    while time.time() < until_s and any(one.alive for one in processes):
+        time.sleep(min(0.1, max(0.0, until_s - time.time())))

@@ -1,4 +1,0 @@
-"""How the embedded models are trained: drawn pictures in, ONNX files out. Needs PyTorch; see ``docs/models.md``.
-
-``python -m hvt_study.train detector|classifier|all`` trains, ``… eval`` measures what was trained.
-"""

@@ -1,0 +1,116 @@
+"""``python -m hvt_train``: train the embedded models, or measure them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.inference.embedded import CLASSIFIER, DETECTOR, embedded_model
+
+__all__ = ["main"]
+
+_PROGRAM = "python -m hvt_train"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the program; 0, or 2 after one sentence on stderr where the user can mend something."""
+    return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    arguments = _parser().parse_args(argv)
+    run = {"eval": _evaluate, "curve": _curve}.get(arguments.command, _train)
+    return run(arguments)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=_PROGRAM, description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, what in (
+        ("detector", f"train {DETECTOR}"),
+        ("classifier", f"train {CLASSIFIER}"),
+        ("all", "train both"),
+    ):
+        own = commands.add_parser(name, help=what, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+        own.add_argument("--out", type=Path, required=True, default=argparse.SUPPRESS, metavar="FOLDER")
+        own.add_argument("--seed", type=int, default=1)
+        own.add_argument("--threads", type=int, default=2, help="of PyTorch")
+        own.add_argument("--workers", type=int, default=1, help="processes that draw")
+        own.add_argument("--scenes", type=int, default=102, help="demo scenes in the pool")
+        own.add_argument("--places", type=int, default=323, help="other places in the pool")
+        own.add_argument("--crop-scenes", type=int, default=45, help="demo scenes that stills are cut from")
+        own.add_argument("--rate", type=float, default=2e-3, help="greatest learning rate")
+        own.add_argument("--steps", type=int, default=9000, help="of the detector")
+        own.add_argument("--batch", type=int, default=8, help="views in a step of the detector")
+        own.add_argument("--classifier-steps", type=int, default=5000, help="of 64 crops each")
+        own.add_argument("--minutes", type=float, default=None, help="end each network's schedule by then")
+        own.add_argument(
+            "--start", type=Path, default=None, metavar="STATE", help="detector weights to go on from"
+        )
+    own = commands.add_parser("eval", help="measure", formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    own.add_argument("--drawn", action="store_true", help="on held-out drawn scenes")
+    own.add_argument(
+        "--real", type=Path, metavar="CLIP", default=None, help="on a real clip, against --reference"
+    )
+    own.add_argument(
+        "--reference", type=Path, metavar="MODEL", default=None, help="detector whose boxes count as true"
+    )
+    own.add_argument(
+        "--speed", action="store_true", help="milliseconds of the detector at 640x384 on one thread"
+    )
+    own.add_argument("--detector", type=Path, default=embedded_model(DETECTOR))
+    own.add_argument("--classifier", type=Path, default=embedded_model(CLASSIFIER))
+    own.add_argument("--seeds", type=int, default=8, help="held-out scenes")
+    own.add_argument("--every", type=int, default=10, help="frames of the clip: every n-th")
+    own.add_argument("--threads", type=int, default=1)
+    own = commands.add_parser("curve", help="draw the training curve of a log")
+    own.add_argument("log", type=Path)
+    own.add_argument("--out", type=Path, required=True, metavar="SVG")
+    own.add_argument("--title", default="")
+    own.add_argument("--quality", default="validation")
+    return parser
+
+
+def _curve(arguments: argparse.Namespace) -> int:
+    from hvt_train.curve import draw_curve  # noqa: PLC0415
+
+    if not arguments.log.is_file():
+        raise UserError(f"{arguments.log} does not exist; the log of a training run is expected")
+    draw_curve(arguments.log, arguments.out, title=arguments.title, quality=arguments.quality)
+    return 0
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    try:
+        from hvt_train.recipe import run_recipe  # noqa: PLC0415  # PyTorch is needed for this alone
+    except ModuleNotFoundError as error:
+        raise UserError(f"training needs the package {error.name}: pip install torch onnx") from None
+    run_recipe(arguments)
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from hvt_train.report import print_drawn, print_real, print_speed  # noqa: PLC0415
+
+    if not (arguments.drawn or arguments.real or arguments.speed):
+        raise UserError("eval was asked for nothing; give --drawn, --speed, or --real with --reference")
+    if (arguments.real is None) != (arguments.reference is None):
+        raise UserError(
+            "--real and --reference belong together: a clip, and the model whose boxes count as true"
+        )
+    if arguments.speed:
+        print_speed(arguments.detector)
+    if arguments.drawn:
+        print_drawn(
+            arguments.detector, arguments.classifier, seeds=arguments.seeds, threads=arguments.threads
+        )
+    if arguments.real:
+        print_real(arguments.detector, arguments.real, arguments.reference, every=arguments.every)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,198 @@
+"""How good the embedded models are: on held-out drawn scenes, and on a real clip that training never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.inference.detect import Detector, open_detector
+from hvt_common.values import Boxes, Detections, Image, View
+from hvt_scene.vehicles import CLASS_NAMES
+from hvt_train.places import Picture
+from hvt_train.pool import BASE_SIZE, HELD_OUT_SEED, Shot, coded, shoot
+
+__all__ = [
+    "CLEAN",
+    "DrawnResult",
+    "RealResult",
+    "average_precision",
+    "drawn_pictures",
+    "evaluate_drawn",
+    "evaluate_real",
+    "overlaps",
+]
+
+CLEAN = 0
+"""The bitrate that stands for frames that were not coded."""
+_LEAST_VISIBLE = 0.3
+_LEAST_SIDE_PX = 4.0
+_VEHICLES = frozenset({"car", "van", "truck", "bus"})
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnResult:
+    """Average precision at IoU 0.5."""
+
+    by_class: dict[str, float]
+    objects: int
+
+    @property
+    def mean(self) -> float:
+        """mAP@0.5 over the classes that occur."""
+        return float(np.mean(list(self.by_class.values())))
+
+
+@dataclass(frozen=True, slots=True)
+class RealResult:
+    """Agreement on vehicles with a reference detector, at IoU 0.5."""
+
+    recall: float
+    precision: float
+    objects: int
+    frames: int
+
+
+def overlaps(first: Boxes, second: Boxes) -> npt.NDArray[np.float32]:
+    """(N, M) IoU."""
+    low = np.maximum(first[:, None, :2], second[None, :, :2])
+    high = np.minimum(first[:, None, 2:], second[None, :, 2:])
+    inner = (high - low).clip(0).prod(2)
+    areas = [(boxes[:, 2:] - boxes[:, :2]).prod(1) for boxes in (first, second)]
+    return np.asarray(inner / np.maximum(areas[0][:, None] + areas[1][None] - inner, 1e-9), np.float32)
+
+
+def drawn_pictures(
+    seeds: Sequence[int], *, moments: int, bitrates_bps: Sequence[int], coded_frames: int = 12
+) -> dict[int, list[Picture]]:
+    """Base pictures of held-out scenes by bitrate, every second one in the demo's own look; `CLEAN` is uncoded."""
+    pictures: dict[int, list[Picture]] = {bitrate_bps: [] for bitrate_bps in bitrates_bps}
+    lossy = [bitrate_bps for bitrate_bps in bitrates_bps if bitrate_bps != CLEAN]
+    for seed in seeds:
+        scene = shoot(HELD_OUT_SEED + seed, demo_look=seed % 2 == 0)
+        for t_s in np.linspace(2.0, scene.duration_s - 1.0, moments):
+            shot = Shot(scene, float(t_s))
+            clean = shot.picture(BASE_SIZE)
+            seen = dict(zip(lossy, coded(shot, bitrates_bps=lossy, frames=coded_frames), strict=True))
+            for bitrate_bps, group in pictures.items():
+                image = seen.get(bitrate_bps, clean.image_bgr)
+                group.append(Picture(image, clean.boxes_px, clean.class_ids, clean.visible))
+    return pictures
+
+
+def evaluate_drawn(detector: Detector, pictures: Sequence[Picture]) -> DrawnResult:
+    """mAP@0.5. What is less than 30 % visible or under 4 pixels counts neither for nor against.
+
+    The detector should be opened with a very low confidence, so that the whole curve is there.
+    """
+    seen = [detector.detect(picture.image_bgr) for picture in pictures]
+    by_class, count = {}, 0
+    for kind, name in enumerate(CLASS_NAMES):
+        if name not in detector.class_names:
+            continue
+        rows = [
+            _matches(picture, found, kind, detector.class_names.index(name))
+            for picture, found in zip(pictures, seen, strict=True)
+        ]
+        total = sum(row[2] for row in rows)
+        count += total
+        if total:
+            scores, hits = (np.concatenate([row[i] for row in rows]) for i in (0, 1))
+            by_class[name] = average_precision(scores, hits.astype(bool), total)
+    return DrawnResult(by_class, count)
+
+
+def _matches(
+    picture: Picture, found: Detections, kind: int, kind_found: int
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_], int]:
+    """Scores, hits and number of objects of one class in one picture; greedy, best first, each object once."""
+    sides = (picture.boxes_px[:, 2:] - picture.boxes_px[:, :2]).max(1)
+    counts = (picture.visible >= _LEAST_VISIBLE) & (sides >= _LEAST_SIDE_PX)
+    mine = picture.class_ids == kind
+    wanted, ignored = picture.boxes_px[mine & counts], picture.boxes_px[~counts]
+    rows = found.class_ids == kind_found
+    boxes, scores = found.boxes_xyxy_px[rows], found.confidences[rows]
+    table = overlaps(boxes, wanted)
+    hits, keep = np.zeros(len(boxes), bool), np.ones(len(boxes), bool)
+    for row in range(len(boxes)):
+        best = int(table[row].argmax()) if len(wanted) else -1
+        if best >= 0 and table[row, best] >= 0.5:
+            hits[row], table[:, best] = True, 0
+        elif len(ignored) and _inside_share(boxes[row], ignored).max() > 0.5:
+            keep[row] = False
+    return scores[keep], hits[keep], len(wanted)
+
+
+def _inside_share(box: npt.NDArray[np.float32], others: Boxes) -> npt.NDArray[np.float32]:
+    """Share of the box that lies in each of the others."""
+    inner = (np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])).clip(0).prod(1)
+    return np.asarray(inner / max(float((box[2:] - box[:2]).prod()), 1e-9), np.float32)
+
+
+def average_precision(scores: npt.NDArray[np.float32], hits: npt.NDArray[np.bool_], total: int) -> float:
+    """Area under the precision envelope over recall, all points (VOC 2010 and later)."""
+    order = np.argsort(-scores, kind="stable")
+    found = np.cumsum(hits[order])
+    recall = np.concatenate([[0.0], found / total, [1.0]])
+    precision = np.concatenate([[1.0], found / np.arange(1, len(found) + 1), [0.0]])
+    envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(((recall[1:] - recall[:-1]) * envelope[1:]).sum())
+
+
+def clip_frames(clip: Path, *, every: int) -> Iterator[Image]:
+    """Every n-th frame of a clip, whole in a 1280x720 picture as the base letterboxes it."""
+    with av.open(str(clip)) as container:
+        for index, frame in enumerate(container.decode(video=0)):
+            if index % every == 0:
+                yield _letterboxed(np.asarray(frame.to_ndarray(format="bgr24"), np.uint8))
+
+
+def _letterboxed(image: Image) -> Image:
+    size = (image.shape[1], image.shape[0])
+    view = View.fitted(size, BASE_SIZE, fit="letterbox")
+    canvas = np.zeros((BASE_SIZE[1], BASE_SIZE[0], 3), np.uint8)
+    x, y = (round(v) for v in view.offset_px)
+    wide, high = round(size[0] * view.scale), round(size[1] * view.scale)
+    canvas[y : y + high, x : x + wide] = cv2.resize(image, (wide, high), interpolation=cv2.INTER_AREA)
+    return canvas
+
+
+def reference_vehicles(reference: Path, frames: Sequence[Image], *, confidence: float = 0.4) -> list[Boxes]:
+    """Boxes of vehicles that the reference model sees in each untouched frame."""
+    detector = open_detector(str(reference), confidence=confidence)
+    return [_vehicles(detector, frame) for frame in frames]
+
+
+def _vehicles(detector: Detector, frame: Image) -> Boxes:
+    found = detector.detect(frame)
+    rows = [index for index, kind in enumerate(found.class_ids) if detector.class_names[kind] in _VEHICLES]
+    return _one_each(found.boxes_xyxy_px[rows])
+
+
+def _one_each(boxes: Boxes) -> Boxes:
+    """Drop what lies over a better box: to "vehicle or not", car and van on one spot are one vehicle."""
+    kept: list[int] = []
+    table = overlaps(boxes, boxes)
+    for row in range(len(boxes)):
+        if not kept or table[row, kept].max() < 0.6:
+            kept.append(row)
+    return boxes[kept]
+
+
+def evaluate_real(detector: Detector, frames: Sequence[Image], truth: Sequence[Boxes]) -> RealResult:
+    """Recall and precision of vehicles of any kind at the confidence the detector was opened with."""
+    hits = found = total = 0
+    for frame, wanted in zip(frames, truth, strict=True):
+        boxes = _vehicles(detector, frame)
+        table = overlaps(boxes, wanted)
+        for row in range(len(boxes)):
+            best = int(table[row].argmax()) if len(wanted) else -1
+            if best >= 0 and table[row, best] >= 0.5:
+                hits, table[:, best] = hits + 1, 0
+        found, total = found + len(boxes), total + len(wanted)
+    return RealResult(hits / max(total, 1), hits / max(found, 1), total, len(frames))

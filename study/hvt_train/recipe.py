@@ -1,0 +1,162 @@
+"""The whole recipe: draw the pool, train, export, and leave logs and weights beside the files."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import datetime as dt
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+
+from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.detect import open_detector
+from hvt_common.inference.embedded import CLASSIFIER, DETECTOR
+from hvt_scene.vehicles import CLASS_NAMES
+from hvt_train.classifier import export_classifier, train_classifier
+from hvt_train.crops import CropSource, held_out_crops, pool_crops, scene_crops
+from hvt_train.evaluate import CLEAN, drawn_pictures, evaluate_drawn
+from hvt_train.export import metadata
+from hvt_train.loop import LoopSettings
+from hvt_train.pool import PoolPlan, fill_pool
+from hvt_train.train_detector import export_detector, train_detector
+from hvt_train.views import ViewSettings
+
+__all__ = ["run_recipe"]
+
+_VALIDATION = range(100, 104)
+"""Held-out scenes by which the best weights are chosen; ``eval`` measures on others."""
+
+_SUMMARY = {
+    DETECTOR: "Vehicles and people seen from above or aslant, trained on drawn scenes alone. Input BGR 0…255, free"
+    " multiples of 32, letterboxed top-left with 114; output a raw YOLOX head.",
+    CLASSIFIER: "Class of a 96x96 crop (padded by 15 %) of a vehicle or person, trained on drawn scenes alone.",
+}
+
+
+def run_recipe(arguments: argparse.Namespace) -> None:
+    """Train what ``arguments.command`` names (``detector``, ``classifier`` or ``all``) into ``arguments.out``."""
+    cv2.setNumThreads(1)
+    torch.set_num_threads(arguments.threads)
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    plan = PoolPlan(scenes=arguments.scenes, places=arguments.places)
+    pool = fill_pool(out / "pool", plan, workers=arguments.workers)
+    if arguments.command in ("detector", "all"):
+        _detector(arguments, pool)
+    if arguments.command in ("classifier", "all"):
+        _classifier(arguments, pool)
+
+
+def _detector(arguments: argparse.Namespace, pool: list[Path]) -> None:
+    groups = drawn_pictures(_VALIDATION, moments=1, bitrates_bps=(CLEAN, 800_000)).values()
+    pictures = [picture for group in groups for picture in group]
+
+    def measure(path: Path) -> float:
+        return evaluate_drawn(
+            open_detector(str(path), confidence=0.01, threads=arguments.threads), pictures
+        ).mean
+
+    best = _Best(arguments, DETECTOR, export_detector, measure)
+    train_detector(
+        pool,
+        settings=LoopSettings(
+            steps=arguments.steps, rate=arguments.rate, budget_s=_seconds(arguments), check_every=400
+        ),
+        views=ViewSettings(side=384),
+        seed=arguments.seed,
+        batch=arguments.batch,
+        workers=arguments.workers,
+        log=arguments.out / f"{DETECTOR}.jsonl",
+        check=best.check,
+        start=arguments.start,
+    )
+
+
+def _classifier(arguments: argparse.Namespace, pool: list[Path]) -> None:
+    stills = list(held_out_crops(_VALIDATION, moments=1))
+    crops, names = [crop for crop, _ in stills], [name for _, name in stills]
+
+    def measure(path: Path) -> float:
+        posteriors = open_classifier(str(path), threads=arguments.threads).classify(crops)
+        return float(np.mean([p.class_name == name for p, name in zip(posteriors, names, strict=True)]))
+
+    groups = [*pool_crops(pool, most=40), *scene_crops(range(arguments.crop_scenes), moments=4, most=60)]
+    train_classifier(
+        CropSource(groups, seed=arguments.seed),
+        settings=LoopSettings(
+            steps=arguments.classifier_steps,
+            rate=arguments.rate,
+            budget_s=_seconds(arguments),
+            check_every=500,
+        ),
+        seed=arguments.seed,
+        batch=64,
+        workers=arguments.workers,
+        log=arguments.out / f"{CLASSIFIER}.jsonl",
+        check=_Best(arguments, CLASSIFIER, export_classifier, measure).check,
+    )
+
+
+class _Best:
+    """Measures the file at every check on held-out scenes, and keeps weights and ONNX file of the best one."""
+
+    def __init__(
+        self,
+        arguments: argparse.Namespace,
+        name: str,
+        export: Callable[..., None],
+        measure: Callable[[Path], float],
+    ) -> None:
+        self._stem = arguments.out / name
+        self._export, self._measure = export, measure
+        self._properties = _properties(name, arguments.seed)
+        self._best = -1.0
+
+    def check(self, net: nn.Module, step: int) -> dict[str, float]:
+        """Export, measure and perhaps keep the averaged network of this step."""
+        trial = self._stem.with_suffix(".trial.onnx")
+        self._export(
+            copy.deepcopy(net), trial, properties={**self._properties, "hvt.training_step": str(step)}
+        )
+        quality = self._measure(trial)
+        if quality >= self._best:
+            self._best = quality
+            torch.save(net.state_dict(), self._stem.with_suffix(".pt"))
+            trial.replace(self._stem.with_suffix(".onnx"))
+        return {"validation": round(quality, 4)}
+
+
+def _properties(name: str, seed: int) -> dict[str, str]:
+    return metadata(
+        name=name,
+        classes=CLASS_NAMES,
+        seed=seed,
+        commit=_commit(),
+        date=dt.datetime.now(dt.UTC).date().isoformat(),
+        summary=_SUMMARY[name],
+    )
+
+
+def _commit() -> str:
+    """The commit that is checked out, with a plus where files differ from it; "unknown" outside a repository."""
+    try:
+        head, changes = _git("rev-parse", "HEAD"), _git("status", "--porcelain", ".")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head + ("+" if changes else "")
+
+
+def _git(*words: str) -> str:
+    command = ["git", *words]
+    done = subprocess.run(command, cwd=Path(__file__).parent, check=True, capture_output=True, text=True)  # noqa: S603
+    return done.stdout.strip()
+
+
+def _seconds(arguments: argparse.Namespace) -> float | None:
+    return None if arguments.minutes is None else arguments.minutes * 60

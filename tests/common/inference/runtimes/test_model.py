@@ -1,0 +1,126 @@
+"""Opening ONNX files that come from anywhere."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from onnx import TensorProto, helper
+
+from hvt_common.errors import UserError
+from hvt_common.inference.runtimes.model import MAX_MODEL_BYTES, ModelSettings, open_model
+from onnx_models import colour_detector, constant_model
+
+
+def test_a_model_says_its_ports_and_metadata_and_runs(tmp_path: Path) -> None:
+    """Without this nothing that detects or classifies can be opened."""
+    model = open_model(
+        constant_model(tmp_path / "m.onnx", np.ones((1, 2)), np.zeros((1, 3)), metadata={"names": "[]"}),
+        settings=ModelSettings(threads=1),
+    )
+    assert [(port.name, port.shape) for port in model.outputs] == [("output0", (1, 2)), ("output1", (1, 3))]
+    assert model.inputs[0].shape == (1, 3, 64, 64)
+    assert model.inputs[0].dtype == np.float32
+    assert model.metadata == {"names": "[]"}
+    first, second = model.run(np.zeros((1, 3, 64, 64), np.float32))
+    assert first.tolist() == [[1, 1]]
+    assert second.shape == (1, 3)
+
+
+def test_free_sizes_are_none(tmp_path: Path) -> None:
+    """A model of any size would be taken for one of a fixed size."""
+    model = open_model(colour_detector(tmp_path / "m.onnx", "yolox", size=None))
+    assert model.inputs[0].shape == (1, 3, None, None)
+
+
+def test_what_is_no_model_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    """A user who mistypes a path would read a traceback of onnxruntime."""
+    good = constant_model(tmp_path / "good.onnx", np.ones((1, 2))).read_bytes()
+    files = {
+        "text.onnx": b"not a model at all, but words\n",
+        "empty.onnx": b"",
+        "short.onnx": good[:-40],
+        "longer.onnx": good + b"\xff\xff",
+        "picture.onnx": b"\x89PNG\r\n\x1a\n" + bytes(100),
+        "head.onnx": b"\x08\x07\x12\x07pytorch",
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    for name in (*files, "missing.onnx", "."):
+        with pytest.raises(UserError) as caught:
+            open_model(tmp_path / name)
+        assert str(tmp_path / name) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_file_over_the_cap_is_not_even_parsed(tmp_path: Path) -> None:
+    """A wrong path to a huge file would fill the drone's memory."""
+    path = tmp_path / "huge.onnx"
+    with path.open("wb") as file:
+        file.truncate(MAX_MODEL_BYTES + 1)
+    with pytest.raises(UserError, match=str(MAX_MODEL_BYTES + 1)):
+        open_model(path)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(cut=st.integers(0, 10_000), place=st.integers(0, 10_000), byte=st.integers(0, 255))
+def test_damaged_models_are_refused_or_open_but_never_crash(
+    tmp_path: Path, cut: int, place: int, byte: int
+) -> None:
+    """A download that broke off, or a worn memory card, would end the process with a traceback."""
+    path = tmp_path / "m.onnx"
+    content = bytearray(constant_model(path, np.ones((1, 2))).read_bytes())
+    content[place % len(content)] = byte
+    path.write_bytes(bytes(content[: len(content) - cut % 60]))
+    with contextlib.suppress(UserError):
+        assert open_model(path, settings=ModelSettings(threads=1)).path == path
+
+
+@pytest.mark.parametrize("location", ["../weights.bin", "/etc/hostname"])
+def test_weights_outside_the_folder_of_the_model_are_refused(tmp_path: Path, location: str) -> None:
+    """A model from elsewhere could read any file of the user's."""
+    folder = tmp_path / "models"
+    folder.mkdir()
+    (tmp_path / "weights.bin").write_bytes(np.ones(4, np.float32).tobytes())
+    weights = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[4], data_location=TensorProto.EXTERNAL)
+    weights.external_data.add(key="location", value=location)
+    value = helper.make_tensor_value_info
+    graph = helper.make_graph(
+        [helper.make_node("Add", ["x", "w"], ["y"])],
+        "external",
+        [value("x", TensorProto.FLOAT, [4])],
+        [value("y", TensorProto.FLOAT, [4])],
+        [weights],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    (folder / "m.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(UserError, match=r"m\.onnx cannot be opened"):
+        open_model(folder / "m.onnx")
+
+
+def test_an_operator_of_a_foreign_library_is_refused(tmp_path: Path) -> None:
+    """A model that needs custom code must say so when it is opened, not in flight."""
+    value = helper.make_tensor_value_info
+    graph = helper.make_graph(
+        [helper.make_node("Secret", ["x"], ["y"], domain="elsewhere")],
+        "custom",
+        [value("x", TensorProto.FLOAT, [4])],
+        [value("y", TensorProto.FLOAT, [4])],
+    )
+    opsets = [helper.make_opsetid("", 13), helper.make_opsetid("elsewhere", 1)]
+    (tmp_path / "m.onnx").write_bytes(
+        helper.make_model(graph, opset_imports=opsets, ir_version=8).SerializeToString()
+    )
+    with pytest.raises(UserError, match=r"cannot be opened: .*elsewhere"):
+        open_model(tmp_path / "m.onnx")
+
+
+def test_an_input_of_the_wrong_shape_is_a_sentence(tmp_path: Path) -> None:
+    """A size that a model cannot take would end in a traceback of onnxruntime."""
+    model = open_model(constant_model(tmp_path / "m.onnx", np.ones((1, 2))))
+    with pytest.raises(UserError, match="does not run on a 1x3x32x32 input"):
+        model.run(np.zeros((1, 3, 32, 32), np.float32))

@@ -1,0 +1,241 @@
+"""What runs the networks: the choice, and OpenVINO against onnxruntime on real graphs."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnxruntime as ort
+import pytest
+from onnx import helper
+
+from hvt_common.errors import UserError
+from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.detect import open_detector
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
+from hvt_common.inference.runtimes.openvino_model import find_openvino
+from hvt_common.inference.runtimes.providers import PROVIDERS, OpenVinoCpu, choose_provider
+from hvt_common.inference.store.cli import main
+from hvt_common.values import Detections
+from hvt_edge.config import EdgeConfig
+from hvt_edge.wiring import make_detector
+from hvt_ground.config import GroundConfig
+from hvt_ground.wiring import Models
+from onnx_models import colour_classifier, colour_detector, constant_model, save
+
+CPU = ("AzureExecutionProvider", "CPUExecutionProvider")
+WITH_CUDA = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
+OPENVINO = ModelSettings(provider="openvino")
+
+needs_openvino = pytest.mark.skipif(
+    find_openvino() is None, reason="openvino is not installed: hvt[openvino]"
+)
+needs_bf16 = pytest.mark.skipif(
+    not (find_openvino() or OpenVinoCpu("", bf16=False)).bf16,
+    reason="openvino is not installed or this processor has no bf16",
+)
+
+
+def found(*, bf16: bool) -> Callable[[], OpenVinoCpu]:
+    """As if this OpenVINO were installed."""
+    return lambda: OpenVinoCpu("2026.4", bf16=bf16)
+
+
+def never() -> OpenVinoCpu:
+    """OpenVINO must not be looked for: importing it takes a fifth of a second."""
+    raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("onnxruntime", "openvino", "provider", "why"),
+    [
+        (CPU, lambda: None, "cpu", r"not installed \(pip install 'hvt\[openvino\]'\)"),
+        (CPU, found(bf16=False), "cpu", "this processor has no bf16"),
+        (CPU, found(bf16=True), "openvino", r"OpenVINO 2026\.4 .* computes in bf16"),
+        (WITH_CUDA, never, "cuda", "onnxruntime-gpu is installed"),
+    ],
+)
+def test_auto_takes_the_fastest_that_is_here_and_says_why(
+    onnxruntime: tuple[str, ...], openvino: Callable[[], OpenVinoCpu | None], provider: str, why: str
+) -> None:
+    """Half the speed of a machine would lie idle, or nobody could tell what computes."""
+    choice = choose_provider("auto", onnxruntime=onnxruntime, openvino=openvino)
+    assert choice.provider == provider
+    assert not choice.asked
+    assert re.search(why, choice.why), choice.why
+
+
+def test_a_provider_that_is_asked_for_is_taken_or_refused() -> None:
+    """A user who asked for the GPU would silently get the processor."""
+    assert choose_provider("cpu", onnxruntime=CPU, openvino=never).provider == "cpu"
+    assert choose_provider("tensorrt", onnxruntime=WITH_CUDA, openvino=never).provider == "tensorrt"
+    assert "float32" in choose_provider("openvino", onnxruntime=CPU, openvino=found(bf16=False)).why
+    for wanted, remedy in (
+        ("cuda", "pip install onnxruntime-gpu"),
+        ("tensorrt", "pip install onnxruntime-gpu"),
+        ("coreml", "on macOS only"),
+        ("openvino", r"pip install 'hvt\[openvino\]'"),
+    ):
+        with pytest.raises(UserError, match=rf"--provider {wanted} is not installed here \(.*{remedy}"):
+            choose_provider(wanted, onnxruntime=CPU, openvino=lambda: None)
+    with pytest.raises(UserError, match="--provider 'npu' is not known: choose one of auto, cpu, cuda"):
+        choose_provider("npu", onnxruntime=CPU, openvino=never)
+
+
+@pytest.mark.skipif(
+    "CUDAExecutionProvider" in ort.get_available_providers(), reason="this onnxruntime has CUDA"
+)
+def test_asking_for_cuda_without_it_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A user would read a traceback, or fly on the processor believing in the GPU."""
+    path = colour_detector(tmp_path / "m.onnx", "yolox")
+    with pytest.raises(UserError, match="--provider cuda is not installed here"):
+        open_detector(str(path), provider="cuda")
+    assert main(["info", str(path), "--provider", "cuda"]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_edge_and_ground_hand_their_provider_on(tmp_path: Path) -> None:
+    """--provider would be accepted and change nothing."""
+    detector = str(colour_detector(tmp_path / "d.onnx", "yolox"))
+    classifier = str(colour_classifier(tmp_path / "c.onnx"))
+    for word in ("cpu", "openvino") if find_openvino() else ("cpu",):
+        at_edge = make_detector(EdgeConfig(source="demo", detector=detector, provider=word))
+        ground = Models(GroundConfig(detector=detector, classifier=classifier, provider=word)).take()
+        assert [one.model.provider.provider for one in (at_edge, *ground)] == [word] * 3
+    assert EdgeConfig().provider == GroundConfig().provider == "auto"
+    with pytest.raises(UserError, match="is not known"):
+        make_detector(EdgeConfig(source="demo", detector=detector, provider="fast"))
+
+
+def test_what_runs_a_network_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Two machines of different speed, and nobody could see why."""
+    path = colour_detector(tmp_path / "m.onnx", "yolox")
+    with caplog.at_level(logging.INFO, "hvt_common.inference.runtimes.model"):
+        model = open_model(path, settings=ModelSettings(provider="auto"))
+    assert caplog.messages == [f"m.onnx runs on {model.provider.provider}: {model.provider.why}"]
+    assert model.provider.provider in PROVIDERS[1:]
+
+
+@needs_bf16
+def test_auto_falls_back_where_openvino_cannot_read_a_model(tmp_path: Path) -> None:
+    """A model that ran yesterday would not start today because OpenVINO was installed for another."""
+    path = save(
+        tmp_path / "m.onnx",
+        [helper.make_node("Det", ["x"], ["y"])],  # onnxruntime has it
+        inputs={"x": (1, 3, 4, 4)},
+        outputs={"y": (1, 3)},
+    )
+    with pytest.raises(UserError, match=r"cannot be read by openvino: No conversion .*Det"):
+        open_model(path, settings=OPENVINO)
+    model = open_model(path, settings=ModelSettings(provider="auto"))
+    assert model.provider.provider == "cpu"
+    assert "cannot be read by openvino" in model.provider.why
+
+
+@needs_openvino
+def test_openvino_says_the_same_ports_and_metadata(tmp_path: Path) -> None:
+    """Class names and input sizes would depend on what runs the network."""
+    path = constant_model(
+        tmp_path / "m.onnx", np.ones((1, 2)), np.arange(6.0).reshape(1, 2, 3), metadata={"names": "['a']"}
+    )
+    ours, theirs = open_model(path), open_model(path, settings=OPENVINO)
+    assert (theirs.inputs, theirs.outputs, theirs.metadata) == (ours.inputs, ours.outputs, ours.metadata)
+    feed = np.zeros((1, 3, 64, 64), np.float32)
+    for one, other in zip(ours.run(feed), theirs.run(feed), strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(UserError, match="does not run on a 1x3x32x32 input: it takes images"):
+        theirs.run(np.zeros((1, 3, 32, 32), np.float32))
+
+
+@needs_openvino
+@pytest.mark.parametrize("kind", ["yolox", "ultralytics"])
+def test_a_detector_finds_the_same_in_every_size_with_openvino(tmp_path: Path, kind: str) -> None:
+    """A network compiled for one size would answer for another, or the last sizes would pile up."""
+    path = colour_detector(tmp_path / "m.onnx", kind, size=None if kind == "yolox" else (128, 96))
+    ours, theirs = (open_detector(str(path), provider=name) for name in ("cpu", "openvino"))
+    for width, height in ((96, 64), (160, 96), (64, 64), (128, 128), (192, 64), (64, 96), (96, 64)):
+        image = np.zeros((height, width, 3), np.uint8)
+        image[16:32, 32:48] = (0, 0, 250)
+        expected, got = ours.detect(image), theirs.detect(image)
+        assert len(expected) > 0
+        assert len(got) == len(expected) == matches(expected, got)
+        np.testing.assert_allclose(got.confidences, expected.confidences, atol=0.01)
+
+
+@needs_openvino
+def test_answers_of_openvino_are_not_overwritten_by_the_next_run(tmp_path: Path) -> None:
+    """The last frame's boxes would turn into this frame's."""
+    model = open_model(colour_detector(tmp_path / "m.onnx", "yolox", size=(64, 64)), settings=OPENVINO)
+    first = model.run(np.zeros((1, 3, 64, 64), np.float32))[0]
+    kept = first.copy()
+    model.run(np.full((1, 3, 64, 64), 200, np.float32))
+    np.testing.assert_array_equal(first, kept)
+
+
+@needs_openvino
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_a_classifier_takes_every_batch_with_openvino(tmp_path: Path, dtype: type) -> None:
+    """Each new number of stills would compile the network anew, or mix up their answers."""
+    path = colour_classifier(
+        tmp_path / "c.onnx", gain=0.02, metadata={"hvt.mean": "0", "hvt.scale": "1"}, dtype=dtype
+    )
+    ours, theirs = (open_classifier(str(path), provider=name) for name in ("cpu", "openvino"))
+    crops = [np.full((20, 20, 3), (i * 9 % 250, i * 70 % 250, i * 37 % 250), np.uint8) for i in range(40)]
+    for count in (1, 5, 40):
+        for one, other in zip(ours.classify(crops[:count]), theirs.classify(crops[:count]), strict=True):
+            np.testing.assert_allclose(other.probabilities, one.probabilities, atol=0.02)
+    assert len(theirs.model._runner._requests) == 1
+
+
+@needs_openvino
+def test_openvino_gets_no_file_that_onnxruntime_refuses(tmp_path: Path) -> None:
+    """A damaged or hostile model would reach a second parser."""
+    good = colour_detector(tmp_path / "m.onnx", "yolox")
+    (tmp_path / "short.onnx").write_bytes(good.read_bytes()[:-30])
+    for path in (tmp_path / "short.onnx", tmp_path / "none.onnx"):
+        with pytest.raises(UserError, match=path.name):
+            open_model(path, settings=OPENVINO)
+
+
+@pytest.mark.realdata
+@needs_openvino
+def test_openvino_costs_at_most_a_point_of_f1_on_a_real_picture(data: Path) -> None:
+    """The recommended speed-up would be paid for with objects nobody sees."""
+    picture = cv2.imread(str(data / "visdrone/0000001_02999_d_0000005.jpg"))
+    path = str(data / "models/yolov5su_visdrone_640.onnx")
+    ours, theirs = (open_detector(path, provider=name).detect(picture) for name in ("cpu", "openvino"))
+    assert len(ours) > 30
+    assert 2 * matches(ours, theirs) / (len(ours) + len(theirs)) >= 0.99
+
+
+@pytest.mark.realdata
+@needs_openvino
+def test_a_real_classifier_answers_alike_with_openvino(data: Path) -> None:
+    """Class and certainty of a still would depend on the machine."""
+    path = str(data / "models/mobilenet_v2_imagenet.onnx")
+    crops = [cv2.imread(str(data / f"classify_{name}.bmp")) for name in ("sunflower", "dragonfly")]
+    ours, theirs = (open_classifier(path, provider=name).classify(crops) for name in ("cpu", "openvino"))
+    assert [one.class_name for one in ours] == [one.class_name for one in theirs] == ["daisy", "dragonfly"]
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(one.probabilities, other.probabilities, atol=0.03)
+
+
+def matches(expected: Detections, got: Detections) -> int:
+    """Pairs of one class and IoU 0.5, each box once."""
+    free = np.ones(len(expected), bool)
+    for box, class_id in zip(got.boxes_xyxy_px, got.class_ids, strict=True):
+        low = np.maximum(box[:2], expected.boxes_xyxy_px[:, :2])
+        high = np.minimum(box[2:], expected.boxes_xyxy_px[:, 2:])
+        shared = np.prod(np.maximum(high - low, 0), axis=1)
+        areas = np.prod(expected.boxes_xyxy_px[:, 2:] - expected.boxes_xyxy_px[:, :2], axis=1)
+        overlap = shared / (np.prod(box[2:] - box[:2]) + areas - shared)
+        overlap[~free | (expected.class_ids != class_id)] = 0
+        if overlap.max() >= 0.5:
+            free[overlap.argmax()] = False
+    return int((~free).sum())

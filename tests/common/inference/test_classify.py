@@ -1,0 +1,187 @@
+"""Classifiers: preparation of pixels, batches, posteriors, names, and the real ImageNet network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.inference.classify import OnnxClassifier, open_classifier
+from hvt_common.inference.runtimes.model import open_model
+from onnx_models import colour_classifier, colour_detector, constant_model
+
+PLAIN = {"hvt.mean": "0", "hvt.scale": "[1]"}
+BLUE = np.full((20, 30, 3), (200, 100, 50), np.uint8)  # BGR
+
+
+def scores(path: Path, crop: np.ndarray) -> np.ndarray:
+    """What the first three classes got, as log-probabilities relative to the third."""
+    probabilities = open_classifier(str(path)).classify([crop])[0].probabilities.astype(float)
+    return np.log(probabilities[:3] / probabilities[2])
+
+
+@pytest.mark.parametrize(
+    ("classes", "metadata", "expected"),
+    [
+        (1001, {}, (np.array([50, 100, 200]) - 128) / 128),
+        (1000, {}, (np.array([50, 100, 200]) / 255 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]),
+        (7, {"hvt.mean": "1, 2, 3", "hvt.scale": "(0.01)"}, (np.array([50, 100, 200]) - [1, 2, 3]) / 100),
+        (
+            1001,
+            {"hvt.mean": "100", "hvt.scale": "0.1 0.02 0.01", "hvt.channel_order": "bgr"},
+            (np.array([200, 100, 50]) - 100) * [0.1, 0.02, 0.01],
+        ),
+    ],
+)
+def test_pixels_are_prepared_by_the_documented_rule(
+    tmp_path: Path, classes: int, metadata: dict[str, str], expected: np.ndarray
+) -> None:
+    """A wrong mean or colour order costs a third of the accuracy and looks like a bad model."""
+    path = colour_classifier(tmp_path / "c.onnx", classes=classes, gain=1, metadata=metadata)
+    np.testing.assert_allclose(scores(path, BLUE), expected - expected[2], atol=1e-4)
+
+
+@pytest.mark.parametrize("channels_last", [False, True])
+@pytest.mark.parametrize("batch", ["N", 1, 4])
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_any_batch_and_layout_gives_the_same_answers(
+    tmp_path: Path, *, channels_last: bool, batch: int | str, dtype: type
+) -> None:
+    """Stills would get their neighbour's class, or a model of another layout could not be used."""
+    path = colour_classifier(
+        tmp_path / "c.onnx", batch=batch, channels_last=channels_last, metadata=PLAIN, gain=0.1, dtype=dtype
+    )
+    crops = [np.zeros((9 + i, 40 - i, 3), np.uint8) for i in range(6)]
+    for index, crop in enumerate(crops):
+        crop[..., index % 3] = 100 + index
+    answers = open_classifier(str(path)).classify(crops)
+    assert [answer.class_name for answer in answers] == [f"class {2 - i % 3}" for i in range(6)]
+    expected = [np.exp((100 + i) / 10) / (np.exp((100 + i) / 10) + 2) for i in range(6)]
+    np.testing.assert_allclose([answer.confidence for answer in answers], expected, rtol=0.01)
+    assert open_classifier(str(path)).classify([]) == []
+
+
+def test_more_crops_than_one_batch_keep_their_order(tmp_path: Path) -> None:
+    """A busy second with forty stills would be answered in disorder."""
+    classifier = open_classifier(str(colour_classifier(tmp_path / "c.onnx", metadata=PLAIN, gain=0.01)))
+    crops = [np.full((8, 8, 3), (0, 0, 3 * i), np.uint8) for i in range(70)]
+    confidences = [answer.confidence for answer in classifier.classify(crops)]
+    assert len(confidences) == 70
+    assert confidences == sorted(confidences)
+    assert confidences[69] > confidences[0] + 0.4
+
+
+def test_logits_and_probabilities_give_the_same_posterior(tmp_path: Path) -> None:
+    """Softmax applied twice would make every class equally likely, and entropy useless."""
+    crop = np.full((5, 5, 3), (10, 20, 40), np.uint8)
+    answers = [
+        open_classifier(
+            str(colour_classifier(tmp_path / "c.onnx", metadata=PLAIN, gain=0.05, softmax=softmax))
+        ).classify([crop])[0]
+        for softmax in (False, True)
+    ]
+    expected = np.exp([2.0, 1.0, 0.5]) / np.exp([2.0, 1.0, 0.5]).sum()
+    for answer in answers:
+        np.testing.assert_allclose(answer.probabilities, expected, rtol=1e-4)
+        assert answer.class_name == "class 0"
+        assert answer.confidence == pytest.approx(expected[0], rel=1e-4)
+        assert answer.entropy_nats == pytest.approx(-(expected * np.log(expected)).sum(), rel=1e-3)
+
+
+def test_broken_scores_say_nothing_rather_than_anything(tmp_path: Path) -> None:
+    """A NaN in a posterior would poison the fusion of a whole track."""
+    model = open_model(constant_model(tmp_path / "c.onnx", np.array([[1.0, np.nan, 3.0, 0.0]])))
+    answer = OnnxClassifier(model).classify([BLUE])[0]
+    np.testing.assert_allclose(answer.probabilities, [0.25] * 4)
+    assert answer.entropy_nats == pytest.approx(np.log(4))
+
+
+def test_odd_crops_do_not_crash(tmp_path: Path) -> None:
+    """A one-pixel object or a grey camera would end the ground station."""
+    classifier = open_classifier(str(colour_classifier(tmp_path / "c.onnx")))
+    shapes = [(1, 1, 3), (1, 1), (3, 900, 3), (40, 40, 1), (2000, 1, 3)]
+    answers = classifier.classify([np.full(shape, 7, np.uint8) for shape in shapes])
+    assert len(answers) == len(shapes)
+    assert all(np.isfinite(answer.probabilities).all() for answer in answers)
+
+
+def test_names_of_1000_and_1001_classes_are_reconciled(tmp_path: Path) -> None:
+    """Every class would be off by one: a tench for every goldfish."""
+    labels = tmp_path / "labels.txt"
+    thousand = [f"thing {i}, synonym {i}" for i in range(1000)]
+    for rows, classes, first in (
+        (thousand, 1000, "thing 0"),
+        (thousand, 1001, "background"),
+        (["background", *thousand], 1001, "background"),
+        (["Background", *thousand], 1000, "thing 0"),
+    ):
+        labels.write_text("\n".join(rows))
+        names = open_classifier(
+            str(colour_classifier(tmp_path / "c.onnx", classes=classes)), labels=labels
+        ).class_names
+        assert (len(names), names[0], names[-1]) == (classes, first, "thing 999")
+    labels.write_text("\n".join(["thing", *thousand]))
+    with pytest.raises(UserError, match=r"1001 class names.*1000 classes.*the reverse if"):
+        open_classifier(str(colour_classifier(tmp_path / "c.onnx", classes=1000)), labels=labels)
+    labels.write_text("a\nb\n")
+    with pytest.raises(UserError, match=r"labels\.txt has 2 class names, .* has 3 classes"):
+        open_classifier(str(colour_classifier(tmp_path / "c.onnx")), labels=labels)
+
+
+def test_names_in_the_metadata_are_used(tmp_path: Path) -> None:
+    """A model that knows its classes would show numbers."""
+    path = colour_classifier(tmp_path / "c.onnx", metadata={"classes": '["car, auto", "bus", "truck"]'})
+    assert open_classifier(str(path)).class_names == ("car", "bus", "truck")
+
+
+def test_what_is_no_classifier_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    """A detector given by mistake would refine every track into nonsense."""
+    for path in (
+        colour_detector(tmp_path / "d.onnx", "yolox"),
+        colour_detector(tmp_path / "u.onnx", "ultralytics"),
+        constant_model(tmp_path / "one.onnx", np.ones((1, 1))),
+        constant_model(tmp_path / "map.onnx", np.ones((1, 3, 8, 8))),
+    ):
+        with pytest.raises(UserError, match=r"is not a classifier .* accepted: an image") as caught:
+            open_classifier(str(path))
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match="does not exist"):
+        open_classifier(str(tmp_path / "none.onnx"))
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [{"hvt.mean": "much"}, {"hvt.scale": "1 2"}, {"hvt.mean": "nan"}, {"hvt.channel_order": "RGBA"}],
+)
+def test_malformed_preparation_is_refused(tmp_path: Path, metadata: dict[str, str]) -> None:
+    """A typing mistake in an export would be a silent loss of accuracy."""
+    with pytest.raises(UserError, match=next(iter(metadata))):
+        open_classifier(str(colour_classifier(tmp_path / "c.onnx", metadata=metadata)))
+
+
+@pytest.mark.realdata
+def test_the_real_network_knows_a_flower_and_a_dragonfly(data: Path) -> None:
+    """The preparation of pixels, the labels or their offset would be wrong for the shipped classifier."""
+    classifier = open_classifier(
+        str(data / "models/mobilenet_v2_imagenet.onnx"), labels=data / "models/imagenet_labels_1001.txt"
+    )
+    crops = [cv2.imread(str(data / f"classify_{name}.bmp")) for name in ("sunflower", "dragonfly")]
+    flower, dragonfly = classifier.classify(crops)
+    assert (flower.class_name, dragonfly.class_name) == ("daisy", "dragonfly")
+    assert min(flower.confidence, dragonfly.confidence) > 0.9
+    assert max(flower.entropy_nats, dragonfly.entropy_nats) < 0.5
+    assert flower.probabilities.shape == (1001,)
+    assert flower.probabilities.sum() == pytest.approx(1, abs=1e-4)
+    blank = classifier.classify([np.full((224, 224, 3), 128, np.uint8)])[0]
+    assert blank.entropy_nats > 3 * max(flower.entropy_nats, dragonfly.entropy_nats)
+
+
+@pytest.mark.realdata
+def test_a_real_detector_is_no_classifier(data: Path) -> None:
+    """Swapping the two model options would go unnoticed."""
+    with pytest.raises(UserError, match="is not a classifier"):
+        open_classifier(str(data / "models/yolox_nano.onnx"))

@@ -1,0 +1,477 @@
+"""Detectors: heads, letterbox, suppression, names, and the real models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnxruntime as ort
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
+from hvt_common.inference.detect import OnnxDetector, open_detector
+from hvt_common.inference.detect_heads import (
+    EndToEndHead,
+    UltralyticsHead,
+    YoloxHead,
+    anchor_count,
+    choose_head,
+)
+from hvt_common.inference.letterbox import Letterbox, as_bgr
+from hvt_common.inference.motion import MotionDetector
+from hvt_common.inference.nms import MAX_DETECTIONS, suppress
+from hvt_common.inference.runtimes.model import open_model
+from onnx_models import STRIDES, cells, colour_classifier, colour_detector, constant_model
+
+RGB = str({0: "red", 1: "green", 2: "blue"})
+
+
+def iou(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(N, M) overlaps, written apart from the code under test."""
+    result = np.zeros((len(first), len(second)))
+    for i, a in enumerate(np.asarray(first, float)):
+        for j, b in enumerate(np.asarray(second, float)):
+            width = max(0.0, min(a[2], b[2]) - max(a[0], b[0]))
+            height = max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
+            union = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - width * height
+            result[i, j] = width * height / union if union else 0.0
+    return result
+
+
+def empty(rows: int, columns: int) -> np.ndarray:
+    """An output in which nothing was found."""
+    return np.zeros((1, rows, columns), np.float32)
+
+
+# --- heads ---------------------------------------------------------------------------------------------------------
+
+
+def test_yolox_boxes_come_out_exactly(tmp_path: Path) -> None:
+    """Every box of the most permissive detector family would be somewhere else."""
+    table = empty(84, 5 + 3)
+    grid = cells((64, 64))
+    row = int(np.flatnonzero((grid == (2, 1, 16)).all(axis=1))[0])
+    table[0, row] = [0.25, 0.5, np.log(2), np.log(1.5), 0.8, 0.1, 0.9, 0.2]
+    detector = open_detector(str(constant_model(tmp_path / "m.onnx", table)), confidence=0.5)
+    found = detector.detect(np.zeros((64, 64, 3), np.uint8))
+    assert detector.class_names == ("class 0", "class 1", "class 2")
+    assert found.class_ids.tolist() == [1]
+    np.testing.assert_allclose(found.confidences, [0.72], rtol=1e-5)
+    np.testing.assert_allclose(found.boxes_xyxy_px, [[36 - 16, 24 - 12, 36 + 16, 24 + 12]], rtol=1e-5)
+
+
+def test_a_yolox_export_that_is_decoded_already_is_told_apart(tmp_path: Path) -> None:
+    """Decoding twice would blow every box up to the whole image."""
+    grid = cells((64, 64))
+    table = empty(84, 6)
+    table[0, :, :2] = (grid[:, :2] + 0.5) * grid[:, 2:]
+    table[0, :, 2:4] = 10
+    table[0, 20, :6] = [30, 20, 12, 8, 0.9, 1.0]
+    found = open_detector(str(constant_model(tmp_path / "m.onnx", table))).detect(
+        np.zeros((64, 64, 3), np.uint8)
+    )
+    np.testing.assert_allclose(found.boxes_xyxy_px, [[24, 16, 36, 24]], rtol=1e-5)
+
+
+def test_ultralytics_boxes_come_out_exactly_and_suppressed_by_class(tmp_path: Path) -> None:
+    """One car would count as five, or a person before a car would vanish."""
+    table = empty(4 + 2, 84)
+    table[0, :, 3] = [30, 20, 20, 10, 0.3, 0.7]
+    table[0, :, 9] = [34, 20, 20, 10, 0.0, 0.8]
+    table[0, :, 60] = [30, 20, 20, 10, 0.9, 0.1]
+    table[0, :, 70] = [50, 50, 10, 10, 0.1, 0.26]
+    table[0, :, 71] = [50, 20, 10, 10, 0.1, 0.24]
+    found = open_detector(str(constant_model(tmp_path / "m.onnx", table))).detect(
+        np.zeros((64, 64, 3), np.uint8)
+    )
+    np.testing.assert_allclose(found.confidences, [0.9, 0.8, 0.26], rtol=1e-5)
+    assert found.class_ids.tolist() == [0, 1, 1]
+    np.testing.assert_allclose(found.boxes_xyxy_px, [[20, 15, 40, 25], [24, 15, 44, 25], [45, 45, 55, 55]])
+
+
+def test_two_names_of_one_vehicle_are_one_detection(tmp_path: Path) -> None:
+    """Each van would be two tracks, a car and a van, in every list and every count."""
+    table = empty(4 + 2, 84)
+    table[0, :, 3] = [30, 20, 20, 10, 0.7, 0.0]
+    table[0, :, 9] = [31, 20, 20, 10, 0.0, 0.8]
+    found = open_detector(str(constant_model(tmp_path / "m.onnx", table))).detect(
+        np.zeros((64, 64, 3), np.uint8)
+    )
+    assert found.class_ids.tolist() == [1]
+
+
+def test_end_to_end_boxes_come_out_exactly(tmp_path: Path) -> None:
+    """The newest YOLO models could not be used."""
+    table = empty(20, 6)
+    table[0, 2] = [5, 6, 30, 40, 0.6, 2]
+    table[0, 7] = [5, 6, 31, 40, 0.9, 1]
+    table[0, 8] = [5, 6, 31, 40, 0.2, 1]
+    path = constant_model(tmp_path / "m.onnx", table, metadata={"names": RGB})
+    detector = open_detector(str(path))
+    found = detector.detect(np.zeros((64, 64, 3), np.uint8))
+    assert [detector.class_names[i] for i in found.class_ids] == ["green", "blue"]
+    np.testing.assert_allclose(found.boxes_xyxy_px, [[5, 6, 31, 40], [5, 6, 30, 40]])
+    with pytest.raises(UserError, match="does not say its class names"):
+        open_detector(str(constant_model(tmp_path / "n.onnx", table)))
+
+
+def test_broken_numbers_never_become_detections(tmp_path: Path) -> None:
+    """One NaN would poison the tracker for the rest of the flight."""
+    head = YoloxHead(1, strides=STRIDES, decoded=False)
+    bad = empty(84, 6)
+    bad[0, :, 4:] = 0.9
+    bad[0, ::4, 0] = np.nan
+    bad[0, 1::4, 2] = np.inf
+    bad[0, 2::4, 5] = np.nan
+    bad[0, 3::8, 4] = np.inf
+    good = head.decode(bad, confidence=0.25, input_size=(64, 64))
+    assert np.isfinite(good.boxes_input_px).all()
+    assert len(good.scores) < 42
+    columns = empty(5, 84)
+    columns[0, 4] = np.nan
+    assert len(UltralyticsHead(1).decode(columns, confidence=0.25, input_size=(64, 64)).scores) == 0
+    rows = empty(9, 6)
+    rows[0, :, 2:] = [5, 5, 0.9, np.nan]
+    assert len(EndToEndHead().decode(rows, confidence=0.25, input_size=(64, 64)).scores) == 0
+
+
+def test_heads_are_chosen_by_anchor_count() -> None:
+    """A YOLOX model would be read as an Ultralytics one, or the reverse."""
+    assert anchor_count((640, 640), STRIDES) == 8400
+    assert anchor_count((1280, 736), STRIDES) == 19320
+    assert isinstance(choose_head(empty(8400, 85), (640, 640)), YoloxHead)
+    assert isinstance(choose_head(empty(84, 8400), (640, 640)), UltralyticsHead)
+    assert isinstance(choose_head(empty(6, 8400), (640, 640)), UltralyticsHead)
+    assert isinstance(choose_head(empty(300, 6), (640, 640)), EndToEndHead)
+    assert choose_head(empty(8400, 84), (320, 320)) is None
+    assert choose_head(empty(84, 8400) + 2, (640, 640)) is None
+    assert choose_head(np.zeros((1, 1000), np.float32), (640, 640)) is None
+
+
+# --- letterbox -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("head", ["yolox", "ultralytics"])
+@pytest.mark.parametrize("shape", [(48, 128), (200, 64), (96, 96), (311, 517), (31, 64)])
+def test_a_coloured_square_is_found_where_it_is(tmp_path: Path, head: str, shape: tuple[int, int]) -> None:
+    """Boxes would be shifted or stretched on every image that is not square, or red and blue swapped."""
+    size = (96, 64)
+    path = colour_detector(tmp_path / "m.onnx", head, size=size)
+    detector = open_detector(str(path), confidence=0.9)
+    letterbox = Letterbox.fitted(
+        (shape[1], shape[0]), size, anchor="top-left" if head == "yolox" else "centre"
+    )
+    left, top, width, height = letterbox.content
+    # The cell of stride 8 that lies wholly on the image, around its middle, and where that is on the image.
+    cell = np.array([(left + width // 2) // 8 * 8, (top + height // 2) // 8 * 8])
+    scale = np.array([shape[1] / width, shape[0] / height])
+    low, high = (cell - (left, top)) * scale, (cell + 8 - (left, top)) * scale
+    for channel in range(3):
+        image = np.full((*shape, 3), 60, np.uint8)
+        image[max(0, int(low[1] - 2)) : int(high[1] + 3), max(0, int(low[0] - 2)) : int(high[0] + 3)] = 0
+        image[
+            max(0, int(low[1] - 2)) : int(high[1] + 3), max(0, int(low[0] - 2)) : int(high[0] + 3), channel
+        ] = 255
+        found = detector.detect(image)
+        expected = np.clip([*low, *high], 0, [shape[1], shape[0]] * 2)
+        best = iou(found.boxes_xyxy_px, expected[None]).ravel()
+        assert best.max() > 0.99
+        # YOLOX networks see BGR as it is; Ultralytics networks see RGB.
+        assert found.class_ids[best.argmax()] == (channel if head == "yolox" else 2 - channel)
+
+
+def test_the_border_is_grey_114() -> None:
+    """Networks would see an edge around every picture that they were not trained on."""
+    from hvt_common.inference.letterbox import Letterboxer
+
+    boxer = Letterboxer(anchor="centre", rgb=True, gain=1 / 255, dtype=np.dtype(np.float32))
+    tensor, letterbox = boxer.fill(np.full((10, 40, 3), (10, 20, 30), np.uint8), (64, 32))
+    assert letterbox.content == (0, 8, 64, 16)
+    np.testing.assert_allclose(tensor[0, :, 0, 0], np.float32(114 / 255), rtol=1e-6)
+    np.testing.assert_allclose(tensor[0, :, 16, 30], np.array([30, 20, 10]) / 255, rtol=1e-6)
+    other, _ = boxer.fill(np.full((40, 10, 3), 255, np.uint8), (64, 32))
+    assert other[0, 0, 16, 32] == 1
+    np.testing.assert_allclose(other[0, 0, 16, 2], 114 / 255, rtol=1e-6)
+
+
+@given(
+    width=st.integers(1, 5000),
+    height=st.integers(1, 5000),
+    cells_x=st.integers(1, 40),
+    cells_y=st.integers(1, 40),
+    anchor=st.sampled_from(["top-left", "centre"]),
+)
+def test_the_letterbox_holds_the_image_and_maps_back(
+    width: int, height: int, cells_x: int, cells_y: int, anchor: str
+) -> None:
+    """A panorama or a sliver would crash the detector or lose its boxes."""
+    size = (cells_x * 32, cells_y * 32)
+    letterbox = Letterbox.fitted((width, height), size, anchor=anchor)
+    left, top, w, h = letterbox.content
+    assert min(left, top) >= 0
+    assert w >= 1
+    assert h >= 1
+    assert left + w <= size[0]
+    assert top + h <= size[1]
+    whole = letterbox.to_image(np.array([[left, top, left + w, top + h], [-9e9, -9e9, 9e9, 9e9]], np.float32))
+    np.testing.assert_allclose(whole, [[0, 0, width, height]] * 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 1, 3), (1, 1), (7, 500, 3), (500, 3, 3), (40, 40), (40, 40, 1), (40, 40, 4)]
+)
+@pytest.mark.parametrize("size", [(64, 64), None])
+def test_odd_images_do_not_crash(
+    tmp_path: Path, shape: tuple[int, ...], size: tuple[int, int] | None
+) -> None:
+    """A thermal camera, or a broken frame, would end the process."""
+    detector = open_detector(str(colour_detector(tmp_path / "m.onnx", "yolox", size=size)), confidence=0.45)
+    found = detector.detect(np.full(shape, 255, np.uint8))
+    assert len(found) >= 1
+    assert (found.boxes_xyxy_px[:, 2:] <= (shape[1], shape[0])).all()
+    assert (found.boxes_xyxy_px[:, :2] >= 0).all()
+    assert (np.diff(found.confidences) <= 0).all()
+
+
+def test_what_is_no_image_is_a_bug() -> None:
+    """An empty crop would be stretched into a phantom."""
+    for wrong in (
+        np.zeros((0, 4, 3), np.uint8),
+        np.zeros((4, 4, 3), np.float32),
+        np.zeros((4, 4, 2), np.uint8),
+    ):
+        with pytest.raises(ValueError, match="image"):
+            as_bgr(wrong)
+
+
+# --- suppression ---------------------------------------------------------------------------------------------------
+
+
+def plain_suppression(boxes: np.ndarray, scores: np.ndarray, classes: np.ndarray, limit: float) -> list[int]:
+    """Greedy suppression, word for word."""
+    kept: list[int] = []
+    for i in sorted(range(len(scores)), key=lambda i: (-scores[i], i)):
+        if all(
+            classes[i] != classes[j] or iou(boxes[i : i + 1], boxes[j : j + 1])[0, 0] <= limit for j in kept
+        ):
+            kept.append(i)
+    return kept
+
+
+@given(seed=st.integers(0, 10_000), count=st.integers(0, 40))
+def test_suppression_keeps_what_the_definition_keeps(seed: int, count: int) -> None:
+    """Neighbouring cars would swallow each other, or one car be seen twice."""
+    rng = np.random.default_rng(seed)
+    centres, sides = rng.uniform(0, 60, (count, 2)), rng.uniform(5, 40, (count, 2))
+    boxes = np.concatenate([centres - sides / 2, centres + sides / 2], axis=1).astype(np.float32)
+    scores = (rng.integers(1, 12, count) / 12).astype(np.float32)  # with ties
+    classes = rng.integers(0, 3, count).astype(np.int32)
+    assert suppress(boxes, scores, classes, iou=0.45).tolist() == plain_suppression(
+        boxes, scores, classes, 0.45
+    )
+
+
+def test_crowds_survive_up_to_the_cap() -> None:
+    """A car park of 600 cars would lose some; a broken model would flood the tracker."""
+    x, y = np.meshgrid(np.arange(50.0), np.arange(40.0))
+    boxes = np.stack([x, y, x + 0.9, y + 0.9], axis=-1).reshape(-1, 4).astype(np.float32) * 20
+    scores = np.linspace(1, 0.3, len(boxes), dtype=np.float32)
+    crowd = np.repeat(np.arange(600), 12)
+    assert suppress(boxes[crowd], scores[crowd], np.zeros(len(crowd), np.int32), iou=0.45).tolist() == [
+        *range(0, 7200, 12)
+    ]
+    assert len(suppress(boxes, scores, np.zeros(len(boxes), np.int32), iou=0.45)) == MAX_DETECTIONS
+    assert len(suppress(boxes, scores, np.zeros(len(boxes), np.int32), iou=0.45, limit=7)) == 7
+
+
+# --- opening -------------------------------------------------------------------------------------------------------
+
+
+def test_float16_models_are_fed_float16(tmp_path: Path) -> None:
+    """Half-precision exports for small GPUs could not be used."""
+    image = np.zeros((64, 64, 3), np.uint8)
+    image[16:24, 40:48, 1] = 255
+    for head in ("yolox", "ultralytics"):
+        path = colour_detector(tmp_path / "m.onnx", head, dtype=np.float16)
+        found = open_detector(str(path), confidence=0.9).detect(image)
+        np.testing.assert_allclose(found.boxes_xyxy_px, [[40, 16, 48, 24]], atol=0.05)
+        assert found.class_ids.tolist() == [1]
+
+
+def test_a_free_input_takes_the_size_of_the_image_or_of_the_user(tmp_path: Path) -> None:
+    """Small objects would be shrunk away although the model could see them."""
+    path = colour_detector(tmp_path / "m.onnx", "yolox", size=None)
+    free = OnnxDetector(open_model(path))
+    sizes = [(1280, 720), (1, 1), (416, 416), (3840, 2160), (1921, 1)]
+    assert [free.input_size(size) for size in sizes] == [
+        (1280, 736),
+        (32, 32),
+        (416, 416),
+        (1920, 1088),
+        (1920, 32),
+    ]
+    assert OnnxDetector(open_model(path), size=(416, 320)).input_size((1280, 720)) == (416, 320)
+
+
+def test_names_come_from_file_then_metadata_then_the_usual_lists(tmp_path: Path) -> None:
+    """Overlays would show numbers, or wrong words."""
+    named = str(colour_detector(tmp_path / "a.onnx", "ultralytics", metadata={"names": RGB}))
+    assert open_detector(named).class_names == ("red", "green", "blue")
+    labels = tmp_path / "labels.txt"
+    labels.write_text("one\ntwo\nthree\n")
+    assert open_detector(named, labels=labels).class_names == ("one", "two", "three")
+    for classes, names in ((80, COCO_NAMES), (10, VISDRONE_NAMES)):
+        path = constant_model(tmp_path / "b.onnx", empty(4 + classes, 126), size=(96, 64))
+        assert open_detector(str(path)).class_names == names
+    labels.write_text("one\ntwo\n")
+    with pytest.raises(UserError, match=r"labels\.txt has 2 class names; .* has 3 classes"):
+        open_detector(named, labels=labels)
+    wrong = colour_detector(tmp_path / "c.onnx", "ultralytics", metadata={"names": "['a']"})
+    with pytest.raises(UserError, match=r"metadata of .* has 1 class names"):
+        open_detector(str(wrong))
+
+
+def test_what_is_no_detector_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    """A classifier given by mistake would fly and see nothing."""
+    scores = empty(7, 84)
+    models = {
+        "classifier": colour_classifier(tmp_path / "c.onnx", batch=1, classes=1000),
+        "wrong anchors": constant_model(tmp_path / "w.onnx", empty(8, 100)),
+        "two heads": constant_model(tmp_path / "t.onnx", scores, scores),
+        "logits": constant_model(tmp_path / "l.onnx", scores - 5),
+        "masks": constant_model(tmp_path / "s.onnx", scores, metadata={"task": "segment"}),
+    }
+    for path in models.values():
+        with pytest.raises(
+            UserError, match=r"is not a detector .* accepted heads: YOLOX \(1, A, 5\+C\)"
+        ) as caught:
+            open_detector(str(path))
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match=r"outputs: scores \(1, 1000\) float32"):
+        open_detector(str(models["classifier"]))
+    with pytest.raises(
+        UserError, match=r"detector 'yolo' is not known .*give one of motion, .*or an ONNX file"
+    ):
+        open_detector("yolo")
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ({"confidence": 1.5}, r"confidence 1\.5"),
+        ({"nms_iou": -0.1}, r"NMS IoU -0\.1"),
+        ({"size": (100, 64)}, "100x64"),
+        ({"size": (0, 64)}, "0x64"),
+        ({"size": (32, 64)}, "32x64 does not fit"),
+    ],
+)
+def test_settings_out_of_range_are_refused(tmp_path: Path, setting: dict[str, object], words: str) -> None:
+    """A mistyped number would silently detect nothing."""
+    path = str(colour_detector(tmp_path / "m.onnx", "yolox"))
+    with pytest.raises(UserError, match=words):
+        open_detector(path, **setting)
+
+
+def test_motion_is_a_detector_by_name() -> None:
+    """Nothing would run on a machine without any model."""
+    detector = open_detector("motion", confidence=0.4)
+    assert isinstance(detector, MotionDetector)
+    assert detector.class_names == ("moving",)
+
+
+# --- real models ---------------------------------------------------------------------------------------------------
+
+
+def reference(path: Path, image: np.ndarray, *, confidence: float, size: tuple[int, int]) -> list[tuple]:
+    """A straightforward decode after the models' own documentation, one candidate after the other."""
+    session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    yolox = "yolox" in path.name
+    height, width = image.shape[:2]
+    ratio = min(size[0] / width, size[1] / height)
+    new = (
+        (int(width * ratio), int(height * ratio)) if yolox else (round(width * ratio), round(height * ratio))
+    )
+    left, top = (0, 0) if yolox else ((size[0] - new[0]) // 2, (size[1] - new[1]) // 2)
+    canvas = np.full((size[1], size[0], 3), 114, np.float32)
+    canvas[top : top + new[1], left : left + new[0]] = cv2.resize(image, new)
+    tensor = canvas if yolox else canvas[..., ::-1] / np.float32(255)
+    output = session.run(None, {"images": np.ascontiguousarray(tensor.transpose(2, 0, 1)[None])})[0][0]
+    rows = []
+    for row, (x, y, stride) in zip(output if yolox else output.T, cells(size), strict=True):
+        scores = row[4] * row[5:] if yolox else row[4:]
+        if scores.max() >= confidence:
+            cx, cy, w, h = row[:4]
+            if yolox:
+                cx, cy, w, h = (cx + x) * stride, (cy + y) * stride, np.exp(w) * stride, np.exp(h) * stride
+            box = np.array([cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2]) - [left, top, left, top]
+            rows.append((np.clip(box / ratio, 0, [width, height] * 2), scores.max(), scores.argmax()))
+    boxes, scores, classes = (np.array(column) for column in zip(*rows, strict=True))
+    by_class = plain_suppression(boxes, scores, classes, 0.45)
+    kept = plain_suppression(boxes[by_class], scores[by_class], np.zeros(len(by_class), int), 0.8)
+    return [rows[by_class[i]] for i in kept]
+
+
+def street(data: Path) -> tuple[np.ndarray, Path]:
+    """The real aerial picture and its annotation file."""
+    picture = data / "visdrone/0000001_02999_d_0000005.jpg"
+    return cv2.imread(str(picture)), picture.with_suffix(".txt")
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("yolox_nano", (416, 416)),
+        ("yolox_nano", (640, 384)),
+        ("yolov5su_visdrone_640", (640, 640)),
+        ("yolov5su_visdrone_736x1280", (1280, 736)),
+    ],
+)
+def test_real_models_agree_with_a_plain_decode(data: Path, name: str, size: tuple[int, int]) -> None:
+    """A subtle mistake of scale, order or colour would cost accuracy that nobody can explain."""
+    path, (image, _) = data / f"models/{name}.onnx", street(data)
+    found = open_detector(str(path), confidence=0.3, size=size).detect(image)
+    expected = reference(path, image, confidence=0.3, size=size)
+    assert len(found) == len(expected) >= 4
+    np.testing.assert_allclose(found.confidences, [score for _, score, _ in expected], atol=2e-3)
+    for box, score, class_id in expected:
+        same = (np.abs(found.confidences - score) < 2e-3) & (found.class_ids == class_id)
+        assert np.abs(found.boxes_xyxy_px[same] - box).max(axis=1).min() < 1.0
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "size", "least"),
+    [
+        ("yolox_nano", None, 0.4),
+        ("yolov5su_visdrone_640", None, 0.55),
+        ("yolov5su_visdrone_736x1280", None, 0.75),
+    ],
+)
+def test_real_models_find_the_cars_of_the_annotation(
+    data: Path, name: str, size: tuple[int, int] | None, least: float
+) -> None:
+    """The product would stand on a detector that does not see cars."""
+    image, annotation = street(data)
+    rows = np.loadtxt(annotation, delimiter=",", usecols=range(8))
+    truth = rows[np.isin(rows[:, 5], (4, 5)) & (rows[:, 4] == 1), :4]
+    truth[:, 2:] += truth[:, :2]
+    detector = open_detector(str(data / f"models/{name}.onnx"), confidence=0.25, size=size)
+    found = detector.detect(image)
+    names = np.array(detector.class_names)[found.class_ids]
+    cars = found.boxes_xyxy_px[np.isin(names, ("car", "van", "truck", "bus"))]
+    recall = (iou(truth, cars).max(axis=1) >= 0.5).mean()
+    print(f"{name}: {len(truth)} cars, recall {recall:.3f}, {len(cars)} found")
+    assert recall >= least
+
+
+@pytest.mark.realdata
+def test_the_real_classifier_is_no_detector(data: Path) -> None:
+    """Swapping the two model options would be noticed only by an empty recording."""
+    with pytest.raises(UserError, match=r"probs \(\?, 1001\) float32; logits \(\?, 1001\) float32"):
+        open_detector(str(data / "models/mobilenet_v2_imagenet.onnx"))

@@ -1,0 +1,153 @@
+"""Class names: from files, from metadata, and what they mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES, ids_of_kinds, kind_of, same_kind
+from hvt_common.inference.labels import first_synonym, metadata_labels, read_labels
+
+
+def test_one_name_a_line(tmp_path: Path) -> None:
+    """Every class would carry its neighbour's name."""
+    path = tmp_path / "labels.txt"
+    path.write_bytes("\ufeffcar\r\n traffic light \r\ncrane\r\ncrane\r\n\r\n".encode())
+    assert read_labels(path) == ("car", "traffic light", "crane", "crane")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty"),
+        (b" \n\n", "empty"),
+        (b"car\n\nbus\n", "no name in line 2"),
+        (b"car\n" + b"x" * 201, "201 characters in line 2"),
+        (b"\xff\xfe\x00car", "not UTF-8"),
+        (b"car\x00\x01\n", "not text in line 1"),
+        (b"a\n" * 100_001, "100001 lines"),
+        (b"a" * (9 << 20), "larger than"),
+    ],
+)
+def test_a_file_that_holds_no_labels_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+    """A wrong file would label every object with nonsense, or end in a traceback."""
+    path = tmp_path / "labels.txt"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=words) as caught:
+        read_labels(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    """A mistyped path would end in a traceback."""
+    with pytest.raises(UserError, match="does not exist"):
+        read_labels(tmp_path / "none.txt")
+    with pytest.raises(UserError, match="is not a file"):
+        read_labels(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "names"),
+    [
+        ({"names": "{0: 'car', 1: 'bus'}"}, ("car", "bus")),
+        ({"names": "{'1': 'bus', '0': 'car'}"}, ("car", "bus")),
+        ({"names": "['car', 'bus']"}, ("car", "bus")),
+        ({"names": '{"0": "car", "1": "bus"}'}, ("car", "bus")),
+        ({"classes": '["car", "bus"]'}, ("car", "bus")),
+        ({}, None),
+        ({"names": "{0: 'car', 7: 'bus'}"}, None),
+        ({"names": "{0: 'car', 'x': 'bus'}"}, None),
+        ({"names": "__import__('os').getcwd()"}, None),
+        ({"names": "(" * 5000}, None),
+        ({"names": "{}"}, None),
+        ({"classes": "[" * 100_000}, None),
+        ({"classes": "3"}, None),
+    ],
+)
+def test_names_in_metadata_are_read_but_never_run(
+    metadata: dict[str, str], names: tuple[str, ...] | None
+) -> None:
+    """A model without a labels file would show numbers, and a hostile one could run code."""
+    assert metadata_labels(metadata) == names
+
+
+def test_the_first_synonym_is_shown() -> None:
+    """An overlay would be covered by six words for an estate car."""
+    assert first_synonym("beach wagon, station wagon, wagon") == "beach wagon"
+    assert first_synonym(",") == ","
+
+
+def test_class_lists_have_their_published_sizes_and_order() -> None:
+    """A car would be called a bus by every model without labels."""
+    assert len(COCO_NAMES) == len(set(COCO_NAMES)) == 80
+    assert [COCO_NAMES[i] for i in (0, 2, 5, 7, 37, 79)] == [
+        "person",
+        "car",
+        "bus",
+        "truck",
+        "surfboard",
+        "toothbrush",
+    ]
+    assert [VISDRONE_NAMES[i] for i in (0, 3, 9)] == ["pedestrian", "car", "motor"]
+
+
+def test_the_words_of_the_pilot_reach_every_detector() -> None:
+    """A class list drawn up for COCO would find no person in a VisDrone detector."""
+    wanted = ("car", "truck", "bus", "person")
+    assert {VISDRONE_NAMES[i] for i in ids_of_kinds(VISDRONE_NAMES, wanted)} == {
+        "pedestrian",
+        "people",
+        "car",
+        "van",
+        "truck",
+        "bus",
+    }
+    assert {COCO_NAMES[i] for i in ids_of_kinds(COCO_NAMES, wanted)} == set(wanted)
+    assert ids_of_kinds(("moving",), wanted) == {0}
+    assert ids_of_kinds(("tree",), wanted) == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("minivan", "car"),
+        ("Model T", "car"),
+        ("beach wagon, station wagon", "car"),
+        ("trailer truck", "truck"),
+        ("moving van", "truck"),
+        ("trolleybus", "bus"),
+        ("motor scooter", "motor"),
+        ("passenger car, coach, carriage", "train"),
+        ("Oak Tree", "oak tree"),
+    ],
+)
+def test_imagenet_words_have_a_kind(name: str, kind: str) -> None:
+    """Class before and class after a still could not be compared."""
+    assert kind_of(name) == kind
+    assert same_kind(name, kind)
+    assert not same_kind(name, "zebra")
+
+
+@pytest.mark.realdata
+def test_every_imagenet_row_of_the_table_is_an_imagenet_class(data: Path) -> None:
+    """A misspelt row would never match."""
+    imagenet = {
+        first_synonym(label).casefold() for label in read_labels(data / "models/imagenet_labels_1001.txt")
+    }
+    words = {
+        "minivan",
+        "sports car",
+        "convertible",
+        "cab",
+        "jeep",
+        "limousine",
+        "beach wagon",
+        "racer",
+        "model t",
+    }
+    words |= {"minibus", "school bus", "trolleybus", "trailer truck", "moving van", "pickup", "garbage truck"}
+    words |= {"tow truck", "fire engine", "moped", "motor scooter", "police van", "ambulance", "golfcart"}
+    assert words <= imagenet
+    assert {word: kind_of(word) for word in words if kind_of(word) == word} == {}

@@ -1,0 +1,450 @@
+"""The wire format: every message there and back, and nothing but WireError for anything else."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import struct
+import zlib
+from pathlib import Path
+
+import msgpack
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.strategies import SearchStrategy
+
+from hvt_common.protocol.messages import (
+    MAX_PAYLOAD_BYTES,
+    MAX_STILL_RESULTS,
+    AlsoShown,
+    BaseHeader,
+    ControlAnswer,
+    ControlRequest,
+    CorruptError,
+    Feedback,
+    Health,
+    Info,
+    Message,
+    PastHave,
+    PastHeader,
+    PastStill,
+    PastUnit,
+    RoiHeader,
+    Status,
+    StillResult,
+    TrackNow,
+    TrackStep,
+    UnknownVersionError,
+    WireError,
+    kinds,
+    pack_past_still,
+    pack_past_units,
+    parse_past_still,
+    parse_past_units,
+)
+from hvt_common.protocol.messages.envelope import WIRE_VERSION, Nested
+from hvt_common.protocol.messages.fields import (
+    I63,
+    U32,
+    U64,
+    Blob,
+    Choice,
+    Flag,
+    Int,
+    Kind,
+    ListOf,
+    MapOf,
+    Real,
+    Scalar,
+    Scaled,
+    Text,
+    TupleOf,
+)
+from hvt_common.values import View
+from messages import BASE, EXAMPLES, FEEDBACK, INFO, REQUEST, ROI, STATUS, STEP
+
+DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "wire.md"
+MESSAGES: tuple[type[Message], ...] = (
+    BaseHeader,
+    RoiHeader,
+    TrackStep,
+    Info,
+    Status,
+    ControlRequest,
+    ControlAnswer,
+    Feedback,
+    PastHeader,
+)
+
+
+def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911, PLR0912 - one case for each kind
+    """Any value that a field of this kind may have."""
+    match kind:
+        case Int(low, high):
+            return st.integers(low, high)
+        case Scaled(low, high, per):
+            return st.integers(round(low * per), round(high * per)).map(lambda raw: raw / per)
+        case Real(low, high):
+            return st.floats(low, high)
+        case Flag():
+            return st.booleans()
+        case Blob(max_bytes):
+            return st.binary(max_size=min(max_bytes, 300))
+        case Text(max_bytes):
+            return st.text(st.characters(codec="utf-8").filter(str.isprintable), max_size=max_bytes // 4)
+        case Choice(words):
+            return st.sampled_from(words)
+        case Scalar(max_bytes):
+            return st.integers(-I63, I63) | st.floats(-1e300, 1e300) | value_of(Text(max_bytes))
+        case TupleOf(inner, length):
+            return st.tuples(*[value_of(inner)] * length)
+        case ListOf(inner, max_items):
+            return st.lists(value_of(inner), max_size=min(max_items, 6)).map(tuple)
+        case MapOf(inner, max_items, key_bytes):
+            return st.dictionaries(value_of(Text(key_bytes)), value_of(inner), max_size=min(max_items, 6))
+        case Nested(of) if of is AlsoShown:
+            place = st.tuples(st.integers(-2000, 0), st.integers(-2000, 0), st.integers(0, 2000), st.just(7))
+            box = place.map(lambda box: tuple(one / 8 for one in box))
+            return st.builds(of, track_id=value_of(Int(0, U32)), box_source_px=box)
+        case Nested(of):
+            return st.builds(of, **{name: value_of(inner) for name, inner in kinds(of)})
+    raise AssertionError(kind)
+
+
+def message_of(message: type[Message]) -> SearchStrategy:
+    """Any value of a message type."""
+    fields = {name: value_of(kind) for name, kind in kinds(message)}
+    if message is RoiHeader:
+        corner, side = st.integers(0, 16000), st.integers(1, 16000)
+        crop = st.tuples(corner, corner, side, side)
+        fields["crop_source_px"] = crop.map(lambda box: (box[0], box[1], box[0] + box[2], box[1] + box[3]))
+        fields["box_source_px"] = crop.map(lambda box: (-box[0] / 8, 0.0, box[2] / 8, box[3] / 8))
+    return st.builds(message, **fields)
+
+
+any_message = st.sampled_from(MESSAGES).flatmap(message_of)
+
+
+@given(message=any_message, payload=st.binary(max_size=200))
+@settings(max_examples=300, deadline=None)
+def test_every_message_survives_the_wire(message, payload):
+    """A user would see boxes, classes or counts other than those the edge meant."""
+    assert type(message).parse(message.pack(payload), payload) == message
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_examples_survive_the_wire(message):
+    """The same with values as they are in flight."""
+    assert type(message).parse(message.pack()) == message
+
+
+def test_typical_sizes_are_small():
+    """Metadata would eat the bits that stills need."""
+    assert len(BASE.pack()) <= 40
+    assert len(ROI.pack()) <= 150
+    assert len(STEP.pack()) <= 45 + len(STEP.boxes)
+    assert len(STATUS.pack()) <= 240
+    assert len(REQUEST.pack()) <= 20
+
+
+@given(data=st.binary(max_size=600), message=st.sampled_from(MESSAGES))
+@example(data=b"", message=BaseHeader)
+@example(data=b"\x91" * 600, message=Info)
+@example(data=b"\x91" * 60_000, message=Info)
+@example(data=b"\xdd\xff\xff\xff\xff", message=Info)
+@example(data=b"\xdf\xff\xff\xff\xff", message=Status)
+@example(data=b"\xc6\xff\xff\xff\xff", message=Status)
+@example(data=b"\xc1", message=Status)
+@example(data=b"\xd6\xff\x00\x00\x00\x00", message=Status)
+@example(data=b"\xc7\x0c\xff" + b"\xff" * 12, message=Status)
+@example(data=b"\x92\x01\xa2\xff\xfe", message=Feedback)
+@example(data=b"\x92\x01\x81\x91\x01\x02", message=Feedback)
+@example(data=b"\x91\xc3", message=BaseHeader)
+@settings(max_examples=400, deadline=None)
+def test_arbitrary_bytes_are_a_wire_error(data, message):
+    """One hostile or broken sender would end the process."""
+    with pytest.raises(WireError):
+        message.parse(data, data)
+
+
+@given(
+    values=st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers(-(2**63), U64)
+        | st.floats()
+        | st.text(max_size=80)
+        | st.binary(max_size=20),
+        lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+        max_leaves=30,
+    ),
+    message=st.sampled_from(MESSAGES),
+)
+@settings(max_examples=300, deadline=None)
+def test_well_formed_nonsense_with_a_good_checksum_is_a_wire_error_or_bounded(values, message):
+    """A sender that packs and seals rightly but fills fields wrongly would get through."""
+    data = sealed([WIRE_VERSION, *(values if isinstance(values, list) else [values])])
+    try:
+        parsed = message.parse(data)
+    except WireError:
+        return
+    assert message.parse(parsed.pack()) == parsed
+
+
+@given(message=any_message, payload=st.binary(max_size=60), seed=st.integers(0, 2**30))
+@settings(max_examples=200, deadline=None)
+def test_a_flipped_bit_is_noticed(message, payload, seed):
+    """A corrupt access unit would be decoded to garbage, or a still would refine the wrong track."""
+    whole = bytearray(message.pack(payload) + payload)
+    length = len(whole) - len(payload)
+    bit = seed % (len(whole) * 8)
+    whole[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(WireError):
+        type(message).parse(bytes(whole[:length]), bytes(whole[length:]))
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_every_truncation_and_extension_is_noticed(message):
+    """Half a message would pass for a whole one."""
+    data = message.pack(b"payload")
+    for length in range(len(data)):
+        with pytest.raises(WireError):
+            type(message).parse(data[:length], b"payload")
+    with pytest.raises(WireError):
+        type(message).parse(data + b"\x00", b"payload")
+    with pytest.raises(CorruptError):
+        type(message).parse(data, b"payloa")
+
+
+def sealed(array: list) -> bytes:
+    """An array with a right checksum, made without the code under test."""
+    body = msgpack.packb([*array, U32])[:-5]
+    return body + b"\xce" + struct.pack(">I", zlib.crc32(body))
+
+
+def base_fields(**changed: object) -> bytes:
+    """A good `BaseHeader` with some fields changed, made without the code under test."""
+    fields = {
+        "session_id": 1,
+        "sequence": 2,
+        "frame_index": 3,
+        "capture_ns": 4,
+        "send_delay_ns": 5,
+        "flags": 1,
+    }
+    return sealed([WIRE_VERSION, *(fields | changed).values()])
+
+
+def test_the_independent_packing_is_accepted():
+    """The refusals below would prove nothing if the whole were refused anyway."""
+    header = BaseHeader.parse(base_fields())
+    assert (header.session_id, header.send_ns, header.flags) == (1, 9, 1)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"flags": True}, "BaseHeader.flags: bool in place of a whole number"),
+        ({"flags": 256}, "BaseHeader.flags: 256 is outside 0…255"),
+        ({"sequence": -1}, "BaseHeader.sequence: -1 is outside"),
+        ({"sequence": 2.0}, "BaseHeader.sequence: float in place of a whole number"),
+        ({"sequence": "2"}, "BaseHeader.sequence: str in place of a whole number"),
+        ({"sequence": None}, "BaseHeader.sequence: NoneType in place"),
+        ({"sequence": [2]}, "BaseHeader.sequence: list in place"),
+        ({"capture_ns": 2**63}, "BaseHeader.capture_ns: 9223372036854775808 is outside"),
+        ({"extra": 1}, "BaseHeader has 7 fields in place of 6"),
+    ],
+)
+def test_a_wrong_field_is_named(changed, said):
+    """Whoever writes another sender would search in the dark."""
+    with pytest.raises(WireError, match=re.escape(said)):
+        BaseHeader.parse(base_fields(**changed))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 0.0, 1e9, 15, True, "15"])
+def test_a_frame_rate_that_is_none_is_refused(bad):
+    """NaN or zero frames a second would reach divisions on the ground."""
+    values = [kind.encode(getattr(INFO, name)) for name, kind in kinds(Info)]
+    values[[name for name, _ in kinds(Info)].index("fps")] = bad
+    with pytest.raises(WireError, match=re.escape("Info.fps")):
+        Info.parse(sealed([WIRE_VERSION, *values]))
+
+
+@pytest.mark.parametrize("bad", ["\x1b[2J", "a\nb", "x" * 65, "ü" * 33, "\u202e"])
+def test_text_that_is_long_or_does_not_print_is_refused(bad):
+    """A class name could clear the operator's terminal."""
+    values = [kind.encode(getattr(ROI, name)) for name, kind in kinds(RoiHeader)]
+    values[[name for name, _ in kinds(RoiHeader)].index("class_name")] = bad
+    with pytest.raises(WireError, match=re.escape("RoiHeader.class_name: text")):
+        RoiHeader.parse(sealed([WIRE_VERSION, *values]))
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [("crop_source_px", [5, 5, 5, 9]), ("crop_source_px", [0, 9, 5, 9]), ("box_source_px", [80, 0, 8, 8])],
+)
+def test_an_empty_crop_or_inverted_box_is_refused(name, bad):
+    """The crop's area divides on the ground."""
+    values = [kind.encode(getattr(ROI, field)) for field, kind in kinds(RoiHeader)]
+    values[[field for field, _ in kinds(RoiHeader)].index(name)] = bad
+    with pytest.raises(WireError, match="RoiHeader: "):
+        RoiHeader.parse(sealed([WIRE_VERSION, *values]))
+
+
+def test_another_version_is_told_apart():
+    """A newer edge would be reported as corrupt instead of as newer."""
+    with pytest.raises(UnknownVersionError, match="schema version 3, only 2 is known"):
+        BaseHeader.parse(sealed([3, "anything"]))
+    with pytest.raises(WireError, match=r"begins with a version"):
+        BaseHeader.parse(sealed([True, 1, 2, 3, 4, 5, 6]))
+
+
+def test_oversized_messages_are_not_looked_at():
+    """Memory would follow whatever a stranger sends."""
+    with pytest.raises(WireError, match="longer than 80"):
+        BaseHeader.parse(bytes(81))
+    with pytest.raises(WireError, match="payload of"):
+        BaseHeader.parse(BASE.pack(), bytes(MAX_PAYLOAD_BYTES + 1))
+
+
+def test_our_own_values_out_of_bounds_are_a_bug_and_say_so():
+    """A wrong value would be sent and refused on the other side, far from its cause."""
+    with pytest.raises(ValueError, match=r"^-1 cannot be sent as int"):
+        BaseHeader(session_id=-1, sequence=0, frame_index=0, capture_ns=0, send_delay_ns=0, flags=0).pack()
+    with pytest.raises(ValueError, match=rf"array ≤ {MAX_STILL_RESULTS}"):
+        Feedback(
+            **{name: getattr(FEEDBACK, name) for name, _ in kinds(Feedback) if name != "stills"},
+            stills=FEEDBACK.stills * (MAX_STILL_RESULTS + 1),
+        ).pack()
+
+
+def test_quantised_fields_are_rounded_not_refused():
+    """Boxes and confidences come with more digits than the wire carries."""
+    header = RoiHeader(
+        **{
+            name: getattr(ROI, name)
+            for name, _ in kinds(RoiHeader)
+            if name not in ("confidence", "box_source_px")
+        },
+        confidence=0.61349,
+        box_source_px=(1.06, 2.0, 9.07, 12.99),
+    )
+    parsed = RoiHeader.parse(header.pack(b"x"), b"x")
+    assert parsed.confidence == 0.613
+    assert parsed.box_source_px == (1.0, 2.0, 9.125, 13.0)
+
+
+def test_info_gives_the_view():
+    """Stills would be pasted at the wrong place in the base frame."""
+    view = Info.parse(INFO.pack()).view
+    assert view == View.fitted((3840, 2160), (1280, 720), fit="crop")
+
+
+# What an edge kept while its link was away
+
+stored_still = st.builds(
+    PastStill, st.binary(max_size=1024), st.text(max_size=16), st.binary(min_size=1, max_size=300)
+)
+stored_units = st.lists(
+    st.tuples(st.integers(0, U32), st.integers(0, I63), st.booleans(), st.binary(min_size=1, max_size=40)),
+    min_size=1,
+    max_size=8,
+    unique_by=(lambda row: row[0], lambda row: row[1]),
+).map(
+    lambda rows: tuple(
+        PastUnit(frame, at, keyframe, data)
+        for frame, at, (_, _, keyframe, data) in zip(
+            sorted(row[0] for row in rows), sorted(row[1] for row in rows), rows, strict=True
+        )
+    )
+)
+
+
+@given(still=stored_still, units=stored_units)
+@settings(max_examples=200, deadline=None)
+def test_what_was_kept_survives_the_wire(still, units):
+    """What an operator sees of an outage would not be what the edge saw."""
+    assert parse_past_still(pack_past_still(still)) == still
+    assert parse_past_units(pack_past_units(units)) == units
+
+
+nonsense = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), U64)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.binary(max_size=8),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=20,
+)
+
+
+@given(data=st.binary(max_size=400) | nonsense.map(msgpack.packb))
+@example(data=b"")
+@example(data=b"\x91" * 100_000)
+@example(data=b"\xdd\xff\xff\xff\xff")
+@example(data=b"\xc6\xff\xff\xff\xff")
+@example(data=b"\xc7\x0c\xff" + b"\xff" * 12)
+@example(data=bytes(MAX_PAYLOAD_BYTES + 1))
+@settings(max_examples=400, deadline=None)
+def test_any_bytes_of_a_kept_object_are_refused_or_within_bounds(data):
+    """One hostile or damaged object would end the ground."""
+    with contextlib.suppress(WireError):
+        still = parse_past_still(data)
+        assert len(still.attachment) <= 1024
+        assert still.payload
+    with contextlib.suppress(WireError):
+        units = parse_past_units(data)
+        assert 1 <= len(units) <= 2400
+        assert all(
+            0 <= unit.frame_index <= U32 and 0 <= unit.capture_ns <= I63 and unit.data for unit in units
+        )
+        assert [unit.frame_index for unit in units] == sorted({unit.frame_index for unit in units})
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [],
+        [[1, 5, True, b""]],
+        [[1, 5, 1, b"x"]],
+        [[-1, 5, True, b"x"]],
+        [[2**32, 5, True, b"x"]],
+        [[1, 2**63, True, b"x"]],
+        [[1, 5, True, b"x"], [1, 6, False, b"x"]],
+        [[1, 5, True, b"x"], [2, 5, False, b"x"]],
+        [[1, 5, True]],
+        [[frame, frame, False, b"x"] for frame in range(2401)],
+    ],
+)
+def test_kept_video_that_cannot_be_one_is_refused(rows):
+    """Frames out of order would freeze the viewer that plays the hole."""
+    with pytest.raises(WireError):
+        parse_past_units(msgpack.packb(rows))
+
+
+@pytest.mark.parametrize(
+    "values", [[], [b"", "e", b""], [b"", b"", b"x"], [bytes(1025), "", b"x"], [b"", "e" * 65, b"x"]]
+)
+def test_a_kept_still_that_cannot_be_one_is_refused(values):
+    """Its header would be taken for something else."""
+    with pytest.raises(WireError):
+        parse_past_still(msgpack.packb(values))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [*MESSAGES, AlsoShown, Health, PastHave, StillResult, TrackNow],
+    ids=lambda message: message.__name__,
+)
+def test_the_document_lists_every_field_with_its_bounds(message):
+    """Whoever writes a subscriber from docs/wire.md would read the wrong field."""
+    section = DOCUMENT.read_text(encoding="utf-8").split(f"### `{message.__name__}`", 1)[1].split("\n#", 1)[0]
+    rows = re.findall(r"^\| (\d+) \| `(\w+)` \| ([^|]+) \|", section, re.MULTILINE)
+    first = 1 if issubclass(message, Message) else 0
+    expected = [
+        (str(number), name, kind.describe()) for number, (name, kind) in enumerate(kinds(message), first)
+    ]
+    assert [(number, name, bounds.strip()) for number, name, bounds in rows] == expected

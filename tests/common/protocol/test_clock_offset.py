@@ -1,0 +1,105 @@
+"""Time on both sides: a clock without steps, and the offset between two of them."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.runtime.clock import SteadyClock
+
+MS = 1_000_000
+delays = st.integers(0, 5_000 * MS)
+
+
+def exchange(
+    clock: ClockOffset, *, at_ns: int, offset_ns: int, out_ns: int, held_ns: int, back_ns: int
+) -> bool:
+    """A question at ``at_ns`` to a clock that is ``offset_ns`` ahead."""
+    heard = at_ns + out_ns
+    return clock.add(
+        t0_ns=at_ns,
+        t1_ns=heard + offset_ns,
+        t2_ns=heard + held_ns + offset_ns,
+        t3_ns=heard + held_ns + back_ns,
+    )
+
+
+def test_an_even_path_gives_the_exact_offset():
+    """Latency in the summary would be wrong by the difference of the clocks."""
+    clock = ClockOffset()
+    assert clock.offset_ns is None
+    assert clock.error_ns is None
+    assert clock.to_local_ns(5) == 5
+    assert exchange(clock, at_ns=0, offset_ns=-70 * MS, out_ns=4 * MS, held_ns=9 * MS, back_ns=4 * MS)
+    assert clock.offset_ns == -70 * MS
+    assert clock.error_ns == 4 * MS
+    assert clock.to_local_ns(1_000 * MS) == 1_070 * MS
+
+
+@given(
+    offset=st.integers(-(10**18), 10**18),
+    paths=st.lists(st.tuples(delays, delays, delays), min_size=1, max_size=20),
+)
+def test_the_truth_is_within_the_stated_error(offset, paths):
+    """The stated error would be a lie, and with it every latency."""
+    clock = ClockOffset(window_ns=10**15)
+    for number, (out, held, back) in enumerate(paths):
+        assert exchange(
+            clock, at_ns=number * 10**11, offset_ns=offset, out_ns=out, held_ns=held, back_ns=back
+        )
+    assert abs(clock.offset_ns - offset) <= clock.error_ns
+    assert clock.error_ns == (min(out + back for out, _, back in paths) + 1) // 2
+
+
+def test_the_shortest_round_trip_speaks_until_it_is_old():
+    """One exchange behind a keyframe would bend all latencies; an old one would hide a drift for ever."""
+    clock = ClockOffset(window_ns=60_000 * MS)
+    exchange(clock, at_ns=0, offset_ns=0, out_ns=MS, held_ns=0, back_ns=MS)
+    exchange(clock, at_ns=1_000 * MS, offset_ns=0, out_ns=300 * MS, held_ns=0, back_ns=MS)
+    assert clock.offset_ns == 0
+    exchange(clock, at_ns=61_000 * MS, offset_ns=8 * MS, out_ns=2 * MS, held_ns=0, back_ns=2 * MS)
+    assert clock.offset_ns == 8 * MS
+
+
+def test_contradictory_times_are_left_out():
+    """A stepped clock would give a negative round trip, which always wins."""
+    clock = ClockOffset()
+    assert not clock.add(t0_ns=10, t1_ns=0, t2_ns=100, t3_ns=20)
+    assert not clock.add(t0_ns=0, t1_ns=50, t2_ns=40, t3_ns=90)
+    assert clock.offset_ns is None
+
+
+def test_a_clock_that_was_set_is_believed_at_once():
+    """For a minute every latency would be wrong by the step."""
+    clock = ClockOffset()
+    exchange(clock, at_ns=0, offset_ns=0, out_ns=MS, held_ns=0, back_ns=MS)
+    exchange(clock, at_ns=20_000 * MS, offset_ns=3_600_000 * MS, out_ns=40 * MS, held_ns=0, back_ns=40 * MS)
+    assert clock.offset_ns == 3_600_000 * MS
+    exchange(clock, at_ns=40_000 * MS, offset_ns=3_600_000 * MS, out_ns=90 * MS, held_ns=0, back_ns=10 * MS)
+    assert clock.offset_ns == 3_600_000 * MS  # the better of those after the step
+    assert clock.error_ns == 40 * MS
+
+
+def test_a_clock_that_was_wrong_at_the_start_is_said_once(caplog):
+    """A drone without a battery for its clock would record a flight of 1970, and nobody would know why."""
+    wall, monotonic = [1_000_000 * MS], [5_000 * MS]
+    clock = SteadyClock(wall_ns=lambda: wall[0], monotonic_ns=lambda: monotonic[0])
+    for drift_ms, said in ((9_000, 0), (3_600_000, 1), (7_200_000, 1), (0, 1)):
+        monotonic[0] += 2_000 * MS
+        wall[0] = 995_000 * MS + monotonic[0] + drift_ms * MS
+        assert clock() == 995_000 * MS + monotonic[0]
+        assert len(caplog.records) == said
+    assert caplog.records[0].getMessage().startswith("the clock of this machine was set by +3600 s")
+
+
+def test_a_wall_clock_that_is_set_leaves_no_step():
+    """NTP coming up in mid-flight would look like an hour in a queue, or silence the camera for as long."""
+    wall, monotonic = [1_000_000 * MS], [5_000 * MS]
+    clock = SteadyClock(wall_ns=lambda: wall[0], monotonic_ns=lambda: monotonic[0])
+    shown = [clock()]
+    for step_ms in (3_600_000, -7_200_000, 0):
+        wall[0] += (step_ms + 40) * MS
+        monotonic[0] += 40 * MS
+        shown.append(clock())
+    assert shown == [(1_000_000 + 40 * step) * MS for step in range(4)]

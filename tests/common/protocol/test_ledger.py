@@ -1,0 +1,187 @@
+"""The account of line bytes and its rolling windows."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+
+WINDOW = 1_000
+SLACK = 2_000
+CHANNELS = list(Channel)
+
+events = st.lists(
+    st.tuples(st.integers(0, 400), st.sampled_from(CHANNELS), st.integers(0, 5_000), st.integers(0, 60)),
+    min_size=1,
+    max_size=80,
+)
+
+
+def dated(gaps: list) -> list:
+    """Events with times that never go back."""
+    at = 0
+    out = []
+    for gap, channel, payload, attachment in gaps:
+        at += gap
+        out.append((at, channel, payload, attachment))
+    return out
+
+
+def fed(items: list) -> Ledger:
+    """A ledger that counted these events."""
+    ledger = Ledger(window_ns=WINDOW, slack_ns=SLACK)
+    for at, channel, payload, attachment in items:
+        ledger.count(channel, payload_bytes=payload, attachment_bytes=attachment, overhead_bytes=66, at_ns=at)
+    return ledger
+
+
+def brute(items: list, channel: Channel | None, now: int) -> int:
+    """A window's line bytes, from the definition."""
+    return sum(
+        payload + attachment + 66
+        for at, entry, payload, attachment in items
+        if now - WINDOW < at <= now and channel in (None, entry)
+    )
+
+
+def brute_worst(items: list, channel: Channel | None) -> int:
+    """The fullest window in bits a second, from the definition."""
+    return max(brute(items, channel, at) for at, *_ in items) * 8 * 1_000_000
+
+
+@given(gaps=events)
+@settings(max_examples=150, deadline=None)
+def test_windows_and_worst_windows_are_exact(gaps):
+    """The budget would be held on average and broken in some second."""
+    items = dated(gaps)
+    ledger = fed(items)
+    worst = ledger.worst_window_bps
+    assert worst.base == brute_worst(items, Channel.BASE)
+    assert worst.roi == brute_worst(items, Channel.ROI)
+    assert worst.total == brute_worst(items, None)
+    newest = items[-1][0]
+    for now in (newest, newest + 1, newest + 500, newest + WINDOW, newest - 700, newest - SLACK):
+        for channel in (None, *CHANNELS):
+            assert ledger.window_bytes(channel, now) == brute(items, channel, now)
+
+
+@given(gaps=events, seed=st.integers(0, 10_000))
+@settings(max_examples=150, deadline=None)
+def test_slightly_other_order_gives_the_same_account(gaps, seed):
+    """Edge and ground would print two different sums of the same bytes: stills overtake, clocks do not."""
+    items = dated(gaps)
+    shift = random.Random(seed)
+    late = sorted(items, key=lambda item: item[0] + shift.randrange(SLACK))
+    one, other = fed(items), fed(late)
+    assert one.summary(3.0) == other.summary(3.0)
+    assert one.window_bytes(None, items[-1][0]) == other.window_bytes(None, items[-1][0])
+
+
+def test_totals_put_every_byte_in_one_place():
+    """Metadata would hide in the payload or be counted twice."""
+    ledger = Ledger()
+    ledger.count(Channel.BASE, payload_bytes=5_000, attachment_bytes=39, overhead_bytes=240, at_ns=0)
+    ledger.count(Channel.ROI, payload_bytes=1_500, attachment_bytes=90, overhead_bytes=136, at_ns=10)
+    ledger.count(Channel.META, payload_bytes=200, attachment_bytes=0, overhead_bytes=84, at_ns=20)
+    ledger.count(Channel.PAST, payload_bytes=700, attachment_bytes=40, overhead_bytes=120, at_ns=20)
+    summary = ledger.summary(2.0)
+    assert (summary.base_bytes, summary.roi_bytes, summary.past_bytes) == (5_000, 1_500, 700)
+    assert (summary.meta_bytes, summary.overhead_bytes) == (39 + 90 + 40 + 200, 240 + 136 + 120 + 84)
+    assert summary.line_bytes == ledger.line_bytes == 5_279 + 1_726 + 860 + 284
+    assert summary.messages == {"base": 1, "roi": 1, "past": 1, "meta": 1}
+    assert (summary.base_bps, summary.roi_bps) == (5_279 * 4, 1_726 * 4)
+    assert summary.total_bps == (5_279 + 1_726 + 860 + 284) * 4
+    assert (ledger.first_ns, ledger.last_ns) == (0, 20)
+    assert ledger.messages(Channel.ROI) == 1
+
+
+def test_an_empty_run_has_rates_of_zero():
+    """A run that ended before its first frame would end in a division by zero."""
+    summary = Ledger().summary(0.0)
+    assert summary.total_bps == 0
+    assert summary.worst_window_bps.total == 0
+
+
+def test_memory_stays_flat():
+    """The process would grow over hours of flight."""
+    ledger = Ledger()
+    sizes = set()
+    for frame in range(20_000):
+        ledger.count(
+            Channel.BASE,
+            payload_bytes=5_000,
+            attachment_bytes=40,
+            overhead_bytes=240,
+            at_ns=frame * 66_666_667,
+        )
+        if frame > 100:
+            sizes.add(len(ledger._pending) + len(ledger._windows.entries))
+    assert max(sizes) <= 3 * 15 + 3
+    assert ledger.worst_window_bps.total == 15 * 5_280 * 8
+
+
+def test_a_clock_set_back_starts_the_windows_afresh():
+    """An hour's step of the clock would pile every later message into one window."""
+    ledger = fed([(10_000_000 + n * 100, Channel.BASE, 934, 0) for n in range(50)])
+    before = ledger.worst_window_bps.base
+    for n in range(50):
+        ledger.count(Channel.BASE, payload_bytes=934, attachment_bytes=0, overhead_bytes=66, at_ns=n * 100)
+    assert before == ledger.worst_window_bps.base == 10 * 1_000 * 8 * 1_000_000
+    assert ledger.window_bytes(None, 4_900) == 10_000
+    assert ledger.base_bytes == 100 * 934
+
+
+def test_fates_are_counted_by_reason():
+    """Nobody could tell why a still never came."""
+    ledger = Ledger()
+    ledger.record_fate("sent", "small")
+    ledger.record_fate("sent", "small")
+    ledger.record_fate("dropped", "stale")
+    assert ledger.fates("sent") == {"small": 2}
+    assert ledger.summary(1.0).fates == {
+        "sent": {"small": 2},
+        "deferred": {},
+        "dropped": {"stale": 1},
+        "received": {},
+    }
+
+
+@pytest.mark.parametrize(
+    ("payload", "attachment", "encoding", "framing"),
+    [
+        # Measured with `ss -ti` between two peers, key hvt/edge-1/base (15 characters), eclipse-zenoh 1.10.2.
+        (200, 44, "", 31),
+        (100, 44, "video/h265", 31),
+        (127, 44, "video/h265", 31),
+        (128, 44, "video/h265", 32),
+        (200, 44, "image/jpeg", 32),
+        (200, 44, "application/msgpack", 54),
+        (200, 44, "image/avif", 45),
+        (16_000, 127, "video/h265", 32),
+        (2_000, 129, "video/h265", 33),
+        # Fragments of 16384 bytes.
+        (16_000, 39, "video/h265", 32),
+        (16_320, 39, "video/h265", 42),
+        (30_000, 39, "video/h265", 43),
+        (60_000, 39, "video/h265", 61),
+        (300_000, 39, "video/h265", 196),
+    ],
+)
+def test_framing_is_what_was_measured(payload, attachment, encoding, framing):
+    """The overhead column would be a guess."""
+    segments = -(-(payload + attachment + framing) // 1448)
+    got = overhead_bytes(payload, attachment, key="hvt/edge-1/base", encoding=encoding)
+    assert got == framing + 52 * segments
+
+
+@given(payload=st.integers(0, 4_000_000), attachment=st.integers(0, 500))
+def test_overhead_is_bounded_and_grows_with_size(payload, attachment):
+    """A formula with a hole would let a still through that the link has no room for."""
+    key = "hvt/uav-1/roi"
+    got = overhead_bytes(payload, attachment, key=key, encoding="image/jpeg")
+    assert 52 + 12 + len(key) < got <= 160 + 0.05 * (payload + attachment)
+    assert overhead_bytes(payload + 1, attachment, key=key, encoding="image/jpeg") >= got

@@ -1,0 +1,82 @@
+"""What a run says of itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.reporting import StatusLine, check_writable, print_table, write_json
+
+
+def test_the_summary_file_is_written_whole(tmp_path):
+    """A program that reads the summary would find half of one."""
+    path = tmp_path / "summary.json"
+    path.write_text("old and longer than the new content is")
+    write_json(path, {"edge": "uav-1", "frames": 3})
+    assert json.loads(path.read_text()) == {"edge": "uav-1", "frames": 3}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_summary_can_go_into_a_pipe(tmp_path):
+    """``--summary /dev/stdout`` would fail after the run, or replace the device."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    got: list[str] = []
+    reader = threading.Thread(target=lambda: got.append(pipe.read_text()))
+    reader.start()
+    write_json(pipe, [{"edge": "uav-1"}])
+    reader.join(10)
+    assert json.loads(got[0]) == [{"edge": "uav-1"}]
+    assert pipe.is_fifo()
+
+
+def test_files_that_cannot_be_written_are_refused_before_the_run(tmp_path):
+    """The numbers of an hour's flight would be lost at its end."""
+    check_writable(None, name="--summary")
+    check_writable(tmp_path / "new.json", name="--summary")
+    for path, said in (
+        (tmp_path, "is a folder: name a file"),
+        (tmp_path / "none" / "s.json", "is in a folder that does not exist: make "),
+    ):
+        with pytest.raises(UserError, match=said):
+            check_writable(path, name="--summary")
+
+
+def test_what_was_in_a_file_survives_the_check(tmp_path):
+    """A run that fails at once would already have emptied yesterday's summary."""
+    path = tmp_path / "s.json"
+    path.write_text("yesterday")
+    check_writable(path, name="--summary")
+    assert path.read_text() == "yesterday"
+
+
+def test_a_table_says_paths_and_names_as_they_are(capsys):
+    """A recording in a folder ``[run 1]`` would be shown under another name, or the table would crash."""
+    print_table("uav[/]1", [("recording", "/data/[run 1]/[/bold]:car:.rrd"), ("[red]", "x")])
+    out = capsys.readouterr().out
+    assert "/data/[run 1]/[/bold]:car:.rrd" in out
+    assert "uav[/]1" in out
+    assert "[red]" in out
+
+
+def test_a_log_gets_a_line_now_and_then(capsys):
+    """An hour's log would hold thousands of status lines, or none."""
+    with StatusLine(quiet=False) as line:
+        for number in range(11):
+            line.show(f"frame {number}")
+        line.note("[note] :wave:")
+    err = capsys.readouterr().err
+    assert [one for one in err.splitlines() if one.startswith("frame")] == ["frame 0", "frame 5", "frame 10"]
+    assert "[note] :wave:" in err
+
+
+def test_quiet_is_quiet(capsys):
+    """``--quiet`` would not be."""
+    with StatusLine(quiet=True) as line:
+        line.show("status")
+        line.note("note")
+    assert capsys.readouterr() == ("", "")

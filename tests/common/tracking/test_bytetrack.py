@@ -1,0 +1,467 @@
+"""ByteTrack: fidelity to the authors' program, life of a track, and the filter and assignment beneath it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
+
+from clear_mot import Frames, score
+from hvt_common.tracking import kalman
+from hvt_common.tracking.association import assign, overlaps
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.values import Detections, Tracks
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def seen(*boxes: tuple[float, ...], confidence: float = 0.9, class_id: int = 0) -> Detections:
+    """Detections x1 y1 x2 y2 of equal confidence and class."""
+    return Detections(
+        np.array(boxes, np.float32).reshape(-1, 4),
+        np.full(len(boxes), confidence, np.float32),
+        np.full(len(boxes), class_id, np.int32),
+    )
+
+
+def scene(seed: int, *, frames: int = 12, count: int = 8) -> list[Detections]:
+    """Moving boxes with jitter, gaps and every level of confidence; coordinates are multiples of 1/16 px."""
+    rng = np.random.default_rng(seed)
+    centre, velocity = rng.uniform(50, 400, (count, 2)), rng.normal(0, 4, (count, 2))
+    size = rng.uniform(15, 60, (count, 2))
+    result = []
+    for _ in range(frames):
+        centre = centre + velocity
+        boxes = np.concatenate((centre - size / 2, centre + size / 2), axis=1)
+        boxes = np.round((boxes + rng.normal(0, 1.5, boxes.shape)) * 16) / 16
+        kept = rng.random(count) > 0.15
+        confidences = np.clip(rng.beta(4, 2, count), 0, 1)
+        result.append(
+            Detections(
+                boxes[kept].astype(np.float32),
+                confidences[kept].astype(np.float32),
+                rng.integers(0, 3, int(kept.sum())).astype(np.int32),
+            )
+        )
+    return result
+
+
+def run(tracker: ByteTracker, detections: list[Detections], *, every: int = 1) -> list[Tracks]:
+    """All frames through a tracker, with detection on every n-th."""
+    return [
+        tracker.update(each, frame_index=k) if k % every == 0 else tracker.predict(frame_index=k)
+        for k, each in enumerate(detections)
+    ]
+
+
+# --- fidelity
+
+
+def palace(data: Path) -> tuple[list[Detections], dict[int, np.ndarray]]:
+    """Detections of each frame of the street scene, and rows of the authors' tracks with x2, y2 for w, h."""
+    results = json.loads((data / "tracking/palace/detections.json").read_text())["results"]
+    rows = np.array(
+        [[float(r[k]) for k in ("frame_id", "x", "y", "width", "height", "prob")] for r in results]
+    )
+    rows[:, 3:5] += rows[:, 1:3]
+    detections = []
+    for frame in range(int(rows[:, 0].max()) + 1):
+        here = rows[rows[:, 0] == frame]
+        confidences = here[:, 5].astype(np.float32)
+        detections.append(
+            Detections(here[:, 1:5].astype(np.float32), confidences, np.zeros(len(here), np.int32))
+        )
+    reference = np.loadtxt(data / "tracking/palace/bytetrack_tracks.txt", delimiter=",")
+    reference[:, 4:6] += reference[:, 2:4]
+    return detections, {k: reference[reference[:, 0] == k] for k in range(len(detections))}
+
+
+@pytest.mark.realdata
+def test_reproduces_the_authors_program_box_by_box(data: Path) -> None:
+    """Results published with ByteTrack would not hold for HVT: another id, box or score somewhere."""
+    detections, reference = palace(data)
+    ours = run(ByteTracker(fps=30), detections)
+    assert len({int(i) for tracks in ours for i in tracks.ids}) == 45
+    for tracks in ours:
+        expected = reference[tracks.frame_index]
+        expected = expected[np.argsort(expected[:, 1])]
+        assert tracks.ids.tolist() == expected[:, 1].astype(int).tolist()
+        np.testing.assert_allclose(tracks.boxes_xyxy_px, expected[:, 2:6], atol=1e-3)
+        np.testing.assert_allclose(tracks.confidences, expected[:, 6], atol=1e-4)
+
+
+@pytest.mark.realdata
+def test_every_fifth_frame_still_follows_the_scene(data: Path) -> None:
+    """Detection every fifth frame (the default) would lose or mix up objects between the detections."""
+    detections, reference = palace(data)
+    truth: Frames = {k: (rows[:, 1].astype(int), rows[:, 2:6]) for k, rows in reference.items()}
+    ours = run(ByteTracker(fps=30), detections, every=5)
+    result = score(truth, {t.frame_index: (t.ids, t.boxes_xyxy_px.astype(float)) for t in ours})
+    assert result.idf1 > 0.78
+    assert result.mota > 0.84
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("sequence", "mota", "idf1"), [("TUD-Campus", 0.526, 0.558), ("TUD-Stadtmitte", 0.564, 0.645)]
+)
+def test_the_yardstick_gives_published_figures(data: Path, sequence: str, mota: float, idf1: float) -> None:
+    """The tests that compare tracks would measure with a wrong yardstick."""
+    frames = []
+    for name in ("gt.txt", "test.txt"):
+        rows = np.loadtxt(data / "tracking/motmetrics_tud" / sequence / name, delimiter=",")
+        rows = rows[rows[:, 6] == 1] if name == "gt.txt" else rows
+        rows[:, 4:6] += rows[:, 2:4]
+        frames.append(
+            {int(k): (rows[rows[:, 0] == k, 1], rows[rows[:, 0] == k, 2:6]) for k in set(rows[:, 0])}
+        )
+    result = score(*frames)
+    assert (round(result.mota, 3), round(result.idf1, 3)) == (mota, idf1)
+
+
+def dense_filter(measurements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One track through the textbook 8x8 filter: initiate, then predict and correct for each measurement."""
+    transition, observe = np.eye(8) + np.eye(8, k=4), np.eye(4, 8)
+
+    def noise(h: float, p: float, v: float) -> np.ndarray:
+        return np.diag(np.square([p * h, p * h, 1e-2, p * h, v * h, v * h, 1e-5, v * h]))
+
+    mean = np.r_[measurements[0], np.zeros(4)]
+    covariance = noise(mean[3], 2 / 20, 10 / 160)
+    for measured in measurements[1:]:
+        process = noise(mean[3], 1 / 20, 1 / 160)
+        mean, covariance = transition @ mean, transition @ covariance @ transition.T + process
+        h = mean[3]
+        expected = observe @ covariance @ observe.T + np.diag(np.square([h / 20, h / 20, 1e-1, h / 20]))
+        gain = covariance @ observe.T @ np.linalg.inv(expected)
+        mean = mean + gain @ (measured - observe @ mean)
+        covariance = covariance - gain @ expected @ gain.T
+    return mean, covariance
+
+
+def test_the_split_filter_equals_the_dense_one() -> None:
+    """Boxes would drift from what ByteTrack computes: the four 2x2 blocks must hold the whole covariance."""
+    rng = np.random.default_rng(1)
+    steps = np.cumsum(rng.normal(0, [4, 4, 0.01, 1], (20, 5, 4)), axis=0)
+    steps += [200, 100, 0.5, 80]
+    states = kalman.initiate(steps[0])
+    for measured in steps[1:]:
+        kalman.predict(states)
+        kalman.correct(states, measured)
+    for k in range(5):
+        mean, covariance = dense_filter(steps[:, k])
+        np.testing.assert_allclose(states[k, :2].ravel(), mean, rtol=1e-9, atol=1e-9)
+        blocks = np.diag([*states[k, kalman.VAR_P], *states[k, kalman.VAR_V]])
+        blocks += np.diag(states[k, kalman.COV_PV], 4) + np.diag(states[k, kalman.COV_PV], -4)
+        np.testing.assert_allclose(blocks, covariance, rtol=1e-9, atol=1e-12)
+
+
+@given(seed=seeds, rows=st.integers(0, 7), columns=st.integers(0, 7), limit=st.floats(0.05, 1))
+@settings(max_examples=150, deadline=None)
+def test_assignment_has_the_optimum_of_lap_with_a_cost_limit(
+    seed: int, rows: int, columns: int, limit: float
+) -> None:
+    """Where objects are close, tracks would take other detections than in ByteTrack."""
+    cost = np.random.default_rng(seed).random((rows, columns))
+    extended = np.full((rows + columns, rows + columns), limit / 2)  # what lap.lapjv(extend_cost=True) solves
+    extended[:rows, :columns] = cost
+    extended[rows:, columns:] = 0
+    i, j = linear_sum_assignment(extended)
+    real = (i < rows) & (j < columns)
+    ours = assign(cost, limit=limit)
+    assert sorted(zip(*map(np.ndarray.tolist, ours), strict=True)) == sorted(
+        zip(i[real].tolist(), j[real].tolist(), strict=True)
+    )
+
+
+def test_overlap_counts_whole_pixels() -> None:
+    """Small objects would be matched more strictly than in ByteTrack."""
+    a = np.array([[0.0, 0.0, 9.0, 9.0]])
+    b = np.array([[0.0, 0.0, 9.0, 9.0], [5.0, 0.0, 14.0, 9.0], [20.0, 0.0, 29.0, 9.0]])
+    np.testing.assert_allclose(overlaps(a, b), [[1.0, 50 / 150, 0.0]])
+
+
+# --- properties
+
+
+@given(seed=seeds, every=st.sampled_from([1, 3]))
+@settings(max_examples=30, deadline=None)
+def test_order_of_detections_does_not_matter(seed: int, every: int) -> None:
+    """Edge and ground would number the same objects differently when their detectors order boxes differently."""
+    rng = np.random.default_rng(seed)
+    detections = scene(seed)
+    detections[4].confidences[:] = 0.8  # ties too
+    shuffled = []
+    for each in detections:
+        order = rng.permutation(len(each))
+        shuffled.append(Detections(each.boxes_xyxy_px[order], each.confidences[order], each.class_ids[order]))
+    for a, b in zip(
+        run(ByteTracker(fps=15), detections, every=every),
+        run(ByteTracker(fps=15), shuffled, every=every),
+        strict=True,
+    ):
+        assert a.ids.tolist() == b.ids.tolist()
+        np.testing.assert_array_equal(a.boxes_xyxy_px, b.boxes_xyxy_px)
+        np.testing.assert_array_equal(a.class_ids, b.class_ids)
+
+
+@given(seed=seeds, dx=st.integers(-500, 500), dy=st.integers(-500, 500))
+@settings(max_examples=30, deadline=None)
+def test_tracks_move_with_the_picture(seed: int, dx: int, dy: int) -> None:
+    """Objects would be tracked differently in one corner of the frame than in another."""
+    detections = scene(seed)
+    shift = np.array([dx, dy, dx, dy], np.float32)
+    shifted = [Detections(d.boxes_xyxy_px + shift, d.confidences, d.class_ids) for d in detections]
+    for a, b in zip(run(ByteTracker(fps=15), detections), run(ByteTracker(fps=15), shifted), strict=True):
+        assert a.ids.tolist() == b.ids.tolist()
+        np.testing.assert_allclose(a.boxes_xyxy_px + shift, b.boxes_xyxy_px, atol=1e-3)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(1, 90), st.booleans()), max_size=20))
+@settings(max_examples=60, deadline=None)
+def test_any_sequence_of_calls_is_survived(calls: list[tuple[bool, int, bool]]) -> None:
+    """An empty street, a gap in the stream or a pause of the detector would stop the edge or the ground."""
+    tracker, frame = ByteTracker(fps=15), 0
+    for searched, step, empty in calls:
+        frame += step
+        detections = Detections.none() if empty else seen((10, 10, 40, 40), (100, 50, 130, 90))
+        tracks = (
+            tracker.update(detections, frame_index=frame) if searched else tracker.predict(frame_index=frame)
+        )
+        assert tracks.frame_index == frame
+        assert np.isfinite(tracks.boxes_xyxy_px).all()
+        assert (np.diff(tracks.ids) > 0).all()
+
+
+# --- life of a track
+
+
+def test_a_new_object_is_listed_when_found_twice() -> None:
+    """A single false detection would become a track, or a real object would wait longer than it must."""
+    tracker = ByteTracker(fps=30)
+    tracker.update(Detections.none(), frame_index=0)
+    box = (100, 100, 140, 160)
+    assert len(tracker.update(seen(box), frame_index=1)) == 0
+    found = tracker.update(seen(box), frame_index=2)
+    assert (found.ids.tolist(), found.started.tolist()) == ([1], [True])
+    assert (found.born_frames.tolist(), found.seen_frames.tolist()) == ([1], [2])
+    assert tracker.update(seen(box), frame_index=3).started.tolist() == [False]
+
+
+def test_the_first_frame_confirms_at_once_and_weak_detections_never_start() -> None:
+    """The operator would wait for the first picture's objects, or be shown what the detector hardly believes."""
+    tracks = ByteTracker(fps=30).update(seen((0, 0, 20, 20)), frame_index=0)
+    assert (tracks.ids.tolist(), tracks.started.tolist()) == ([1], [True])
+    assert len(ByteTracker(fps=30).update(seen((0, 0, 20, 20), confidence=0.55), frame_index=0)) == 0
+
+
+def test_a_weak_detection_carries_a_track_on() -> None:
+    """Partly hidden objects would be lost: the very idea of ByteTrack."""
+    tracker = ByteTracker(fps=30)
+    tracker.update(seen((0, 0, 40, 40)), frame_index=0)
+    tracks = tracker.update(seen((0, 0, 40, 40), confidence=0.2), frame_index=1)
+    assert tracks.ids.tolist() == [1]
+    assert tracks.confidences[0] == pytest.approx(0.2)
+    assert len(tracker.update(seen((0, 0, 40, 40), confidence=0.09), frame_index=2)) == 0
+
+
+def test_predicted_frames_carry_tracks_on_and_lose_none() -> None:
+    """Between two detections boxes would freeze, vanish, or start anew."""
+    tracker = ByteTracker(fps=15)
+    for k in range(0, 30, 5):
+        moving = (100 + 4 * k, 100, 140 + 4 * k, 160)
+        tracks = tracker.update(seen(moving), frame_index=k)
+        for ahead in range(1, 5):
+            tracks = tracker.predict(frame_index=k + ahead)
+            assert tracks.ids.tolist() == [1]
+            assert tracks.seen_frames.tolist() == [k]
+            assert not tracks.started.any()
+    np.testing.assert_allclose(
+        tracks.boxes_xyxy_px, [[216, 100, 256, 160]], atol=2
+    )  # frame 29 at 4 px a frame
+
+
+def test_a_small_fast_object_is_confirmed_between_rare_detections() -> None:
+    """From a drone, a car that leaves its own box within five frames would never become a track."""
+    cars = [(100 + 4.5 * k, 100, 118 + 4.5 * k, 112) for k in range(0, 26, 5)]
+    found = {}
+    for growth in (0.0, 3.0):
+        tracker = ByteTracker(TrackerSettings(search_growth_per_s=growth), fps=15)
+        tracker.update(Detections.none(), frame_index=0)
+        ids = [
+            tracker.update(seen(car), frame_index=5 * k).ids.tolist() for k, car in enumerate(cars, start=1)
+        ]
+        found[growth] = ids
+    assert found[0.0] == [[], [], [], [], [], []]
+    assert found[3.0] == [[], [1], [1], [1], [1], [1]]
+
+
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize(("hidden_frames", "same"), [(20, True), (25, True), (45, False)])
+def test_lost_tracks_are_remembered_in_frames_not_in_updates(
+    every: int, hidden_frames: int, *, same: bool
+) -> None:
+    """With detection every fifth frame, a lost id would haunt the picture five times as long as meant."""
+    tracker, box = ByteTracker(fps=30), (100, 100, 140, 160)
+    last = 10 + hidden_frames + 10
+    for k in range(last + 1):
+        if k % every:
+            tracks = tracker.predict(frame_index=k)
+            continue
+        visible = k <= 10 or k >= 10 + hidden_frames
+        tracks = tracker.update(seen(box) if visible else Detections.none(), frame_index=k)
+        assert len(tracks) == 0 or visible
+        if k == 10 + hidden_frames:
+            assert tracks.started.tolist() == ([True] if same else [])
+    assert tracks.ids.tolist() == ([1] if same else [2])
+
+
+def test_a_long_interruption_ends_all_tracks() -> None:
+    """After an outage, objects would get the ids of others that stood there a minute ago."""
+    tracker, box = ByteTracker(fps=15), (100, 100, 140, 160)
+    for k in (0, 1, 12):
+        assert tracker.update(seen(box), frame_index=k).ids.tolist() == [1]
+    assert len(tracker.update(seen(box), frame_index=900)) == 0
+    assert tracker.update(seen(box), frame_index=901).ids.tolist() == [2]
+
+
+def test_gaps_are_stepped_like_predicted_frames() -> None:
+    """Frames that the link lost would shift every box."""
+    a, b = ByteTracker(fps=15), ByteTracker(fps=15)
+    for k in (0, 1, 2, 3, 8):
+        box = (100 + 5 * k, 100, 140 + 5 * k, 160)
+        for between in range(4, 8) if k == 8 else ():
+            b.predict(frame_index=between)
+        left, right = a.update(seen(box), frame_index=k), b.update(seen(box), frame_index=k)
+    np.testing.assert_array_equal(left.boxes_xyxy_px, right.boxes_xyxy_px)
+
+
+@given(seed=seeds, ahead=st.integers(0, 80))
+@settings(max_examples=40, deadline=None)
+def test_looking_ahead_shows_what_prediction_would_and_changes_nothing(seed: int, ahead: int) -> None:
+    """A list shown between two frames would differ from the track, or move it."""
+    asked, other = ByteTracker(fps=15), ByteTracker(fps=15)
+    detections = scene(seed)
+    for tracker in (asked, other):
+        run(tracker, detections[:-1], every=2)
+    before = other.update(detections[-1], frame_index=20)
+    assert asked.update(detections[-1], frame_index=20).ids.tolist() == before.ids.tolist()
+    shown = asked.extrapolated(frame_index=20 + ahead)
+    asked.extrapolated(frame_index=50)
+    foreseen = other.predict(frame_index=20 + ahead) if ahead else before
+    assert shown.frame_index == foreseen.frame_index
+    assert shown.ids.tolist() == foreseen.ids.tolist()
+    np.testing.assert_array_equal(shown.boxes_xyxy_px, foreseen.boxes_xyxy_px)
+    assert shown.seen_frames.tolist() == foreseen.seen_frames.tolist()
+    assert not shown.started.any()
+    if ahead < 15:  # further ahead one step ends all tracks where two do not
+        np.testing.assert_array_equal(
+            asked.predict(frame_index=20 + ahead + 1).boxes_xyxy_px,
+            other.predict(frame_index=20 + ahead + 1).boxes_xyxy_px,
+        )
+    asked.predict(frame_index=200)
+    with pytest.raises(ValueError, match="must not be below"):
+        asked.extrapolated(frame_index=20 + ahead)
+
+
+def test_the_class_follows_the_votes() -> None:
+    """A car seen once as a truck would change its label, or a wrong first label would stay for ever."""
+    tracker, box = ByteTracker(fps=30), (0, 0, 40, 40)
+
+    def after(first: int, classes: list[tuple[int, float]]) -> list[int]:
+        return [
+            int(tracker.update(seen(box, confidence=c, class_id=k), frame_index=first + n).class_ids[0])
+            for n, (k, c) in enumerate(classes)
+        ]
+
+    assert after(0, [(2, 0.9), (2, 0.9), (5, 0.3), (2, 0.9)]) == [2, 2, 2, 2]
+    assert after(4, [(7, 0.9)] * 12)[-1] == 7
+
+
+def test_unusable_detections_are_left_out() -> None:
+    """One NaN from a detector would spread to every box."""
+    nan, inf = float("nan"), float("inf")
+    good = (100, 100, 140, 160)
+    bad = [
+        (nan, 0, 1, 1),
+        (0, 0, inf, 9),
+        (-inf, 0, inf, 9),
+        (50, 50, 40, 60),
+        (5, 5, 5, 9),
+        (0, 0, 3e38, 3e38),
+    ]
+    tracker = ByteTracker(fps=30)
+    for k in range(3):
+        detections = seen(good, *bad, (300, 300, 330, 330))
+        detections.confidences[-1] = nan
+        tracks = tracker.update(detections, frame_index=k)
+        assert tracks.ids.tolist() == [1]
+        np.testing.assert_allclose(tracks.boxes_xyxy_px, [good])
+
+
+def test_tiny_boxes_are_not_listed_but_keep_their_id() -> None:
+    """Specks would fill the candidates of the policy."""
+    tracker = ByteTracker(fps=30)
+    assert len(tracker.update(seen((0, 0, 3, 3)), frame_index=0)) == 0
+    small = ByteTracker(TrackerSettings(min_box_area_px2=0), fps=30)
+    assert len(small.update(seen((0, 0, 3, 3)), frame_index=0)) == 1
+
+
+def test_results_do_not_change_afterwards() -> None:
+    """The recording would show the boxes of later frames."""
+    tracker = ByteTracker(fps=30)
+    first = tracker.update(seen((0, 0, 40, 40)), frame_index=0)
+    before = first.boxes_xyxy_px.copy(), first.started.copy(), first.confidences.copy()
+    tracker.update(seen((3, 3, 43, 43), confidence=0.7), frame_index=1)
+    for kept, now in zip(before, (first.boxes_xyxy_px, first.started, first.confidences), strict=True):
+        np.testing.assert_array_equal(kept, now)
+
+
+def test_reset_starts_over_and_instances_do_not_share_ids() -> None:
+    """A second edge on the same ground would take ids away from the first."""
+    a, b = ByteTracker(fps=30), ByteTracker(fps=30)
+    assert a.update(seen((0, 0, 40, 40)), frame_index=5).ids.tolist() == [1]
+    assert b.update(seen((0, 0, 40, 40)), frame_index=5).ids.tolist() == [1]
+    a.reset()
+    assert a.update(seen((0, 0, 40, 40)), frame_index=0).ids.tolist() == [1]
+
+
+def test_wrong_calls_are_refused() -> None:
+    """A frame handed in twice would silently speed everything up."""
+    tracker = ByteTracker(fps=30)
+    tracker.update(Detections.none(), frame_index=3)
+    with pytest.raises(ValueError, match="frame_index is 3"):
+        tracker.predict(frame_index=3)
+    with pytest.raises(ValueError, match="class_ids holds -1"):
+        tracker.update(seen((0, 0, 9, 9), class_id=-1), frame_index=4)
+
+
+@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf")])
+def test_impossible_rates_are_refused(fps: float) -> None:
+    """Lost tracks would be remembered for ever or not at all."""
+    with pytest.raises(ValueError, match="fps is"):
+        ByteTracker(fps=fps)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("track_confidence", 1.5),
+        ("low_confidence", 0.6),
+        ("match_iou", -0.1),
+        ("track_buffer", -1),
+        ("min_box_area_px2", float("nan")),
+        ("search_growth_per_s", -1.0),
+        ("class_decay", 2.0),
+        ("camera_motion", "magic"),
+    ],
+)
+def test_settings_out_of_bounds_are_refused(setting: str, value: object) -> None:
+    """A typing mistake in a configuration would show only as bad tracks."""
+    with pytest.raises(ValueError, match=setting):
+        TrackerSettings(**{setting: value})

@@ -1,0 +1,424 @@
+"""Why there is no link, in words: probes of real listeners, keys read before the start, rights read from the file."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_keys import EXPIRED, Fleet
+from hvt_common.errors import UserError
+from hvt_common.transport.doctor.certificate import KeyPair, TlsFiles
+from hvt_common.transport.doctor.diagnose import LinkWatch, why_unlinked
+from hvt_common.transport.doctor.probe import why_no_link
+from hvt_common.transport.rights import Rights
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings, configure
+from outsider import joined
+from processes import free_ports
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    """An edge and a ground on 127.0.0.1."""
+    fleet = Fleet(tmp_path_factory.mktemp("keys") / "own")
+    fleet.keys("add-edge", "uav-1")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    return fleet
+
+
+def _files(fleet: Fleet, name: str = "uav-1", *, ca: Fleet | None = None) -> TlsFiles:
+    pair = KeyPair(fleet.folder / f"{name}.pem", fleet.folder / f"{name}.key")
+    return TlsFiles(root_ca=(ca or fleet).folder / "ca.pem", connect=pair)
+
+
+@contextmanager
+def _server(answer: bytes | None) -> Iterator[int]:
+    """A TCP server that sends something to who connects, or hangs up, or (None) keeps silent; yields its port."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        stop = threading.Event()
+
+        def serve() -> None:
+            while not stop.is_set():
+                try:
+                    taken, _ = listening.accept()
+                except OSError:
+                    return
+                with taken:
+                    if answer is None:
+                        stop.wait()
+                    else:
+                        taken.sendall(answer)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            stop.set()
+            listening.shutdown(socket.SHUT_RDWR)
+            thread.join(5)
+
+
+# Probes of what is not Zenoh. Those of Zenoh with one fault each are in tests/integration/test_security.py.
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        (b"SSH-2.0-OpenSSH_9.2\r\n", "does not speak TLS: connect to tcp/127.0.0.1:"),
+        (b"", "does not speak TLS: connect to tcp/127.0.0.1:"),
+        (
+            None,
+            "does not answer TLS within 3 s: it is a plain tcp/… port, or the link carries next to nothing",
+        ),
+    ],
+    ids=["another protocol", "hangs up", "silent"],
+)
+def test_a_port_without_tls(fleet: Fleet, answer: bytes | None, says: str) -> None:
+    """Somebody's other service on the port: the user would search among the certificates."""
+    with _server(answer) as port:
+        said = why_no_link(f"tls/127.0.0.1:{port}", _files(fleet))
+    assert said.startswith(f"tls/127.0.0.1:{port}: what listens there ")
+    assert says in said
+
+
+def test_a_plain_endpoint_that_is_something_else(fleet: Fleet) -> None:
+    """A web server on the port is no ground, and says nothing that Zenoh would pass on."""
+    with _server(b"HTTP/1.1 400 Bad Request\r\n\r\n") as port:
+        assert "no Zenoh link comes of it" in why_no_link(f"tcp/127.0.0.1:{port}", TlsFiles())
+
+
+@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+def test_nobody_there(fleet: Fleet, protocol: str, free_port: int) -> None:
+    """The most frequent of all: the ground is not running yet."""
+    said = why_no_link(f"{protocol}/127.0.0.1:{free_port}", _files(fleet))
+    assert said == (
+        f"{protocol}/127.0.0.1:{free_port}: nobody listens on port {free_port} there: is the other side running?"
+    )
+    assert (
+        "nobody listens" in why_no_link(f"{protocol}/[::1]:{free_port}", _files(fleet)) or not socket.has_ipv6
+    )
+
+
+def test_a_name_that_nobody_has(fleet: Fleet) -> None:
+    """A typing error in the host is to be seen as one."""
+    said = why_no_link("tls/no-such-host.invalid:7447", _files(fleet))
+    assert "no machine of the name 'no-such-host.invalid' is known here" in said
+
+
+def test_what_cannot_be_probed_says_so(fleet: Fleet) -> None:
+    """UDP has no connection to refuse: silence would look like a diagnosis that forgot."""
+    assert "cannot be seen from outside" in why_no_link("udp/127.0.0.1:7447", _files(fleet))
+
+
+def test_keys_that_vanish_during_a_flight_are_a_sentence(fleet: Fleet, tmp_path: Path) -> None:
+    """The thread that explains must not die of what it was to explain."""
+    other = fleet.copy(tmp_path / "gone")
+    with _server(b"") as port:
+        settings = other.settings("uav-1", "edge", connect=(f"tls/127.0.0.1:{port}",))
+        (other.folder / "uav-1.key").unlink()
+        assert why_unlinked(settings) == [
+            "the keys of this machine can no longer be read (No such file or directory)"
+        ]
+
+
+def test_two_links_to_one_place_are_explained_once(free_port: int) -> None:
+    """The two endpoints by priority would say the same sentence twice."""
+    endpoints = tuple(f"tcp/127.0.0.1:{free_port}?prio={prio}#so_sndbuf=8192" for prio in ("1-3", "4-7"))
+    (said,) = why_unlinked(LinkSettings("edge", connect=endpoints))
+    assert said.startswith(f"tcp/127.0.0.1:{free_port}: nobody")
+
+
+# The watch
+
+
+def test_the_watch_explains_once_and_is_quiet_when_the_link_comes(
+    free_port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A line a second in the journal of a drone that waits for its ground hides everything else."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    settings = LinkSettings("edge", connect=(endpoint,), name="uav-1")
+    with open_session(settings) as session, LinkWatch(session, settings, served=lambda _: True) as watch:
+        assert watch.trouble == ""
+        _until(lambda: watch.trouble)
+        assert "nobody listens" in watch.trouble
+        with open_session(LinkSettings("ground", listen=(endpoint,))):
+            _until(lambda: not watch.trouble)
+    lines = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert lines == [
+        f"no link: {endpoint}: nobody listens on port {free_port} there: is the other side running?"
+    ]
+
+
+def test_a_second_link_that_does_not_come_is_said_once(
+    free_port: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Answers that were to overtake pictures would wait behind them, and refused calls would cost bytes."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    file = tmp_path / "one.json5"
+    file.write_text("{ transport: { unicast: { max_links: 1 } } }")
+    settings = LinkSettings("edge", connect=(endpoint,), name="uav-1", links=2)
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,), zenoh_config=file)),
+        open_session(settings) as session,
+    ):
+        _until(session.info.links)
+        with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch:
+            _until(lambda: caplog.records)
+            time.sleep(0.6)
+            assert watch.trouble == ""
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said.startswith(
+        "one of the two links is missing: answers and pictures share the other; either the other"
+    )
+
+
+def test_a_guest_with_one_link_is_no_half(
+    free_port: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A viewer that calls with one link would be reported as a loss, and the user search for what is not missing."""
+    own, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    settings = LinkSettings("edge", listen=(own,), connect=(other,), name="uav-1", links=2)
+    with (
+        open_session(LinkSettings("ground", listen=(other,), links=2)),
+        open_session(settings) as session,
+    ):
+        _until(lambda: len(session.info.links()) == 2)
+        with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2) as watch, joined(own):
+            _until(lambda: len(session.info.links()) == 3)
+            time.sleep(1.5)
+            assert watch.trouble == ""
+    assert not caplog.records
+
+
+def _until(true: object, *, within_s: float = 25.0) -> None:
+    deadline_s = time.monotonic() + within_s
+    while not true():  # type: ignore[operator]
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+def _watching() -> bool:
+    return any(one.name == "hvt-link-watch" for one in threading.enumerate())
+
+
+def test_the_watch_ends_with_its_session_and_holds_nobody_up(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C during a visit to a dead address has to end the program at once."""
+    _until(lambda: not _watching())
+    visiting = threading.Event()
+
+    def noted(endpoint: str, files: TlsFiles) -> str:
+        visiting.set()
+        return why_no_link(endpoint, files)
+
+    monkeypatch.setattr("hvt_common.transport.doctor.diagnose.why_no_link", noted)
+    monkeypatch.setattr(
+        "hvt_common.transport.doctor.probe._STEP_S", 60.0
+    )  # the visit lasts until the server goes
+    with _server(None) as port:
+        settings = fleet.settings("uav-1", "edge", connect=(f"tls/127.0.0.1:{port}",))
+        with open_session(settings) as session:
+            with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2):
+                assert visiting.wait(25)
+            assert _watching(), "nobody has waited for the visit"
+    _until(lambda: not _watching())
+
+
+# Keys, before the start
+
+
+def _start(fleet: Fleet, file: Path, *, name: str = "uav-1", listen: bool = False) -> None:
+    endpoint = ("tls/127.0.0.1:9",)
+    settings = LinkSettings(
+        "ground" if listen else "edge",
+        listen=endpoint if listen else (),
+        connect=() if listen else endpoint,
+        zenoh_config=file,
+        name=None if listen else name,
+    )
+    with open_session(settings):
+        pass
+
+
+@pytest.mark.parametrize("side", ["connect", "listen"])
+@pytest.mark.parametrize("part", ["certificate", "private_key"])
+def test_a_file_that_is_missing_is_named_with_its_setting(fleet: Fleet, side: str, part: str) -> None:
+    """Zenoh would go on trying for ever, without a word."""
+    setting = f"{side}_{part}"
+    file = fleet.changed("uav-1", **{setting: "/nowhere/x.pem"})
+    with pytest.raises(
+        UserError, match=rf"^/nowhere/x.pem, the {setting} of --zenoh-config, cannot be read \(No such"
+    ):
+        _start(fleet, file, listen=side == "listen")
+    file = fleet.changed("uav-1", **{setting: None})
+    with pytest.raises(UserError, match=rf"but no {setting}: give both"):
+        _start(fleet, file, listen=side == "listen")
+
+
+def test_a_listener_without_keys_is_refused(fleet: Fleet) -> None:
+    """Zenoh's own words for it are those of a library."""
+    file = fleet.changed("uav-1", listen_certificate=None, listen_private_key=None)
+    with pytest.raises(
+        UserError, match=r"listening on tls/127.0.0.1:9 takes listen_certificate and listen_private"
+    ):
+        _start(fleet, file, listen=True)
+
+
+def test_keys_that_others_can_read_are_warned_of(
+    fleet: Fleet, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The key of a drone copied with mode 644: everything works, for everybody on that machine."""
+    other = fleet.copy(tmp_path / "open")
+    (other.folder / "uav-1.key").chmod(0o644)
+    _start(other, other.file("uav-1"))
+    assert f"{other.folder}/uav-1.key: every user of this machine can read this key" in caplog.text
+    caplog.clear()
+    (other.folder / "uav-1.key").chmod(0o640)  # root:hvt, as the documents say
+    _start(other, other.file("uav-1"))
+    assert caplog.text == ""
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_a_key_that_this_user_cannot_read_is_named(fleet: Fleet, tmp_path: Path) -> None:
+    """The service runs as a user of its own, and the keys were copied by root."""
+    other = fleet.copy(tmp_path / "closed")
+    (other.folder / "uav-1.key").chmod(0)
+    with pytest.raises(
+        UserError, match=r"connect_private_key of --zenoh-config, cannot be read \(Permission denied\)"
+    ):
+        _start(other, other.file("uav-1"))
+
+
+def test_another_machines_key_does_not_pass(fleet: Fleet, tmp_path: Path) -> None:
+    """Half of a copy: the certificate of one machine and the key of another."""
+    file = fleet.changed("uav-1", connect_private_key=str(fleet.folder / "base.key"))
+    with pytest.raises(UserError, match=r"uav-1.pem and .*base.key do not belong together"):
+        _start(fleet, file)
+    text = tmp_path / "text.pem"
+    text.write_text("no key at all")
+    file = fleet.changed("uav-1", connect_certificate=str(text))
+    with pytest.raises(UserError, match="are not a certificate and its key in PEM"):
+        _start(fleet, file)
+    file = fleet.changed("uav-1", root_ca_certificate=str(text))
+    with pytest.raises(UserError, match="root_ca_certificate of --zenoh-config, holds no certificate in PEM"):
+        _start(fleet, file)
+
+
+def test_an_encrypted_key_does_not_ask_for_its_password(fleet: Fleet, tmp_path: Path) -> None:
+    """A service would wait on a terminal that it does not have."""
+    from cryptography.hazmat.primitives import serialization
+
+    plain = (fleet.folder / "uav-1.key").read_bytes()
+    locked = tmp_path / "locked.key"
+    locked.write_bytes(
+        serialization.load_pem_private_key(plain, None).private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.BestAvailableEncryption(b"secret"),
+        )
+    )
+    file = fleet.changed("uav-1", connect_private_key=str(locked))
+    with pytest.raises(UserError, match="this key is encrypted; a key without a password is needed"):
+        _start(fleet, file)
+
+
+def test_an_expired_certificate_is_refused_here_not_there(fleet: Fleet, tmp_path: Path) -> None:
+    """Two years after delivery: the one day on which nobody remembers certificates."""
+    other = fleet.copy(tmp_path / "old")
+    other.reissue("uav-1", now=EXPIRED)
+    with pytest.raises(
+        UserError, match=r"uav-1.pem: this certificate expired on \d{4}-\d\d-\d\d \d\d:\d\d UTC \(it is"
+    ):
+        _start(other, other.file("uav-1"))
+
+
+def test_a_clock_that_is_behind_is_warned_of_and_tried(
+    fleet: Fleet, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A drone without a clock of its own starts in the past and learns the time later: it must not stay down."""
+    import datetime as dt
+
+    other = fleet.copy(tmp_path / "young")
+    other.reissue("uav-1", now=dt.datetime.now(dt.UTC) + dt.timedelta(days=5))
+    _start(other, other.file("uav-1"))
+    assert re.search(r"uav-1.pem: this certificate holds from .* is the clock right\?", caplog.text)
+    caplog.clear()
+    other.reissue("uav-1", now=dt.datetime.now(dt.UTC) - dt.timedelta(days=810))
+    _start(other, other.file("uav-1"))
+    assert "this certificate expires on" in caplog.text
+
+
+def test_an_edge_that_is_not_who_its_certificate_says_is_told(fleet: Fleet) -> None:
+    """It would fly, and all that it sends would be dropped in silence."""
+    with pytest.raises(
+        UserError, match=r"--edge-id uav-2: .*uav-1.pem is the certificate of 'uav-1', which may write"
+    ):
+        _start(fleet, fleet.file("uav-1"), name="uav-2")
+
+
+def test_keys_that_are_not_used_are_not_looked_at(fleet: Fleet, free_port: int) -> None:
+    """The same file on a bench, over plain TCP on loopback, must not need the keys."""
+    file = fleet.changed("uav-1", connect_certificate="/nowhere/x.pem")
+    settings = LinkSettings("edge", connect=(f"tcp/127.0.0.1:{free_port}",), zenoh_config=file, name="uav-2")
+    with open_session(settings):
+        pass
+
+
+def test_a_certificate_reads_the_same_from_both_ends(fleet: Fleet) -> None:
+    """Its name is what access control goes by: read wrongly, a good edge would be refused."""
+    pair = KeyPair(fleet.folder / "base.pem", fleet.folder / "base.key")
+    here, there = pair.read(listens=True), pair.read(listens=False)
+    assert here == there
+    assert (here.name, here.hosts) == ("base", ("base", "127.0.0.1"))
+    assert here.not_after_s - here.not_before_s == pytest.approx(825 * 86_400 + 3600, abs=2)
+
+
+# Rights
+
+
+def _rights(text: str) -> Rights:
+    config = zenoh.Config()
+    config.insert_json5("access_control", text)
+    return Rights.of(config)
+
+
+def test_without_access_control_everything_is_allowed() -> None:
+    """A plain configuration must not be called one without rights."""
+    rights = Rights.of(configure(LinkSettings("ground"))[0])
+    assert rights.knows("anybody")
+    assert rights.allow("anybody", flow="ingress", message="put", key="hvt/uav-1/base")
+    assert rights.allow_somebody(flow="egress", message="query", key="hvt/uav-1/control")
+
+
+def test_rights_are_read_as_zenoh_reads_them() -> None:
+    """A rule read too kindly gives no warning, one read too strictly a false one."""
+    rights = _rights(
+        """{ enabled: true, default_permission: "deny",
+             subjects: [{ id: "a", cert_common_names: ["a", "b"] }, { id: "all" }],
+             rules: [
+               { id: "r", permission: "allow", flows: ["ingress"], messages: ["put"], key_exprs: ["hvt/*/base"] },
+               { id: "no", permission: "deny", flows: ["ingress"], messages: ["put"], key_exprs: ["hvt/x/**"] },
+               { id: "q", permission: "allow", messages: ["query"], key_exprs: ["**"] }],
+             policies: [{ subjects: ["a"], rules: ["r", "no"] }, { subjects: ["all"], rules: ["q"] }] }"""
+    )
+    assert rights.allow("b", flow="ingress", message="put", key="hvt/y/base")
+    assert not rights.allow("b", flow="ingress", message="put", key="hvt/x/base"), (
+        "a refusal goes before a permission"
+    )
+    assert not rights.allow("b", flow="egress", message="put", key="hvt/y/base")
+    assert not rights.allow("c", flow="ingress", message="put", key="hvt/y/base")
+    for flow in ("ingress", "egress"):  # no flow said: both
+        assert rights.allow("c", flow=flow, message="query", key="hvt/y/control")
+    assert rights.knows("c"), "the subject without names is everybody"

@@ -1,0 +1,64 @@
+"""What gives way when far more comes than can be looked at, and that it is told of once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hvt_common.protocol.ledger import Channel, Ledger
+from hvt_common.transport.flood import FloodWatch
+from hvt_common.transport.inbox import Inbox, Received
+
+SECOND_NS = 1_000_000_000
+ITEM = Received("hvt/uav-1/base", b"x" * 100, b"", "", 0)
+
+
+def test_a_flood_is_told_of_once_a_minute_and_never_where_there_is_none():
+    """Nobody would look for who sends it; or the log would be full of it."""
+    watch = FloodWatch(most_per_s=100)
+    for second in range(5):
+        for _ in range(100):
+            assert watch.note("base", now_ns=second * SECOND_NS) is None
+            assert watch.note("status", now_ns=second * SECOND_NS) is None
+    told = [watch.note("base", now_ns=n * SECOND_NS // 500) for n in range(10 * 500, 130 * 500)]
+    assert [n for n in told if n is not None] == [101, 101]
+    first, second = (index for index, n in enumerate(told) if n is not None)
+    assert second - first >= 60 * 500
+
+
+def test_one_row_does_not_keep_the_others_out_of_the_inbox():
+    """Reports by the thousand would take the place of every picture."""
+    inbox = Inbox(capacity=8, overflow="newest", share=0.75)
+    for _ in range(50):
+        inbox.put(replace(ITEM, key="hvt/uav-1/status"))
+    assert (len(inbox), inbox.dropped) == (6, 44)
+    for _ in range(3):
+        inbox.put(ITEM)
+    assert (len(inbox), inbox.dropped) == (8, 45)
+    assert inbox.get(timeout_s=0).key == "hvt/uav-1/status"
+    inbox.put(ITEM)
+    assert [inbox.get(timeout_s=0).key.rpartition("/")[2] for _ in range(8)] == ["status"] * 5 + ["base"] * 3
+    for _ in range(6):
+        inbox.put(ITEM)
+    assert len(inbox) == 6, "what was taken out makes room again"
+
+
+def test_one_row_does_not_take_all_bytes_of_the_inbox():
+    """A few huge messages would do what thousands of small ones may not."""
+    inbox = Inbox(capacity=100, overflow="newest", capacity_bytes=1000, share=0.5)
+    for _ in range(9):
+        inbox.put(ITEM)
+    inbox.put(replace(ITEM, key="hvt/uav-1/roi"))
+    assert (len(inbox), inbox.dropped) == (6, 4)
+
+
+def test_the_account_of_a_flood_stays_small():
+    """A sender whose clock stands still, or who invents reasons, would fill the memory of the ground."""
+    ledger = Ledger()
+    for number in range(150_000):
+        ledger.count(Channel.ROI, payload_bytes=10, attachment_bytes=5, overhead_bytes=5, at_ns=SECOND_NS)
+        ledger.record_fate("received", f"reason {number}")
+    assert len(ledger._pending) + len(ledger._windows.entries) < 140_000
+    assert ledger.line_bytes == 150_000 * 20
+    reasons = ledger.fates("received")
+    assert len(reasons) == 24
+    assert reasons["other"] == 150_000 - 23

@@ -1,0 +1,481 @@
+"""Sessions over real Zenoh on loopback."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.channels import EdgeKeys, Row, selector
+from hvt_common.protocol.messages import BaseHeader, Command, ControlAnswer, ControlRequest, Flags
+from hvt_common.transport.session import (
+    Inbox,
+    LinkSettings,
+    Received,
+    ask,
+    declare_publisher,
+    open_session,
+    serve,
+    subscribe,
+)
+from hvt_common.transport.zenoh_config import configure
+
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "wire.md"
+KEYS = EdgeKeys("uav-1")
+
+
+def wait_for(condition, *, timeout_s: float = 10) -> None:
+    """Poll until true; a test that waits in vain fails here."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+def item(number: int) -> Received:
+    """A message that says its number."""
+    return Received(key="k", payload=bytes((number,)), attachment=b"", encoding="", received_ns=number)
+
+
+@pytest.fixture
+def endpoint(free_port):
+    """A free endpoint on loopback."""
+    return f"tcp/127.0.0.1:{free_port}"
+
+
+def ground(endpoint: str) -> LinkSettings:
+    """The listening side."""
+    return LinkSettings("ground", listen=(endpoint,))
+
+
+def edge(endpoint: str) -> LinkSettings:
+    """The connecting side."""
+    return LinkSettings("edge", connect=(endpoint,))
+
+
+def test_messages_cross_with_attachment_and_encoding(endpoint):
+    """Nothing would arrive, or without what HVT knows about it."""
+    inbox = Inbox(capacity=8, overflow="newest")
+    with open_session(ground(endpoint)) as listener, open_session(edge(endpoint)) as connector:
+        subscriber = subscribe(listener, selector(Row.BASE, edges="uav-*"), inbox=inbox)
+        publisher = declare_publisher(connector, Row.BASE, keys=KEYS)
+        other = declare_publisher(connector, Row.BASE, keys=EdgeKeys("rover-1"))
+        wait_for(lambda: publisher.matching_status.matching)
+        keyframe = bytes(range(256)) * 400
+        publisher.put(keyframe, attachment=b"header")
+        other.put(b"not asked for")
+        publisher.put(b"second", attachment=b"")
+        first, second = inbox.get(timeout_s=5), inbox.get(timeout_s=5)
+        assert inbox.get(timeout_s=0.1) is None
+        assert not other.matching_status.matching
+        subscriber.undeclare()
+    assert (first.key, first.payload, first.attachment) == ("hvt/uav-1/base", keyframe, b"header")
+    assert first.encoding == "video/h265"
+    assert (second.payload, second.attachment) == (b"second", b"")
+    assert 0 <= second.received_ns - first.received_ns < 60_000_000_000
+
+
+def test_the_edge_may_start_first(endpoint):
+    """Whoever starts the drone before the ground station would have to start it again."""
+    with open_session(edge(endpoint)) as connector:
+        publisher = declare_publisher(connector, Row.BASE, keys=KEYS)
+        publisher.put(b"nobody hears this")
+        inbox = Inbox(capacity=8, overflow="newest")
+        for _ in range(2):  # and the ground may come and go
+            with open_session(ground(endpoint)) as listener:
+                subscriber = subscribe(listener, selector(Row.BASE), inbox=inbox)
+                wait_for(lambda: publisher.matching_status.matching)
+                publisher.put(b"heard")
+                assert inbox.get(timeout_s=5).payload == b"heard"
+                subscriber.undeclare()
+            wait_for(lambda: not publisher.matching_status.matching)
+
+
+def test_questions_are_answered_and_silence_ends(endpoint):
+    """A ground that joins late would wait for ever for an edge that is not there."""
+    with open_session(ground(endpoint)) as listener, open_session(edge(endpoint)) as connector:
+        answers = {b"size?": b"1280x720"}
+        queryable = serve(connector, Row.INFO, keys=KEYS, answer=answers.get)
+        wait_for(lambda: ask(listener, Row.INFO, keys=KEYS, question=b"size?", timeout_s=1) == b"1280x720")
+        assert ask(listener, Row.INFO, keys=KEYS, question=b"other?", timeout_s=1) is None
+        assert ask(listener, Row.CONTROL, keys=KEYS, question=b"size?", timeout_s=1) is None
+        queryable.undeclare()
+
+
+@pytest.mark.parametrize(("overflow", "left"), [("newest", [0, 1, 2]), ("oldest", [2, 3, 4])])
+def test_a_full_inbox_drops_what_was_declared(overflow, left):
+    """Memory would grow with a slow consumer, or Zenoh's callback would stall every other stream."""
+    inbox = Inbox(capacity=3, overflow=overflow)
+    for number in range(5):
+        inbox.put(item(number))
+    assert (len(inbox), inbox.dropped) == (3, 2)
+    assert [inbox.get(timeout_s=0).received_ns for _ in range(3)] == left
+    assert inbox.get(timeout_s=0) is None
+
+
+def test_closing_an_inbox_wakes_its_reader():
+    """The process would hang at its end."""
+    inbox = Inbox(capacity=3, overflow="newest")
+    got = []
+    reader = threading.Thread(target=lambda: got.append(inbox.get(timeout_s=60)))
+    reader.start()
+    inbox.close()
+    reader.join(10)
+    assert got == [None]
+
+
+def test_no_shared_memory_no_scouting_no_open_door():
+    """Byte counts would lie, strangers would find the session, or it would listen on every address."""
+    config, listen = configure(LinkSettings("edge", connect=("tcp/192.0.2.1:7447",)))
+    assert config.get_json("transport/shared_memory/enabled") == "false"
+    assert config.get_json("scouting/multicast/enabled") == "false"
+    assert config.get_json("scouting/gossip/enabled") == "false"
+    assert config.get_json("listen/endpoints") == "[]"
+    assert listen == ()
+
+
+def test_roles_have_an_endpoint_of_their_own():
+    """The two commands without options would not find each other."""
+    config, listen = configure(LinkSettings("ground"))
+    assert listen == ("tcp/127.0.0.1:7447",)
+    assert config.get_json("connect/endpoints") == "[]"
+    config, listen = configure(LinkSettings("edge"))
+    assert listen == ()
+    assert config.get_json("connect/endpoints") == '["tcp/127.0.0.1:7447"]'
+
+
+def test_the_users_file_goes_before_our_defaults_and_after_our_arguments(tmp_path):
+    """A tuned link would run with other settings than its file says."""
+    path = tmp_path / "zenoh.json5"
+    path.write_text(
+        """{ // comments are fine
+          listen: { endpoints: ["tcp/127.0.0.1:7001"] },
+          connect: { endpoints: ["tcp/192.0.2.9:7002"] },
+          transport: { link: { tx: { lease: 1234, queue: { size: { data_high: 9 } } } } },
+        }"""
+    )
+    config, listen = configure(LinkSettings("edge", connect=("tcp/192.0.2.1:7447",), zenoh_config=path))
+    assert config.get_json("connect/endpoints") == '["tcp/192.0.2.1:7447"]'
+    assert listen == ("tcp/127.0.0.1:7001",)
+    assert config.get_json("transport/link/tx/lease") == "1234"
+    assert config.get_json("transport/link/tx/queue/size/data_high") == "9"
+    assert config.get_json("transport/link/tx/queue/size/background") == "1"
+    assert config.get_json("transport/shared_memory/enabled") == "false"
+
+
+def _links(settings):
+    config, _ = configure(settings)
+    return json.loads(config.get_json("connect/endpoints")), config.get_json("transport/unicast/max_links")
+
+
+def test_two_links_by_priority_are_asked_for_only_where_wanted(tmp_path):
+    """A second connection costs a handshake and keep-alives that the budget does not count."""
+    there = (
+        "tcp/192.0.2.1:7447",
+        "tls/192.0.2.1:7448#so_sndbuf=1",
+        "tcp/192.0.2.1:1?prio=2-7",
+        "udp/192.0.2.1:1",
+    )
+    assert _links(LinkSettings("edge", connect=there)) == (list(there), "1")
+    split = [
+        *("tcp/192.0.2.1:7447?prio=1-3", "tcp/192.0.2.1:7447?prio=4-7"),
+        *("tls/192.0.2.1:7448?prio=1-3#so_sndbuf=1", "tls/192.0.2.1:7448?prio=4-7#so_sndbuf=1"),
+        *there[2:],
+    ]
+    assert _links(LinkSettings("edge", connect=there, links=2)) == (split, "2")
+    assert _links(LinkSettings("asker", connect=there))[0] == list(there)
+    path = tmp_path / "two.json5"
+    path.write_text("{ transport: { unicast: { max_links: 2 } } }")
+    assert _links(LinkSettings("edge", connect=there, zenoh_config=path)) == (split, "2")
+    assert _links(LinkSettings("ground"))[1] == "2", "who listens takes two from whoever asks"
+
+
+def test_tls_links_do_not_hide_seconds_of_video_in_the_kernel():
+    """The socket of a full TLS link would grow to megabytes, and every picture be seconds old."""
+    config, _ = configure(LinkSettings("edge"))
+    for protocol in ("tcp", "tls"):
+        assert config.get_json(f"transport/link/{protocol}/so_sndbuf") == "65536"
+
+
+def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
+    """Answers would wait behind pictures although two links were asked for, or a row would be lost between them."""
+    with open_session(ground(endpoint)) as listener:
+        inbox = Inbox(capacity=64, overflow="newest")
+        subscriber = subscribe(listener, "hvt/uav-1/*", inbox=inbox)
+        with open_session(LinkSettings("edge", connect=(endpoint,), links=2)) as connector:
+            queryable = serve(connector, Row.INFO, keys=KEYS, answer=lambda question: question)
+            wait_for(lambda: all(len(session.info.links()) == 2 for session in (connector, listener)))
+            for session in (connector, listener):
+                assert sorted(one.priorities for one in session.info.links()) == [(1, 3), (4, 7)]
+            rows = (Row.BASE, Row.ROI, Row.TRACKS, Row.PAST, Row.STATUS)
+            publishers = {row: declare_publisher(connector, row, keys=KEYS) for row in rows}
+            wait_for(lambda: all(one.matching_status.matching for one in publishers.values()))
+            for row, publisher in publishers.items():
+                publisher.put(str(row).encode())
+            came = {inbox.get(timeout_s=5).payload.decode() for _ in rows}
+            assert came == {str(row) for row in rows}
+            assert ask(listener, Row.INFO, keys=KEYS, question=b"who?", timeout_s=5) == b"who?"
+            queryable.undeclare()
+        subscriber.undeclare()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{\n mode: "peer",\n foo: ]\n}', r"zenoh\.json5:3: not JSON5: Unexpected .\]. at column 7$"),
+        ("{", r"zenoh\.json5(:\d+)?: not JSON5: "),
+        ("[]", r"zenoh\.json5: a Zenoh configuration is an object in braces, this is a list$"),
+        (
+            "{\n transport: {\n  unicast: { max_linkss: 2 } } }",
+            r"zenoh\.json5:3: Zenoh does not accept it: unknown field `max_linkss`$",
+        ),
+        ('{\n mode: "pear" }', r"zenoh\.json5:2: Zenoh does not accept it: unknown variant `pear`$"),
+        (
+            '{ listen: { endpoints: ["tcp"] } }',
+            r"zenoh\.json5: Zenoh does not accept it: .*Endpoints must be",
+        ),
+        ("[" * 100_000, r"zenoh\.json5: not JSON5: "),
+    ],
+)
+def test_a_broken_file_is_one_sentence_with_its_line(tmp_path, text, said):
+    """The user would search a hundred lines for a missing brace."""
+    path = tmp_path / "zenoh.json5"
+    path.write_text(text)
+    with pytest.raises(UserError, match=said) as caught:
+        configure(LinkSettings("edge", zenoh_config=path))
+    assert "\n" not in str(caught.value)
+    assert ".rs:" not in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read_is_one_sentence(tmp_path):
+    """The user would see a traceback for a typo in a name."""
+    with pytest.raises(UserError, match=r"nowhere\.json5: cannot read the Zenoh configuration: No such file"):
+        configure(LinkSettings("edge", zenoh_config=tmp_path / "nowhere.json5"))
+    with pytest.raises(UserError, match="Is a directory"):
+        configure(LinkSettings("edge", zenoh_config=tmp_path))
+    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UserError, match="not UTF-8 text"):
+        configure(LinkSettings("edge", zenoh_config=tmp_path / "binary"))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "",
+        "tcp",
+        "127.0.0.1:7447",
+        "tcp/127.0.0.1",
+        "tcp/:7447",
+        "http/127.0.0.1:80",
+        "tcp/127.0.0.1:0",
+        "tcp/127.0.0.1:65536",
+        "tcp/127.0.0.1:x",
+        "tcp/a b:1",
+        "tcp//127.0.0.1:7447",
+        "tcp/127.0.0.1:1\n",
+    ],
+)
+def test_an_endpoint_that_is_none_is_one_sentence(wrong):
+    """Zenoh would say it in terms of its own source, or not at all."""
+    for settings in (LinkSettings("edge", connect=(wrong,)), LinkSettings("ground", listen=(wrong,))):
+        with pytest.raises(UserError, match="PROTOCOL/HOST:PORT is accepted"):
+            configure(settings)
+
+
+@pytest.mark.parametrize(
+    "right",
+    ["tcp/[::1]:7447", "udp/localhost:1?rel=1", "tls/127.0.0.1:65535", "tcp/127.9.9.9:7447#so_sndbuf=8192"],
+)
+def test_loopback_endpoints_are_accepted(right):
+    """A valid endpoint would be refused."""
+    assert configure(LinkSettings("ground", listen=(right,)))[1] == (right,)
+
+
+@pytest.mark.parametrize(
+    "open_door", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "udp/192.0.2.7:7447", "tls/drone.example:7447"]
+)
+def test_listening_beyond_loopback_needs_keys_or_consent(open_door, tmp_path):
+    """Anybody on the network could watch the video and command the edge."""
+    with pytest.raises(UserError, match=r"without keys .* accept it with --insecure"):
+        configure(LinkSettings("ground", listen=(open_door,)))
+    assert configure(LinkSettings("ground", listen=(open_door,), insecure=True))[1] == (open_door,)
+    path = tmp_path / "file.json5"
+    path.write_text(f'{{ listen: {{ endpoints: {{ peer: ["{open_door}"] }} }} }}')
+    with pytest.raises(UserError, match="without keys"):
+        configure(LinkSettings("ground", zenoh_config=path))
+    path.write_text("{ transport: { link: { tls: { enable_mtls: true } } } }")
+    settings = LinkSettings("ground", listen=(open_door,), zenoh_config=path)
+    if open_door.startswith("tls/"):
+        assert configure(settings)[1] == (open_door,)
+    else:
+        with pytest.raises(UserError, match="without keys"):
+            configure(settings)
+
+
+def test_a_port_in_use_names_the_endpoint():
+    """The second ground on a machine would end in a traceback, or run and hear nothing."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(UserError, match=f"^cannot listen on {endpoint}: the port is in use;"):
+            open_session(ground(endpoint)).__enter__()
+
+
+def test_an_address_of_another_machine_is_one_sentence():
+    """The same for a mistyped address."""
+    settings = LinkSettings("ground", listen=("tcp/192.0.2.1:7447",), insecure=True)
+    with pytest.raises(UserError, match="this machine has no such address"):
+        open_session(settings).__enter__()
+
+
+LISTENER = """
+    import sys, time
+    from hvt_common.transport.session import *
+    from hvt_common.protocol.channels import *
+    with open_session(LinkSettings("ground", listen=(sys.argv[1],))) as session:
+        inbox = Inbox(capacity=8, overflow="oldest")
+        subscriber = subscribe(session, selector(Row.BASE), inbox=inbox)
+        print("up", flush=True)
+        time.sleep(120)
+"""
+STUCK_SENDER = """
+    import sys, threading, time
+    from hvt_common.transport.session import *
+    from hvt_common.protocol.channels import *
+    with open_session(LinkSettings("edge", connect=(sys.argv[1],))) as session:
+        publisher = declare_publisher(session, Row.BASE, keys=EdgeKeys("uav-1"))
+        while not publisher.matching_status.matching:
+            time.sleep(0.01)
+        print("up", flush=True)
+        sys.stdin.readline()
+        count = 0
+        def send():
+            global count
+            while True:
+                publisher.put(bytes(5000))
+                count += 1
+        threading.Thread(target=send, daemon=True).start()
+        last = -1
+        while count != last:  # until put blocks
+            last = count
+            time.sleep(0.2)
+        print("stuck", flush=True)
+        if sys.argv[2] == "raise":
+            raise RuntimeError("on purpose")
+    print("closed", flush=True)
+"""
+
+
+def start(code: str, *arguments: str) -> subprocess.Popen:
+    """A process of its own, as the two sides are."""
+    return subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code), *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("way", ["leave", "raise"])
+def test_leaving_a_dead_link_ends_the_process(endpoint, way):
+    """Ctrl-C in the field would hang for as long as the link is stuck: Zenoh alone takes 10 s and then raises."""
+    listener = start(LISTENER, endpoint)
+    try:
+        assert listener.stdout.readline() == "up\n"
+        sender = start(STUCK_SENDER, endpoint, way)
+        assert sender.stdout.readline() == "up\n"
+        os.kill(listener.pid, signal.SIGSTOP)
+        sender.stdin.write("go\n")
+        sender.stdin.flush()
+        out, err = sender.communicate(timeout=30)
+    finally:
+        listener.kill()
+        listener.communicate()
+    if way == "raise":
+        assert sender.returncode == 1
+        assert err.rstrip().endswith("RuntimeError: on purpose")
+    else:
+        assert (sender.returncode, out.split()) == (0, ["stuck", "closed"])
+
+
+@pytest.mark.integration
+def test_interrupting_a_subscriber_ends_it(endpoint):
+    """A callback subscriber that is not closed hangs at exit."""
+    listener = start(LISTENER, endpoint)
+    assert listener.stdout.readline() == "up\n"
+    listener.send_signal(signal.SIGINT)
+    _, err = listener.communicate(timeout=20)
+    assert err.rstrip().endswith("KeyboardInterrupt")
+
+
+@pytest.mark.integration
+def test_the_subscriber_of_the_document_writes_the_video(endpoint, tmp_path):
+    """Whoever copies it would get nothing, or garbage after the first loss."""
+    code = re.search(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)[1]
+    asked = threading.Event()
+
+    def answer(question: bytes) -> bytes:
+        if ControlRequest.parse(question).command == Command.KEYFRAME:
+            asked.set()
+        return ControlAnswer(
+            session_id=7, accepted=True, reason="", still_ask=-1, frame_index=-1, tracks=()
+        ).pack()
+
+    with open_session(LinkSettings("edge", listen=(endpoint,))) as session:
+        publisher = declare_publisher(session, Row.BASE, keys=KEYS)
+        queryable = serve(session, Row.CONTROL, keys=KEYS, answer=answer)
+        reader = start(code, endpoint, "uav-1", str(tmp_path / "out.hevc"))
+        try:
+            assert asked.wait(20)
+            wait_for(lambda: publisher.matching_status.matching)
+            # Sequence 1 comes without a keyframe before it, 4 is lost, 5 depends on it, 8 is corrupt.
+            for sequence, keyframe, kept in [
+                (1, False, False),
+                (2, True, True),
+                (3, False, True),
+                (5, False, False),
+                (6, True, True),
+                (7, False, True),
+                (8, False, False),
+                (9, False, False),
+                (10, True, True),
+            ]:
+                payload = f"{'+' if kept else '-'}{sequence}".encode()
+                header = BaseHeader(
+                    session_id=7,
+                    sequence=sequence,
+                    frame_index=sequence,
+                    capture_ns=time.time_ns(),
+                    send_delay_ns=0,
+                    flags=Flags.KEYFRAME if keyframe else 0,
+                ).pack(payload)
+                publisher.put(b"-x" if sequence == 8 else payload, attachment=header)
+            wait_for(lambda: (tmp_path / "out.hevc").read_bytes().endswith(b"+10"))
+        finally:
+            reader.kill()
+            _, err = reader.communicate()
+        queryable.undeclare()
+    assert (tmp_path / "out.hevc").read_bytes() == b"+2+3+6+7+10", err
+
+
+def test_zenoh_still_calls_the_encodings_as_the_ledger_does():
+    """The overhead formula gives 1 byte to encodings that Zenoh has a number for."""
+    from hvt_common.protocol.ledger import _STANDARD_ENCODINGS
+
+    known = {str(value) for value in vars(zenoh.Encoding).values() if isinstance(value, zenoh.Encoding)}
+    assert known >= _STANDARD_ENCODINGS

@@ -1,0 +1,105 @@
+"""The decoder of the base stream, fed by the real encoder."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from clips import framed, smooth_pictures
+from hvt_common.video.hevc import MAX_SIDE_PX, BaseDecoder
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+
+SIZE = (320, 192)
+
+
+def coded(count: int, *, keyframes: tuple[int, ...] = (), size: tuple[int, int] = SIZE) -> list[bytes]:
+    """Access units of a small easy clip."""
+    encoder = BaseEncoder(EncoderSettings(size=size, fps=15, bitrate_bps=300_000, preset="ultrafast"))
+    return [
+        encoder.encode(frame, keyframe=frame.index in keyframes).data
+        for frame in framed(smooth_pictures(count, size=size))
+    ]
+
+
+def test_every_unit_gives_its_picture_at_once():
+    """The picture would lag behind the flight, and a still's base crop would be that of another frame."""
+    decoder = BaseDecoder()
+    for index, data in enumerate(coded(12)):
+        picture = decoder.decode(data)
+        assert picture is not None
+        assert picture.shape == (192, 320, 3)
+        assert picture.dtype == np.uint8
+        red = np.argwhere((picture[..., 2] > 180) & (picture[..., 0] < 90) & (picture[..., 1] < 110))
+        assert abs(red[:, 1].min() - 7 * index) <= 3, "the square is where this very frame had it"
+
+
+def test_colours_come_back_without_a_shift():
+    """Every pixel would be two levels off: 0.9 dB that the bits have paid for."""
+    pictures = smooth_pictures(6, size=SIZE)
+    decoder = BaseDecoder()
+    for picture, data in zip(pictures, coded(6), strict=True):
+        error = decoder.decode(data).astype(np.float64) - picture
+    assert np.abs(error.mean(axis=(0, 1))).max() < 0.35
+    assert 10 * np.log10(255**2 / (error**2).mean()) > 36
+
+
+def test_garbage_gives_nothing_and_a_keyframe_mends_it():
+    """One bad message would end the ground or freeze its picture for the rest of the flight."""
+    units = coded(8, keyframes=(4,))
+    decoder = BaseDecoder()
+    assert decoder.decode(b"") is None
+    assert decoder.decode(b"\x00\x00\x01 no access unit at all" * 9) is None
+    assert decoder.decode(units[0]) is not None
+    decoder.reset()
+    assert decoder.decode(units[4]) is not None
+    assert decoder.decode(units[5]) is not None
+
+
+def test_without_its_keyframe_a_unit_gives_nothing():
+    """A ground that joined late would be shown grey smear as if it were the picture."""
+    decoder = BaseDecoder()
+    assert [decoder.decode(data) for data in coded(4)[1:]] == [None, None, None]
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_damaged_units_never_raise(data):
+    """A flipped bit on the way would end the process; what it decodes to is for the checksum to prevent."""
+    units = _UNITS
+    which = data.draw(st.integers(0, len(units) - 1))
+    broken = bytearray(units[which])
+    for _ in range(data.draw(st.integers(1, 6))):
+        broken[data.draw(st.integers(0, len(broken) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    cut = data.draw(st.integers(0, len(broken)))
+    decoder = BaseDecoder()
+    for index, unit in enumerate(units):
+        picture = decoder.decode(bytes(broken[:cut]) if index == which else unit)
+        assert picture is None or picture.ndim == 3
+
+
+_UNITS = coded(4)
+
+
+def test_an_oversized_picture_is_not_taken():
+    """A few hostile bytes would make the ground reserve gigabytes."""
+    encoder = av.CodecContext.create("libx265", "w")
+    encoder.width, encoder.height, encoder.pix_fmt = MAX_SIDE_PX + 64, 64, "yuv420p"
+    encoder.time_base = Fraction(1, 15)
+    encoder.options = {"preset": "ultrafast", "tune": "zerolatency", "x265-params": "log-level=none"}
+    picture = av.VideoFrame(MAX_SIDE_PX + 64, 64, "yuv420p")
+    picture.pts = 0
+    units = [bytes(packet) for packet in encoder.encode(picture)]
+    assert BaseDecoder().decode(b"".join(units)) is None
+    assert BaseDecoder().decode(coded(1)[0]) is not None
+
+
+@pytest.mark.parametrize("size", [(64, 64), (322, 178), (1920, 1080)])
+def test_sizes_that_are_no_multiple_of_a_coding_block_are_cut_right(size):
+    """The picture would have the encoder's padding at its right and lower border."""
+    picture = BaseDecoder().decode(coded(1, size=size)[0])
+    assert picture.shape == (size[1], size[0], 3)

@@ -1,0 +1,364 @@
+"""What was kept comes back in pieces, until a ground has it: a real store, a real assembly, a link that loses."""
+
+from __future__ import annotations
+
+import logging
+import random
+from collections import Counter
+
+import pytest
+
+from hvt_common.protocol.messages import MAX_PAST_HAVES, PastHave, PastHeader, PastKind, parse_past_units
+from hvt_edge.backlog.backfill import Backfill, Piece
+from hvt_ground.backlog import PastAssembly, past_content
+from kept import UNITS, S, add_stills, add_units, opened, shifted
+
+RTT = 100_000_000
+
+
+class Ground:
+    """The receiving half, as `hvt_ground` has it; what came is kept by key."""
+
+    def __init__(self, receiver_id: int = 1) -> None:
+        self.receiver_id = receiver_id
+        self.assembly = PastAssembly()
+        self.objects: dict[tuple, bytes] = {}
+        self.order: list[tuple] = []
+        self.knows = {7}
+        self.twice = Counter()
+
+    def take(self, piece: Piece) -> None:
+        """A piece arrives."""
+        header = PastHeader(
+            session_id=piece.session_id,
+            kind=piece.kind,
+            number=piece.number,
+            offset=piece.offset,
+            total_bytes=piece.total_bytes,
+            send_ns=1,
+        )
+        whole = self.assembly.piece(PastHeader.parse(header.pack(piece.data), piece.data), piece.data)
+        if whole is None:
+            return
+        key = (piece.session_id, piece.kind, piece.number)
+        if piece.kind == PastKind.INFO:
+            self.knows.add(piece.session_id)
+        elif piece.session_id not in self.knows:
+            self.assembly.want_info(piece.session_id)
+            self.assembly.settle(key, usable=False)
+            return
+        past_content(key, whole, edge="uav-1") if piece.kind != PastKind.INFO else None
+        self.twice[key] += 1
+        self.objects[key] = whole
+        self.order.append(key)
+        self.assembly.settle(key, usable=True)
+
+
+class Rig:
+    """A store, its backfill, a link of 100 kB/s, and a ground that reports five times a second."""
+
+    def __init__(self, folder, *, session_id: int = 7, loss: float = 0.0, seed: int = 0) -> None:
+        self.folder = folder
+        self.done: list[tuple] = []
+        self.backfill = Backfill(
+            folder, session_id=session_id, on_done=lambda entry: self.done.append(entry.key)
+        )
+        self.ground = Ground()
+        self.now_ns = 0
+        self.loss, self.random = loss, random.Random(seed)
+        self.sent: list[Piece] = []
+        self.listening = True
+
+    def run(self, seconds: float, *, piece_bytes: int = 5000, reports: bool = True) -> None:
+        """Time passes."""
+        for step in range(round(seconds * 20)):
+            self.now_ns += S // 20
+            piece = self.backfill.next_piece(piece_bytes, now_ns=self.now_ns, round_trip_ns=RTT)
+            if piece is not None:
+                self.sent.append(piece)
+                if self.listening and self.random.random() >= self.loss:
+                    self.ground.take(piece)
+            if reports and step % 4 == 3 and self.random.random() >= self.loss:
+                self.report()
+
+    def report(self) -> None:
+        """What the ground has to say."""
+        haves = self.ground.assembly.take_haves(MAX_PAST_HAVES)
+        self.backfill.hear(haves, receiver_id=self.ground.receiver_id, now_ns=self.now_ns)
+
+
+def fill(folder, *, stills: int = 6) -> None:
+    """Some stills and three segments."""
+    add_stills(folder, {number: float(number) for number in range(stills)})
+    for part in range(3):
+        add_units(folder, [shifted(unit, 10 * part) for unit in UNITS])
+
+
+def test_stills_come_by_worth_then_video_newest_first_and_the_disk_is_free(tmp_path):
+    """The operator would wait for minutes of road before the one still that matters."""
+    with opened(tmp_path) as folder:
+        fill(folder)
+        rig = Rig(folder)
+        expected = {entry.key: folder.read(entry) for entry in folder.best_stills()}
+        expected |= {entry.key: folder.read(entry) for entry in folder.newest_segments()}
+        rig.run(15)
+        kinds = [(key[1], key[2]) for key in rig.ground.order]
+        assert kinds == [("still", n) for n in (5, 4, 3, 2, 1, 0)] + [("base", n) for n in (300, 150, 0)]
+        assert rig.ground.objects == expected
+        assert rig.done == rig.ground.order
+        assert (folder.stills, folder.segments) == (0, 0)
+        assert set(rig.ground.twice.values()) == {1}
+        assert sum(len(piece.data) for piece in rig.sent) == sum(len(one) for one in expected.values())
+
+
+def test_video_comes_first_where_somebody_asked_for_it(tmp_path):
+    """The command would change nothing."""
+    with opened(tmp_path) as folder:
+        fill(folder)
+        rig = Rig(folder)
+        rig.backfill.video_first = True
+        rig.run(15)
+        assert [key[1] for key in rig.ground.order] == ["base"] * 3 + ["still"] * 6
+
+
+def test_the_facts_of_a_former_session_come_before_its_objects(tmp_path):
+    """The ground would have pictures of a session that it knows nothing of."""
+    with opened(tmp_path) as folder:
+        fill(folder)
+    with opened(tmp_path, session_id=8) as folder:
+        rig = Rig(folder, session_id=8)
+        rig.ground.knows = set()
+        rig.run(16)
+        assert rig.ground.order[0] == (7, "info", 0)
+        assert len(rig.ground.order) == 10
+        assert [one.name for one in tmp_path.iterdir()] == ["lock"], "nothing is left"
+
+
+def test_a_ground_that_asks_for_the_facts_gets_them(tmp_path):
+    """A ground that was started again could make nothing of what comes."""
+    with opened(tmp_path) as folder:
+        fill(folder)
+        rig = Rig(folder)  # it is the present session: its facts are not sent unasked
+        rig.ground.knows = set()
+        rig.run(30)
+        assert (7, "info", 0) in rig.ground.objects
+        assert len(rig.ground.objects) == 10
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.2])
+def test_lost_pieces_and_reports_cost_time_and_nothing_else(tmp_path, loss):
+    """A lossy link would leave holes, or begin everything anew."""
+    with opened(tmp_path) as folder:
+        fill(folder)
+        rig = Rig(folder, loss=loss, seed=3)
+        rig.run(240)
+        assert len(rig.ground.objects) == 9
+        assert (folder.stills, folder.segments) == (0, 0)
+        assert rig.backfill.given_up == 0
+        assert set(rig.ground.twice.values()) == {1}
+
+
+def test_after_an_outage_it_goes_on_where_the_ground_left_off(tmp_path):
+    """Each outage would begin the video of the last one again."""
+    with opened(tmp_path) as folder:
+        add_units(folder, UNITS * 1 + [shifted(unit, 4) for unit in UNITS[:14]])
+        total = len(folder.read(next(folder.newest_segments())))
+        rig = Rig(folder)
+        rig.run(0.6)
+        have = sum(len(piece.data) for piece in rig.sent)
+        assert 0 < have < total
+        rig.backfill.interrupt()
+        rig.run(30)
+        resent = sum(len(piece.data) for piece in rig.sent) - total
+        assert len(rig.ground.objects) == 1
+        assert resent <= 4 * 5000, "what went out before the first report"
+
+
+def test_a_ground_that_was_started_again_gets_it_from_the_beginning(tmp_path):
+    """The object would be complete for the edge and half for the ground."""
+    with opened(tmp_path) as folder:
+        fill(folder, stills=0)
+        rig = Rig(folder)
+        rig.run(0.8)
+        rig.ground = Ground(receiver_id=2)
+        rig.run(60)
+        assert len(rig.ground.objects) == 3
+        for key, data in rig.ground.objects.items():
+            assert parse_past_units(data)[0].frame_index == key[2]
+
+
+def test_what_a_ground_does_not_take_is_put_aside_and_never_deleted(tmp_path, caplog):
+    """One object would hold up all others for ever; or who listens and never answers would empty the store."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0, 2: 0.5})
+        add_units(folder, UNITS)
+        rig = Rig(folder)
+        rig.listening = False
+        with caplog.at_level(logging.WARNING):
+            rig.run(6)
+            assert rig.backfill.given_up == 0
+            rig.run(60)
+        assert rig.backfill.given_up == 3
+        assert Counter(piece.number for piece in rig.sent if piece.offset == 0) == {1: 3, 2: 3, 0: 3}
+        assert (folder.stills, folder.segments) == (2, 1)
+        assert len(list(tmp_path.rglob("*.past"))) == 2
+        assert len(list(tmp_path.rglob("*.mkv"))) == 1
+        assert "3 tries" in caplog.text
+        assert "stays on disk" in caplog.text
+        rig.listening = True
+        rig.ground = Ground(receiver_id=2)
+        rig.ground.assembly.want_info(7)  # its first word
+        rig.report()
+        rig.run(30)
+        assert len([key for key in rig.ground.objects if key[1] != "info"]) == 3, (
+            "another ground is asked again"
+        )
+        assert (folder.stills, folder.segments) == (0, 0)
+
+
+def test_a_ground_that_answers_is_busy_and_not_gone(tmp_path):
+    """A ground that works through what has come would lose all that it has no time for yet."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        rig = Rig(folder)
+        rig.listening = False  # it has no room: the piece is not kept, and it says so
+        key = (7, PastKind.STILL, 1)
+        for _ in range(60):
+            rig.run(1, reports=False)
+            have = PastHave(session_id=7, kind=key[1], number=1, have_bytes=0)
+            rig.backfill.hear([have], receiver_id=1, now_ns=rig.now_ns)
+        assert rig.backfill.given_up == 0
+        rig.listening = True
+        rig.run(5)
+        assert list(rig.ground.objects) == [key]
+        assert folder.stills == 0
+
+
+def test_a_word_that_comes_late_still_counts(tmp_path):
+    """What the ground has would be sent to it again after every start, and fill the disk until then."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        rig = Rig(folder)
+        rig.report()  # it is the one that counts
+        rig.run(30, reports=False)
+        assert rig.backfill.given_up == 1
+        ((_, data),) = rig.ground.objects.items()
+        for have_bytes, left in ((len(data) - 1, 1), (len(data), 0)):
+            have = PastHave(session_id=7, kind=PastKind.STILL, number=1, have_bytes=have_bytes)
+            rig.backfill.hear([have], receiver_id=1, now_ns=rig.now_ns)
+            assert folder.stills == left
+        assert rig.done == [(7, PastKind.STILL, 1)]
+
+
+def test_an_outage_is_no_try(tmp_path):
+    """A flapping link would cost everything that was kept."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        rig = Rig(folder)
+        rig.listening = False
+        for _ in range(10):
+            rig.run(1.5)
+            rig.backfill.interrupt()
+        assert folder.stills == 1
+        rig.listening = True
+        rig.run(3)
+        assert len(rig.ground.objects) == 1
+
+
+def test_reports_of_nonsense_and_of_other_grounds_change_nothing(tmp_path):
+    """Anybody who may report could delete what was kept."""
+    with opened(tmp_path) as folder:
+        add_units(folder, UNITS)
+        rig = Rig(folder)
+        rig.run(0.4)
+        entry = next(folder.newest_segments())
+        total = len(folder.read(entry))
+
+        def have(bytes_: int, *, number: int = 0, kind: str = "base") -> PastHave:
+            return PastHave(session_id=7, kind=kind, number=number, have_bytes=bytes_)
+
+        rig.backfill.hear([have(total)], receiver_id=99, now_ns=rig.now_ns)
+        rig.backfill.hear(
+            [have(total + 1), have(5, number=77), have(0, kind="still"), have(0, kind="info", number=4)],
+            receiver_id=1,
+            now_ns=rig.now_ns,
+        )
+        assert folder.segments == 1
+        rig.run(20)
+        assert len(rig.ground.objects) == 1
+
+
+def test_only_facts_that_are_here_can_be_asked_for(tmp_path):
+    """A flood of reports would fill the memory of the drone with numbers of sessions."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        backfill = Backfill(folder, session_id=7)
+        strangers = [PastHave(session_id=n, kind="info", number=0, have_bytes=0) for n in range(7, 2000)]
+        backfill.hear(strangers, receiver_id=1, now_ns=1)
+        assert backfill._asked == {7}
+
+
+def test_bytes_count_as_arrived_once_whatever_the_link_does(tmp_path):
+    """After each outage the summary would have more come back than was ever kept."""
+    with opened(tmp_path) as folder:
+        add_units(folder, UNITS)
+        total = len(folder.read(next(folder.newest_segments())))
+        rig = Rig(folder)
+        for _ in range(3):
+            rig.run(0.4, piece_bytes=3000)
+            rig.backfill.interrupt()
+        rig.run(30)
+        assert folder.segments == 0
+        assert rig.backfill.acknowledged_bytes == total
+
+
+def test_a_piece_whose_room_was_gone_goes_out_next(tmp_path):
+    """The ground would wait for a hole in the object until the whole of it began again."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        backfill = Backfill(folder, session_id=7)
+        first = backfill.next_piece(1000, now_ns=1, round_trip_ns=RTT)
+        second = backfill.next_piece(600, now_ns=1, round_trip_ns=RTT)
+        backfill.take_back(second)
+        again = backfill.next_piece(2000, now_ns=1, round_trip_ns=RTT)
+        assert (first.offset, again.offset) == (0, second.offset)
+        backfill.interrupt()
+        backfill.take_back(again)  # it was on its way when the link went: nothing to take back
+
+
+def test_memory_holds_one_object(tmp_path):
+    """A store of 200 MB would be read into the memory of a drone."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, dict.fromkeys(range(50), 1.0))
+        for part in range(6):
+            add_units(folder, [shifted(unit, 10 * part) for unit in UNITS])
+        rig = Rig(folder)
+        rig.run(10, reports=False)
+        assert rig.backfill.in_flight == 12, "without a word from the ground no more goes out"
+        assert len(rig.backfill._data[1]) < 200_000
+
+
+def test_a_file_that_goes_while_it_is_sent_stops_nothing(tmp_path):
+    """A full store evicts what is on its way; the next one has to come all the same."""
+    with opened(tmp_path) as folder:
+        fill(folder)
+        rig = Rig(folder)
+        rig.run(1)
+        for entry in [*folder.best_stills(), *list(folder.newest_segments())[:1]]:
+            folder.remove(entry)
+        rig.run(20)
+        assert (folder.stills, folder.segments) == (0, 0)
+        assert {key[2] for key in rig.ground.objects if key[1] == "base"} >= {0, 150}
+
+
+def test_pieces_are_no_smaller_than_they_are_worth(tmp_path):
+    """A link with little room would carry headers."""
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        backfill = Backfill(folder, session_id=7)
+        assert backfill.next_piece(300, now_ns=1, round_trip_ns=RTT) is None
+        assert backfill.next_piece(0, now_ns=1, round_trip_ns=RTT) is None
+        first = backfill.next_piece(1000, now_ns=1, round_trip_ns=RTT)
+        assert (first.offset, len(first.data)) == (0, 1000)
+        rest = first.total_bytes - 1000
+        assert backfill.next_piece(rest, now_ns=1, round_trip_ns=RTT).offset == 1000

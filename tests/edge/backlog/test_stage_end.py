@@ -1,0 +1,260 @@
+"""How the edge leaves a link and comes back to it, and how a run ends: nothing that was admitted may be lost."""
+
+from __future__ import annotations
+
+import pytest
+
+from hvt_common.protocol.channels import Row
+from keeping import STILL, NoStills, Rig
+from kept import S, add_stills, opened
+
+
+def test_what_nobody_acknowledged_is_kept_when_the_run_ends(tmp_path):
+    """A link that breaks a second before the end, or before Ctrl-C, would cost the last second."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 28, reports=True)
+    rig.out.dark = True
+    rig.play(28, 40, reports=True)
+    rig.still(0, utility=2.5)
+    kept = [unit.frame_index for unit in rig.kept()]
+    assert kept == list(range(28, 40))
+    assert rig.kept_stills() == {0: f"still-0-{STILL.capture_ns}-2.5.past"}
+
+
+def test_a_run_that_was_heard_to_its_end_keeps_nothing(tmp_path):
+    """Each demo would leave its last frames in somebody's home, and send them twice."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 28, reports=True)
+    rig.still(0)
+    rig.report()
+    rig.keep.close()
+    assert not (tmp_path / "store").exists()
+
+
+def test_where_no_ground_ever_reports_nothing_is_kept_at_the_end(tmp_path):
+    """Who only listens acknowledges nothing: each run for it would be kept as lost."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 28)
+    assert rig.finish(reports=False) == []
+    rig.keep.close()
+    assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize("adapt", [False, True], ids=["budget", "adapt"])
+def test_frames_and_stills_lost_at_the_end_of_a_clip_come_as_what_was_kept(tmp_path, adapt):
+    """The end of a clip would be missing; with --adapt what was kept would wait for what is lost, for ever."""
+    rig = Rig(tmp_path / "store", adapt=adapt)
+    rig.play(0, 35, reports=True)
+    rig.still(0)
+    rig.report()
+    rig.out.dark = True
+    rig.play(35, 37)
+    rig.still(1)
+    rig.out.dark = False
+    notes = rig.finish()
+    ground = rig.out.ground
+    assert set(ground.past_frames) == set(rig.coded) - ground.frames >= {36}
+    assert ground.past_stills == {1}
+    assert ground.frames >= set(rig.coded) - {35, 36}
+    assert set(ground.twice.values()) == {1}
+    assert len(notes) == 1
+    rig.keep.close()
+    assert not list((tmp_path / "store").rglob("*.past"))
+    assert ("sent", "stored") not in rig.fates, "it counted when it was sent"
+
+
+def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path):
+    """What was kept last would stay on the drone until its next start."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    rig.play(21, 45, linked=False)
+    rig.keep.still(STILL, utility=1.0, now_ns=rig.now_ns)
+    rig.linked = True
+    rig.finish()
+    ground = rig.out.ground
+    assert ground.frames | set(ground.past_frames) == set(range(45))
+    assert {number: ground.past_frames[number] for number in range(21, 45)}.items() <= rig.coded.items()
+    assert ground.past_stills == {STILL.sequence}
+    assert rig.fates == [("sent", "stored")]
+    assert rig.keep.numbers.empty
+    rig.keep.close()
+
+
+def test_the_end_of_a_clip_without_a_link_does_not_wait_for_ever(tmp_path):
+    """A script that plays one clip after the other would hang."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    rig.play(21, 30, linked=False)
+    began_ns = rig.now_ns
+    rig.finish()
+    assert 6 * S <= rig.now_ns - began_ns <= 8 * S
+    assert [unit.frame_index for unit in rig.kept()] == list(range(21, 30)), "they stay for the next start"
+
+
+def test_stills_sent_while_the_link_was_coming_back_are_kept(tmp_path):
+    """They went into the dark, and nobody would know of them."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    rig.play(21, 30, linked=False)
+    assert rig.keep.away
+    rig.still(0, utility=1.5)  # the other thread had not noticed
+    rig.play(30, 31, linked=True)
+    assert not rig.keep.away
+    rig.keep.keep_lost(rig.now_ns)
+    assert rig.kept_stills() == {0: f"still-0-{STILL.capture_ns}-1.5.past"}
+
+
+def test_after_frames_that_were_kept_the_link_goes_on_with_a_keyframe(tmp_path):
+    """The ground would show frames that build on others that it never had."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    rig.play(21, 30, linked=False)
+    rig.admits = lambda _now_ns: len(rig.asked) % 3 == 1  # the link fills between two questions
+    asked = len(rig.asked)
+    rig.play(30, 60, linked=True)
+    assert len(rig.asked) - asked == 30, "once for each frame"
+    after = [header for header in rig.out.base if header.frame_index >= 30]
+    assert after[0].keyframe
+    before = [header for header in rig.out.base if header.frame_index < 30]
+    assert [one.sequence for one in after] == list(
+        range(before[-1].sequence + 1, rig.sender.base_sequence + 1)
+    )
+    first = after[0].frame_index
+    sent = {header.frame_index for header in rig.out.base}
+    assert {unit.frame_index for unit in rig.kept()} >= set(range(21, first)), "until then all is kept"
+    assert not sent & set(range(21, first))
+
+
+def test_a_segment_that_begins_while_the_link_returns_does_not_put_the_picture_off(tmp_path):
+    """The link would be back, and the picture not, until the next keyframe of the plan a minute later."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    rig.play(21, 30, linked=False)
+    rig.admits = lambda _now_ns: False
+    rig.play(30, 32, linked=True)
+    rig.keep._segment_ns = None  # as after ten seconds, or after a frame that the disk refused
+    rig.play(32, 40, linked=True)
+    rig.admits = lambda _now_ns: True
+    rig.play(40, 60, linked=True)
+    after = [header.frame_index for header in rig.out.base if header.frame_index >= 30]
+    assert after == list(range(after[0], 60))
+    assert after[0] <= 50, "within the patience of a keyframe that is due"
+    rig.keep.close()
+
+
+def test_only_to_who_reports_is_anything_sent_that_was_kept(tmp_path):
+    """Whoever listens and never answers would get it all, and a ground would then find the store empty."""
+    with opened(tmp_path / "store", session_id=6) as folder:
+        add_stills(folder, {1: 1.0})
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 60)
+    assert not rig.keep.may_send(rig.now_ns)
+    rig.report()
+    assert rig.keep.may_send(rig.now_ns)
+    assert not rig.keep.may_send(rig.now_ns + 2 * S), "it has fallen silent"
+    rig.keep.close()
+
+
+def test_what_may_be_sent_now_and_how_much(tmp_path):
+    """Backfill would go before the picture, or before a live still."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    assert not rig.keep.may_send(rig.now_ns), "the link is two seconds old at the least"
+    rig.play(21, 60, reports=True)
+    assert rig.keep.may_send(rig.now_ns)
+    rig.keyframes.request(rig.now_ns)
+    assert not rig.keep.may_send(rig.now_ns), "a keyframe is to come"
+    rig.play(60, 75, reports=True)
+    assert rig.keep.may_send(rig.now_ns)
+    assert rig.keep.room_bytes(rig.now_ns, live_waits=False) == 5000, "50 ms of 800 kbps"
+    assert rig.keep.room_bytes(rig.now_ns, live_waits=True) == 1400
+    rig.keep.attend(NoStills(live_waits=True))
+    assert rig.keep.live_waits()
+    for number in range(22):
+        rig.still(number)
+    assert rig.keep.room_bytes(rig.now_ns, live_waits=False) == 0, "a third of the stills' share stays free"
+    assert rig.keep.room_bytes(rig.now_ns, live_waits=True) == 1400
+    rig.play(75, 90, linked=False)
+    assert not rig.keep.may_send(rig.now_ns)
+    rig.keep.close()
+
+
+def test_kept_video_leaves_the_stills_its_share_and_no_more(tmp_path):
+    """With --lend the stills of an outage would take all that the video had: the store would hold stills only."""
+    rig = Rig(tmp_path / "store", lend=True, budget=(400_000, 300_000))
+    rig.play(0, 15, reports=True)
+    stills = 0
+    for first in range(15, 150):
+        rig.play(first, first + 1, linked=False)
+        room = rig.sender.still_room_bytes(rig.now_ns, paced=False)
+        while room >= 1500:
+            rig.keep.still(STILL, utility=1.0, now_ns=rig.now_ns)
+            stills += 1
+            room = rig.sender.still_room_bytes(rig.now_ns, paced=False)
+    video = sum(len(rig.coded[index]) for index in range(15, 150))
+    carry = 2.0 * 100_000 / 8
+    assert stills * 1500 + video <= 9 * 400_000 / 8 + carry
+    assert stills * 1500 >= 9 * 100_000 / 8, "their own share they have"
+    rig.keep.close()
+
+
+def test_in_an_outage_stills_have_the_room_that_the_link_gave_them(tmp_path):
+    """The pacer takes silence for a link of 100 kbps: not one still of the outage would be kept."""
+    rig = Rig(tmp_path / "store", adapt=True)
+    rig.play(0, 21, reports=True)
+    assert rig.sender.total_bps == 800_000
+    rig.out.dark = True
+    rig.play(21, 60)
+    assert rig.keep.away
+    assert rig.follower.pacer.rate_bps == 100_000
+    assert rig.sender.total_bps == 800_000
+    assert rig.sender.still_room_bytes(rig.now_ns, paced=False) > 5_000
+    rig.out.dark = False
+    rig.report()
+    rig.play(60, 62)
+    assert not rig.keep.away
+    assert rig.sender.total_bps == rig.follower.pacer.rate_bps < 800_000, (
+        "the link has to show first what it carries"
+    )
+    rig.keep.close()
+
+
+def test_the_end_of_the_stores_thread_is_noticed_on_a_good_link(tmp_path):
+    """Nothing would be kept in the next outage, and nobody would know."""
+
+    def broken() -> bytes:
+        raise ZeroDivisionError
+
+    rig = Rig(tmp_path / "store", info=broken)
+    rig.play(0, 7, reports=True)
+    rig.keep.still(STILL, utility=1.0, now_ns=rig.now_ns)
+    rig.keep._worker._thread.join(timeout=10)
+    with pytest.raises(ZeroDivisionError):
+        rig.play(7, 8, linked=True)
+    rig.keep.close()
+
+
+def test_stills_of_a_former_run_count_for_that_one(tmp_path):
+    """The summary would have more stills sent than were ever chosen."""
+    with opened(tmp_path / "store", session_id=6) as folder:
+        add_stills(folder, {2**31 + 5: 1.0, 3: 1.0})
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    rig.finish()
+    assert len([key for key in rig.out.ground.twice if key[1] == "still"]) == 2
+    assert rig.keep.numbers.sent_stills == 2
+    assert rig.fates == []
+    rig.keep.close()
+
+
+def test_what_goes_out_of_the_store_is_within_the_budget(tmp_path):
+    """The hard budget would hold for everything but this."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    rig.play(21, 110, linked=False)
+    rig.linked = True
+    rig.finish()
+    assert sum(row is Row.PAST for row, _, _ in rig.out.puts) > 10
+    assert rig.keep.numbers.empty
+    assert rig.ledger.worst_window_bps.total <= 800_000
+    rig.keep.close()

@@ -1,0 +1,288 @@
+"""The threads behind the store: a disk that hangs, a link that is full, a folder that vanishes."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from clips import START_NS
+from hvt_common.protocol.channels import Row
+from hvt_common.protocol.messages import PastHave, PastKind
+from hvt_edge.backlog.backfill import Piece
+from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.intake import EndSegment, Intake, KeptUnit
+from hvt_edge.backlog.outgoing import Outgoing
+from hvt_edge.backlog.worker import StoreWorker
+from keeping import Rig
+from kept import INFO, UNITS, S, add_stills, add_units, opened, shifted
+from processes import eventually
+
+UNIT = KeptUnit(UNITS[0], UNITS[0].data)
+
+
+class Link:
+    """How pieces leave, and what was sent; it may be `full`, so that sending blocks."""
+
+    def __init__(self, *, live_waits: bool = False) -> None:
+        self.waits = live_waits
+        self.full = threading.Event()
+        self.full.set()
+        self.open = True
+        self.gone = 0
+        """So many pieces find that their room is gone."""
+        self.now_ns = START_NS
+        self.sent: list[tuple[int, Piece]] = []
+        self.round_trip_ns, self.total_bps = S // 10, 800_000
+
+    def may_send(self, now_ns: int) -> bool:
+        """Whether the link is there."""
+        return self.open
+
+    def live_waits(self) -> bool:
+        """Whether a live still waits."""
+        return self.waits
+
+    def room_bytes(self, now_ns: int, *, live_waits: bool) -> int:
+        """Of a piece."""
+        return 1400 if live_waits else 5000
+
+    def send(self, piece: Piece, *, now_ns: int) -> int:
+        """Send it."""
+        self.full.wait(timeout=20)
+        if self.gone:
+            self.gone -= 1
+            return 0
+        self.sent.append((now_ns, piece))
+        self.now_ns += S // 1000
+        return len(piece.data) + 60
+
+
+def worker_of(path: Path, link: Link, *, info=INFO.pack, close_s: float = 5.0) -> StoreWorker:
+    """A store with its thread."""
+    return StoreWorker(
+        lambda: Folder(path, max_bytes=50_000_000, session_id=7, info=info),
+        link,
+        session_id=7,
+        clock=lambda: link.now_ns,
+        close_s=close_s,
+    )
+
+
+def test_a_disk_that_hangs_costs_what_waits_and_says_so(tmp_path, caplog):
+    """The edge would never end; or would end and say nothing of what it lost."""
+    disk = threading.Event()
+
+    def slow() -> bytes:
+        disk.wait(timeout=20)
+        return INFO.pack()
+
+    worker = worker_of(tmp_path / "store", Link(), info=slow, close_s=0.3)
+    taken = sum(worker.offer(UNIT) for _ in range(600))
+    assert 512 <= taken <= 513
+    with caplog.at_level(logging.WARNING):
+        worker.close()
+    assert f"{taken - 1} frames and stills" in caplog.text, "one is being written"
+    disk.set()
+    worker._thread.join(timeout=10)
+
+
+def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
+    """The segment would never end, and never be sent: the outage's video would wait for the next one."""
+    disk, link = threading.Event(), Link()
+    link.open = False
+
+    def slow() -> bytes:
+        disk.wait(timeout=20)
+        return INFO.pack()
+
+    worker = worker_of(tmp_path / "store", link, info=slow)
+    units = [shifted(unit, 4 * part) for part in range(10) for unit in UNITS]
+    taken = [unit.frame_index for unit in units if worker.offer(KeptUnit(unit, UNITS[0].data))]
+    worker.end_segment()
+    worker.video_first()
+    disk.set()
+    eventually(
+        lambda: not worker.waiting and worker._folder.open_segments == 0, within_s=20, what="all is kept"
+    )
+    assert worker._backfill.video_first
+    assert not worker.offer(KeptUnit(UNITS[0], b"")) or worker.numbers.segments > 1
+    worker.close()
+    assert len(taken) < len(units)
+    with opened(tmp_path / "store", session_id=8) as folder:
+        assert folder.span_ns > 25 * S
+
+
+def test_one_frame_is_not_nothing(tmp_path):
+    """Who asks for the video would be told that there is none; a clip would end without sending it."""
+    link = Link()
+    link.open = False
+    worker = worker_of(tmp_path / "store", link)
+    assert worker.numbers.empty
+    worker.offer(UNIT)
+    eventually(lambda: not worker.numbers.empty, within_s=10, what="it is there")
+    assert (worker.numbers.segments, worker.numbers.video_s) == (1, 0.0)
+    worker.end_segment()
+    eventually(lambda: worker._folder.segments == 1, within_s=10, what="it is an object")
+    assert not worker.numbers.empty
+    worker.close()
+
+
+def test_the_words_of_a_full_line_are_few():
+    """A link that flaps over a dead disk would fill the memory; or the words would go where frames go."""
+    intake = Intake(2)
+    assert [intake.offer(UNIT) for _ in range(3)] == [True, True, False]
+    for number in range(500):
+        intake.end_segment()
+        intake.interrupt()
+        have = PastHave(session_id=7, kind=PastKind.BASE, number=number, have_bytes=5)
+        intake.hear([have], receiver_id=3)
+    assert len(intake) == 2
+    news, first = intake.take(0.0)
+    assert (news.interrupted, first) == (True, UNIT)
+    assert [have.number for _, have in news.haves] == list(range(436, 500)), "the newest"
+    assert [type(intake.take(0.0)[1]) for _ in range(3)] == [KeptUnit, EndSegment, type(None)]
+    assert not intake.take(0.0)[0].interrupted
+    intake.close()
+    assert not intake.offer(UNIT)
+    assert intake.ended
+
+
+def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
+    """A put may block for seconds: what is seen meanwhile would not be kept."""
+    with opened(tmp_path / "store") as folder:
+        add_units(folder, UNITS)
+    link = Link()
+    link.full.clear()
+    worker = worker_of(tmp_path / "store", link)
+    eventually(lambda: worker._outgoing.busy, within_s=10, what="a piece is being sent")
+    for unit in UNITS[:10]:
+        worker.offer(KeptUnit(shifted(unit, 50), UNITS[0].data))
+    eventually(lambda: worker.numbers.segments == 2 and not worker.waiting, within_s=10, what="it is kept")
+    assert link.sent == []
+    link.full.set()
+    eventually(lambda: len(link.sent) > 3, within_s=10, what="it goes on")
+    worker.close()
+
+
+def test_after_the_last_word_nothing_goes_out(tmp_path):
+    """The last report says how much there was: a ground that has it all would have closed its account already."""
+    with opened(tmp_path / "store") as folder:
+        add_units(folder, UNITS)
+    link = Link()
+    link.full.clear()
+    worker = worker_of(tmp_path / "store", link)
+    eventually(lambda: worker._outgoing.busy, within_s=10, what="a piece is being sent")
+    worker.send_no_more()
+    link.full.set()
+    for unit in UNITS[:10]:
+        worker.offer(KeptUnit(shifted(unit, 50), UNITS[0].data))
+    eventually(lambda: worker.numbers.segments == 2 and not worker.waiting, within_s=10, what="it is kept")
+    worker.close()
+    assert len(link.sent) == 1, "the one that was under way"
+
+
+def test_a_piece_whose_room_is_gone_comes_next_and_no_hole_is_left(tmp_path):
+    """The ground would wait for the hole, and the object begin again."""
+    with opened(tmp_path / "store") as folder:
+        add_units(folder, UNITS)
+    link = Link()
+    link.gone = 3
+    worker = worker_of(tmp_path / "store", link)
+    eventually(lambda: len(link.sent) > 2, within_s=10, what="pieces go out")
+    worker.close()
+    offsets = [(piece.offset, len(piece.data)) for _, piece in link.sent]
+    assert [offset for offset, _ in offsets] == [
+        sum(size for _, size in offsets[:n]) for n in range(len(offsets))
+    ]
+
+
+def test_where_live_stills_always_wait_a_trickle_goes_on(tmp_path):
+    """A busy scene would keep what was admitted before from ever arriving; or be held up by it."""
+    with opened(tmp_path / "store") as folder:
+        add_units(folder, UNITS)
+    link = Link(live_waits=True)
+    worker = worker_of(tmp_path / "store", link)
+    eventually(lambda: len(link.sent) == 1, within_s=10, what="the first piece")
+    for _ in range(40):
+        before = len(link.sent)
+        link.now_ns += S // 10
+        worker._intake.wake()
+        eventually(
+            lambda: worker._intake._woken is False and not worker._outgoing._piece, within_s=5, what="a turn"
+        )
+        assert len(link.sent) - before <= 1
+    worker.close()
+    times = [at_ns for at_ns, _ in link.sent]
+    assert all(later - earlier >= S // 2 for earlier, later in pairwise(times))
+    assert len(times) >= 3
+    assert {len(piece.data) for _, piece in link.sent} == {1400}
+
+
+@pytest.mark.parametrize("then", ["end", "keep"])
+def test_a_folder_that_vanishes_in_mid_flight_ends_nothing(tmp_path, caplog, then):
+    """A stick that is pulled out would end the flight."""
+    link, store = Link(), tmp_path / "store"
+    link.open = False
+    worker = worker_of(store, link)
+    for unit in UNITS[:10]:
+        worker.offer(KeptUnit(unit, UNITS[0].data))
+    eventually(lambda: worker.numbers.video_s > 0.5, within_s=10, what="they are written")
+    shutil.rmtree(store)
+    with caplog.at_level(logging.WARNING):
+        if then == "end":
+            worker.end_segment()
+        worker.offer(KeptUnit(shifted(UNITS[0], 60), UNITS[0].data))
+        eventually(lambda: worker.failed, within_s=10, what="it is noticed")
+        worker.close()
+    assert worker.numbers.empty
+    assert worker.numbers.unreadable == 1
+    assert caplog.text.count("cannot be kept any more") == 1
+
+
+def test_what_a_dying_run_had_kept_is_sent_by_the_next(tmp_path):
+    """An edge that is restarted at once would leave it for another flight."""
+    store, link = tmp_path / "store", Link()
+    with opened(store) as dying:
+        add_stills(dying, {1: 1.0})
+        worker = worker_of(store, link)
+        eventually(lambda: worker._folder is not None, within_s=10, what="it is open")
+        assert worker.numbers.empty
+    link.now_ns += 2 * S
+    eventually(lambda: worker.numbers.stills == 1, within_s=10, what="it asked again")
+    eventually(lambda: link.sent, within_s=10, what="it is sent")
+    worker.close()
+
+
+def test_an_error_in_sending_ends_the_process_too():
+    """Nothing would come back any more, and nobody would know."""
+
+    def broken(_piece: Piece) -> int:
+        raise ZeroDivisionError
+
+    woken = threading.Event()
+    outgoing = Outgoing(broken, on_done=woken.set)
+    outgoing.put(Piece(7, PastKind.STILL, 1, 0, 3, b"abc"))
+    assert woken.wait(timeout=10)
+    with pytest.raises(ZeroDivisionError):
+        outgoing.take()
+    outgoing.close(5.0)
+
+
+def test_the_link_that_blocks_is_the_edges_own(tmp_path):
+    """With the real sender a full link would hold up the disk all the same."""
+    rig = Rig(tmp_path / "store")
+    gate = threading.Event()
+    rig.out.before_put = lambda row: row is not Row.PAST or gate.wait(timeout=20)
+    rig.play(0, 21, reports=True)
+    rig.play(21, 40, linked=False)
+    rig.play(40, 90, linked=True, reports=True)
+    eventually(lambda: rig.keep._worker._outgoing.busy, within_s=10, what="a piece is being sent")
+    rig.play(90, 110, linked=False)
+    eventually(lambda: not rig.keep._worker.waiting, within_s=10, what="frames are kept")
+    gate.set()
+    assert {unit.frame_index for unit in rig.kept()} >= set(range(90, 110))

@@ -1,0 +1,295 @@
+"""What an edge does when it is asked for more, with its real parts and a real budget."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clips import START_NS
+from command_rig import SESSION, TICK_NS, VIEW, Rig, picture
+from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader
+from hvt_common.video.still_codecs import still_codec
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+
+
+def shown(header: RoiHeader, data: bytes) -> np.ndarray:
+    """The decoded crop."""
+    x1, y1, x2, y2 = header.crop_source_px
+    size = header.parameters.get("w", x2 - x1), header.parameters.get("h", y2 - y1)
+    return still_codec(header.codec).decode(data, size=size, parameters=header.parameters)
+
+
+def test_a_box_of_three_seconds_ago_is_cut_from_the_frame_of_then():
+    """The operator would look closer at a place that the object has left long ago."""
+    rig = Rig()
+    rig.run(60)
+    answer = rig.ask("still", x=300, y=200, w=96, h=64, at_ms=-3000, quality=90)
+    assert (answer.accepted, answer.reason, answer.frame_index) == (True, "", 14)
+    rig.run(3)
+    ((header, data),) = rig.asked()
+    assert header.parameters == {"ask": answer.still_ask}
+    assert (header.frame_index, header.crop_source_px, header.track_id) == (14, (300, 200, 396, 264), -1)
+    truth = picture(14)[200:264, 300:396]
+    assert cv2.PSNR(shown(header, data), truth) > 30
+    other = picture(59)[200:264, 300:396]
+    assert cv2.PSNR(shown(header, data), other) < 20
+
+
+def test_a_track_is_found_where_it_was_at_that_frame():
+    """A still of track 5 would show the road that it left."""
+    rig = Rig()
+    rig.run(60)
+    answer = rig.ask("still", track=5, frame=20)
+    rig.run(2)
+    ((header, _),) = rig.asked()
+    assert answer.frame_index == header.frame_index == 20
+    expected = VIEW.to_source(np.array([rig.box(20)], np.float32))[0]
+    assert header.box_source_px == pytest.approx(expected.tolist(), abs=0.1)
+    assert (header.track_id, header.class_name) == (5, "car")
+
+
+def test_what_is_asked_for_goes_before_the_methods_own():
+    """An operator would wait behind what a policy finds interesting."""
+    rig = Rig()
+    rig.run(40, others=True)
+    assert rig.out.stills, "the method does send stills"
+    before = len(rig.out.stills)
+    answer = rig.ask("still", x=0, y=0, w=300, h=300, quality=80)
+    assert answer.accepted
+    rig.run(75, others=True)
+    assert [header.reason for header, _ in rig.out.stills[before : before + 1]] == ["asked"]
+    assert len(rig.out.stills) > before + 1, "and the others go on afterwards"
+    assert rig.fates["sent", "asked"] == 1
+
+
+@pytest.mark.parametrize("codec", ["jpeg", "residual"])
+def test_no_window_exceeds_the_budget_for_it(codec):
+    """A request from afar would buy one picture with the video of everybody."""
+    rig = Rig("200kbps", share=0.8, codec=codec)
+    sent: list[tuple[int, int]] = []
+    record_still, record_base = rig.budget.record_still, rig.budget.record_base
+    rig.budget.record_still = lambda size, now_ns: (
+        sent.append((now_ns, size)),
+        record_still(size, now_ns=now_ns),
+    )
+    rig.budget.record_base = lambda size, now_ns: (
+        sent.append((now_ns, size)),
+        record_base(size, now_ns=now_ns),
+    )
+    for _ in range(12):
+        rig.run(10, others=True)
+        rig.ask("still", quality=95)
+    fullest = max(sum(size for at, size in sent if end - 10**9 < at <= end) for end, _ in sent)
+    assert fullest <= 200_000 / 8
+    assert len(rig.asked()) >= 3
+    assert {header.codec for header, _ in rig.asked()} == {"jpeg"}, "who asks has no base to build on"
+
+
+def test_one_that_never_fits_comes_smaller_within_some_seconds():
+    """Asking for the whole frame on a thin link would never be answered, or block all other stills."""
+    rig = Rig("150kbps", share=0.9)
+    rig.run(40)
+    answer = rig.ask("still", quality=95)
+    rig.run(75)
+    ((header, data),) = rig.asked()
+    assert header.parameters["ask"] == answer.still_ask
+    assert len(data) <= 15_000 / 8
+    assert shown(header, data).shape[1] == header.parameters["w"] < 512
+
+
+REFUSED = [
+    ({"track": 9}, "no track 9 at frame 59: the edge's own tracks there are 5"),
+    ({"track": 5, "at_ms": -9000}, "of 9 s ago is not held: frames go back 2.9 s"),
+    ({"frame": 1000}, "frame 1000 is yet to come: the newest is 59"),
+    ({"x": 900, "y": 0, "w": 100, "h": 10}, "not inside the frame of 960x540 source pixels"),
+    ({"x": -1, "y": 0, "w": 100, "h": 10}, "not inside the frame"),
+    ({"x": 1, "y": 1, "w": 4, "h": 400}, "too small: 8 pixels a side"),
+    ({"x": 1, "y": 1, "w": 40}, "x, y, w and h, all four"),
+    ({"track": 5, "x": 1, "y": 1, "w": 40, "h": 40}, "of a track or of a box"),
+    ({"frame": 5, "at_ms": -5}, "of a frame or of a time"),
+    ({"at_ms": 5}, "at_ms is a whole number from -3600000 to 0"),
+    ({"quality": 100}, "quality is a whole number from 5 to 95"),
+    ({"track": "five"}, "track is a whole number"),
+    ({"zoom": 3}, "still takes no 'zoom'"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "reason"), REFUSED)
+def test_what_cannot_be_served_is_refused_with_the_reason(arguments, reason):
+    """The operator would wait for a picture that never comes."""
+    rig = Rig(ring_s=3.0)
+    rig.run(60)
+    answer = rig.ask("still", **arguments)
+    assert not answer.accepted
+    assert reason in answer.reason
+    rig.run(3)
+    assert rig.asked() == []
+
+
+def test_too_many_and_too_poor_are_refused():
+    """A loop at a ground would fill the drone's memory, or wait for what no budget will ever send."""
+    rig = Rig("150kbps", share=0.9)
+    rig.run(30)
+    answers = [rig.ask("still", quality=95) for _ in range(6)]
+    assert [one.accepted for one in answers] == [True] * 4 + [False] * 2
+    assert "4 stills that were asked for wait already" in answers[-1].reason
+    poor = Rig(name="M0", share=None)
+    poor.run(3)
+    assert "the budget leaves nothing for stills" in poor.ask("still").reason
+
+
+def test_whoever_waits_can_ask_what_became_of_it():
+    """A still that was given up would be waited for until the timeout, and nobody would know why."""
+    rig = Rig("150kbps", share=0.9)
+    rig.run(30)
+    first, second = rig.ask("still", track=5), rig.ask("still", track=5)
+    rig.run(4)
+    assert rig.ask("still-fate", ask=first.still_ask).accepted, "sent or waiting"
+    rig.chooser.close()
+    assert len(rig.asked()) in (1, 2)
+    if len(rig.asked()) == 1:
+        assert "session ended" in rig.ask("still-fate", ask=second.still_ask).reason
+    assert "nothing is known" in rig.ask("still-fate", ask=99).reason
+    assert "session is ending" in rig.ask("still").reason
+
+
+def test_the_tracks_are_those_of_the_newest_frame_in_source_pixels():
+    """The ids that a still can be asked by would be guesswork."""
+    rig = Rig()
+    assert "no frame yet" in rig.ask("tracks").reason
+    rig.run(10)
+    answer = rig.ask("tracks")
+    (track,) = answer.tracks
+    assert (answer.frame_index, track.track_id, track.class_id, track.confidence) == (9, 5, 0, 0.8)
+    expected = VIEW.to_source(np.array([rig.box(9)], np.float32))[0]
+    assert track.box_source_px == pytest.approx(expected.tolist(), abs=0.1)
+
+
+def test_another_budget_counts_from_a_keyframe_that_comes_at_once():
+    """An operator whose link got thin could not say so, or would wait ten seconds for it."""
+    rig = Rig("800kbps")
+    rig.run(20)
+    rig.keyframes.done(rig.now_ns)  # so fresh that a request for a picture would be answered by it
+    assert rig.ask("set-budget", bps=500_000).accepted
+    assert rig.keyframes.due(rig.now_ns)
+    encoder = rig.renewal(1, rig.now_ns)
+    assert encoder is not None
+    assert rig.renewal.base_bps == 375_000
+    assert rig.budget.base_step_bytes == 375_000 / 8 / 15
+    assert rig.commands.config.budget_bps == 500_000
+    assert rig.renewal(1, rig.now_ns) is None, "once"
+
+
+def test_a_budget_that_x265_cannot_follow_is_refused_and_changes_nothing():
+    """The video would overshoot a budget that somebody believes in."""
+    rig = Rig("800kbps")
+    answer = rig.ask("set-budget", bps=20_000)
+    assert "20 kbps would leave 15 kbps for video, and 640x360 at 15 fps takes at least" in answer.reason
+    assert rig.commands.config.budget_bps == 800_000
+    assert rig.renewal(1, rig.now_ns) is None
+    assert not rig.ask("set-budget", bps=0).accepted
+    assert not rig.ask("set-budget", bps=10**12).accepted
+    assert not rig.ask("set-budget").accepted
+
+
+def test_the_budget_cannot_be_changed_all_the_time():
+    """Each change costs a keyframe: a loop at a ground would leave no bits for anything else."""
+    rig = Rig("800kbps")
+    assert rig.ask("set-budget", bps=500_000).accepted
+    assert "wait two seconds" in rig.ask("set-budget", bps=600_000).reason
+    rig.request_ns += 2_000_000_000
+    assert rig.ask("set-budget", bps=600_000).accepted
+
+
+def test_another_method_decides_from_then_on():
+    """Whoever finds out in flight that he needs other stills would have to land."""
+    rig = Rig(name="M0", share=None)
+    rig.run(5)
+    assert rig.ask("set-method", method="m1").accepted
+    assert rig.commands.config.method == "M1"
+    rig.renewal(1, rig.now_ns)
+    assert rig.renewal.base_bps == 0.8125 * 400_000, "stills have their share again"
+    rig.run(60, others=True)
+    assert rig.out.stills
+    rig.request_ns += 2_000_000_000
+    assert rig.ask("set-method", method="M0").accepted
+    sent = len(rig.out.stills)
+    rig.run(30, others=True)
+    assert len(rig.out.stills) <= sent + 1
+    for name in ("M99", "R0"):
+        assert not rig.ask("set-method", method=name).accepted
+    assert rig.commands.config.method == "M0"
+
+
+def test_requests_of_another_session_and_floods_are_refused():
+    """A request that waited on the link would hit the flight after; one loop would keep all others out."""
+    rig = Rig()
+    other = ControlRequest(session_id=SESSION + 1, command=Command.KEYFRAME, arguments={})
+    assert "session has ended" in rig.commands.answer(other).reason
+    mine = replace(other, session_id=0)
+    answers = [rig.commands.answer(mine) for _ in range(40)]
+    assert [one.accepted for one in answers] == [True] * 32 + [False] * 8
+    assert "at most 32 a second" in answers[-1].reason
+    rig.request_ns += 1_000_000_000
+    assert rig.commands.answer(mine).accepted
+
+
+_VALUES = st.integers(-(2**63) + 1, 2**63 - 1) | st.floats(-1e300, 1e300) | st.text("abM150", max_size=8)
+_NAMES = st.sampled_from(
+    ["track", "x", "y", "w", "h", "at_ms", "frame", "quality", "ask", "bps", "method", "zz"]
+)
+HOSTILE = Rig()
+HOSTILE.run(40)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    command=st.sampled_from([*Command, "", "land"]),
+    arguments=st.dictionaries(_NAMES, _VALUES | st.integers(-5, 700), max_size=6),
+)
+def test_no_request_breaks_the_edge(command, arguments):
+    """Anybody with the right to ask could bring the drone's video down with one message."""
+    answer = HOSTILE.ask(command, **arguments)
+    HOSTILE.run(1)
+    assert answer.accepted == (not answer.reason)
+    assert HOSTILE.on_demand.waiting <= 4
+    assert HOSTILE.renewal.count == 0
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    totals=st.lists(st.sampled_from([200_000, 400_000, 800_000, 1_400_000]), min_size=2, max_size=4),
+)
+def test_after_a_change_every_message_keeps_to_the_budget_of_its_own_time(seed, totals):
+    """The link that got thin would go on being flooded for a second after the operator said so."""
+    rng = np.random.default_rng(seed)
+    budget = RollingBudget(BudgetSettings(totals[0], round(0.8 * totals[0]), fps=15))
+    sent: list[tuple[int, int]] = []
+    for tick in range(45 * len(totals)):
+        total, keyframe = totals[tick // 45], tick % 45 == 0
+        now_ns = START_NS + tick * TICK_NS
+        if keyframe and tick:
+            budget.set_total(total, round(0.8 * total), 15.0, now_ns=now_ns)
+        size = int(min(total / 8, 0.8 * total / 8 / 15 * rng.gamma(4, 0.25) * (4 if keyframe else 1)))
+        at_ns = budget.earliest_ns(size, now_ns=now_ns, base=True)
+        if at_ns - now_ns > 100_000_000 and not keyframe:
+            continue  # the frame loop leaves out a frame that would have to wait
+        budget.record_base(size, now_ns=at_ns, keyframe=keyframe)
+        _check(sent, (at_ns, size), total)
+        while (room := budget.still_room(now_ns)) > 300:
+            still = int(rng.integers(300, room + 1))
+            budget.record_still(still, now_ns=now_ns)
+            _check(sent, (now_ns, still), total)
+
+
+def _check(sent: list[tuple[int, int]], message: tuple[int, int], total_bps: int) -> None:
+    """The window that ends with this message holds no more than the budget of its time."""
+    sent.append(message)
+    inside = sum(size for at_ns, size in sent if message[0] - 10**9 < at_ns <= message[0])
+    assert inside <= total_bps / 8

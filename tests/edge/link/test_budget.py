@@ -1,0 +1,388 @@
+"""The hard budget, against brute force over every rolling window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_edge.link.budget import BASE_PEAK, BudgetSettings, RollingBudget
+
+SECOND_NS = 1_000_000_000
+START_NS = 1_790_000_000 * SECOND_NS
+
+
+@dataclass
+class Run:
+    """A budget, and everything that was recorded with it."""
+
+    settings: BudgetSettings
+    own_peak: bool = True
+    """Whether base messages keep the base stream's own peak, as in flight."""
+    events: list[tuple[int, int, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.budget = RollingBudget(self.settings)
+
+    def base(self, size: int, now_ns: int, *, keyframe: bool = False) -> int:
+        """One base message."""
+        at_ns = self.budget.earliest_ns(size, now_ns=now_ns, base=self.own_peak)
+        self.budget.record_base(size, now_ns=at_ns, keyframe=keyframe)
+        self.events.append((at_ns, size, "base"))
+        return at_ns
+
+    def status(self, size: int, now_ns: int) -> None:
+        """One report."""
+        at_ns = self.budget.earliest_ns(size, now_ns=now_ns)
+        self.budget.record_metadata(size, now_ns=at_ns)
+        self.events.append((at_ns, size, "meta"))
+
+    def still(self, size: int, now_ns: int) -> None:
+        """One still."""
+        self.budget.record_still(size, now_ns=now_ns)
+        self.events.append((now_ns, size, "still"))
+
+    def fullest(self, window_ns: int, kinds: tuple[str, ...] = ("base", "meta", "still")) -> int:
+        """Most bytes in any window (t - W, t]; the fullest ends with an event."""
+        chosen = [(at_ns, size) for at_ns, size, kind in self.events if kind in kinds]
+        return max(
+            (sum(size for at_ns, size in chosen if end - window_ns < at_ns <= end) for end, _ in chosen),
+            default=0,
+        )
+
+
+def total_bytes(one: BudgetSettings) -> float:
+    """B_tot times the window."""
+    return one.total_bps * one.window_ns / 8 / SECOND_NS
+
+
+def budgets(
+    *, windows: tuple[float, ...] = (0.5, 1.0, 2.3), lend: bool | None = None
+) -> st.SearchStrategy[BudgetSettings]:
+    """Plausible settings."""
+    return st.builds(
+        lambda total, share, fps, window, metadata, lend: BudgetSettings(
+            total_bps=total,
+            base_bps=round(total * share),
+            fps=fps,
+            window_ns=round(window * SECOND_NS),
+            metadata_bps=metadata,
+            lend=lend,
+        ),
+        st.sampled_from([100_000, 800_000, 1_400_000]),
+        st.floats(0.3, 1.0),
+        st.sampled_from([3.0, 10.0, 15.0, 29.97]),
+        st.sampled_from(windows),
+        st.sampled_from([0, 8_000]),
+        st.booleans() if lend is None else st.just(lend),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(one=budgets(), seed=st.integers(0, 2**32 - 1), burst=st.floats(0.0, 3.0), greed=st.floats(0.1, 1.0))
+def test_no_rolling_window_exceeds_the_total(one, seed, burst, greed):
+    """The link would be asked for more than the user has, in some second of the flight."""
+    rng = np.random.default_rng(seed)
+    run, mean = Run(one), one.base_bps / 8 / one.fps
+    for number in range(min(240, round(6 * one.fps) + 20)):
+        now_ns = START_NS + round(number * SECOND_NS / one.fps)
+        keyframe = number == 0 or rng.random() < 0.02
+        size = mean * rng.gamma(2, 0.5) * (1 + burst * (rng.random() < 0.1)) + (8 * mean if keyframe else 0)
+        size = int(min(size, total_bytes(one)))  # no single message exceeds the window
+        run.base(size, now_ns, keyframe=keyframe)
+        if number % max(1, round(one.fps)) == 0:
+            run.status(400, now_ns)
+        for _ in range(4):
+            room = run.budget.still_room(now_ns)
+            if room < 300:
+                break
+            run.still(int(rng.integers(300, max(300, round(room * greed)) + 1)), now_ns)
+    assert run.fullest(one.window_ns) <= total_bytes(one)
+
+
+@settings(max_examples=40, deadline=None)
+@given(one=budgets(lend=False), seed=st.integers(0, 2**32 - 1))
+def test_stills_keep_to_their_share(one, seed):
+    """Stills would live on what the base leaves, and the base's quality would be paid for twice."""
+    rng = np.random.default_rng(seed)
+    run = Run(one)
+    for number in range(min(240, round(8 * one.fps))):
+        now_ns = START_NS + round(number * SECOND_NS / one.fps)
+        run.base(int(one.base_bps / 8 / one.fps * rng.uniform(0.1, 0.6)), now_ns)  # it leaves a lot
+        while (room := run.budget.still_room(now_ns)) >= 200:
+            run.still(int(rng.integers(200, room + 1)), now_ns)
+    share = one.still_bps / 8
+    for seconds in (one.window_ns / SECOND_NS, 1.0, 4.0):
+        fullest = run.fullest(round(seconds * SECOND_NS), ("still",))
+        assert fullest <= share * (seconds + one.carry_s) + 1
+
+
+@settings(max_examples=60, deadline=None)
+@given(one=budgets(), seed=st.integers(0, 2**32 - 1))
+def test_a_base_message_waits_no_longer_than_a_window_and_keeps_its_order(one, seed):
+    """A picture would come late for nothing, or before the one that it rests on."""
+    rng = np.random.default_rng(seed)
+    run, last_ns = Run(one, own_peak=False), 0
+    for number in range(100):
+        now_ns = START_NS + round(number * SECOND_NS / one.fps)
+        size = int(rng.integers(1, round(total_bytes(one) * 1.3)))
+        ready_ns = max(now_ns, last_ns)
+        before = sum(held for at_ns, held, _ in run.events if at_ns > ready_ns - one.window_ns)
+        at_ns = run.base(size, now_ns)
+        assert ready_ns <= at_ns <= ready_ns + one.window_ns
+        if before + size <= total_bytes(one):
+            assert at_ns == ready_ns, "there was room"
+        elif size <= total_bytes(one):
+            # Just so long, and no longer: a nanosecond earlier the window would have been too full.
+            early = sum(held for other, held, _ in run.events[:-1] if other > at_ns - 1 - one.window_ns)
+            assert early + size > total_bytes(one)
+        last_ns = at_ns
+
+
+def test_messages_of_one_moment_leave_the_window_together():
+    """In lockstep a frame and its stills have one time: frames a second later would wait longer than they must."""
+    run = Run(
+        BudgetSettings(total_bps=80_000, base_bps=40_000, fps=10), own_peak=False
+    )  # 10 000 bytes a window
+    run.still(3_000, START_NS)
+    run.still(3_000, START_NS)
+    run.base(2_000, START_NS + 500_000_000)
+    assert run.base(8_000, START_NS + 600_000_000) == START_NS + SECOND_NS
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    one=budgets(windows=(0.5, 1.0)),
+    skew=st.integers(0, 300_000_000),
+)
+def test_two_threads_with_times_a_little_apart_hold_it_too(seed, one, skew):
+    """The still thread decides at a time that has passed, while a base message already waits for a later one."""
+    rng = np.random.default_rng(seed)
+    run, mean = Run(one), one.base_bps / 8 / one.fps
+    for number in range(100):
+        now_ns = START_NS + round(number * SECOND_NS / one.fps)
+        run.base(int(min(mean * rng.gamma(1, 1.5), total_bytes(one))), now_ns)
+        late_ns = now_ns - int(rng.integers(0, skew + 1))
+        for _ in range(3):
+            room = run.budget.still_room(late_ns)
+            if room < 200:
+                break
+            run.still(int(rng.integers(200, room + 1)), late_ns)
+    assert run.fullest(one.window_ns) <= total_bytes(one)
+
+
+@pytest.mark.parametrize("window_s", [1.0, 2.0])
+@pytest.mark.parametrize(("total_bps", "base_bps"), [(800_000, 650_000), (1_400_000, 1_200_000)])
+def test_with_a_steady_base_the_stills_get_their_share(total_bps, base_bps, window_s):
+    """A budget that is too careful would leave unused what the user paid for."""
+    one = BudgetSettings(total_bps, base_bps, fps=15, window_ns=round(window_s * SECOND_NS))
+    run, sent, seconds = Run(one), 0, 30
+    rng = np.random.default_rng(1)
+    for number in range(seconds * 15):
+        now_ns = START_NS + round(number * SECOND_NS / 15)
+        run.base(round(base_bps / 8 / 15 * rng.uniform(0.9, 1.1)), now_ns)
+        while run.budget.still_room(now_ns) >= 1_500:
+            run.still(1_500, now_ns)
+            sent += 1_500
+    assert sent * 8 / seconds >= 0.85 * (total_bps - base_bps)
+    assert run.fullest(one.window_ns) <= total_bytes(one)
+
+
+def test_stills_yield_where_the_base_overshoots():
+    """Stills and a burst of the base together would fill the link's queues."""
+    one = BudgetSettings(800_000, 650_000, fps=15)
+    run, rooms = Run(one), []
+    for number in range(45):
+        now_ns = START_NS + round(number * SECOND_NS / 15)
+        run.base(round(650_000 / 8 / 15 * (1.2 if number >= 15 else 1.0)), now_ns)
+        rooms.append(run.budget.still_room(now_ns))
+    assert rooms[14] > 15_000
+    assert rooms[29] < 3_000
+
+
+def test_a_keyframe_fits_once_what_was_before_it_has_left():
+    """It would be sent into a full window, and every picture after it would wait."""
+    one = BudgetSettings(800_000, 650_000, fps=15)  # 100 000 bytes a window
+    run = Run(one)
+    for number in range(30):
+        now_ns = START_NS + round(number * SECOND_NS / 15)
+        run.base(5_400, now_ns)
+    now_ns += SECOND_NS // 15
+    assert run.budget.keyframe_fits(20_000, now_ns=now_ns)
+    run.still(10_000, now_ns)
+    assert not run.budget.keyframe_fits(20_000, now_ns=now_ns)
+    # The stills leave after a second in which the base went on as before.
+    for number in range(30, 46):
+        now_ns = START_NS + round(number * SECOND_NS / 15)
+        run.base(5_400, now_ns)
+    assert run.budget.keyframe_fits(20_000, now_ns=now_ns + SECOND_NS // 15)
+
+
+@pytest.mark.parametrize("window_s", [0.5, 1.0, 4.0])
+def test_the_most_a_still_is_ever_given_is_known(window_s):
+    """A wish larger than that would wait for room that never comes."""
+    one = BudgetSettings(800_000, 650_000, fps=10, window_ns=round(window_s * SECOND_NS))
+    budget = RollingBudget(one)
+    assert budget.most_still_bytes == int(min(window_s, 2.0) * 150_000 / 8)
+    rooms = []
+    for number in range(120):
+        now_ns = START_NS + round(number * SECOND_NS / 10)
+        budget.record_base(8125, now_ns=now_ns)
+        rooms.append(budget.still_room(now_ns))
+    assert max(rooms[round(20 * window_s) :]) <= budget.most_still_bytes
+    assert rooms[-1] >= 0.95 * budget.most_still_bytes
+
+
+def test_memory_is_bounded_and_a_long_window_costs_no_more():
+    """An hour of flight would make each frame slower than the one before."""
+    budget = RollingBudget(BudgetSettings(800_000, 650_000, fps=30, window_ns=10 * SECOND_NS))
+    for number in range(2_000):
+        now_ns = START_NS + round(number * SECOND_NS / 30)
+        at_ns = budget.earliest_ns(2_700, now_ns=now_ns)
+        budget.record_base(2_700, now_ns=at_ns)
+        budget.still_room(now_ns)
+    assert len(budget._events) <= 2 * 10 * 30 + 1
+    assert len(budget._burst) <= 31
+
+
+@given(jitter=st.lists(st.integers(0, 60_000_000), min_size=60, max_size=60), burst=st.floats(1.0, 1.8))
+def test_the_base_keeps_its_own_peak_where_frames_bunch_up(jitter: list[int], burst: float):
+    """In real time frames come late and close together; the radio would see a burst that no VBV allowed."""
+    settings = BudgetSettings(total_bps=800_000, base_bps=650_000, fps=15)
+    run = Run(settings)
+    mean = settings.base_bps / 8 / settings.fps
+    waits = []
+    for number, late_ns in enumerate(jitter):
+        size = round(mean * (burst if number % 5 == 0 else 1.25 - burst / 4))
+        now_ns = START_NS + round(number * SECOND_NS / 15) + late_ns
+        waits.append(run.base(size, now_ns) - now_ns)
+    assert run.fullest(SECOND_NS, ("base",)) <= BASE_PEAK * settings.base_bps / 8
+    assert max(waits) < SECOND_NS / 5
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What went over a lumpy base: one coded frame each ``every`` ticks of 15 a second."""
+
+    run: Run
+    still_bytes: int
+    base_bytes: int
+    longest_wait_s: float
+
+
+def fly(one: BudgetSettings, *, every: int, use: float, seconds: int = 20, seed: int = 0) -> Flight:
+    """Stills as large and as many as are admitted, on each tick, beside a base that uses a share of B_v."""
+    rng, run, longest = np.random.default_rng(seed), Run(one), 0
+    for tick in range(seconds * 15):
+        now_ns = START_NS + round(tick * SECOND_NS / 15)
+        if tick % every == 0:
+            at_ns = run.base(round(use * one.base_bps / 8 / one.fps * rng.uniform(0.8, 1.2)), now_ns)
+            longest = max(longest, at_ns - now_ns)
+        while (room := run.budget.still_room(now_ns)) >= 500:
+            run.still(min(room, int(rng.integers(500, 1_800))), now_ns)
+    sums = {kind: sum(size for _, size, other in run.events if other == kind) for kind in ("still", "base")}
+    return Flight(run, sums["still"], sums["base"], longest / SECOND_NS)
+
+
+@pytest.mark.parametrize(("every", "use"), [(1, 0.7), (1, 0.9), (3, 0.7), (5, 0.7), (15, 0.7)])
+def test_what_the_base_leaves_is_lent_and_no_more(every, use):
+    """A quiet scene would leave a third of the link idle while tracks wait for their still."""
+    plain = BudgetSettings(300_000, 240_000, fps=15 / every)
+    alone = fly(plain, every=every, use=use)
+    lent = fly(replace(plain, lend=True), every=every, use=use)
+    total = plain.total_bps / 8 * 20
+    assert alone.still_bytes + alone.base_bytes < (use * 0.8 + 0.2 + 0.03) * total
+    assert 0.96 * total < lent.still_bytes + lent.base_bytes <= 1.01 * total
+    assert lent.run.fullest(plain.window_ns) <= total_bytes(plain)
+    assert lent.longest_wait_s <= alone.longest_wait_s + 0.07, "the base pays for what it lent"
+
+
+def test_nothing_is_lent_where_the_base_takes_its_share():
+    """Lending would take from the base what it needs itself."""
+    plain = BudgetSettings(300_000, 240_000, fps=5)
+    assert fly(replace(plain, lend=True), every=3, use=1.05).still_bytes == pytest.approx(
+        fly(plain, every=3, use=1.05).still_bytes, rel=0.15, abs=5_000
+    )
+
+
+@pytest.mark.parametrize("every", [1, 3, 5])
+@pytest.mark.parametrize("use", [0.5, 0.8, 1.0])
+def test_a_loan_is_counted_and_what_is_kept_for_others_is_not_lent(every, use):
+    """What the base left would be given twice, or the tracks channel would find its bytes spent."""
+    one = BudgetSettings(300_000, 140_000, fps=15 / every, metadata_bps=100_000, lend=True)
+    flight = fly(one, every=every, use=use)
+    rate_bps = flight.still_bytes * 8 / 20
+    # The share, two seconds of it saved up at the start, and what was left; frames that differ by 20 % leave a little
+    # more than their mean does.
+    assert rate_bps == pytest.approx(66_000 + (1 - use) * 140_000, abs=14_000)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    one=budgets(windows=(1.0,)),
+    seed=st.integers(0, 2**32 - 1),
+    changes=st.lists(
+        st.tuples(st.floats(0.3, 1.0), st.sampled_from([1, 2, 3, 5, 7])), min_size=1, max_size=4
+    ),
+)
+def test_no_window_exceeds_the_total_when_rate_and_share_change_in_flight(one, seed, changes):
+    """At every keyframe with --fps auto or --video-share auto the link would get more than the user has."""
+    rng = np.random.default_rng(seed)
+    one = replace(one, fps=15.0)
+    run, every, base_bps, since = Run(one), 1, one.base_bps, 0
+    for tick in range(45 * (len(changes) + 1)):
+        now_ns = START_NS + round(tick * SECOND_NS / 15)
+        keyframe = tick % 45 == 0
+        if keyframe and tick:
+            share, every = changes[tick // 45 - 1]
+            base_bps, since = round(one.total_bps * share), tick
+            run.budget.set_base(base_bps, 15 / every, now_ns=now_ns)
+        if (tick - since) % every == 0:
+            size = base_bps / 8 * every / 15 * rng.gamma(4, 0.25) * (3 if keyframe else 1)
+            run.base(int(min(size, total_bytes(one))), now_ns, keyframe=keyframe)
+        for _ in range(4):
+            room = run.budget.still_room(now_ns)
+            if room < 200:
+                break
+            run.still(int(rng.integers(200, room + 1)), now_ns)
+    assert run.fullest(one.window_ns) <= total_bytes(one)
+
+
+def test_a_new_split_changes_what_stills_get_and_no_frame_waits_for_it():
+    """Bits that the scene asks for elsewhere would stay where they were, or pictures would come late."""
+    run = Run(BudgetSettings(300_000, 240_000, fps=15))
+    sent = {"before": 0, "after": 0}
+    for tick in range(15 * 40):
+        now_ns = START_NS + round(tick * SECOND_NS / 15)
+        if tick == 300:
+            run.budget.set_base(200_000, 5.0, now_ns=now_ns)
+        coded = tick < 300 or tick % 3 == 0
+        if coded:
+            at_ns = run.base(round((240_000 if tick < 300 else 3 * 200_000) / 8 / 15), now_ns)
+            assert at_ns == now_ns
+        while run.budget.still_room(now_ns) >= 800:
+            run.still(800, now_ns)
+            sent["before" if tick < 300 else "after"] += 800
+    assert sent["before"] * 8 / 20 == pytest.approx(60_000, rel=0.15)
+    assert sent["after"] * 8 / 20 == pytest.approx(100_000, rel=0.15)
+    assert run.fullest(SECOND_NS) <= 300_000 / 8
+
+
+def test_metadata_comes_out_of_what_stills_have():
+    """The tracks channel would make every picture wait, because stills had already spent its bytes."""
+    one = BudgetSettings(200_000, 160_000, fps=15, metadata_bps=10_000)
+    run, sent = Run(one), 0
+    for tick in range(15 * 20):
+        now_ns = START_NS + round(tick * SECOND_NS / 15)
+        assert run.base(round(160_000 / 8 / 15), now_ns) == now_ns
+        if tick % 5 == 0:
+            run.status(10_000 // 8 // 3, now_ns)
+        while run.budget.still_room(now_ns) >= 300:
+            run.still(300, now_ns)
+            sent += 300
+    assert sent * 8 / 20 == pytest.approx(30_000, rel=0.15)
+    assert run.budget.most_still_bytes == 30_000 // 8

@@ -1,0 +1,577 @@
+"""The rate follows the link: a bottleneck with a queue, simulated, and what the edge would have sent into it."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.messages import Feedback
+from hvt_edge.config import EdgeConfig, check
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.pacer import Flight, Pacer
+from hvt_edge.link.rate_control import LeastDelay, Progress, RateController, RateSettings, Reopening
+from hvt_edge.video.frame_skip import Cadence
+from hvt_edge.video.reconfigure import HeldCadence
+from messages import feedback
+
+MS = 1_000_000
+S = 1_000_000_000
+STEP_NS = 5 * MS
+FPS = 15
+
+
+@dataclass
+class World:
+    """An edge of base frames and stills, a FIFO bottleneck and a ground that reports; stepped in 5 ms.
+
+    The base stream is re-opened as `Reopening` says; each re-opening and each ten seconds bring a keyframe. Stills
+    fill what is left of the rate. ``loss`` takes messages away without a queue; ``offset_ns`` is the ground's clock.
+    """
+
+    link_bps: Callable[[float], float]
+    ceiling_bps: int = 800_000
+    floor_bps: int = 100_000
+    delay_ns: int = 20 * MS
+    loss: float = 0.0
+    share: float = 0.8
+    offset_ns: Callable[[float], int] = lambda _t: 0
+    stills: bool = True
+    cross_bps: Callable[[float], float] = lambda _t: 0.0
+    seed: int = 0
+    jitter_ns: int = 2 * MS
+    now_ns: int = 1_000 * S
+    rates: list[tuple[float, int]] = field(default_factory=list)
+    delays: list[tuple[float, float]] = field(default_factory=list)
+    """(time of arrival, seconds from sending to arrival)."""
+    arrived: list[tuple[float, int]] = field(default_factory=list)
+    held: int = 0
+    sent: int = 0
+    reopened: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.controller = RateController(RateSettings(ceiling_bps=self.ceiling_bps, floor_bps=self.floor_bps))
+        self.pacer = Pacer(self.controller)
+        self.reopening = Reopening()
+        self.base_bps = self.share * self.ceiling_bps
+        self.random = random.Random(self.seed)
+        self.start_ns = self.now_ns
+        self.queue: list[list] = []  # [kind, sequence, bits left, sent_ns, line bytes]
+        self.air: list[tuple[int, str, int, int, int]] = []
+        self.reports: list[tuple[int, Feedback]] = []
+        self.sequence = self.still_sequence = -1
+        self.heard = {"base": (-1, 0), "roi": (-1, 0)}
+        self.lost = 0
+        self.last_seen = -1
+        self.report_sequence = 0
+        self.next_frame_ns = self.now_ns
+        self.next_report_ns = self.now_ns
+        self.news = False
+        self.keyframe = True
+        self.last_keyframe_ns = self.now_ns
+        self.tokens = 0.0
+        self.window: list[tuple[int, int]] = []
+
+    def run(self, seconds: float) -> World:
+        """Let so much time pass."""
+        until_ns = self.now_ns + round(seconds * S)
+        while self.now_ns < until_ns:
+            self._step()
+            self.now_ns += STEP_NS
+        return self
+
+    @property
+    def t(self) -> float:
+        """Seconds since the start."""
+        return (self.now_ns - self.start_ns) / S
+
+    def rate_between(self, begin: float, end: float) -> list[int]:
+        """The controller's rates in a span."""
+        return [rate for t, rate in self.rates if begin <= t < end]
+
+    def arrived_bps(self, begin: float, end: float) -> float:
+        """What arrived in a span."""
+        return 8 * sum(size for t, size in self.arrived if begin <= t < end) / (end - begin)
+
+    def _step(self) -> None:
+        while self.reports and self.reports[0][0] <= self.now_ns:
+            self.pacer.hear(self.reports.pop(0)[1], now_ns=self.now_ns)
+        if self.now_ns >= self.next_frame_ns:
+            self.next_frame_ns += round(S / FPS)
+            self._frame()
+        self._carry()
+        self._report()
+        self.rates.append((self.t, self.pacer.rate_bps))
+
+    def _frame(self) -> None:
+        rate = self.pacer.rate_bps
+        wanted = min(self.share * self.pacer.steady_bps, rate)
+        if self.reopening.wants(wanted, self.base_bps, settled=self.pacer.settled, now_ns=self.now_ns):
+            self.keyframe = True
+        self.tokens = min(rate / 8, self.tokens + max(0.0, rate - self.base_bps) / 8 / FPS)
+        self.window = [(at, size) for at, size in self.window if at > self.now_ns - S]
+        full = sum(size for _, size in self.window) * 8 > rate
+        if full or not self.pacer.admits_base(self.now_ns):
+            self.held += 1
+            return
+        if self.keyframe or self.now_ns - self.last_keyframe_ns > 10 * S:
+            if self.keyframe and self.t > 0:
+                self.base_bps = wanted
+                self.reopening.done(self.now_ns)
+                self.reopened.append(self.t)
+            self.keyframe, self.last_keyframe_ns = False, self.now_ns
+            size = max(6_000, round(0.2 * self.base_bps / 8))
+        else:
+            size = round(0.97 * self.base_bps / 8 / FPS * self.random.uniform(0.7, 1.3))
+        self.sequence += 1
+        self.sent += 1
+        self._send("base", self.sequence, size)
+        self.pacer.sent_base(self.sequence, size, now_ns=self.now_ns)
+        while self.stills and self.tokens >= 1_500 and self.pacer.admits_still(self.now_ns):
+            self.still_sequence += 1
+            self.tokens -= 1_500
+            self._send("roi", self.still_sequence, 1_500)
+            self.pacer.sent_still(self.still_sequence, 1_500, now_ns=self.now_ns)
+
+    def _send(self, kind: str, sequence: int, size: int) -> None:
+        self.window.append((self.now_ns, size))
+        self.queue.append([kind, sequence, 8.0 * size, self.now_ns, size])
+
+    def _carry(self) -> None:
+        bits = max(0.0, self.link_bps(self.t) - self.cross_bps(self.t)) * STEP_NS / S
+        while self.queue and bits > 0:
+            head = self.queue[0]
+            taken = min(bits, head[2])
+            head[2] -= taken
+            bits -= taken
+            if head[2] <= 0:
+                self.queue.pop(0)
+                at_ns = self.now_ns + self.delay_ns + round(self.random.uniform(0, self.jitter_ns))
+                if self.random.random() >= self.loss:
+                    self.air.append((at_ns, head[0], head[1], head[3], head[4]))
+        while self.air and self.air[0][0] <= self.now_ns:
+            at_ns, kind, sequence, sent_ns, size = self.air.pop(0)
+            self.arrived.append((self.t, size))
+            self.news = True
+            if kind == "base":
+                self.lost += sequence - self.last_seen - 1
+                self.last_seen = sequence
+                self.delays.append((self.t, (at_ns - sent_ns) / S))
+            if sequence > self.heard[kind][0]:
+                self.heard[kind] = (sequence, at_ns)
+
+    def _report(self) -> None:
+        overdue = self.now_ns >= self.next_report_ns + 400 * MS
+        if self.now_ns < self.next_report_ns or not (self.news or overdue) or not self.link_bps(self.t):
+            return
+        self.next_report_ns, self.news = self.now_ns + 150 * MS, False
+        self.report_sequence += 1
+        self.reports.append((self.now_ns + self.delay_ns, self.feedback(self.report_sequence)))
+
+    def feedback(self, number: int, *, receiver: int = 1, base: int | None = None) -> Feedback:
+        """What the ground would say now."""
+        sequence, at_ns = self.heard["base"]
+        send_ns = self.now_ns + self.offset_ns(self.t)
+        return report(
+            number,
+            receiver=receiver,
+            base=sequence if base is None else base,
+            still=self.heard["roi"][0],
+            send_ns=send_ns,
+            held_us=max(0, self.now_ns - at_ns) // 1000 if sequence >= 0 else 0,
+            lost=self.lost,
+        )
+
+
+def report(
+    number: int,
+    *,
+    receiver: int = 1,
+    base: int = -1,
+    still: int = -1,
+    send_ns: int = 0,
+    held_us: int = 0,
+    lost: int = 0,
+) -> Feedback:
+    """A receiver report."""
+    return feedback(
+        receiver_id=receiver,
+        sequence=number,
+        send_ns=send_ns,
+        lost=lost,
+        base_sequence=base,
+        base_held_us=held_us,
+        still_sequence=still,
+    )
+
+
+def steps(*parts: tuple[float, float]) -> Callable[[float], float]:
+    """A link rate of pieces: (from second, bits a second)."""
+    return lambda t: next(rate for begin, rate in reversed(parts) if t >= begin)
+
+
+# The bars of the issue, in the simulation
+
+
+def test_a_steady_link_above_the_budget_is_never_left_below_the_ceiling():
+    """On a link that carries the budget the picture would be worse than paid for."""
+    world = World(steps((0, 1e6))).run(60)
+    assert min(world.rate_between(0, 60)) == 800_000
+    assert world.held == 0
+    assert world.reopened == []
+
+
+def test_a_fall_to_a_fifth_and_back():
+    """Behind a hill the picture would be seconds old; past it, it would stay as coarse as behind it."""
+    world = World(steps((0, 1e6), (15, 2e5), (35, 1e6))).run(60)
+    late = [t for t, delay in world.delays if delay > 1.0]
+    assert late
+    assert max(late) < 18.0
+    assert max(delay for t, delay in world.delays if 18 <= t < 60) < 0.6
+    assert world.arrived_bps(20, 35) > 0.85 * 200_000
+    before = world.arrived_bps(5, 15)
+    assert min(world.arrived_bps(t, t + 2) for t in range(48, 58, 2)) > 0.9 * before
+    assert world.rates[-1][1] == 800_000
+    assert len(world.reopened) <= 12
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_loss_without_a_queue_does_not_collapse_the_rate(seed):
+    """A radio that loses one packet in twenty would be taken for a full one."""
+    world = World(steps((0, 1e6)), loss=0.05, seed=seed).run(60)
+    assert min(world.rate_between(0, 60)) > 600_000
+
+
+def test_heavy_loss_lowers_the_rate():
+    """A policer that drops what is too much without a queue would be flooded for ever."""
+    world = World(steps((0, 1e6)), loss=0.3).run(40)
+    assert world.rate_between(30, 40)[-1] < 600_000
+    assert world.pacer.backoffs >= 2
+
+
+@pytest.mark.parametrize("stills", [True, False])
+def test_a_link_below_the_budget_is_filled_without_oscillation(stills):
+    """The picture would pump between coarse and frozen."""
+    world = World(steps((0, 2e5)), stills=stills, share=0.8 if stills else 1.0).run(60)
+    rates = world.rate_between(20, 60)
+    assert min(rates) > 150_000
+    assert max(rates) < 300_000
+    assert world.arrived_bps(20, 60) > 0.85 * 200_000
+    assert max(delay for t, delay in world.delays if t > 20) < 0.6
+    assert len([t for t in world.reopened if t > 20]) <= 12
+    falls = sum(1 for a, b in pairwise(rates) if b < a)
+    assert falls <= 8  # one for each trial of what is beyond
+
+
+def test_after_an_outage_the_picture_is_live_at_once():
+    """The operator would first watch eight seconds of the past."""
+    world = World(steps((0, 1e6), (15, 0), (23, 1e6))).run(45)
+    assert 100_000 in world.rate_between(17, 23)
+    # What was on its way when the link went, and the frames that ask whether it is back.
+    stale = [t for t, delay in world.delays if delay > 1.0]
+    assert max(stale) < 24.0
+    assert max(delay for t, delay in world.delays if t >= 24.0) < 0.5
+    assert world.rates[-1][1] == 800_000
+    assert min(world.rate_between(30, 45)) > 700_000
+
+
+def test_little_traffic_does_not_keep_the_rate_at_its_least():
+    """After an outage the picture would stay as coarse as the least budget makes it, however good the link is."""
+    world = World(steps((0, 1e6), (15, 0), (23, 1e6)), stills=False, share=0.6).run(45)
+    assert 100_000 in world.rate_between(17, 23)
+    assert world.rates[-1][1] == 800_000
+
+
+def test_what_was_never_sent_proves_nothing():
+    """A quiet scene would let the rate run away from what the link has shown, and the next busy one overrun it."""
+    controller = RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))
+    controller.on_silence(0)
+    for number in range(1, 200):
+        now_ns = number * 150 * MS
+        controller.on_progress(
+            Progress(
+                now_ns=now_ns, sent_ns=now_ns - 40 * MS, arrived_ns=now_ns - 20 * MS, own_ns=5 * MS,
+                arrived_bytes=number * 1_500,
+            )
+        )  # fmt: skip
+    assert 150_000 < controller.rate_bps <= 200_000  # 80 kbps arrive
+
+
+def test_a_satellite_in_the_path_is_no_congestion():
+    """A long way would be taken for a long queue."""
+    world = World(steps((0, 1e6)), delay_ns=600 * MS).run(60)
+    assert min(world.rate_between(0, 60)) == 800_000
+    assert world.held <= 10  # of 900, while the round trip is not known yet
+
+
+def test_a_route_that_becomes_longer_costs_some_seconds_only():
+    """After a hand-over to a satellite the edge would stay at its least for good."""
+    world = World(steps((0, 1e6)))
+    world.run(15)
+    world.delay_ns = 320 * MS
+    world.run(60)
+    assert world.rates[-1][1] == 800_000
+    assert min(world.rate_between(60, 75)) == 800_000
+
+
+def test_cross_traffic_is_given_way_and_taken_back():
+    """Two edges on one radio would starve each other."""
+    world = World(steps((0, 1e6)), cross_bps=lambda t: 5e5 if 15 <= t < 30 else 0.0).run(60)
+    assert max(world.rate_between(20, 30)) < 750_000
+    assert world.arrived_bps(20, 30) > 400_000
+    assert world.rates[-1][1] == 800_000
+
+
+def test_a_slow_clock_drift_is_no_queue():
+    """Ground clocks that run 50 ppm fast would take the picture down to nothing within the hour."""
+    world = World(steps((0, 1e6)), offset_ns=lambda t: 10**15 + round(t * 50e-6 * S)).run(60)
+    assert min(world.rate_between(0, 60)) == 800_000
+
+
+@pytest.mark.parametrize("jump_s", [3_600, -3_600])
+def test_a_clock_that_is_set_is_no_queue(jump_s):
+    """NTP coming up on the ground would freeze the picture."""
+    world = World(steps((0, 1e6)), offset_ns=lambda t: 0 if t < 10 else jump_s * S).run(30)
+    assert min(world.rate_between(0, 30)) == 800_000
+
+
+@pytest.mark.parametrize("jump_s", [2, -2])
+def test_a_small_clock_step_costs_some_seconds_only(jump_s):
+    """It cannot be told from a queue at once, but it would have to be in the end."""
+    world = World(steps((0, 1e6)), offset_ns=lambda t: 0 if t < 10 else jump_s * S).run(80)
+    assert world.rates[-1][1] == 800_000
+
+
+# Reports that lie
+
+
+def test_reports_of_others_do_not_steer():
+    """Anybody who may send feedback would slow the edge down, or make it flood its link."""
+    world = World(steps((0, 1e6))).run(5)
+    for number in range(200):
+        world.pacer.hear(
+            report(number, receiver=2, base=world.sequence, send_ns=number * 10**15), now_ns=world.now_ns
+        )
+    assert world.pacer.ignored == 200
+    assert min(world.run(10).rate_between(0, 15)) == 800_000
+
+
+@given(
+    reports=st.lists(
+        st.tuples(
+            st.integers(0, 3),
+            st.integers(0, 2**32 - 1),
+            st.integers(-1, 2**32 - 1),
+            st.integers(-1, 2**32 - 1),
+            st.integers(0, 2**63 - 1),
+            st.integers(0, 2**32 - 1),
+            st.integers(0, 2**53 - 1),
+            st.integers(0, 10 * S),
+        ),
+        max_size=60,
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_absurd_reports_keep_the_rate_within_its_bounds(reports):
+    """One forged message would stop the edge or crash it."""
+    controller = RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))
+    pacer, now_ns = Pacer(controller), 10**18
+    for number, (receiver, sequence, base, still, send_ns, held_us, lost, pause_ns) in enumerate(reports):
+        now_ns += pause_ns
+        pacer.sent_base(number, 5_000, now_ns=now_ns)
+        pacer.hear(
+            report(
+                sequence, receiver=receiver, base=base % (number + 3) - 1, still=still, send_ns=send_ns,
+                held_us=held_us, lost=lost,
+            ),
+            now_ns=now_ns,
+        )  # fmt: skip
+        pacer.admits_still(now_ns)
+        pacer.admits_base(now_ns)
+        assert 100_000 <= pacer.rate_bps <= 800_000
+        assert 100_000 <= pacer.steady_bps <= 800_000
+        assert math.isfinite(controller.excess_ns)
+    # Honest reports go on: nothing that was said before holds the edge back for good.
+    world = World(steps((0, 1e6)))
+    world.pacer, world.controller = pacer, controller
+    world.now_ns = world.start_ns = world.next_frame_ns = world.next_report_ns = now_ns + 5 * S
+    world.last_keyframe_ns = world.now_ns
+    world.sequence = world.last_seen = len(reports) + 10
+    world.run(60)
+    assert pacer.rate_bps >= 0.9 * 800_000
+
+
+def test_a_number_that_was_never_sent_acknowledges_nothing():
+    """A forged report would open the gate while the link is full."""
+    flight = Flight()
+    flight.sent_base(0, 5_000, now_ns=0, rate_bps=800_000)
+    assert flight.acknowledge(1, -1) is None
+    assert flight.size_bytes == 5_000
+    assert flight.acknowledge(0, -1) is not None
+    assert flight.size_bytes == 0
+
+
+def test_what_is_on_its_way_is_bounded():
+    """An edge whose ground never reports would grow without end."""
+    flight = Flight()
+    for sequence in range(5_000):
+        flight.sent_base(sequence, 100, now_ns=sequence, rate_bps=800_000)
+        flight.sent_still(sequence, 100, now_ns=sequence, rate_bps=800_000)
+    assert flight.size_bytes <= 2 * 1024 * 100
+
+
+# Small parts
+
+
+def test_nobody_reports_and_nothing_is_held_back():
+    """A recording at the edge would have holes as long as no ground is there."""
+    pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
+    for number in range(100):
+        pacer.sent_base(number, 5_000, now_ns=number * 66 * MS)
+        assert pacer.admits_base(number * 66 * MS)
+    assert pacer.rate_bps == 800_000
+
+
+def test_the_start_waits_for_the_first_report():
+    """On a link much thinner than the budget the ground could not even ask what the session is."""
+    pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
+    pacer.link(True, now_ns=0)
+    admitted = []
+    for number in range(75):
+        now_ns = number * S // 15
+        if pacer.admits_base(now_ns):
+            admitted.append(number)
+            pacer.sent_base(len(admitted) - 1, 5_000, now_ns=now_ns, keyframe=number == 2)
+    # 0.5 s from the keyframe on, and after the wait who never reports is served all the same.
+    assert admitted == [*range(10), *range(40, 75)]
+    pacer.hear(report(0, base=10), now_ns=5 * S)
+    assert pacer.ignored == 0
+
+
+def test_a_receiver_that_has_left_is_forgotten():
+    """Another listener, which does not report, would see one frame a second for good."""
+    world = World(steps((0, 1e6))).run(5)
+    world.pacer.link(True, now_ns=world.now_ns)
+    admitted = 0
+    for number in range(20 * FPS):
+        now_ns = world.now_ns + number * S // FPS
+        if world.pacer.admits_base(now_ns):
+            admitted += number < 14 * FPS
+            world.sequence += 1
+            world.pacer.sent_base(world.sequence, 2_000, now_ns=now_ns)
+    assert admitted < 30
+    assert world.pacer.admits_base(now_ns + S // FPS)
+    assert world.pacer.rate_bps == 800_000
+
+
+def test_a_link_that_comes_back_is_noticed_once():
+    """No keyframe would come, and the ground would wait for one."""
+    world = World(steps((0, 1e6))).run(5)
+    assert not world.pacer.link(True, now_ns=world.now_ns)
+    assert not world.pacer.link(False, now_ns=world.now_ns)
+    assert world.pacer.rate_bps == 100_000
+    assert world.pacer.admits_base(world.now_ns)  # nothing leaves, and a recording goes on
+    assert world.pacer.link(True, now_ns=world.now_ns)
+    assert not world.pacer.link(True, now_ns=world.now_ns)
+
+
+def test_another_ceiling_is_followed_at_once():
+    """``set-budget`` would have no effect."""
+    world = World(steps((0, 1e6))).run(5)
+    world.pacer.set_ceiling(400_000)
+    assert world.pacer.rate_bps == 400_000
+    world.pacer.set_ceiling(600_000)
+    assert world.pacer.rate_bps == 600_000
+    world.pacer.set_ceiling(50_000)
+    assert world.pacer.rate_bps == 50_000
+
+
+def test_the_least_delay_forgets():
+    """A route that became longer would count as a queue for ever."""
+    least = LeastDelay(10)
+    assert [least.add(delay, now_ns=t) for t, delay in ((0, 5), (5, 9), (11, 9), (15, 9), (22, 9))] == [
+        5, 5, 5, 5, 9,
+    ]  # fmt: skip
+
+
+def test_x265_is_opened_anew_only_where_it_is_worth_it():
+    """A keyframe at each small step would cost more than the step."""
+    reopening = Reopening()
+    assert not reopening.wants(105, 100, settled=False, now_ns=0)
+    assert not reopening.wants(110, 100, settled=False, now_ns=1 * S)
+    assert reopening.wants(110, 100, settled=False, now_ns=4 * S)
+    assert reopening.wants(130, 100, settled=False, now_ns=4 * S)
+    assert reopening.wants(79, 100, settled=False, now_ns=4 * S)
+    reopening.done(4 * S)
+    assert not reopening.wants(50, 100, settled=False, now_ns=5 * S)
+    assert reopening.wants(50, 100, settled=False, now_ns=6 * S)
+    reopening.done(10 * S)
+    assert not reopening.wants(103, 100, settled=True, now_ns=11 * S)
+    assert reopening.wants(103, 100, settled=True, now_ns=15 * S)
+
+
+def test_the_same_reports_give_the_same_rates():
+    """A run could not be understood afterwards."""
+    runs = [World(steps((0, 1e6), (5, 2e5))).run(15).rates for _ in range(2)]
+    assert runs[0] == runs[1]
+
+
+def test_one_report_cannot_do_more_than_its_share():
+    """A single odd delay would take the picture down."""
+    controller = RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))
+    for number in range(30):
+        delay_ns = 20 * MS + (3 * S if number == 20 else 0)
+        now_ns = number * 150 * MS
+        controller.on_progress(
+            Progress(
+                now_ns=now_ns, sent_ns=now_ns - 50 * MS, arrived_ns=now_ns - 50 * MS + delay_ns,
+                own_ns=50 * MS, arrived_bytes=number * 10_000,
+            )
+        )  # fmt: skip
+    assert controller.rate_bps == 800_000
+
+
+def test_the_budget_takes_another_total_at_once():
+    """What the link does not carry any more would still be sent."""
+    budget = RollingBudget(BudgetSettings(total_bps=800_000, base_bps=400_000, fps=10))
+    for frame in range(20):
+        budget.record_base(5_000, now_ns=frame * 100 * MS)
+    now_ns = 2 * S
+    assert budget.still_room(now_ns) > 0
+    budget.set_total(440_000, 400_000, 10, now_ns=now_ns)
+    assert 0 < budget.still_room(now_ns) <= 5_000
+    budget.set_total(200_000, 400_000, 10, now_ns=now_ns)
+    assert budget.still_room(now_ns) == 0
+    assert budget.earliest_ns(5_000, now_ns=now_ns, base=True) > now_ns + 400 * MS
+    budget.set_total(800_000, 160_000, 5, now_ns=now_ns)
+    assert budget.base_step_bytes == 4_000
+
+
+def test_few_frames_where_x265_can_do_no_more():
+    """At a rate that x265 cannot follow the link would be overrun for good."""
+    least = [1]
+    cadence = HeldCadence(Cadence(2), lambda: least[0])
+    assert cadence.at_keyframe(0) == 2
+    least[0] = 5
+    assert cadence.every_n == 2  # at keyframes only
+    assert cadence.at_keyframe(10) == 5
+    cadence.coded(10, keyframe=True, mean_qp=30.0)
+    assert [tick for tick in range(11, 17) if cadence.codes(tick)] == [15, 16]
+    least[0] = 1
+    assert cadence.at_keyframe(20) == 2
+
+
+def test_a_floor_above_the_ceiling_is_refused():
+    """The edge would start and do what nobody asked for."""
+    with pytest.raises(UserError, match="--min-budget 500 kbps is more than --budget 400 kbps"):
+        check(EdgeConfig(source="demo", budget=400_000, min_budget=500_000))
+    assert check(EdgeConfig(source="demo", size=(320, 180), budget=80_000)).floor_bps == 80_000
+    assert check(EdgeConfig(source="demo")).floor_bps == 100_000
+    assert not EdgeConfig(source="demo", pace="lockstep").adapts

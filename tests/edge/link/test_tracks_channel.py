@@ -1,0 +1,98 @@
+"""The edge's end of the tracks channel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clips import START_NS
+from hvt_common.protocol.messages import TrackStep, TrackStepDecoder
+from hvt_common.values import Frame, Tracks
+from hvt_edge.link.tracks_channel import TrackReporter, TrackReportSettings
+from hvt_edge.perception.analyzer import Seen
+
+PIXELS = np.zeros((8, 8, 3), np.uint8)
+
+
+def seen(index: int, *, ages=(0, 0), detected: bool = True, coded: bool = True, fps: float = 15) -> Seen:
+    """Two tracks, last detected so many ticks ago."""
+    frame = Frame(index, START_NS + round(index * 1e9 / fps), PIXELS, PIXELS)
+    count = len(ages)
+    left = 10.0 * np.arange(count) + index
+    tracks = Tracks(
+        frame_index=index,
+        ids=np.arange(1, count + 1),
+        boxes_xyxy_px=np.stack([left, left, left + 20, left + 30], axis=1).astype(np.float32),
+        confidences=np.full(count, 0.5, np.float32),
+        class_ids=np.arange(count, dtype=np.int32),
+        born_frames=np.zeros(count, np.int64),
+        seen_frames=index - np.array(ages, np.int64),
+        started=np.zeros(count, bool),
+    )
+    return Seen(frame, PIXELS if coded else None, tracks, detected=detected)
+
+
+class Line:
+    """A sender whose budget has room 40 ms later; it makes each message twice, as `Sender.status` does."""
+
+    def __init__(self) -> None:
+        self.steps: list[TrackStep] = []
+
+    def tracks(self, make, *, now_ns):
+        """Keeps what goes out."""
+        make(now_ns)
+        self.steps.append(TrackStep.parse(make(now_ns + 40_000_000)))
+
+
+def told(shown: list[Seen], **settings) -> list[TrackStep]:
+    """What leaves the edge."""
+    line = Line()
+    reporter = TrackReporter(line, session_id=77, settings=TrackReportSettings(**settings))
+    for one in shown:
+        reporter.report(one, now_ns=one.frame.capture_ns + 5_000_000)
+    assert reporter.steps == len(line.steps)
+    return line.steps
+
+
+def test_each_decision_step_is_told_and_nothing_else():
+    """The ground would lack tracks, or pay for what the detector never saw."""
+    steps = told([seen(index, detected=index % 5 == 0, coded=index % 2 == 0) for index in range(31)])
+    assert [step.frame_index for step in steps] == [0, 5, 10, 15, 20, 25, 30]
+    assert [step.sequence for step in steps] == list(range(7))
+    assert [step.reference for step in steps] == [-1, 0, 1, -1, 3, 4, -1]
+    decoder = TrackStepDecoder()
+    for step in steps:
+        got = decoder.decode(step)
+        np.testing.assert_allclose(
+            got.boxes_xyxy_px[0], seen(step.frame_index).tracks.boxes_xyxy_px[0], atol=1
+        )
+        assert got.class_ids.tolist() == [0, 1]
+
+
+def test_the_time_of_sending_is_that_of_the_budget():
+    """Both ledgers would disagree about the windows."""
+    step = told([seen(3)])[0]
+    assert step.session_id == 77
+    assert step.capture_ns == seen(3).frame.capture_ns
+    assert step.send_delay_ns == 45_000_000
+
+
+def test_no_more_steps_than_allowed():
+    """A detector on every frame would fill a thin link with boxes."""
+    every = [seen(index) for index in range(45)]
+    assert [step.frame_index for step in told(every)] == list(range(0, 45, 5))
+    assert len(told(every, most_per_s=1)) == 3
+    assert len(told(every, most_per_s=100)) == 45
+
+
+def test_tracks_that_were_long_not_found_are_left_out():
+    """Ghosts would stand on the operator's screen."""
+    steps = told([seen(20, ages=(0, 6, 5, 19))])
+    assert TrackStepDecoder().decode(steps[0]).ids.tolist() == [1, 3]
+    assert len(TrackStepDecoder().decode(told([seen(20, ages=())])[0])) == 0
+
+
+def test_an_empty_scene_is_told():
+    """The last tracks would stay on the screen for ever."""
+    steps = told([seen(0), seen(5, ages=())])
+    decoder = TrackStepDecoder()
+    assert [len(decoder.decode(step)) for step in steps] == [2, 0]

@@ -1,0 +1,391 @@
+"""The place where bytes leave the edge: headers, ledger and budget."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row
+from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, Flags, Health, RoiHeader, Status
+from hvt_common.values import AccessUnit, Still
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import (
+    BASE_ATTACHMENT_BYTES,
+    STATUS_BYTES,
+    Sender,
+    base_overhead_bps,
+)
+
+SECOND_NS = 1_000_000_000
+NOW_NS = 1_790_000_000 * SECOND_NS
+JPEG = "image/jpeg"
+
+
+class Out:
+    """Keeps what was put, as a link would carry it."""
+
+    def __init__(self) -> None:
+        self.puts: list[tuple[Row, bytes, bytes, str]] = []
+
+    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+        """Keep it."""
+        self.puts.append((row, payload, attachment or b"", encoding))
+
+    def line_bytes(self, keys: EdgeKeys) -> int:
+        """What all of it takes on the line."""
+        return sum(
+            len(payload)
+            + len(attachment)
+            + overhead_bytes(len(payload), len(attachment), key=keys.key(row), encoding=encoding)
+            for row, payload, attachment, encoding in self.puts
+        )
+
+
+class Rig:
+    """A sender with all that it needs."""
+
+    def __init__(self, *, total_bps: int = 800_000, lockstep: bool = False) -> None:
+        self.out, self.ledger, self.waits = Out(), Ledger(), []
+        self.budget = RollingBudget(BudgetSettings(total_bps, round(total_bps * 0.8), fps=15))
+        self.sender = Sender(
+            self.out,
+            ledger=self.ledger,
+            budget=self.budget,
+            edge_id="uav-1",
+            session_id=2**64 - 1,
+            lockstep=lockstep,
+            wait_until=self.waits.append,
+        )
+
+
+def unit(index: int, size: int = 1_000, *, keyframe: bool = False) -> AccessUnit:
+    """One access unit."""
+    return AccessUnit(index, NOW_NS + index, bytes(size), keyframe=keyframe)
+
+
+def still(size: int = 100, **changes) -> Still:
+    """One still."""
+    fields = {
+        "sequence": 0,
+        "frame_index": 3,
+        "capture_ns": NOW_NS,
+        "track_id": 5,
+        "box_source_px": (1.0, 2.0, 30.0, 40.0),
+        "crop_source_px": (0, 0, 34, 45),
+        "class_name": "car",
+        "confidence": 0.5,
+        "reason": "utility",
+        "codec": "jpeg",
+        "quality_pct": 65,
+        "data": bytes(size),
+    }
+    return Still(**(fields | changes))
+
+
+def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
+    """A report with so many reasons."""
+    counts = {f"{name}{number}": 4_000_000_000 for number in range(reasons)}
+    return Status(
+        session_id=2**64 - 1,
+        sequence=70_000,
+        state="running",
+        send_ns=at_ns,
+        media_ns=max(0, at_ns - NOW_NS),
+        last_base_sequence=70_000,
+        last_still_sequence=70_000,
+        base_bytes=10**9,
+        roi_bytes=10**9,
+        past_bytes=10**9,
+        meta_bytes=10**9,
+        overhead_bytes=10**9,
+        base_messages=10**6,
+        roi_messages=10**6,
+        past_messages=10**6,
+        meta_messages=10**6,
+        worst_window_bps=(10**7, 10**7, 10**7),
+        sent=counts,
+        deferred=counts,
+        dropped=counts,
+        health=Health(
+            frames_captured=10**6,
+            frames_encoded=10**6,
+            frames_dropped=10**6,
+            keyframes=10**4,
+            tracks=10**4,
+            base_queue=100,
+            still_queue=100,
+            encode_ms=1000.0,
+            detect_ms=1000.0,
+            feedback_age_ms=10_000,
+        ),
+    )
+
+
+def test_a_base_message_says_what_the_ground_needs():
+    """The ground could not order, check or date the pictures."""
+    rig = Rig()
+    rig.sender.base(unit(4, keyframe=True), now_ns=NOW_NS + 100)
+    rig.sender.base(unit(7), now_ns=NOW_NS + 200)
+    headers = [BaseHeader.parse(attachment, payload) for _, payload, attachment, _ in rig.out.puts]
+    assert [one.sequence for one in headers] == [0, 1]
+    assert [one.frame_index for one in headers] == [4, 7]
+    assert [one.keyframe for one in headers] == [True, False]
+    assert headers[0].flags == Flags.KEYFRAME | Flags.PARAMETER_SETS
+    assert headers[1].flags == 0
+    assert [one.capture_ns for one in headers] == [NOW_NS + 4, NOW_NS + 7]
+    assert [one.send_ns for one in headers] == [NOW_NS + 100, NOW_NS + 200]
+    assert {one.session_id for one in headers} == {2**64 - 1}
+    assert [encoding for *_, encoding in rig.out.puts] == ["video/h265"] * 2
+    assert rig.sender.base_sequence == 1
+
+
+def test_lockstep_is_flagged():
+    """The ground would show media time as delay."""
+    rig = Rig(lockstep=True)
+    rig.sender.base(unit(0, keyframe=True), now_ns=NOW_NS)
+    rig.sender.still(still(), now_ns=NOW_NS)
+    (_, payload, attachment, _), (_, data, roi, _) = rig.out.puts
+    assert BaseHeader.parse(attachment, payload).flags == 7
+    assert RoiHeader.parse(roi, data).flags == Flags.LOCKSTEP
+
+
+def test_a_still_says_what_it_shows():
+    """The ground could not place it."""
+    rig = Rig()
+    sent = still(sequence=6)
+    rig.sender.still(sent, now_ns=NOW_NS + 50)
+    ((row, payload, attachment, encoding),) = rig.out.puts
+    header = RoiHeader.parse(attachment, payload)
+    assert (row, payload, encoding) == (Row.ROI, sent.data, JPEG)
+    for name in (
+        "sequence",
+        "frame_index",
+        "capture_ns",
+        "track_id",
+        "crop_source_px",
+        "class_name",
+        "reason",
+        "codec",
+    ):
+        assert getattr(header, name) == getattr(sent, name)
+    assert header.box_source_px == sent.box_source_px
+    assert (header.confidence, header.quality_pct, header.send_ns) == (0.5, 65, NOW_NS + 50)
+    assert rig.sender.still_sequence == 6
+
+
+def test_the_ledger_counts_the_very_bytes_that_were_put():
+    """The account of the edge would not agree with that of the ground, nor with the bill."""
+    rig = Rig(total_bps=10_000_000)
+    for index in range(30):
+        now_ns = NOW_NS + index * SECOND_NS // 15
+        line = rig.sender.base(unit(index, 900 + 61 * index, keyframe=index == 0), now_ns=now_ns)
+        _, payload, attachment, encoding = rig.out.puts[-1]
+        around = overhead_bytes(len(payload), len(attachment), key="hvt/uav-1/base", encoding=encoding)
+        assert line == len(payload) + len(attachment) + around
+        if index % 3 == 0:
+            rig.sender.still(still(300 + index, sequence=index // 3), now_ns=now_ns)
+        if index % 15 == 0:
+            rig.sender.status(lambda at_ns: status(at_ns, reasons=3), now_ns=now_ns)
+    puts = rig.out.puts
+    assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
+    assert rig.ledger.base_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Row.BASE)
+    assert rig.ledger.roi_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Row.ROI)
+    assert [rig.ledger.messages(one) for one in Channel] == [30, 10, 0, 2]
+    assert rig.ledger.line_bytes == sum(size for _, size in rig.budget._events)
+
+
+def test_what_finds_no_room_is_sent_when_there_is_and_says_so():
+    """The window would be overrun, or the ground's ledger would see other windows than the edge's."""
+    rig = Rig(total_bps=80_000)  # 10 000 bytes a second
+    rig.sender.base(unit(0, 6_000, keyframe=True), now_ns=NOW_NS)
+    rig.sender.base(unit(1, 6_000), now_ns=NOW_NS + 100)
+    rig.sender.status(status, now_ns=NOW_NS + 200)
+    assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS, NOW_NS + SECOND_NS]
+    (_, _, _, _), (_, payload, attachment, _), (_, report, _, _) = rig.out.puts
+    assert BaseHeader.parse(attachment, payload).send_ns == NOW_NS + SECOND_NS
+    assert Status.parse(report).send_ns == NOW_NS + SECOND_NS
+    assert rig.ledger.worst_window_bps.total <= 80_000
+
+
+_NAMES = st.text(st.characters(codec="utf-8"), max_size=90) | st.sampled_from(["車" * 64, "é" * 64, "a" * 64])
+_NUMBERS = st.integers(-(2**63) + 1, 2**63 - 1) | st.floats(-1e300, 1e300) | st.text("abc", max_size=64)
+_FAR_BOXES = st.tuples(*[st.floats(-30_000, 0)] * 2, *[st.floats(0, 32_000)] * 2)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    class_name=_NAMES,
+    reason=_NAMES,
+    codec=st.text(st.characters(codec="ascii", categories=["L", "N"]), min_size=1, max_size=24),
+    sequence=st.integers(0, 2**32 - 1),
+    frame=st.integers(0, 2**32 - 1),
+    track=st.integers(-1, 2**32 - 1),
+    box=_FAR_BOXES,
+    far=st.integers(0, 32_000),
+    late_ns=st.integers(0, 2**40),
+    media_type=st.sampled_from([JPEG, "image/webp", "image/avif", "application/vnd.hvt.residual"]),
+    parameters=st.dictionaries(st.text("abcdef", max_size=16), _NUMBERS, max_size=4),
+    also=st.lists(st.tuples(st.integers(0, 2**32 - 1), _FAR_BOXES), max_size=MAX_ALSO),
+    spend=st.integers(0, 15_000),
+)
+def test_a_still_of_just_the_room_takes_just_the_room(  # noqa: PLR0917 - hypothesis
+    class_name, reason, codec, sequence, frame, track, box, far, late_ns, media_type, parameters, also, spend
+):
+    """A still with a long name or many tracks would overrun the window, or a usual one waste its admission."""
+    rig = Rig()
+    now_ns = NOW_NS + late_ns
+    if spend:
+        rig.sender.base(unit(0, spend), now_ns=now_ns)
+    asked = still(
+        0,
+        sequence=sequence,
+        frame_index=frame,
+        track_id=track,
+        class_name=class_name,
+        reason=reason,
+        codec=codec,
+        confidence=0.9994,
+        quality_pct=100,
+        box_source_px=box,
+        crop_source_px=(far, far, far + 700, far + 700),
+        media_type=media_type,
+        parameters=parameters,
+        also=tuple(also),
+    )
+    room_line = rig.budget.still_room(now_ns)
+    room = rig.sender.still_room_bytes(now_ns, still=asked)
+    before = rig.ledger.line_bytes
+    rig.sender.still(replace(asked, data=bytes(room)), now_ns=now_ns)
+    _, payload, attachment, encoding = rig.out.puts[-1]
+    assert encoding == ("application/octet-stream" if "hvt" in media_type else media_type)
+    taken = rig.ledger.line_bytes - before
+    assert room == 0 or room_line - 72 <= taken <= room_line, "short by a header of TCP and one of a fragment"
+    header = RoiHeader.parse(attachment, payload)
+    if class_name.isprintable():
+        assert class_name.startswith(header.class_name)
+        assert len(header.class_name.encode()) > 60 or header.class_name == class_name
+
+
+def test_before_there_is_a_still_the_room_is_that_of_a_usual_one():
+    """The method would plan with room that no still has, or leave room unused."""
+    rig = Rig()
+    now_ns = NOW_NS + 10 * SECOND_NS
+    usual = still(track_id=150, sequence=300, frame_index=900, box_source_px=(1.5, 900.0, 99.25, 999.0))
+    exact = rig.sender.still_room_bytes(now_ns, still=usual)
+    assert abs(rig.sender.still_room_bytes(now_ns) - exact) < 32
+    assert abs(rig.sender.most_still_bytes() - exact) < 32
+
+
+def test_tracks_wait_for_the_window_and_are_counted_as_metadata():
+    """The third channel would break the budget, or come out of thin air in the account."""
+    rig = Rig(total_bps=80_000)  # 10 000 bytes a second
+    rig.sender.base(unit(0, 9_400, keyframe=True), now_ns=NOW_NS)
+    rig.sender.tracks(lambda at_ns: bytes([at_ns == NOW_NS + SECOND_NS] * 200), now_ns=NOW_NS + 100)
+    (_, (row, payload, attachment, encoding)) = rig.out.puts
+    assert (row, payload, attachment, encoding) == (
+        Row.TRACKS,
+        bytes([True] * 200),
+        b"",
+        DELIVERIES[Row.TRACKS].encoding,
+    )
+    assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS]
+    assert rig.ledger.messages(Channel.META) == 1
+    assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
+    assert rig.ledger.worst_window_bps.total <= 80_000
+    assert rig.ledger.line_bytes == sum(size for _, size in rig.budget._events)
+
+
+@given(
+    sequence=st.integers(-1, 2**32 - 2),
+    frame=st.integers(0, 2**32 - 1),
+    capture=st.integers(0, 2**62),
+    late_ns=st.integers(0, 2**60),
+    keyframe=st.booleans(),
+)
+def test_a_base_header_never_takes_more_than_is_counted_on(sequence, frame, capture, late_ns, keyframe):
+    """The base would take more than its room, a few bytes in every message."""
+    rig = Rig()
+    rig.sender.base_sequence = sequence
+    rig.sender.base(AccessUnit(frame, capture, bytes(9), keyframe=keyframe), now_ns=capture + late_ns)
+    assert len(rig.out.puts[0][2]) <= BASE_ATTACHMENT_BYTES
+
+
+def test_what_is_set_aside_for_headers_and_status_suffices():
+    """x265 would be given bits that the headers need, and the base would exceed its share."""
+    report = status(NOW_NS + 10**12, reasons=3, name="no_gain").pack()
+    assert len(report) <= STATUS_BYTES
+    rig = Rig(total_bps=50_000_000)
+    for index in range(15):
+        rig.sender.base(unit(index, 5_000), now_ns=NOW_NS + index * SECOND_NS // 15)
+    rig.sender.status(lambda at_ns: status(at_ns, reasons=3), now_ns=NOW_NS + SECOND_NS - 1)
+    spent_bps = 8 * (rig.ledger.line_bytes - rig.ledger.base_bytes)
+    aside_bps = base_overhead_bps(15 * 8 * 5_000, fps=15, edge_id="uav-1")
+    assert spent_bps <= aside_bps <= 1.2 * spent_bps
+
+
+def test_two_threads_keep_one_account():
+    """Real-time runs would lose bytes from the ledger, or crash while a report is made."""
+    rig, keys = Rig(total_bps=400_000_000), EdgeKeys("uav-1")
+    errors: list[BaseException] = []
+
+    def stills() -> None:
+        try:
+            for number in range(1_500):
+                now_ns = NOW_NS + number * 1_000_000
+                if rig.sender.still_room_bytes(now_ns, still=still()) > 200:
+                    rig.sender.still(still(200, sequence=number), now_ns=now_ns)
+                rig.sender.fate("sent", f"reason{number % 20}")
+        except BaseException as error:  # noqa: BLE001
+            errors.append(error)
+
+    def report(at_ns: int) -> Status:
+        account = rig.ledger.summary(1.0)
+        assert account.line_bytes == sum(size for size in (rig.ledger.line_bytes,))
+        return status(at_ns, reasons=len(rig.ledger.fates("sent")))
+
+    thread = threading.Thread(target=stills)
+    thread.start()
+    for number in range(1_500):
+        now_ns = NOW_NS + number * 1_000_000
+        rig.sender.base(unit(number, 500), now_ns=now_ns)
+        if number % 10 == 0:
+            rig.sender.status(report, now_ns=now_ns)
+    thread.join()
+    assert errors == []
+    assert rig.ledger.line_bytes == rig.out.line_bytes(keys)
+    sequences = [
+        BaseHeader.parse(attachment, payload).sequence
+        for row, payload, attachment, _ in rig.out.puts
+        if row is Row.BASE
+    ]
+    assert sequences == list(range(1_500))
+    assert sum(rig.ledger.fates("sent").values()) == 1_500
+
+
+def test_attachments_are_messagepack_arrays():
+    """Another program could not read them."""
+    rig = Rig()
+    rig.sender.base(unit(0, keyframe=True), now_ns=NOW_NS)
+    assert isinstance(msgpack.unpackb(rig.out.puts[0][2]), list)
+    assert DELIVERIES[Row.BASE].encoding == rig.out.puts[0][3]
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_a_keyframe_is_weighed_against_the_window(fits):
+    """Keyframes would come into full windows, or never."""
+    rig = Rig()
+    rng = np.random.default_rng(0)
+    for index in range(30):
+        now_ns = NOW_NS + index * SECOND_NS // 15
+        rig.sender.base(unit(index, int(rng.integers(4_900, 5_100))), now_ns=now_ns)
+    now_ns += SECOND_NS // 15
+    if not fits:
+        rig.sender.still(still(15_000), now_ns=now_ns)
+    assert rig.sender.keyframe_fits(20_000, now_ns=now_ns) is fits

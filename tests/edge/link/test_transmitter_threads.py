@@ -1,0 +1,157 @@
+"""The frame loop, the stills and what was kept send at one time: the budget holds whoever comes first."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import count
+
+import pytest
+
+from hvt_common.protocol.channels import Row
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import PastKind, RoiHeader
+from hvt_common.values import AccessUnit
+from hvt_edge.backlog.backfill import Piece
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import Sender
+from keeping import STILL, Out
+
+S = 1_000_000_000
+NOW_NS = 1_790_000_000 * S
+TOTAL = 800_000
+
+
+class Rig:
+    """A sender; nothing has gone out for a while."""
+
+    def __init__(self) -> None:
+        self.out, self.ledger, self.waits = Out(), Ledger(), []
+        self.out.dark = True
+        self.sender = Sender(
+            self.out,
+            ledger=self.ledger,
+            budget=RollingBudget(BudgetSettings(TOTAL, 400_000, fps=15)),
+            edge_id="uav-1",
+            session_id=7,
+            lockstep=False,
+            wait_until=self.waits.append,
+        )
+
+    def still(self, number: int, size: int, *, now_ns: int = NOW_NS) -> None:
+        """One of so many bytes."""
+        self.sender.still(replace(STILL, sequence=number, data=b"\xff" * size), now_ns=now_ns)
+
+    def past(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:
+        """A piece of so many bytes."""
+        return self.sender.past(Piece(7, PastKind.BASE, 0, offset, 10**6, bytes(size)), now_ns=now_ns)
+
+
+def test_a_piece_that_lost_its_room_to_a_still_is_not_sent():
+    """105000 bytes would go into a window of 100000."""
+    rig = Rig()
+    for number in range(7):
+        rig.still(number, 12_000)
+    room = rig.sender.past_room_bytes(NOW_NS, reserve=0.0)
+    assert room == 5_000, "what the store's thread is told"
+    rig.still(7, 12_000)  # by the stills' thread, meanwhile
+    assert rig.past(room) == 0
+    assert [row for row, _, _ in rig.out.puts if row is Row.PAST] == []
+    assert rig.past(rig.sender.past_room_bytes(NOW_NS, reserve=0.0)) in range(5_000)
+    assert rig.ledger.worst_window_bps.total <= TOTAL
+
+
+def test_a_still_that_lost_its_room_waits_until_there_is_some():
+    """A still and a piece that were both admitted would exceed the window together."""
+    rig = Rig()
+    assert rig.past(40_000)
+    room = rig.sender.still_room_bytes(NOW_NS)
+    assert room > 7_000
+    assert rig.past(55_000, offset=40_000)  # by the store's thread, meanwhile
+    rig.still(0, room)
+    row, payload, attachment = rig.out.puts[-1]
+    assert row is Row.ROI
+    header = RoiHeader.parse(attachment, payload)
+    assert header.capture_ns + header.send_delay_ns >= NOW_NS + S, "when the window has moved on"
+    assert rig.waits[-1] == header.capture_ns + header.send_delay_ns
+    assert rig.ledger.worst_window_bps.total <= TOTAL
+
+
+def test_a_still_that_has_its_room_goes_at_once():
+    """Each still would wait a window."""
+    rig = Rig()
+    rig.still(0, rig.sender.still_room_bytes(NOW_NS))
+    assert rig.waits == [NOW_NS]
+
+
+class Clock:
+    """One for all, in ticks of a hundredth of a second."""
+
+    def __init__(self) -> None:
+        self.now_ns = NOW_NS
+
+    def __call__(self) -> int:
+        """Now."""
+        return self.now_ns
+
+
+def frames(rig: Rig, clock: Clock) -> Iterator[None]:
+    """The frame loop: each step is one that another thread may come between."""
+    for index in count():
+        due_ns = NOW_NS + index * S // 15
+        while clock() < due_ns:
+            yield
+        at_ns = clock()
+        yield
+        rig.sender.base(AccessUnit(index, due_ns, bytes(1_500 + 2_000 * (index % 3)), False), now_ns=at_ns)
+
+
+def stills(rig: Rig, clock: Clock) -> Iterator[None]:
+    """The stills' thread."""
+    for number in count():
+        at_ns = clock()
+        room = rig.sender.still_room_bytes(at_ns)
+        yield
+        if room > 500:
+            rig.still(number, min(room, 12_000), now_ns=at_ns)
+        yield
+
+
+def kept(rig: Rig, clock: Clock) -> Iterator[None]:
+    """What was kept."""
+    offset = 0
+    while True:
+        at_ns = clock()
+        room = rig.sender.past_room_bytes(at_ns, reserve=0.0)
+        yield
+        if room > 500:
+            offset += room if rig.past(room, now_ns=at_ns, offset=offset % 900_000) else 0
+        yield
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_three_threads_keep_to_one_budget_in_whatever_order_they_run(seed):
+    """The hard limit would be hard for one thread only: 105000 bytes in a window of 100000."""
+    rig, clock, chance = Rig(), Clock(), random.Random(seed)
+    threads = [one(rig, clock) for one in (frames, stills, kept)]
+    for _ in range(1_000):
+        clock.now_ns += S // 100
+        for _ in range(chance.randrange(1, 8)):
+            next(chance.choice(threads))
+    rows = [row for row, _, _ in rig.out.puts]
+    assert min(rows.count(row) for row in (Row.BASE, Row.ROI, Row.PAST)) > 10
+    assert rig.ledger.worst_window_bps.total <= TOTAL
+
+
+def test_room_for_what_was_kept_leaves_what_base_and_stills_will_want():
+    """A piece would take the room of the next frame, or of a still that comes."""
+    budget = RollingBudget(BudgetSettings(TOTAL, 400_000, fps=15))
+    assert budget.past_room(NOW_NS, reserve=0.0) == 100_000, "no base frame is expected where none goes out"
+    assert budget.past_room(NOW_NS, reserve=0.5) == 75_000
+    budget.record_base(3_000, now_ns=NOW_NS)
+    room = budget.past_room(NOW_NS, reserve=0.0)
+    assert 45_000 <= room <= 50_000, "the base's half of the coming window is not given away"
+    budget.record_past(20_000, now_ns=NOW_NS)
+    assert budget.past_room(NOW_NS, reserve=0.0) <= room
+    assert budget.past_room(NOW_NS + 3 * S, reserve=0.0) == 100_000

@@ -1,0 +1,105 @@
+"""The frame loop in lockstep where not every tick is coded."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from clips import framed, smooth_pictures
+from hvt_common.protocol.channels import Row
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import BaseHeader
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.transmitter import Sender
+from hvt_edge.loop.counts import FrameCounts
+from hvt_edge.loop.lockstep import LockstepPace
+from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.video.frame_skip import Cadence
+from hvt_edge.video.stage import BaseStage
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from messages import feedback
+
+SIZE = (320, 192)
+
+
+class Ground:
+    """Answers each access unit that it gets, and nothing else."""
+
+    def __init__(self) -> None:
+        self.inbox = FeedbackInbox()
+        self.frames: list[int] = []
+
+    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+        """Take one message."""
+        assert row is Row.BASE
+        assert attachment is not None
+        self.frames.append(BaseHeader.parse(attachment, payload).frame_index)
+        report = feedback(
+            session_id=1,
+            sequence=len(self.frames),
+            last_frame_index=self.frames[-1],
+            base_messages=len(self.frames),
+        )
+        self.inbox.receive(report, now_ns=1)
+
+
+class Stills:
+    """Keeps what it was shown; sends nothing."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[int, int | None]] = []
+        self.latest_tracks = None
+
+    def see(self, frame, unit):
+        """Keep it."""
+        self.seen.append((frame.index, unit and unit.frame_index))
+        return frame.index
+
+    def send(self, seen, *, now_ns, held):
+        """Nothing."""
+        return set()
+
+    def hear(self, results):
+        """Nothing."""
+
+
+@pytest.mark.timeout(60)
+def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
+    """With ``--fps auto`` a run in lockstep would stand still for 20 s at the first frame that was never sent."""
+    ground, stills, counts, keyframes = Ground(), Stills(), FrameCounts(), KeyframePlan()
+    stage = BaseStage(
+        BaseEncoder(EncoderSettings(size=SIZE, fps=5.0, bitrate_bps=100_000, preset="ultrafast")),
+        keyframes=keyframes,
+        sender=Sender(
+            ground,
+            ledger=Ledger(),
+            budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=5)),
+            edge_id="uav-1",
+            session_id=1,
+            lockstep=True,
+            wait_until=lambda _at_ns: None,
+        ),
+        recorder=None,
+        first_keyframe_bytes=5000,
+        cadence=Cadence(3),
+    )
+    with LockstepPace(
+        stage,
+        stills,
+        inbox=ground.inbox,
+        keyframes=keyframes,
+        fps=15,
+        counts=counts,
+        heard=lambda: True,
+        stop=threading.Event(),
+    ) as pace:
+        for frame in framed(smooth_pictures(50, size=SIZE)):
+            pace.step(frame)
+            assert pace._follows
+    assert ground.frames == list(range(0, 50, 3))
+    assert stills.seen == [(index, None if index % 3 else index) for index in range(50)]
+    assert pace._follows, "the ground was never given up"
+    assert not pace._in_flight
+    assert counts.encoded == 17

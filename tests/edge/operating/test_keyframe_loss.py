@@ -1,0 +1,152 @@
+"""Keyframes on a link that loses messages: the edge's plan, the ground's reassembler, a round trip between."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from itertools import pairwise
+
+import pytest
+
+from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
+from hvt_ground.link.reassemble import Reassembler
+
+MS = 1_000_000
+FRAME_NS = 66_666_667
+STEP_NS = 10 * MS
+REPORT_NS = 150 * MS
+ROUND_TRIP_NS = 100 * MS
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the reassembler looks at."""
+
+    session_id: int
+    sequence: int
+    frame_index: int
+    keyframe: bool
+
+
+class Ground:
+    """One receiver behind a loss of its own."""
+
+    def __init__(self, number: int, *, loss: float, seed: int) -> None:
+        self.number, self.loss, self.random = number, loss, random.Random(f"{seed}-{number}")
+        self.reassembler: Reassembler[Header] = Reassembler()
+        self.air: list[tuple[int, Header]] = []
+        self.shown_ns: list[int] = []
+        self.seen: set[int] = set()
+
+    def send(self, header: Header, now_ns: int) -> None:
+        """On its way, or lost; the first is not."""
+        if header.sequence == 0 or self.random.random() >= self.loss:
+            self.air.append((now_ns + ROUND_TRIP_NS // 2, header))
+
+    def step(self, now_ns: int) -> bool:
+        """Take in what has come; whether to ask for a keyframe."""
+        while self.air and self.air[0][0] <= now_ns:
+            for unit in self.reassembler.accept(self.air.pop(0)[1], b"", now_ns=now_ns):
+                if unit.verdict == "decode":
+                    self.shown_ns.append(now_ns)
+                    self.seen.add(unit.header.sequence)
+        if wants := self.reassembler.wants_keyframe(now_ns):
+            self.reassembler.keyframe_requested(now_ns)
+        return wants
+
+
+@dataclass
+class Minute:
+    """Sixty seconds at 15 fps; each ground has losses of its own. ``takes_ms``: of the budget, for a keyframe."""
+
+    settings: KeyframeSettings
+    loss: float = 0.05
+    grounds: int = 1
+    reports: bool = True
+    takes_ms: int = 160
+    seed: int = 1
+    refused: int = 0
+
+    def __post_init__(self) -> None:
+        self.plan = KeyframePlan(self.settings)
+        self.sees = [Ground(number, loss=self.loss, seed=self.seed) for number in range(self.grounds)]
+        asks: list[tuple[int, tuple[int, int] | None]] = []
+        self.sent, next_ns = 0, 0
+        for now_ns in range(0, 60_000 * MS, STEP_NS):
+            while asks and asks[0][0] <= now_ns:
+                losses = asks.pop(0)[1]
+                if losses is not None:
+                    self.plan.note_losses(*losses)
+                elif self.plan.request(now_ns) is not None:
+                    self.refused += 1
+            if now_ns >= next_ns:
+                next_ns += FRAME_NS
+                self._frame(now_ns)
+            for ground in self.sees:
+                if ground.step(now_ns):
+                    asks.append((now_ns + ROUND_TRIP_NS // 2, None))
+                if self.reports and now_ns % REPORT_NS == 0:
+                    told = ground.number, ground.reassembler.counters.lost
+                    asks.append((now_ns + ROUND_TRIP_NS // 2, told))
+
+    def _frame(self, now_ns: int) -> None:
+        keyframe = self.plan.now(now_ns, fits=True)
+        if keyframe:
+            self.plan.done(now_ns)
+            self.plan.note_cost(self.takes_ms * MS)
+        header = Header(1, self.sent, self.sent, keyframe)
+        self.sent += 1
+        for ground in self.sees:
+            ground.send(header, now_ns)
+
+    @property
+    def shown(self) -> float:
+        """Share of the frames, at the ground that saw least."""
+        return min(len(ground.seen) for ground in self.sees) / self.sent
+
+    @property
+    def longest_dark_s(self) -> float:
+        """From one picture to the next, at the ground that waited longest."""
+        return max(b - a for ground in self.sees for a, b in pairwise(ground.shown_ns)) / 1e9
+
+    def __str__(self) -> str:
+        return (
+            f"loss {self.loss:.0%}, {self.grounds} ground(s), reports {self.reports}, keyframe {self.takes_ms} ms: "
+            f"shown {100 * self.shown:.0f} %, longest dark {self.longest_dark_s:.2f} s, keyframes {self.plan.sent}, "
+            f"refused {self.refused}"
+        )
+
+
+INTERVAL_NS = 10_000 * MS
+LIMITED = KeyframeSettings(interval_ns=INTERVAL_NS)
+UNLIMITED = KeyframeSettings(interval_ns=INTERVAL_NS, refill_ns=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("loss", "grounds", "takes_ms"),
+    [(0.05, 1, 160), (0.05, 2, 160), (0.1, 2, 160), (0.05, 1, 600), (0.05, 2, 600)],
+)
+def test_a_minute_of_loss_is_as_dark_as_without_a_limit(loss, grounds, takes_ms, seed):
+    """On a radio that loses one frame in twenty the screen would be dark for half of the time, and for seconds."""
+    free = Minute(UNLIMITED, loss=loss, grounds=grounds, takes_ms=takes_ms, seed=seed)
+    limited = Minute(LIMITED, loss=loss, grounds=grounds, takes_ms=takes_ms, seed=seed)
+    assert free.refused == 0
+    assert limited.shown > free.shown - 0.03, f"{limited}\n{free}"
+    assert limited.longest_dark_s <= max(1.5, free.longest_dark_s + 0.5), f"{limited}\n{free}"
+
+
+def test_without_reports_the_purse_alone_lasts_for_an_ordinary_loss():
+    """A ground whose reports are lost as well would be left in the dark."""
+    limited = Minute(LIMITED, loss=0.05, reports=False)
+    assert limited.refused == 0
+    assert limited.shown > 0.75
+
+
+def test_the_rig_can_fail():
+    """It would say nothing of the limit: with one keyframe in two seconds, as it once was, the picture goes."""
+    before = Minute(
+        KeyframeSettings(interval_ns=INTERVAL_NS, refill_ns=2_000 * MS), reports=False, takes_ms=0
+    )
+    assert before.refused > 5
+    assert before.longest_dark_s > 2

@@ -1,0 +1,177 @@
+"""When a keyframe comes."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
+
+MS = 1_000_000
+STEP_NS = 66_666_667
+
+
+def play(plan: KeyframePlan, steps: int, *, fits=lambda _n: True, asked=lambda _n: False) -> list[int]:
+    """Numbers of the frames that became keyframes."""
+    keyframes = []
+    for number in range(steps):
+        now_ns = number * STEP_NS
+        if asked(number):
+            plan.request(now_ns)
+        if plan.now(now_ns, fits=fits(number)):
+            plan.done(now_ns)
+            keyframes.append(number)
+    return keyframes
+
+
+def test_the_first_frame_is_one_whatever_the_budget():
+    """Nobody could decode anything."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0))
+    assert plan.due(0)
+    assert play(plan, 300, fits=lambda _n: False) == [0]
+    assert plan.sent == 1
+
+
+def test_the_schedule_is_kept_and_waits_for_room():
+    """A recording could not be entered in its middle; or the keyframe would not wait for its budget."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=1_000 * MS))
+    assert play(plan, 50) == [0, 15, 30, 45]
+    plan = KeyframePlan(KeyframeSettings(interval_ns=1_000 * MS, scheduled_patience_ns=400 * MS))
+    assert play(plan, 40, fits=lambda n: n % 20 == 19) == [0, 19, 39]  # due at 15 and 34, room at 19 and 39
+    plan = KeyframePlan(KeyframeSettings(interval_ns=1_000 * MS, scheduled_patience_ns=400 * MS))
+    assert play(plan, 40, fits=lambda _n: False) == [0, 21]
+
+
+def test_while_one_is_due_stills_know_it():
+    """Stills would go on taking the room that the keyframe waits for."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0))
+    plan.done(0)
+    assert not plan.due(1_000 * MS)
+    assert plan.request(1_000 * MS) is None
+    assert plan.due(1_000 * MS)
+    assert not plan.now(1_100 * MS, fits=False)
+    assert plan.due(1_100 * MS)
+    assert plan.now(1_200 * MS, fits=True)
+    plan.done(1_200 * MS)
+    assert not plan.due(1_300 * MS)
+
+
+def test_a_request_that_crossed_a_keyframe_is_answered_by_it():
+    """One loss would cost two keyframes, and the second would push pictures and stills aside for nothing."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0))
+    plan.done(0)
+    assert plan.request(200 * MS) is None
+    assert not plan.due(250 * MS)
+    assert plan.request(400 * MS) is None
+    assert plan.due(400 * MS)
+    assert plan.requests == 2
+
+
+def test_a_ground_that_joins_right_after_a_keyframe_sees_a_picture_within_a_second():
+    """It would look at nothing for longer than promised: its first request is taken as answered."""
+    settings = KeyframeSettings(interval_ns=0)
+    second_ask_ns = 300 * MS  # as the reassembler repeats it
+    for joined_ns in range(0, 300 * MS, 10 * MS):
+        plan = KeyframePlan(settings)
+        plan.done(0)
+        asks = {joined_ns, joined_ns + second_ask_ns}
+        for now_ns in range(0, 3_000 * MS, 10 * MS):
+            if now_ns in asks:
+                plan.request(now_ns)
+            if plan.now(now_ns, fits=False):
+                break
+        assert now_ns - joined_ns < 1_000 * MS
+
+
+@given(
+    asks=st.sets(st.integers(0, 199), max_size=60),
+    room=st.sets(st.integers(0, 199)),
+    interval_s=st.sampled_from([0, 2, 10]),
+)
+def test_every_request_is_answered_in_time_and_not_more_often(asks, room, interval_s):
+    """A ground would wait for a picture; or many grounds together would make the stream all keyframes."""
+    settings = KeyframeSettings(interval_ns=interval_s * 1_000 * MS, refill_ns=0)
+    keyframes = play(KeyframePlan(settings), 240, fits=lambda n: n in room, asked=lambda n: n in asks)
+    for ask in asks:
+        near = [
+            one
+            for one in keyframes
+            if -settings.rest_ns < (one - ask) * STEP_NS < settings.patience_ns + STEP_NS
+        ]
+        assert near, f"the request at frame {ask} was not answered: {keyframes}"
+    for first, second in pairwise(keyframes):
+        assert (second - first) * STEP_NS >= settings.rest_ns
+        because_asked = any(first < ask <= second for ask in asks)
+        assert because_asked or (interval_s and (second - first) * STEP_NS >= settings.interval_ns)
+
+
+def ask_at_twenty_a_second(plan: KeyframePlan, *, takes_ms: int, losses: bool) -> tuple[int, list[str]]:
+    """Keyframes and refusals of a minute."""
+    keyframes, refusals = 0, []
+    for number, now_ns in enumerate(range(0, 60_000 * MS, 50 * MS)):
+        if losses:
+            plan.note_losses(number, 2**40 + number)
+        if (refusal := plan.request(now_ns)) is not None:
+            refusals.append(refusal)
+        if plan.now(now_ns, fits=True):
+            plan.done(now_ns)
+            plan.note_cost(takes_ms * MS)
+            keyframes += 1
+    return keyframes, refusals
+
+
+@pytest.mark.parametrize(
+    ("takes_ms", "losses", "most"),
+    [
+        (160, False, 1 + 6 + 60_000 // 700),
+        (470, False, 1 + 6 + 60_000 // (470 / 0.35)),
+        (470, True, 1 + 6 + 60_000 // 600),  # the purse's own go between
+    ],
+    ids=["cheap", "dear", "with invented losses"],
+)
+def test_a_commander_cannot_make_the_stream_all_keyframes(takes_ms, losses, most):
+    """Whoever may command could push pictures and stills aside with three keyframes a second, for ever."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0))
+    keyframes, refusals = ask_at_twenty_a_second(plan, takes_ms=takes_ms, losses=losses)
+    assert 30 < keyframes <= most, "three a second would be 180"
+    assert len(plan._losses) <= 16
+    assert plan.requests == 1200 - len(refusals)
+    assert "the last keyframe came" in refusals[-1]
+    assert "ask again in" in refusals[-1]
+
+
+def test_recovery_after_losses_is_never_refused():
+    """The picture would stay dark because a ground asked for what it needed: six losses in six seconds, then rest."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0))
+    plan.done(0)
+    plan.note_cost(470 * MS)
+    for start_ns in (1_000 * MS, 30_000 * MS):
+        for loss in range(6):
+            now_ns = start_ns + loss * 1_000 * MS
+            assert plan.request(now_ns) is None
+            assert plan.due(now_ns)
+            assert plan.request(now_ns + 10 * MS) is None, "the same loss is asked about twice"
+            plan.done(now_ns + 60 * MS)
+            assert plan.request(now_ns + 100 * MS) is None, "it crossed the keyframe on the way"
+            assert not plan.due(now_ns + 100 * MS)
+
+
+def test_a_reported_loss_is_a_reason_once():
+    """One old loss would be a ticket to as many keyframes as somebody cares to ask for."""
+    plan = KeyframePlan(KeyframeSettings(interval_ns=0, burst=1))
+    plan.done(0)
+    plan.note_cost(3_500 * MS)  # the next in ten seconds
+    assert plan.request(20_000 * MS) is None
+    plan.done(20_000 * MS)
+    plan.note_losses(1, 5)
+    assert plan.request(20_600 * MS) is not None, "too soon, whoever lost what"
+    assert plan.request(20_800 * MS) is None
+    plan.done(20_800 * MS)
+    plan.note_losses(1, 5)
+    plan.note_losses(1, 4)
+    assert plan.request(22_000 * MS) is not None, "nothing more was lost"
+    plan.note_losses(2, 1)
+    assert plan.request(22_000 * MS) is None, "another ground has its own losses"

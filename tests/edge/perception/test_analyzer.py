@@ -1,0 +1,333 @@
+"""What the edge sees of its own stream, and the thread it sees in."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from clips import framed, smooth_pictures
+from flight import CLASSES, SIZE, RedSquares, square_box
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import RoiHeader, StillResult
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.values import Frame, View
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import Sender
+from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.perception.analyzer import Sight, SightSettings
+from hvt_edge.perception.candidates import TrackMemory
+from hvt_edge.stills import stage as still_stage
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.policy.registry import method
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.stage import StillStage, StillWorker
+from hvt_edge.stills.suppression import Suppression
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+
+NOISE = (
+    8
+    * cv2.GaussianBlur(np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0], 1)), (0, 0), 1.5)[..., None]
+)
+FRAMES = [
+    # The camera sees a texture that the base does not show.
+    replace(frame, source_bgr=np.clip(frame.base_bgr + NOISE, 0, 255).astype(np.uint8))
+    for frame in framed(smooth_pictures(30, size=SIZE))
+]
+UNITS = [
+    unit
+    for encoder in [BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))]
+    for unit in map(encoder.encode, FRAMES)
+]
+VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
+
+
+def sight(*, detector=None, view: View = VIEW, **settings) -> Sight:
+    """The edge's eyes."""
+    tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15)
+    return Sight(detector or RedSquares(), tracker, view=view, settings=SightSettings(**settings))
+
+
+def test_every_frame_is_decoded_and_each_nth_is_searched():
+    """Candidates would be of other frames than the stills, or the processor would melt."""
+    eyes = sight(detect_every=5)
+    seen = [eyes.see(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
+    assert [one.frame.index for one in seen if one.detected] == [0, 5, 10, 15, 20, 25]
+    for one in seen[10:]:
+        assert one.tracks.frame_index == one.frame.index
+        assert one.tracks.ids.tolist() == [1]
+        np.testing.assert_allclose(one.tracks.boxes_xyxy_px[0], square_box(one.frame.index), atol=6)
+        error = one.base_bgr.astype(int) - one.frame.base_bgr
+        assert 0 < np.abs(error).mean() < 6, "the decoded picture, not the camera's"
+
+
+def test_in_a_hurry_detection_is_put_off_and_made_up_for():
+    """A slow detector would fall behind more and more; or a busy second would leave it blind for another."""
+    eyes = sight(detect_every=5)
+    hurried = {5, 6, 7, 15}
+    seen = [
+        eyes.see(frame, unit, hurry=frame.index in hurried) for frame, unit in zip(FRAMES, UNITS, strict=True)
+    ]
+    assert [one.frame.index for one in seen if one.detected] == [0, 8, 13, 18, 23, 28]
+    assert all(one.base_bgr.shape == (192, 320, 3) for one in seen)
+
+
+def test_candidates_of_the_source_lie_in_base_pixels():
+    """Stills would be cut at the wrong place where the detector looks at the camera's own frame."""
+    view = View.fitted((640, 384), SIZE, fit="letterbox")
+    eyes = sight(view=view, candidates="source", detect_every=1)
+    for frame, unit in zip(FRAMES[:4], UNITS, strict=False):
+        large = np.repeat(np.repeat(frame.base_bgr, 2, axis=0), 2, axis=1)
+        seen = eyes.see(Frame(frame.index, frame.capture_ns, large, frame.base_bgr), unit)
+    np.testing.assert_allclose(seen.tracks.boxes_xyxy_px[0], square_box(3), atol=3)
+
+
+def test_a_source_smaller_than_the_base_is_looked_at_enlarged():
+    """The edge would look at fewer pixels than the ground does, and its tracks would say less than the picture."""
+    looked_at = []
+
+    class Noting(RedSquares):
+        def detect(self, picture_bgr):
+            looked_at.append(picture_bgr)
+            return super().detect(picture_bgr)
+
+    view = View.fitted((160, 96), SIZE, fit="letterbox")
+    eyes = sight(detector=Noting(), view=view, candidates="source", detect_every=1)
+    for frame, unit in zip(FRAMES[:4], UNITS, strict=False):
+        small = frame.base_bgr[::2, ::2]
+        seen = eyes.see(Frame(frame.index, frame.capture_ns, small, frame.base_bgr), unit)
+    assert all(picture is frame.base_bgr for picture, frame in zip(looked_at, FRAMES, strict=False))
+    np.testing.assert_allclose(seen.tracks.boxes_xyxy_px[0], square_box(3), atol=3)
+
+
+def test_what_a_cropped_base_does_not_show_is_no_candidate():
+    """The ground would get stills of objects that its picture does not have."""
+    view = View.fitted((960, 192), SIZE, fit="crop")  # the base shows the middle third
+    eyes = sight(view=view, candidates="source", detect_every=1)
+    for frame, unit in zip(FRAMES[:3], UNITS, strict=False):
+        wide = np.zeros((192, 960, 3), np.uint8)
+        wide[:, :320] = frame.base_bgr
+        seen = eyes.see(Frame(frame.index, frame.capture_ns, wide, frame.base_bgr), unit)
+    assert len(seen.tracks) == 0
+
+
+def sparse(eyes: Sight, *, every: int, hurried: frozenset[int] = frozenset()) -> list:
+    """All ticks, of which only each n-th is coded, as with ``--fps auto``."""
+    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
+    return [
+        eyes.see(
+            replace(frame, source_bgr=frame.base_bgr),
+            encoder.encode(frame) if frame.index % every == 0 else None,
+            hurry=frame.index in hurried,
+        )
+        for frame in FRAMES
+    ]
+
+
+@pytest.mark.parametrize(
+    ("candidates", "every", "detected"),
+    [
+        ("source", 1, [0, 5, 10, 15, 20, 25]),
+        ("source", 2, [0, 6, 12, 18, 24]),
+        ("source", 5, [0, 5, 10, 15, 20, 25]),
+        ("source", 15, [0, 6, 11, 15, 20, 25]),
+        ("source", 8, [0, 6, 8, 13, 16, 21, 24, 29]),
+        ("decoded", 2, [0, 6, 12, 18, 24]),
+        ("decoded", 8, [0, 8, 16, 24]),
+        ("decoded", 15, [0, 15]),
+    ],
+)
+def test_where_few_ticks_are_coded_each_of_them_has_its_own_detection(candidates, every, detected):
+    """Stills could not be cut where the base has no picture, or would be chosen by what was seen before it."""
+    seen = sparse(sight(candidates=candidates), every=every)
+    assert [one.frame.index for one in seen if one.detected] == detected
+    assert [one.frame.index for one in seen if one.coded] == list(range(0, 30, every))
+    for one in seen:
+        assert (one.base_bgr is None) == (not one.coded)
+        assert one.tracks.frame_index == one.frame.index
+    if every > 5:
+        assert all(one.detected for one in seen if one.coded)
+
+
+def test_ticks_that_are_not_coded_still_move_the_tracks():
+    """At a frame a second, tracks would jump, and the tracks channel have nothing to say between."""
+    seen = sparse(sight(candidates="source", detect_every=3), every=10)
+    for one in seen[7:]:
+        assert one.tracks.ids.tolist() == [1]
+        np.testing.assert_allclose(one.tracks.boxes_xyxy_px[0], square_box(one.frame.index), atol=6)
+
+
+def test_a_hurried_coded_tick_is_made_up_for():
+    """With a slow detector and few coded ticks, detection would be put off until the next coded one."""
+    seen = sparse(sight(candidates="source"), every=15, hurried=frozenset({15}))
+    assert [one.frame.index for one in seen if one.detected] == [0, 6, 11, 16, 21, 26]
+
+
+def test_with_candidates_of_the_source_the_camera_is_followed_on_the_source():
+    """Tracks would be moved by what the coder left of the picture, and not at all between coded ticks."""
+    given: list[bool] = []
+
+    class Watched(ByteTracker):
+        def predict(self, *, frame_index, image_bgr=None):
+            given.append(image_bgr is FRAMES[frame_index].base_bgr)
+            return super().predict(frame_index=frame_index, image_bgr=image_bgr)
+
+    for candidates, followed in (("source", True), ("decoded", False)):
+        tracker = Watched(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
+        settings = SightSettings(candidates=candidates)
+        sparse(Sight(RedSquares(), tracker, view=VIEW, settings=settings), every=2)
+        assert set(given) == {followed}
+        given.clear()
+
+
+class Out:
+    """Keeps what was put."""
+
+    def __init__(self) -> None:
+        self.stills: list[RoiHeader] = []
+
+    def put(self, row, payload, *, attachment=None, encoding="") -> None:
+        """Keep the header."""
+        self.stills.append(RoiHeader.parse(attachment, payload))
+
+
+class Rig:
+    """A still stage with a real budget of 200 kbps for stills, and all that left it."""
+
+    def __init__(self, *, detector=None) -> None:
+        self.out, self.fates = Out(), Counter()
+        self.memory, self.keyframes = TrackMemory(), KeyframePlan()
+        sender = Sender(
+            self.out,
+            ledger=Ledger(),
+            budget=RollingBudget(BudgetSettings(400_000, 200_000, fps=15)),
+            edge_id="edge-1",
+            session_id=1,
+            lockstep=False,
+            wait_until=lambda _at: None,
+        )
+        chooser = Chooser(
+            method("M1"),
+            suppression=Suppression.for_cooldown(0),
+            maker=StillMaker(),
+            memory=self.memory,
+            view=VIEW,
+            class_names=CLASSES,
+            settings=ChooserSettings(fps=15, most_bytes=10_000),
+            on_fate=lambda *fate: self.fates.update([fate]),
+        )
+        self.stage = StillStage(
+            sight(detector=detector),
+            chooser,
+            sender=sender,
+            keyframes=self.keyframes,
+        )
+        self.keyframes.done(FRAMES[0].capture_ns)
+
+    def run(self, count: int = 30) -> None:
+        """Frame after frame, as the lockstep loop does."""
+        for frame, unit in zip(FRAMES[:count], UNITS, strict=False):
+            self.stage.send(self.stage.see(frame, unit), now_ns=frame.capture_ns)
+
+
+def test_a_track_gets_its_stills_when_they_are_due():
+    """M1 would send nothing, or stills of the wrong moment."""
+    rig = Rig()
+    rig.run()
+    assert [one.sequence for one in rig.out.stills] == list(range(len(rig.out.stills)))
+    assert [one.frame_index for one in rig.out.stills] == [0, 15]
+    for one in rig.out.stills:
+        np.testing.assert_allclose(one.box_source_px, square_box(one.frame_index), atol=6)
+    assert rig.fates["sent", "due"] == len(rig.out.stills)
+    assert rig.stage.tracks == 1
+    assert rig.stage.sight_ms > 0
+
+
+def test_while_a_keyframe_is_due_stills_are_held():
+    """A still would take the room that the keyframe waits for."""
+    rig = Rig()
+    assert rig.keyframes.request(FRAMES[0].capture_ns + 500_000_000) is None
+    rig.run()
+    assert rig.out.stills == []
+    rig.keyframes.done(FRAMES[-1].capture_ns)
+    assert rig.stage.waiting == 1
+    rig.stage.close()
+    assert rig.fates["dropped", "ended"] == 1
+
+
+def test_what_the_ground_says_counts_and_no_opinion_does_not():
+    """M3 and M5 would never learn what the classifier sees."""
+    rig = Rig()
+    rig.run(6)
+    answer = {
+        "still_sequence": 0,
+        "track_id": 1,
+        "confidence": 0.9,
+        "entropy_nats": 0.2,
+        "ground_track_id": 3,
+        "again": False,
+    }
+    rig.stage.hear([StillResult(class_name="", **answer)])
+    assert rig.memory._histories[1].belief is None
+    rig.stage.hear(
+        [
+            StillResult(class_name="bus", **answer),
+            StillResult(class_name="bus", **(answer | {"track_id": 99})),
+        ]
+    )
+    assert rig.memory._histories[1].belief.class_name == "bus"
+
+
+def test_the_worker_takes_all_frames_in_order_and_finishes(monkeypatch):
+    """The last stills of a clip would be missing."""
+    monkeypatch.setattr(still_stage, "_FINISH_S", 30 * still_stage._FINISH_S)  # on a busy machine as well
+    rig = Rig()
+    with StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns) as worker:
+        for frame, unit in zip(FRAMES, UNITS, strict=True):
+            while worker._frames.qsize() > 1:  # it is not hurried
+                time.sleep(0.001)
+            worker.offer(frame, unit)
+    assert rig.stage._steps == 30
+    assert [one.frame_index for one in rig.out.stills] == [0, 15]
+
+
+def test_an_error_in_the_worker_is_raised_even_when_its_queue_is_full():
+    """The edge would drop every further frame in silence and look alive."""
+    offered = threading.Event()
+
+    class Broken(RedSquares):
+        def detect(self, image_bgr):
+            assert offered.wait(30)
+            raise RuntimeError("model is gone")
+
+    rig = Rig(detector=Broken())
+    worker = StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns, length=2)
+    for frame, unit in zip(FRAMES[:3], UNITS, strict=False):
+        worker.offer(frame, unit)
+    offered.set()
+    worker._thread.join(30)
+    with pytest.raises(RuntimeError, match="model is gone"):
+        assert worker.full
+    worker.close()
+
+
+def test_closing_a_busy_worker_is_quick_and_leaves_nothing_running():
+    """Ctrl-C would hang behind a slow detector, or two threads would use one queue."""
+
+    class Slow(RedSquares):
+        def detect(self, image_bgr):
+            assert worker._given_up.wait(30), "for as long as anybody waits"
+            return super().detect(image_bgr)
+
+    rig = Rig(detector=Slow())
+    worker = StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns)
+    for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
+        worker.offer(frame, unit)
+    worker.close()
+    assert not worker._thread.is_alive()
+    assert rig.stage._steps < 16, "what was not in hand was left"

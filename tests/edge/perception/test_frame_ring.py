@@ -1,0 +1,90 @@
+"""The ring of source frames: what it keeps, and how far back it goes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clips import START_NS
+from flight import tracks_at
+from hvt_common.values import Frame
+from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+
+SECOND_NS = 1_000_000_000
+PICTURE = np.zeros((10, 20, 3), np.uint8)  # 600 bytes
+
+
+def frame(index: int, *, fps: float = 15.0, picture: np.ndarray = PICTURE) -> Frame:
+    """As a source hands it on."""
+    return Frame(index, START_NS + round(index * SECOND_NS / fps), picture, picture)
+
+
+def filled(ring: FrameRing, count: int, *, fps: float = 15.0) -> FrameRing:
+    """The ring after so many frames."""
+    for index in range(count):
+        ring.add(frame(index, fps=fps), tracks_at(index, {}))
+    return ring
+
+
+def test_with_room_every_frame_of_the_last_seconds_is_there():
+    """An operator who saw something a moment ago would get the frame beside it."""
+    ring = filled(FrameRing(RingSettings(max_bytes=600 * 200, max_age_ns=2 * SECOND_NS)), 100)
+    assert len(ring) == 31
+    assert [ring.near_index(index).frame_index for index in (69, 80, 99)] == [69, 80, 99]
+    assert ring.near_index(68) is None
+    assert ring.reach_s() == pytest.approx(2.0)
+
+
+def test_with_little_memory_it_goes_back_as_far_with_frames_left_out():
+    """On a 4K camera "three seconds ago" would be refused, because 250 MB are gone after 0.7 s."""
+    ring = filled(FrameRing(RingSettings(max_bytes=600 * 10, max_age_ns=5 * SECOND_NS)), 400)
+    assert ring.size_bytes <= 6000
+    assert ring.reach_s() == pytest.approx(5.0, abs=0.7)
+    kept = [
+        ring.near_time(START_NS + round(399 / 15 * SECOND_NS) - ago * SECOND_NS) for ago in (0, 1, 2, 3, 4)
+    ]
+    assert kept[0].frame_index == 399
+    for ago, one in enumerate(kept):
+        assert one.frame_index == pytest.approx(399 - 15 * ago, abs=5.1)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    count=st.integers(0, 120),
+    max_bytes=st.integers(0, 40_000),
+    age_s=st.floats(0.0, 6.0),
+    fps=st.sampled_from([1.0, 5.0, 15.0, 29.97]),
+)
+def test_its_bounds_hold_and_the_newest_is_always_there(count, max_bytes, age_s, fps):
+    """A drone would run out of memory in flight, or "now" would be a picture of before."""
+    ring = FrameRing(RingSettings(max_bytes=max_bytes, max_age_ns=round(age_s * SECOND_NS)))
+    for index in range(count):
+        ring.add(frame(index, fps=fps), tracks_at(index, {}))
+        assert ring.size_bytes == 600 * len(ring) <= max_bytes
+        assert ring.reach_s() <= age_s + 1e-9
+        if max_bytes >= 600:
+            assert ring.newest.frame_index == index
+        else:
+            assert ring.newest is None
+
+
+def test_the_pixels_are_the_sources_own_and_the_tracks_those_of_the_frame():
+    """A still would show what another loss left of it, or the place where the object was later."""
+    picture = np.random.default_rng(0).integers(0, 255, (10, 20, 3), np.uint8)
+    ring = FrameRing()
+    ring.add(frame(0, picture=picture), tracks_at(0, {7: (1.0, 1.0, 5.0, 5.0)}))
+    ring.add(frame(1), tracks_at(1, {7: (2.0, 1.0, 6.0, 5.0)}))
+    kept = ring.near_index(0)
+    assert kept.source_bgr is picture
+    assert kept.tracks.boxes_xyxy_px.tolist() == [[1, 1, 5, 5]]
+
+
+def test_a_frame_that_is_gone_or_to_come_is_not_replaced_by_another():
+    """The operator would be shown another moment than he asked for, and not know."""
+    ring = filled(FrameRing(RingSettings(max_age_ns=SECOND_NS)), 60)
+    newest_ns = ring.newest.capture_ns
+    assert ring.near_index(60) is None
+    assert ring.near_time(newest_ns - 2 * SECOND_NS) is None
+    assert ring.near_time(newest_ns - SECOND_NS).frame_index == 44

@@ -1,0 +1,521 @@
+"""Every kind of source, on real files and real sockets."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+import time
+from fractions import Fraction
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import pairwise
+
+import av
+import cv2
+import numpy as np
+import pytest
+from av.video.reformatter import Interpolation
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.clock import SteadyClock
+from hvt_edge.source.folder import sequence_files
+from hvt_edge.source.live import LiveSource
+from hvt_edge.source.opening import open_source
+from hvt_edge.source.stream import StreamGrabber
+
+BASE = {"size": (320, 180), "fps": 15.0}
+
+
+def painted(number, *, size=(160, 120)):
+    """Paint a grey picture whose level says which frame it is."""
+    return np.full((size[1], size[0], 3), 20 + number % 38 * 6, np.uint8)
+
+
+def number_of(frame):
+    """Read from the grey level which frame it is."""
+    return round((float(frame.source_bgr[20:-20, 20:-20].mean()) - 20) / 6)
+
+
+def write_clip(
+    path, *, codec="libx264", rate=30, count=30, pixels="yuv420p", size=(160, 120), times=None, **options
+):
+    """Encode `painted` frames; ``times`` (in milliseconds) overrides the constant rate.
+
+    Colours are rounded accurately: swscale is otherwise three levels too dark.
+    """
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        stream.width, stream.height, stream.pix_fmt = *size, pixels
+        stream.options = {name: str(value) for name, value in options.items()}
+        if times is not None:
+            stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        for number in range(count):
+            frame = av.VideoFrame.from_ndarray(painted(number, size=size), format="bgr24")
+            frame = frame.reformat(
+                format=pixels, interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND
+            )
+            if times is not None:
+                frame.pts, frame.time_base = times[number], Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return str(path)
+
+
+def play(spec, **settings):
+    """Play a source to its end; returns it, closed, and its frames."""
+    with open_source(spec, **{**BASE, **settings}) as source:
+        return source, list(source.frames(start_ns=1_000))
+
+
+# -- video files ------------------------------------------------------------
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("clip", "count", "size"),
+    [("drone_carpark.mp4", 220, (1100, 720)), ("intel_car-detection.mp4", 453, (768, 432))],
+)
+def test_a_real_clip_gives_the_frames_its_duration_holds(data, clip, count, size):
+    """A user's clip would run fast, slow or short, or its boxes would be stretched."""
+    with open_source(str(data / "clips" / clip), size=(1280, 720), fps=15) as source:
+        assert source.view.source_size == size
+        assert source.frame_count == count
+        seen = 0
+        for frame in source.frames(start_ns=10**18):
+            assert frame.index == seen
+            assert frame.capture_ns == 10**18 + round(Fraction(seen, 15) * 10**9)
+            assert frame.source_bgr.shape == (size[1], size[0], 3)
+            assert frame.base_bgr.shape == (720, 1280, 3)
+            seen += 1
+    assert seen == count
+
+
+@pytest.mark.realdata
+def test_a_real_clip_is_letterboxed_without_distortion(data):
+    """1100x720 in 1280x720 is the very same picture between two black borders; stretched cars would be misjudged."""
+    clip = str(data / "clips" / "drone_carpark.mp4")
+    with open_source(clip, size=(1280, 720), fps=15, max_frames=1) as source:
+        assert not source.live
+        (frame,) = source.frames(start_ns=0)
+    assert np.array_equal(frame.base_bgr[:, 90:1190], frame.source_bgr)
+    assert not frame.base_bgr[:, :90].any()
+    assert not frame.base_bgr[:, 1190:].any()
+
+
+@pytest.mark.realdata
+def test_a_real_clip_shows_the_right_frames(data):
+    """At 24 to 15 fps a wrong choice of frames makes cars jump to and fro."""
+    clip = str(data / "clips" / "drone_carpark.mp4")
+    with av.open(clip) as container:
+        decoded = [
+            frame.to_ndarray(format="bgr24")
+            for _, frame in zip(range(41), container.decode(video=0), strict=False)
+        ]
+    _, frames = play(clip, max_frames=25)
+    for frame in frames:
+        assert np.array_equal(frame.source_bgr, decoded[frame.index * 24 // 15])
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels", "size"),
+    [
+        ("h264.mp4", "libx264", "yuv420p", (160, 120)),
+        ("hevc.mp4", "libx265", "yuv420p", (160, 120)),
+        ("hevc10.mkv", "libx265", "yuv420p10le", (160, 120)),
+        ("vp9.webm", "libvpx-vp9", "yuv420p", (160, 120)),
+        ("av1.mp4", "libsvtav1", "yuv420p", (160, 120)),
+        ("odd.mkv", "ffv1", "bgr0", (161, 121)),
+        ("grey.mkv", "ffv1", "gray", (160, 120)),
+        ("grey10.mkv", "ffv1", "gray10le", (160, 120)),
+        ("motion.avi", "mjpeg", "yuvj420p", (160, 120)),
+    ],
+)
+def test_any_codec_and_pixel_format_comes_out_as_bgr(tmp_path, name, codec, pixels, size):
+    """A clip of another camera would be refused or come out in false colours."""
+    if codec not in av.codecs_available:
+        pytest.skip(f"this FFmpeg has no {codec}")
+    clip = write_clip(tmp_path / name, codec=codec, pixels=pixels, size=size, count=20)
+    source, frames = play(clip)
+    assert source.view.source_size == size
+    assert [number_of(frame) for frame in frames] == list(range(0, 20, 2))
+    for frame in frames:
+        assert frame.source_bgr.shape == (size[1], size[0], 3)
+        assert frame.source_bgr.dtype == np.uint8
+
+
+def test_a_variable_rate_and_a_late_start_are_kept(tmp_path):
+    """A screen or phone recording would play at the wrong speed; a cut clip would begin with seconds of nothing."""
+    times = [5000, 5100, 5500, 5533, 5567, 6000]
+    clip = write_clip(tmp_path / "vfr.mkv", times=times, count=6)
+    _, frames = play(clip, fps=10)
+    shown = [number_of(frame) for frame in frames]
+    assert shown[:11] == [0, 1, 1, 1, 1, 2, 4, 4, 4, 4, 5]
+
+
+def test_a_sideways_clip_stands_upright(tmp_path):
+    """A phone held upright films sideways; the detector would see cars drive up walls."""
+    path = tmp_path / "plain.mp4"
+    picture = np.full((120, 160, 3), 40, np.uint8)
+    picture[:, :40] = 220  # bright at the left
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=15)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        for _ in range(5):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+    raw = bytearray(path.read_bytes())
+    # The track header's matrix (ISO/IEC 14496-12, 8.3.2): identity becomes a quarter turn clockwise.
+    one, zero = (0x10000).to_bytes(4, "big"), bytes(4)
+    identity = one + zero * 3 + one + zero * 3 + (0x40000000).to_bytes(4, "big")
+    minus = (-0x10000).to_bytes(4, "big", signed=True)
+    turned = zero + one + zero + minus + zero * 4 + (0x40000000).to_bytes(4, "big")
+    at = raw.index(identity, raw.index(b"tkhd"))
+    raw[at : at + 36] = turned
+    path.write_bytes(raw)
+    source, frames = play(str(path))
+    assert source.view.source_size == (120, 160)
+    upright = frames[0].source_bgr
+    assert upright[:36].mean() > 180  # what was left is now at the top
+    assert upright[60:].mean() < 80
+
+
+def test_a_damaged_clip_plays_as_far_as_it_goes_and_says_so(tmp_path, caplog):
+    """A drone that lost power leaves a broken file; its user would get nothing of it, or no warning."""
+    clip = write_clip(tmp_path / "whole.ts", count=90, g=10, bf=0)
+    raw = (tmp_path / "whole.ts").read_bytes()
+    broken = tmp_path / "broken.ts"
+    rng = np.random.default_rng(1)
+    half = len(raw) // 2 // 188 * 188
+    broken.write_bytes(raw[:half] + rng.bytes(4000))
+    _, whole = play(clip)
+    with caplog.at_level(logging.WARNING):
+        _, frames = play(str(broken))
+    assert 10 < len(frames) < len(whole)
+    assert [number_of(f) for f in frames[:10]] == [number_of(f) for f in whole[:10]]
+
+
+def test_a_cut_mp4_warns(tmp_path, caplog):
+    """A half-copied clip would pass for a whole one."""
+    clip = tmp_path / "cut.mp4"
+    write_clip(tmp_path / "whole.mp4", count=90, g=10, bf=0, movflags="faststart")
+    with (
+        av.open(str(tmp_path / "whole.mp4")) as source,
+        av.open(str(clip), "w", options={"movflags": "faststart"}) as target,
+    ):
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    raw = clip.read_bytes()
+    clip.write_bytes(raw[: len(raw) * 6 // 10])
+    with caplog.at_level(logging.WARNING):
+        _, frames = play(str(clip))
+    assert 3 < len(frames) < 45
+    assert "cut.mp4" in caplog.text
+
+
+def test_a_clip_plays_twice_and_stops_early(tmp_path):
+    """A second pass would be empty, or a stop in the middle would hang."""
+    clip = write_clip(tmp_path / "clip.mp4", count=60)
+    with open_source(clip, **BASE) as source:
+        first = source.frames(start_ns=0)
+        assert [next(first).index for _ in range(3)] == [0, 1, 2]
+        assert [frame.index for frame in source.frames(start_ns=0)] == list(range(30))
+
+
+def test_source_fps_overrides_a_clips_own_times(tmp_path):
+    """A time lapse could not be played at the rate it was taken."""
+    clip = write_clip(tmp_path / "lapse.mp4", rate=30, count=30)
+    source, frames = play(clip, source_fps=5, fps=5)
+    assert source.frame_count == 30
+    assert [number_of(frame) for frame in frames] == list(range(30))
+
+
+# -- image folders ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "pattern", ["{:07d}.jpg", "img{:06d}.jpg", "shot-{}.png", "{}.bmp", "a{}.webp", "b{}.tif"]
+)
+def test_sequence_folders_play_in_order(tmp_path, pattern):
+    """VisDrone and UAVDT sequences would not play as they are, or play 1, 10, 11, 2."""
+    for number in range(1, 13):
+        assert cv2.imwrite(str(tmp_path / pattern.format(number)), painted(number))
+    (tmp_path / "gt.txt").write_text("1,1,1,1")
+    source, frames = play(str(tmp_path))
+    assert source.frame_count == 12
+    assert not source.live
+    assert [number_of(frame) for frame in frames] == list(range(1, 13))
+    assert frames[-1].capture_ns == 1_000 + round(11 / 15 * 1e9)
+
+
+def test_a_folder_at_its_own_rate(tmp_path):
+    """A 30 fps sequence would play at half speed in a 15 fps stream."""
+    for number in range(12):
+        cv2.imwrite(str(tmp_path / f"{number:07d}.png"), painted(number))
+    source, frames = play(str(tmp_path), source_fps=30)
+    assert source.frame_count == 6
+    assert [number_of(frame) for frame in frames] == [0, 2, 4, 6, 8, 10]
+
+
+def test_an_unreadable_image_is_held_over_and_shifts_nobody(tmp_path, caplog):
+    """One bad file would end the run, or put every later frame against the wrong ground truth."""
+    for number in range(6):
+        cv2.imwrite(str(tmp_path / f"{number:07d}.jpg"), painted(number))
+    (tmp_path / "0000002.jpg").write_bytes(b"not a picture")
+    (tmp_path / "0000003.jpg").write_bytes(b"")
+    with caplog.at_level(logging.WARNING):
+        _, frames = play(str(tmp_path))
+    assert [number_of(frame) for frame in frames] == [0, 1, 1, 1, 4, 5]
+    assert [record.getMessage().count("cannot be read") for record in caplog.records] == [1, 1]
+
+
+def test_another_size_among_images_is_fitted_into_the_first_ones(tmp_path):
+    """A sequence with one odd image would crash the encoder."""
+    cv2.imwrite(str(tmp_path / "1.png"), painted(50, size=(200, 100)))
+    cv2.imwrite(str(tmp_path / "2.png"), painted(50, size=(100, 100)))
+    _, frames = play(str(tmp_path))
+    assert frames[1].source_bgr.shape == (100, 200, 3)
+    assert (frames[1].source_bgr[:, 50:150] == 92).all()
+    assert not frames[1].source_bgr[:, :50].any()
+
+
+def test_hidden_files_are_not_frames(tmp_path):
+    """A folder that came from a Mac would show its thumbnails."""
+    cv2.imwrite(str(tmp_path / "1.png"), painted(1))
+    (tmp_path / "._1.png").write_bytes(b"resource fork")
+    assert [file.name for file in sequence_files(tmp_path)] == ["1.png"]
+
+
+# -- demo ------------------------------------------------------------
+
+
+def test_the_demo_is_a_source_with_truth():
+    """The command `make demo` would have nothing to show, or nothing to measure against."""
+    with open_source("demo", size=(640, 360), fps=15, seed=2, max_frames=2) as source:
+        assert not source.live
+        assert source.frame_count == 2
+        assert source.class_names[:2] == ("car", "van")
+        assert source.view.source_size == (1920, 1080)
+        first, second = source.frames(start_ns=50)
+        truth = source.scene.truth(second.index / source.fps)
+    assert (first.capture_ns, second.capture_ns) == (50, 50 + 66_666_667)
+    assert first.base_bgr.shape == (360, 640, 3)
+    assert len(truth) > 30
+    with open_source("demo", size=(640, 360), fps=12.5) as source:
+        assert source.frame_count == 250
+
+
+# -- live ------------------------------------------------------------
+
+
+class Live(BaseHTTPRequestHandler):
+    """Sends an MPEG-TS recording at a few times its own pace and hangs up, like a camera that restarts."""
+
+    stream: bytes = b""
+
+    def do_GET(self):
+        """Answer with the recording."""
+        self.send_response(200)
+        self.send_header("Content-Type", "video/mp2t")
+        self.end_headers()
+        try:
+            for start in range(0, len(self.stream), 188 * 8):
+                self.wfile.write(self.stream[start : start + 188 * 8])
+                time.sleep(0.01)
+        except OSError:
+            return
+
+    def log_message(self, *_):
+        """Keep quiet."""
+        return
+
+
+@pytest.fixture
+def http_stream(tmp_path):
+    """Serve a stream without a length from loopback."""
+    write_clip(tmp_path / "live.ts", codec="mpeg2video", rate=25, count=200, size=(320, 240), b=2_000_000)
+    Live.stream = (tmp_path / "live.ts").read_bytes()
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Live)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}/live.ts"
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_an_http_stream_plays_live_and_comes_back_after_it_ends(http_stream, caplog):
+    """A camera that restarts would end the flight's telemetry."""
+    began = time.time_ns()
+    with caplog.at_level(logging.WARNING), open_source(http_stream, size=(320, 180), fps=100) as source:
+        assert source.live
+        assert source.frame_count is None
+        assert source.view.source_size == (320, 240)
+        frames = []
+        for frame in source.frames(start_ns=0):
+            frames.append(frame)
+            if "is back" in caplog.text and len(frames) > 20:
+                break
+    assert [frame.index for frame in frames] == list(range(len(frames)))
+    times = [frame.capture_ns for frame in frames]
+    assert began < times[0]
+    assert times == sorted(times)
+    assert frames[0].base_bgr.shape == (180, 320, 3)
+    assert "opening it again" in caplog.text
+    assert not [thread for thread in threading.enumerate() if thread.name == "hvt-source"]
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_a_clock_that_is_set_neither_stops_a_camera_nor_dates_it_anew(http_stream, monkeypatch, step_s):
+    """NTP would silence the camera for as long as the clock was ahead, or put an hour into the recording."""
+    wall_ns, set_by_s = time.time_ns, [0]
+    monkeypatch.setattr(time, "time_ns", lambda: wall_ns() + set_by_s[0] * 1_000_000_000)
+    with open_source(http_stream, size=(320, 180), fps=20, clock=SteadyClock()) as source:
+        times = []
+        for frame in source.frames(start_ns=0):
+            times.append(frame.capture_ns)
+            if len(times) == 10:
+                set_by_s[0] = step_s
+            if len(times) == 25:
+                break
+    gaps = [later - earlier for earlier, later in pairwise(times)]
+    assert min(gaps) > 0
+    assert max(gaps) < 30_000_000_000
+
+
+def test_a_slow_consumer_gets_fresh_frames_and_no_queue(http_stream):
+    """The operator would see the past, later and later."""
+    with open_source(http_stream, size=(320, 180), fps=200) as source:
+        stale = []
+        for frame in source.frames(start_ns=0):
+            stale.append(time.time_ns() - frame.capture_ns)
+            time.sleep(0.15)
+            if len(stale) == 4:
+                break
+        assert source.dropped > 0
+
+
+def test_a_udp_stream_plays(tmp_path):
+    """A drone's video link, which sends MPEG-TS by UDP, could not be used."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    stop = threading.Event()
+
+    def send():
+        with av.open(f"udp://127.0.0.1:{port}?pkt_size=1316", "w", format="mpegts") as container:
+            stream = container.add_stream("mpeg2video", rate=50)
+            stream.width, stream.height, stream.pix_fmt, stream.gop_size = 320, 240, "yuv420p", 5
+            number = 0
+            while not stop.wait(0.01):
+                picture = av.VideoFrame.from_ndarray(painted(number, size=(320, 240)), format="bgr24")
+                container.mux(stream.encode(picture))
+                number += 1
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        with open_source(f"udp://127.0.0.1:{port}", size=(320, 180), fps=15, max_frames=5) as source:
+            frames = list(source.frames(start_ns=0))
+    finally:
+        stop.set()
+        sender.join()
+    assert [frame.index for frame in frames] == list(range(5))
+    # The base rate, although the sender is faster: four periods less the quarter that a frame may be early. Not each
+    # gap by itself: after a frame that is late the next may follow at once.
+    assert frames[-1].capture_ns - frames[0].capture_ns >= (4 - 1 / 4) / 15 * 1e9
+
+
+def test_closing_ends_a_reader_that_waits(http_stream):
+    """Ctrl-C would hang while the camera is silent."""
+    source = LiveSource(StreamGrabber(http_stream), size=(320, 180), fps=15, fit="letterbox")
+    closer = threading.Timer(0.3, source.close)
+    closer.start()
+    list(source.frames(start_ns=0))
+    closer.join()
+    source.close()
+
+
+# -- wrong input ------------------------------------------------------------
+
+
+def refused(spec, **settings):
+    """Return the sentence with which a source is refused."""
+    with pytest.raises(UserError) as caught:
+        open_source(spec, **{**BASE, **settings})
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert not sentence.endswith(".")
+    return sentence
+
+
+def test_missing_and_unusable_files_are_one_sentence(tmp_path):
+    """A typing error would end in a traceback."""
+    empty = tmp_path / "empty.mp4"
+    empty.touch()
+    text = tmp_path / "notes.txt"
+    text.write_text("not a video\n" * 50)
+    noise = tmp_path / "noise.mp4"
+    noise.write_bytes(np.random.default_rng(0).bytes(20_000))
+    bare = tmp_path / "folder"
+    bare.mkdir()
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "1.jpg").write_bytes(b"no picture")
+    assert "nothere.mp4" in refused(str(tmp_path / "nothere.mp4"))
+    assert "empty" in refused(str(empty))
+    assert "no video" in refused(str(text)) or "not a video" in refused(str(text))
+    assert "noise.mp4" in refused(str(noise))
+    assert "no images" in refused(str(bare))
+    assert "none of which" in refused(str(broken))
+
+
+def test_a_sound_file_is_no_video(tmp_path):
+    """A wrong file would fail somewhere in the decoder."""
+    path = tmp_path / "tone.wav"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        stream.layout = "mono"
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+    assert "no video" in refused(str(path))
+
+
+def test_unreachable_streams_are_one_sentence_without_the_password(free_port):
+    """The user would wait for ever, or find the camera's password in the log."""
+    sentence = refused(f"rtsp://admin:secret@127.0.0.1:{free_port}/cam")
+    assert "secret" not in sentence
+    assert "127.0.0.1" in sentence
+    assert "scheme" in refused("gopher://127.0.0.1/x")
+
+
+def test_a_stream_that_never_answers_is_given_up(free_port):
+    """An address that accepts and says nothing would hang the start."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        grabber = StreamGrabber(f"rtsp://127.0.0.1:{silent.getsockname()[1]}/cam", open_s=0.5)
+        with pytest.raises(UserError, match=r"within 0\.5 s"):
+            grabber.open()
+
+
+def test_a_missing_camera_is_one_sentence():
+    """A wrong device number would end in OpenCV's own words."""
+    assert "/dev/video97 does not exist" in refused("/dev/video97")
+    assert "no video device" in refused(os.devnull)
+
+
+@pytest.mark.parametrize("size", [(1281, 720), (1280, 719), (62, 720), (1280, 8194), (0, 0), (-64, 64)])
+def test_impossible_sizes_are_refused(size):
+    """The encoder would crash later, with no hint of the cause."""
+    assert f"{size[0]}x{size[1]}" in refused("demo", size=size)
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, 240.5, float("nan"), float("inf")])
+def test_impossible_rates_are_refused(fps):
+    """A rate of nought would divide by it."""
+    assert "fps" in refused("demo", fps=fps)
+    assert "source-fps" in refused("demo", source_fps=-1.0)

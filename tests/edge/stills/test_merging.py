@@ -1,0 +1,161 @@
+"""Neighbours that share a still: never more bytes, nobody lost, the same every time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.ledger import overhead_bytes
+from hvt_common.protocol.messages import AlsoShown, RoiHeader
+from hvt_common.video.base_crop import coded_size
+from hvt_edge.perception.candidates import Candidate
+from hvt_edge.perception.crop import crop_box
+from hvt_edge.stills.merging import ALSO_BYTES, expected_bytes, group, union_crop
+from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Request
+from hvt_edge.stills.policy.cost import CostEstimate
+
+SOURCE = (1280, 720)
+PADDING = 0.15
+COSTS = st.builds(CostEstimate, st.floats(0, 800), st.floats(0, 0.3), st.just(1000.0))  # fixed, a pixel, mean
+
+
+def wish(track_id: int, x: float, y: float, *, side: float = 20, score: float = 1.0) -> Request:
+    """A wish for a still of a square object."""
+    box = (x, y, x + side, y + side)
+    size = coded_size(crop_box(box, padding=PADDING, source_size=SOURCE))
+    candidate = Candidate(
+        frame_index=7,
+        track_id=track_id,
+        box_base_px=box,
+        box_source_px=box,
+        class_id=0,
+        class_name="car",
+        confidence=0.5,
+        area_share=side * side / (1280 * 720),
+        crop_area_px=float(size[0] * size[1]),
+        born_frame=0,
+    )
+    return Request(candidate, "gain", score)
+
+
+@st.composite
+def wishes(draw) -> list[Request]:
+    """A crowd, most wanted first."""
+    places = draw(
+        st.lists(
+            st.tuples(st.floats(0, 1200), st.floats(0, 640), st.floats(2, 700), st.floats(0, 9)), max_size=30
+        )
+    )
+    some = [
+        wish(number + 1, x, y, side=min(side, 1280 - x, 720 - y), score=score)
+        for number, (x, y, side, score) in enumerate(places)
+    ]
+    return sorted(some, key=lambda one: (-one.score, one.candidate.track_id))
+
+
+def joined(some: list[Request], **changes) -> list[tuple[Request, list[Request]]]:
+    """Grouped as in flight."""
+    settings = {
+        "cost": CostEstimate(300, 0.1, 1000),
+        "overhead_bytes": STILL_OVERHEAD_BYTES,
+        "padding": PADDING,
+        "source_size": SOURCE,
+    }
+    return group(some, **{**settings, **changes})
+
+
+def line_bytes(one: Request, cost: CostEstimate, overhead: float) -> float:
+    """What its still is expected to take."""
+    payload = expected_bytes(one, cost=cost, padding=PADDING, source_size=SOURCE)
+    return payload + overhead + ALSO_BYTES * len(one.also)
+
+
+@settings(max_examples=150, deadline=None)
+@given(some=wishes(), cost=COSTS, overhead=st.floats(0, 300), most=st.integers(0, 15))
+def test_sharing_never_costs_more_and_loses_nobody(some, cost, overhead, most):
+    """Sharing would waste what it is there to save, or an object would never get its still."""
+    groups = joined(some, cost=cost, overhead_bytes=overhead, most=most)
+    assert joined(some, cost=cost, overhead_bytes=overhead, most=most) == groups
+    ids = [request.candidate.track_id for lead, others in groups for request in (lead, *others)]
+    assert sorted(ids) == sorted(one.candidate.track_id for one in some)
+    by_id = {one.candidate.track_id: one for one in some}
+    for lead, others in groups:
+        alone = [by_id[one.candidate.track_id] for one in (lead, *others)]
+        assert (
+            line_bytes(lead, cost, overhead) <= sum(line_bytes(one, cost, overhead) for one in alone) + 1e-6
+        )
+        assert [one.track_id for one in lead.also] == sorted(one.candidate.track_id for one in others)
+        assert len(others) <= most
+        assert lead.score >= max(one.score for one in alone)
+        if others:
+            x1, y1, x2, y2 = union_crop(lead, padding=PADDING, source_size=SOURCE)
+            assert max(x2 - x1, y2 - y1) <= 512
+        else:
+            assert lead == alone[0]
+    scores = [lead.score for lead, _ in groups]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_a_car_park_row_shares_and_the_far_one_does_not():
+    """Four headers would be paid for four objects that one small crop shows."""
+    row = [wish(number, 100 + 24 * number, 200, score=5 - number) for number in range(1, 5)]
+    far = wish(9, 900, 600, score=0.5)
+    (first, others), (second, alone) = joined([*row, far])
+    assert first.candidate.track_id == 1
+    assert [one.candidate.track_id for one in others] == [2, 3, 4]
+    assert union_crop(first, padding=PADDING, source_size=SOURCE) == (121, 197, 219, 223)
+    assert (second, alone) == (far, [])
+    single = sum(one.score * line_bytes(one, CostEstimate(300, 0.1, 1000), 180) for one in row)
+    assert first.score == pytest.approx(single / (300 + 0.1 * 98 * 26 + 180 + 3 * 17))
+
+
+def test_pixels_between_have_their_price():
+    """Two objects at the two ends of the picture would make one huge still."""
+    near, pricey = CostEstimate(300, 0.01, 1000), CostEstimate(300, 0.3, 1000)
+    pair = [wish(1, 100, 200), wish(2, 200, 200)]
+    assert len(joined(pair, cost=near)) == 1
+    assert len(joined(pair, cost=pricey)) == 2
+    assert len(joined([wish(1, 100, 200), wish(2, 700, 200)], cost=CostEstimate(300, 0, 1000))) == 2
+    assert joined([]) == []
+
+
+def test_the_overhead_that_is_reckoned_with_is_the_real_one():
+    """Stills would be joined, or ranked, by a cost that no message has."""
+
+    def header(also: int) -> int:
+        box = (1200.125, 600.5, 1300.375, 650.25)
+        return len(
+            RoiHeader(
+                session_id=2**63,
+                sequence=1200,
+                frame_index=4500,
+                capture_ns=1_790_000_000 * 10**9 + 7,
+                send_delay_ns=30_000_000,
+                flags=0,
+                track_id=345,
+                box_source_px=box,
+                crop_source_px=(1185, 593, 1316, 658),
+                class_name="car",
+                confidence=0.812,
+                reason="gain",
+                codec="jpeg",
+                quality_pct=65,
+                parameters={},
+                also=tuple(AlsoShown(track_id=400 + number, box_source_px=box) for number in range(also)),
+            ).pack(b"x" * 1000)
+        )
+
+    framing = overhead_bytes(1000, header(0), key=EdgeKeys("edge-1").key(Row.ROI), encoding="image/jpeg")
+    assert header(0) + framing == pytest.approx(STILL_OVERHEAD_BYTES, abs=15)
+    assert (header(8) - header(0)) / 8 == pytest.approx(ALSO_BYTES, abs=1)
+
+
+def test_a_crowd_takes_bounded_time():
+    """A thousand tracks would stop the pictures."""
+    rng = np.random.default_rng(3)
+    crowd = [wish(n, float(rng.uniform(0, 1200)), float(rng.uniform(0, 640)), side=8) for n in range(1, 1001)]
+    groups = joined(crowd)
+    assert sum(1 + len(others) for _, others in groups) == 1000

@@ -1,0 +1,348 @@
+"""From tracks to stills, with the real codec; every wish has one fate."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from base_coded import StandIn
+from clips import START_NS, hard_pictures
+from hvt_common.values import Frame, Still, Tracks, View
+from hvt_common.video.still_codecs import JpegCodec
+from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.candidates import Candidate, TrackMemory
+from hvt_edge.stills.gate import Gate
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.outbox import QueueSettings
+from hvt_edge.stills.policy.base import Request, Step
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.suppression import Suppression
+
+SIZE = (640, 360)
+PICTURE = hard_pictures(1, size=SIZE)[0]
+FLAT = np.full_like(PICTURE, 128)
+STEP_NS = 333_333_333
+
+
+@dataclass(frozen=True)
+class ByScore:
+    """Wants every candidate; the score is its id, or what is given for it."""
+
+    scores: tuple[tuple[int, float], ...] = ()
+    name: str = "by-score"
+    video_only: bool = False
+
+    def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
+        """All of them."""
+        given_scores = dict(self.scores)
+        wanted = [
+            Request(one, "test", given_scores.get(one.track_id, float(one.track_id))) for one in candidates
+        ]
+        return sorted(wanted, key=lambda request: -request.score)
+
+
+class Rig:
+    """A chooser, its fates, and steps of a third of a second."""
+
+    def __init__(
+        self,
+        method: ByScore | None = None,
+        *,
+        cooldown: float = 0.0,
+        most_bytes: int = 20_000,
+        picture: np.ndarray = PICTURE,
+        maker: StillMaker | None = None,
+        **settings,
+    ) -> None:
+        self.picture, self.memory = picture, TrackMemory()
+        self.fates: Counter[tuple[str, str]] = Counter()
+        view = View.fitted(SIZE, SIZE, fit="letterbox")
+        self.chooser = Chooser(
+            method or ByScore(),
+            suppression=Suppression.for_cooldown(cooldown),
+            maker=maker or StillMaker(),
+            memory=self.memory,
+            view=view,
+            class_names=("car",),
+            settings=ChooserSettings(
+                fps=3, most_bytes=most_bytes, queue=QueueSettings(max_length=3), **settings
+            ),
+            on_fate=lambda fate, reason: self.fates.update([(fate, reason)]),
+        )
+        self.number = -1
+        self.sent: list[Still] = []
+
+    @property
+    def now_ns(self) -> int:
+        """Time of the step."""
+        return START_NS + self.number * STEP_NS
+
+    def consider(self, boxes: dict[int, tuple[float, ...]], *, base=FLAT, detected: bool = True) -> None:
+        """The next decision step."""
+        self.number += 1
+        count = len(boxes)
+        tracks = Tracks(
+            self.number,
+            np.array(list(boxes), np.int64),
+            np.array(list(boxes.values()), np.float32).reshape(count, 4),
+            np.full(count, 0.5, np.float32),
+            np.zeros(count, np.int32),
+            np.zeros(count, np.int64),
+            np.full(count, self.number),
+            np.zeros(count, np.bool_),
+        )
+        seen = Seen(
+            Frame(self.number, self.now_ns, self.picture, self.picture), base, tracks, detected=detected
+        )
+        self.chooser.consider(seen, now_ns=self.now_ns, room_bytes=1000)
+
+    def stills(self, room: int) -> list[int]:
+        """Send what fits ``room`` in all; the tracks of the stills."""
+        sent, left = [], [room]
+        for still in self.chooser.stills(now_ns=self.now_ns, room=lambda _still: left[-1]):
+            assert len(still.data) <= left[-1]
+            left.append(left[-1] - len(still.data))
+            sent.append(still.track_id)
+            self.sent.append(still)
+        return sent
+
+
+SMALL, LARGE = (20.0, 20.0, 60.0, 50.0), (150.0, 50.0, 500.0, 330.0)
+
+
+def box_at(number: int, side: float = 36.0) -> tuple[float, ...]:
+    """One of many small boxes."""
+    x, y = 10.0 + 45 * (number % 12), 10.0 + 45 * (number // 12)
+    return x, y, x + side, y + side
+
+
+def test_the_most_useful_is_sent_first_as_long_as_there_is_room():
+    """The bits would go to whatever was seen first."""
+    rig = Rig()
+    rig.consider({1: box_at(1), 3: box_at(3), 2: box_at(2)})
+    assert rig.stills(100_000) == [3, 2, 1]
+    assert rig.fates == {("sent", "test"): 3}
+    assert rig.chooser.waiting == 0
+
+
+def test_a_lesser_one_does_not_slip_in_before_the_most_useful():
+    """What matters would starve behind what happens to be small."""
+    rig = Rig(ByScore(((1, 1.0), (2, 2.0))))
+    rig.consider({1: SMALL, 2: LARGE})
+    assert rig.stills(2_500) == []
+    assert rig.chooser.waiting == 2
+    assert rig.stills(60_000) == [2, 1]
+
+
+def test_one_that_never_fits_does_not_block_the_others_for_ever():
+    """One lorry close to the camera would keep every other still from being sent for the rest of the flight."""
+    rig = Rig(ByScore(((1, 1.0), (2, 2.0))))
+    sent: list[int] = []
+    for _ in range(12):
+        rig.consider({1: SMALL, 2: LARGE})  # wished for again at each step, so that no wish grows old
+        sent += rig.stills(2_500)
+    assert set(sent) == {1}
+    assert len(sent) >= 3
+    assert rig.fates["dropped", "too_large"] >= 2
+
+
+def test_one_that_waited_long_is_coded_to_the_room_there_is():
+    """An object that is believed to need a little more than its share would never be seen sharp at all."""
+    rig = Rig(picture=cv2.GaussianBlur(PICTURE, (0, 0), 3))  # codes to far less than is expected
+    expected = 640 + 0.12 * 208 * 208
+    sent = []
+    for _ in range(4):
+        rig.consider({2: (20.0, 20.0, 180.0, 180.0)})
+        sent.append(rig.stills(round(expected * 0.8)))
+    assert sent == [[], [], [], [2]], "a second of waiting"
+
+
+def test_what_the_base_shows_as_well_is_not_sent():
+    """Bits would be spent on stills that show nothing new."""
+    rig = Rig()
+    rig.consider({1: SMALL}, base=PICTURE)
+    assert rig.stills(100_000) == []
+    assert rig.fates == {("dropped", "base_good"): 1}
+    rig.consider({1: SMALL}, base=PICTURE)
+    assert rig.stills(100_000) == []
+    assert rig.fates["deferred", "refused"] == 1, "it rests before it is tried again"
+
+
+def test_between_detections_nothing_is_wished_for_but_what_waits_may_go():
+    """Stills would wait for the next detection although there is room now."""
+    rig = Rig()
+    rig.consider({1: SMALL})
+    assert rig.stills(10) == []
+    rig.consider({1: SMALL, 2: box_at(5)}, detected=False)
+    assert rig.stills(100_000) == [1]
+
+
+def test_sequence_numbers_count_stills_and_nothing_else():
+    """The ground would believe that stills were lost."""
+    rig = Rig()
+    numbers = []
+    for step in range(4):
+        rig.consider({1: SMALL, 2: box_at(7)}, base=PICTURE if step % 2 else FLAT)
+        numbers += [
+            still.sequence for still in rig.chooser.stills(now_ns=rig.now_ns, room=lambda _still: 10**6)
+        ]
+        rig.number += 3  # past the rest of what was refused
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) >= 4
+
+
+def test_closing_says_what_becomes_of_those_that_wait():
+    """The sums of the ledger would not agree."""
+    rig = Rig()
+    rig.consider({1: SMALL, 2: box_at(5)})
+    rig.chooser.close()
+    assert rig.fates == {("dropped", "ended"): 2}
+
+
+# Neighbours, the gate, and stills that build on the base
+
+NEIGHBOURS = {1: (20.0, 20.0, 44.0, 40.0), 2: (46.0, 22.0, 70.0, 42.0), 3: (400.0, 200.0, 440.0, 240.0)}
+BASE_CODED = StillMaker(codec=StandIn(), fallback=JpegCodec())
+BLURRED = cv2.GaussianBlur(PICTURE, (0, 0), 3)
+
+
+def test_neighbours_share_a_still_and_all_of_them_count_as_sent():
+    """Headers would be paid twice for one place, or the neighbour sent again right after."""
+    rig = Rig(share=True, cooldown=5.0)
+    rig.consider(NEIGHBOURS)
+    assert rig.stills(100_000) == [3, 2]
+    alone, pair = rig.sent
+    assert (alone.also, [track for track, _ in pair.also]) == ((), [1])
+    assert pair.crop_source_px == (16, 17, 74, 45)
+    assert all(rig.memory._histories[track].sent_count == 1 for track in (1, 2, 3))
+    assert rig.fates == {("sent", "test"): 2}, "one for each still"
+    rig.consider(NEIGHBOURS)
+    assert rig.stills(100_000) == []
+    assert rig.fates["deferred", "cooldown"] == 3
+
+
+def test_without_the_setting_each_has_its_own():
+    """The paper's methods would send other stills than the paper says."""
+    rig = Rig()
+    rig.consider(NEIGHBOURS)
+    assert rig.stills(100_000) == [3, 2, 1]
+
+
+def test_the_cost_of_a_shared_still_is_learnt_by_what_it_codes():
+    """The method would believe that stills are larger than they are, and wait for room that it does not need."""
+    rig = Rig(share=True)
+    rig.consider({1: NEIGHBOURS[1], 2: NEIGHBOURS[2]})
+    assert rig.stills(100_000) == [2]
+    area, size = 58 * 28, len(rig.sent[0].data)
+    sums = rig.chooser._cost_of("jpeg")._sums
+    assert sums.x / sums.one == area
+    assert sums.y / sums.one == size
+
+
+def test_the_gate_holds_back_what_the_base_shows_well_before_the_method_chooses():
+    """The places in the queue would go to stills that add little."""
+    good = BLURRED.copy()
+    good[:, 320:] = PICTURE[:, 320:]
+    good[:, 320:] = cv2.add(good[:, 320:], (3, 3, 3, 0))  # a little too bright: 38 dB, and no edge is lost
+    boxes = {track: box_at(track) for track in (1, 2)} | {9: (450.0, 100.0, 500.0, 140.0)}
+    rig = Rig(gate=Gate(psnr_y_db=36.0))
+    rig.consider(boxes, base=good)
+    assert rig.fates == {("dropped", "base_good"): 1}
+    assert rig.stills(100_000) == [2, 1]
+    rig.consider(boxes, base=good)
+    assert rig.fates["deferred", "refused"] == 1
+    ungated = Rig(maker=BASE_CODED)
+    ungated.consider(boxes, base=good)
+    assert 9 in ungated.stills(100_000)
+
+
+def test_stills_that_build_on_the_base_wait_for_a_frame_that_has_one():
+    """A step on a tick that is not coded would be lost, or its stills be sent without what they build on."""
+    rig = Rig(maker=BASE_CODED)
+    rig.consider({1: SMALL}, base=None)
+    assert rig.stills(100_000) == []
+    rig.consider({1: SMALL}, base=BLURRED, detected=False)
+    assert rig.stills(100_000) == [1]
+    assert (rig.sent[0].codec, rig.sent[0].frame_index) == ("stand-in", 1)
+    rig.consider({1: SMALL}, base=BLURRED, detected=False)
+    assert rig.stills(100_000) == [], "one step, one decision"
+    plain = Rig()
+    plain.consider({1: SMALL}, base=None)
+    assert plain.stills(100_000) == [1], "what needs no base waits for none"
+
+
+def test_a_still_without_its_base_is_sent_once_more_and_only_once():
+    """The object would stay unseen, or a ground could make the edge send for ever."""
+    rig = Rig(maker=BASE_CODED, cooldown=60.0)
+    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
+    assert rig.stills(100_000) == [2, 1]
+    for sequence in (1, 1, 7, 2**32 - 1):
+        rig.chooser.ask_again(sequence)
+    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
+    assert rig.stills(100_000) == [1]
+    first, again = rig.sent[1:]
+    assert (again.sequence, again.reason, again.codec, again.parameters) == (2, "again", "jpeg", {"again": 1})
+    for name in ("frame_index", "capture_ns", "track_id", "box_source_px", "crop_source_px", "class_name"):
+        assert getattr(again, name) == getattr(first, name)
+    crop = PICTURE[
+        first.crop_source_px[1] : first.crop_source_px[3], first.crop_source_px[0] : first.crop_source_px[2]
+    ]
+    seen = JpegCodec().decode(again.data, size=crop.shape[1::-1])
+    assert np.mean((seen.astype(float) - crop) ** 2) < 150
+    assert rig.memory._histories[1].sent_count == 1, "its rest began with the first"
+    for sequence in (1, 2):
+        rig.chooser.ask_again(sequence)
+    rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
+    assert rig.stills(100_000) == []
+    assert rig.fates["sent", "again"] == 1
+
+
+def test_the_newer_wish_of_a_track_makes_the_old_still_needless():
+    """Bits would go to the object as it was, while its present picture waits."""
+    rig = Rig(maker=BASE_CODED)
+    rig.consider({1: SMALL}, base=BLURRED)
+    assert rig.stills(100_000) == [1]
+    rig.chooser.ask_again(0)
+    rig.consider({1: SMALL}, base=BLURRED)
+    assert rig.stills(100_000) == [1]
+    assert [one.reason for one in rig.sent] == ["test", "test"]
+    assert rig.stills(100_000) == []
+
+
+def test_stills_of_other_codecs_are_never_sent_again():
+    """A forged request would double what a ground already has."""
+    rig = Rig(cooldown=60.0)
+    rig.consider({1: SMALL})
+    assert rig.stills(100_000) == [1]
+    rig.chooser.ask_again(0)
+    rig.consider({1: SMALL})
+    assert rig.stills(100_000) == []
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sets(st.integers(0, 30), max_size=6), st.integers(0, 6_000), st.booleans()),
+        min_size=1,
+        max_size=15,
+    ),
+    st.sampled_from([0.0, 1.0]),
+    st.sampled_from([0.0, 30.0]),
+)
+def test_every_candidate_of_a_step_has_exactly_one_fate(steps, cooldown, gate_db):
+    """The table of fates would not add up to the candidates there were."""
+    rig, candidates = Rig(cooldown=cooldown, gate=Gate(psnr_y_db=gate_db)), 0
+    for tracks, room, good in steps:
+        rig.consider({one: box_at(one) for one in sorted(tracks)}, base=PICTURE if good else FLAT)
+        candidates += len(tracks)
+        rig.stills(room)
+        assert rig.chooser.waiting <= 3
+        assert set(rig.chooser._held_up) <= {one.track_id for one in rig.chooser._queue}
+    rig.chooser.close()
+    assert sum(rig.fates.values()) == candidates

@@ -1,0 +1,256 @@
+"""One frame of the side channel after the other: tracks, stills, and what the ground says of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from base_coded import StandIn
+from clips import framed, smooth_pictures
+from flight import CLASSES, SIZE, RedSquares, square_box
+from hvt_common.protocol.channels import Row
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import RoiHeader, StillResult
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.values import Frame, View
+from hvt_common.video.base_crop import base_crop
+from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.still_codecs import JpegCodec
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import Sender
+from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.perception.analyzer import Sight, SightSettings
+from hvt_edge.perception.candidates import TrackMemory
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.policy.registry import method
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.stage import StillStage, StillWorker
+from hvt_edge.stills.suppression import Suppression
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+
+VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
+_NOISE = np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0]))
+_TEXTURE = 6 * cv2.GaussianBlur(_NOISE, (0, 0), 1.5)[..., None]
+FRAMES = [
+    replace(frame, source_bgr=np.clip(frame.base_bgr + _TEXTURE, 0, 255).astype(np.uint8))
+    for frame in framed(smooth_pictures(30, size=SIZE))
+]
+_ENCODER = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
+UNITS = [_ENCODER.encode(frame) for frame in FRAMES]
+
+
+class Out:
+    """Keeps what was put, in order."""
+
+    def __init__(self) -> None:
+        self.puts: list[tuple[Row, bytes, bytes]] = []
+
+    def put(self, row, payload, *, attachment=None, encoding="") -> None:
+        """Keep it."""
+        self.puts.append((row, payload, attachment or b""))
+
+    @property
+    def stills(self) -> list[tuple[RoiHeader, bytes]]:
+        """Headers and bytes."""
+        return [
+            (RoiHeader.parse(extra, payload), payload) for row, payload, extra in self.puts if row is Row.ROI
+        ]
+
+
+class Rig:
+    """A still stage whose stills build on the base, with a real budget of 200 kbps for them."""
+
+    def __init__(self, *, reports: bool = False, sparse: bool = False) -> None:
+        self.out, self.fates, self.keyframes = Out(), Counter(), KeyframePlan()
+        self.sender = Sender(
+            self.out,
+            ledger=Ledger(),
+            budget=RollingBudget(BudgetSettings(400_000, 200_000, fps=15)),
+            edge_id="edge-1",
+            session_id=1,
+            lockstep=False,
+            wait_until=lambda _at: None,
+        )
+        self.stage = StillStage(
+            Sight(
+                RedSquares(),
+                ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+                view=VIEW,
+                settings=SightSettings(detect_every=5, candidates="source" if sparse else "decoded"),
+            ),
+            Chooser(
+                method("M1"),
+                suppression=Suppression.for_cooldown(0),
+                maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
+                memory=TrackMemory(),
+                view=VIEW,
+                class_names=CLASSES,
+                settings=ChooserSettings(fps=15, most_bytes=10_000),
+                on_fate=lambda *fate: self.fates.update([fate]),
+            ),
+            sender=self.sender,
+            keyframes=self.keyframes,
+            reporter=self if reports else None,
+        )
+        self.keyframes.done(FRAMES[0].capture_ns)
+
+    def report(self, seen, *, now_ns) -> None:
+        """Report the tracks, as the edge's reporter does."""
+        self.sender.tracks(lambda _at_ns: bytes([seen.frame.index]), now_ns=now_ns)
+
+    def run(self, count: int = 30, *, start: int = 0) -> None:
+        """Frame after frame, as the lockstep loop does."""
+        for frame, unit in list(zip(FRAMES, UNITS, strict=True))[start:count]:
+            seen = self.stage.see(frame, unit)
+            self.stage.send(seen, now_ns=frame.capture_ns)
+
+
+def decoded_bases() -> list[np.ndarray]:
+    """The base as the ground has it."""
+    decoder = BaseDecoder()
+    return [decoder.decode(unit.data) for unit in UNITS]
+
+
+def answer(sequence: int, *, again: bool) -> StillResult:
+    """What a ground says of a still that it could not show."""
+    return StillResult(
+        still_sequence=sequence,
+        track_id=1,
+        class_name="",
+        confidence=0.0,
+        entropy_nats=0.0,
+        ground_track_id=-1,
+        again=again,
+    )
+
+
+def test_what_the_edge_builds_on_is_what_the_ground_decodes():
+    """No still would ever fit the ground's pictures."""
+    rig, bases = Rig(), decoded_bases()
+    rig.run()
+    assert [header.frame_index for header, _ in rig.out.stills] == [0, 15]
+    for header, data in rig.out.stills:
+        crop = header.crop_source_px
+        size = (crop[2] - crop[0], crop[3] - crop[1])
+        seen = base_crop(bases[header.frame_index], view=VIEW, crop_source_px=crop, size=size)
+        shown = StandIn().decode(data, size=size, parameters=header.parameters, base_bgr=seen)
+        source = FRAMES[header.frame_index].source_bgr[crop[1] : crop[3], crop[0] : crop[2]].astype(float)
+        assert np.mean((shown - source) ** 2) < 0.8 * np.mean((seen - source) ** 2)
+        np.testing.assert_allclose(header.box_source_px, square_box(header.frame_index), atol=6)
+
+
+def test_a_still_that_the_ground_cannot_show_is_sent_again_from_the_same_frame():
+    """A lost picture of the base would cost the stills on it as well."""
+    rig = Rig()
+    rig.run(4)
+    rig.stage.hear([answer(0, again=True), answer(0, again=True), answer(4_000_000, again=True)])
+    rig.run(8, start=4)
+    (first, _), (second, data) = rig.out.stills
+    assert (first.codec, second.codec, second.reason) == ("stand-in", "jpeg", "again")
+    assert (second.sequence, second.frame_index, second.parameters) == (1, 0, {"again": 0})
+    crop = second.crop_source_px
+    assert JpegCodec().decode(data, size=(crop[2] - crop[0], crop[3] - crop[1])) is not None
+    rig.stage.hear([answer(0, again=True), answer(1, again=True)])
+    rig.run(12, start=8)
+    assert len(rig.out.stills) == 2
+
+
+def test_a_flood_of_requests_costs_no_more_than_each_still_once():
+    """Whoever can speak to the edge could spend its budget."""
+    rig = Rig()
+    for index in range(30):
+        rig.stage.hear([answer(number, again=True) for number in range(500)])
+        rig.run(index + 1, start=index)
+    headers = [header for header, _ in rig.out.stills]
+    assert [one.reason for one in headers] == ["due", "again", "due", "again"]
+    assert len({one.sequence for one in headers}) == len(headers)
+
+
+def test_between_coded_ticks_tracks_go_on_and_stills_wait_for_a_coded_one():
+    """With fewer coded pictures the edge would send stills that nobody can show, or none at all."""
+    rig = Rig(sparse=True)
+    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=1.5, bitrate_bps=120_000, preset="ultrafast"))
+    for frame in FRAMES:
+        unit = encoder.encode(frame) if frame.index % 10 == 3 else None
+        rig.stage.send(rig.stage.see(frame, unit), now_ns=frame.capture_ns)
+    headers = [header for header, _ in rig.out.stills]
+    assert headers
+    assert all(one.frame_index % 10 == 3 for one in headers)
+    assert {one.codec for one in headers} == {"stand-in"}
+    assert rig.stage.latest_tracks.frame_index == 29
+
+
+def test_the_tracks_of_a_step_go_before_its_stills():
+    """The ground would get stills of tracks that it has not heard of."""
+    rig = Rig(reports=True)
+    assert rig.stage.latest_tracks is None
+    rig.run(11)
+    assert [row for row, _, _ in rig.out.puts[:2]] == [Row.TRACKS, Row.ROI]
+    assert [payload[0] for row, payload, _ in rig.out.puts if row is Row.TRACKS] == [0, 5, 10]
+    assert rig.stage.latest_tracks.frame_index == 10
+
+
+def test_frames_that_wait_are_bounded_in_bytes():
+    """A 4K camera and a slow detector would fill the drone's memory."""
+    counted = threading.Event()
+
+    class Slow(RedSquares):
+        def detect(self, image_bgr):
+            assert counted.wait(30)
+            return super().detect(image_bgr)
+
+    rig = Rig()
+    frame_bytes = FRAMES[0].source_bgr.nbytes + FRAMES[0].base_bgr.nbytes
+    slow = Sight(
+        Slow(),
+        ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+        view=VIEW,
+        settings=SightSettings(detect_every=1),
+    )
+    rig.stage._sight = slow
+    worker = StillWorker(
+        rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=4 * frame_bytes + 1
+    )
+    worker.offer(FRAMES[0], UNITS[0])
+    while worker._frames.qsize():
+        time.sleep(0.001)
+    offered = 1
+    while not worker.full and offered < 16:
+        worker.offer(FRAMES[offered], UNITS[offered])
+        offered += 1
+    counted.set()
+    assert offered == 5, "four wait, and one is in hand"
+    worker.close()
+    roomy = StillWorker(Rig().stage, hear=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=1)
+    assert not roomy.full
+    roomy.offer(FRAMES[0], UNITS[0])
+    while roomy._frames.qsize():
+        time.sleep(0.001)
+    assert not roomy.full, "one frame always has its place"
+    roomy.close()
+
+
+def test_a_wish_that_waits_keeps_no_frame():
+    """Eight wishes would hold eight frames of a 4K camera: 200 MB."""
+    import gc
+    import weakref
+
+    class Tracked(np.ndarray):
+        """An array that may be watched."""
+
+    rig = Rig()
+    source = FRAMES[0].source_bgr.copy().view(Tracked)
+    watch = weakref.ref(source)
+    frame = Frame(0, FRAMES[0].capture_ns, source, FRAMES[0].base_bgr)
+    seen = rig.stage.see(frame, UNITS[0])
+    rig.stage.send(seen, now_ns=frame.capture_ns, held=True)
+    assert rig.stage.waiting == 1
+    del source, frame, seen
+    gc.collect()
+    assert watch() is None
+    assert rig.stage.waiting == 1

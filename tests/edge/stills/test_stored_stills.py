@@ -1,0 +1,158 @@
+"""Stills in an outage: chosen as ever, coded without the base, kept instead of sent; and video that is asked for."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import cv2
+import numpy as np
+
+from base_coded import StandIn
+from flight import CLASSES, RedSquares
+from hvt_common.protocol.channels import Row
+from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader, parse_past_still
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.values import Frame, View
+from hvt_common.video.still_codecs import JpegCodec
+from hvt_edge.config import EdgeConfig, check
+from hvt_edge.control.commands import Commands, Served
+from hvt_edge.perception.analyzer import Sight, SightSettings
+from hvt_edge.perception.candidates import TrackMemory
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.policy.registry import method
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.stage import StillStage
+from hvt_edge.stills.suppression import Suppression
+from keeping import FRAMES, SIZE, Rig
+from kept import opened
+from processes import eventually
+
+VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
+_NOISE = np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0]))
+_TEXTURE = 6 * cv2.GaussianBlur(_NOISE, (0, 0), 1.5)[..., None]
+
+
+class StillRig(Rig):
+    """Base stage and still stage, one after the other for each frame; stills build on the base where they can."""
+
+    def __init__(self, folder) -> None:
+        super().__init__(folder)
+        self.chosen: Counter[tuple[str, str]] = Counter()
+        chooser = Chooser(
+            method("M1"),
+            suppression=Suppression.for_cooldown(0),
+            maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
+            memory=TrackMemory(),
+            view=VIEW,
+            class_names=CLASSES,
+            settings=ChooserSettings(fps=15, most_bytes=10_000),
+            on_fate=lambda *fate: self.chosen.update([fate]),
+        )
+        self.side = StillStage(
+            Sight(
+                RedSquares(),
+                ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+                view=VIEW,
+                settings=SightSettings(detect_every=5),
+            ),
+            chooser,
+            sender=self.sender,
+            keyframes=self.keyframes,
+            keep=self.keep,
+        )
+        self.keep.attend(self.side)
+
+    def fly(self, first: int, end: int, *, linked: bool = True) -> None:
+        """Frames of that stretch; nobody reports."""
+        self.linked = linked
+        for frame in FRAMES[first:end]:
+            self.now_ns = frame.capture_ns
+            self.follower.before_frame(self.now_ns)
+            unit = self.stage.encode(frame, now_ns=self.now_ns)
+            self.stage.send(unit, now_ns=self.now_ns)
+            source = np.clip(frame.base_bgr + _TEXTURE, 0, 255).astype(np.uint8)
+            seen = self.side.see(Frame(frame.index, frame.capture_ns, source, frame.base_bgr), unit)
+            self.side.send(seen, now_ns=self.now_ns)
+
+    @property
+    def live(self) -> list[RoiHeader]:
+        """Stills that went into the link."""
+        return [RoiHeader.parse(extra, data) for row, data, extra in self.out.puts if row is Row.ROI]
+
+    def stored(self) -> list[RoiHeader]:
+        """Stills that another start of the edge finds, by number."""
+        self.keep.close()
+        with opened(self.path, session_id=8) as folder:
+            stills = [parse_past_still(folder.read(entry)) for entry in folder.best_stills()]
+        return sorted(
+            (RoiHeader.parse(one.attachment, one.payload) for one in stills), key=lambda one: one.sequence
+        )
+
+
+def test_stills_of_an_outage_are_kept_without_holes_and_without_the_base(tmp_path):
+    """The ground could not show them, because the base comes later; or would ask for numbers that never come."""
+    rig = StillRig(tmp_path / "store")
+    rig.fly(0, 20)
+    before = [one.sequence for one in rig.live]
+    assert before == list(range(len(before)))
+    assert {one.codec for one in rig.live} == {StandIn().name}
+    rig.fly(20, 50, linked=False)
+    assert [one.sequence for one in rig.live] == before, "nothing goes into the dark"
+    rig.fly(50, 70)
+    after = [one.sequence for one in rig.live]
+    assert len(after) > len(before)
+    assert after == list(range(len(after))), "no hole for what was kept"
+    stored = rig.stored()
+    assert {one.codec for one in stored} == {"jpeg"}
+    kept = [one for one in stored if one.sequence >= 2**31]
+    assert [one.sequence - 2**31 for one in kept] == list(range(len(kept)))
+    assert len(kept) >= 2
+    assert {one.frame_index for one in kept} <= set(range(20, 50))
+    assert rig.chosen["deferred", "stored"] == len(kept)
+    assert rig.chosen["sent", "stored"] == 0
+
+
+def test_stills_that_the_link_swallowed_are_kept_as_they_are_without_the_base(tmp_path):
+    """Those sent in the second before the break would be lost, or come back as nothing that can be shown."""
+    rig = StillRig(tmp_path / "store")
+    rig.fly(0, 20)
+    sent = {one.sequence: one.frame_index for one in rig.live}
+    rig.fly(20, 22, linked=False)
+    swallowed = [one for one in rig.stored() if one.sequence < 2**31]
+    assert {one.sequence: one.frame_index for one in swallowed} == sent
+    assert {one.codec for one in swallowed} == {"jpeg"}
+
+
+def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
+    """The command would be refused, or change nothing."""
+    rig = StillRig(tmp_path / "store")
+    config = check(EdgeConfig(source="demo", size=SIZE))
+    commands = Commands(
+        config,
+        session_id=7,
+        keyframes=rig.keyframes,
+        clock=lambda: rig.now_ns,
+        window_ns=lambda: rig.now_ns,
+    )
+
+    def ask() -> str:
+        rig.now_ns += 100_000_000
+        request = ControlRequest(session_id=7, command=Command.SEND_PAST, arguments={})
+        answer = commands.answer(ControlRequest.parse(request.pack()))
+        return "" if answer.accepted else answer.reason
+
+    commands.serve(Served(None, rig.follower._renewal, rig.side._chooser, base_size=SIZE, keep=rig.keep))
+    assert "nothing is kept" in ask()
+    rig.fly(0, 7)
+    rig.report()
+    rig.fly(7, 50, linked=False)
+    eventually(lambda: rig.keep.numbers.stills >= 2, within_s=10, what="stills are kept")
+    assert ask() == ""
+    rig.linked = True
+    rig.finish()
+    assert rig.keep.numbers.empty
+    kinds = [header.kind for header, _ in rig.out.past]
+    assert kinds.index("still") > max(n for n, kind in enumerate(kinds) if kind == "base")
+    rig.keep.close()
+    commands.serve(Served(None, rig.follower._renewal, rig.side._chooser, base_size=SIZE, keep=None))
+    assert "--store 0" in ask()

@@ -1,0 +1,198 @@
+"""Every setting of hvt-edge."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hvt_common.config import load, to_toml
+from hvt_common.errors import UserError
+from hvt_edge.config import REGIMES, EdgeConfig, check
+from hvt_edge.stills.policy.registry import METHODS
+
+
+def read(*argv: str) -> EdgeConfig:
+    """What a command line gives, before it is checked."""
+    return load(EdgeConfig, ["--source", "demo", *argv], program="hvt-edge", description="")[0]
+
+
+def settled(*argv: str) -> EdgeConfig:
+    """What a command line gives."""
+    return check(read(*argv))
+
+
+def test_what_is_said_without_flags_is_the_low_regime():
+    """The defaults of the manual would not be those of the program."""
+    config = settled()
+    assert (config.budget_bps, config.base_bps) == (800_000, 650_000)
+    assert (config.size, config.fps, config.method) == ((1280, 720), 15.0, "M5")
+    assert (config.jpeg_quality, config.padding, config.cooldown, config.detect_every) == (65, 0.15, 2.0, 5)
+
+
+@pytest.mark.parametrize(
+    ("argv", "total", "base"),
+    [
+        (["--regime", "moderate"], 1_400_000, 1_200_000),
+        (["--regime", "low"], 800_000, 650_000),
+        (["--budget", "1Mbps"], 1_000_000, 812_500),
+        (["--budget", "1Mbps", "--video-share", "0.5"], 1_000_000, 500_000),
+        (["--video-share", "75%"], 800_000, 600_000),
+        (["--method", "M0"], 800_000, 800_000),
+        (["--method", "M0", "--regime", "moderate"], 1_400_000, 1_400_000),
+    ],
+)
+def test_budget_regime_and_share_settle_to_two_rates(argv, total, base):
+    """The drone would spend other bits than the user pays for."""
+    config = settled(*argv)
+    assert (config.budget_bps, config.base_bps) == (total, base)
+
+
+def test_the_regimes_are_the_papers():
+    """Results would be compared with those of other budgets."""
+    rates = {name: (one.budget_bps, round(one.budget_bps * one.video_share)) for name, one in REGIMES.items()}
+    assert rates == {"low": (800_000, 650_000), "moderate": (1_400_000, 1_200_000)}
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--regime", "low", "--budget", "1Mbps"], "--regime low already sets"),
+        (["--regime", "low", "--video-share", "0.5"], "--regime low already sets"),
+        (["--video-share", "0"], "--video-share 0 leaves no base stream"),
+        (["--budget", "60kbps"], "raise --budget, or lower --size or --fps"),
+        (["--budget", "500kbps", "--video-share", "0.1"], "leaves 50 kbps for video"),
+        (["--window", "10ms"], "--window 0.01s is not accepted"),
+        (["--window", "61s"], "--window 61s is not accepted"),
+        (["--size", "1281x720"], "size 1281x720 is impossible"),
+        (["--size", "32x32"], "is impossible"),
+        (["--edge-id", "UAV 1"], "edge id 'UAV 1' is not usable"),
+        (["--edge-id", "a" * 33], "is not usable"),
+    ],
+)
+def test_settings_that_contradict_are_one_sentence(argv, said):
+    """The user would guess which of two settings won, or get a traceback."""
+    with pytest.raises(UserError, match=re.escape(said)):
+        settled(*argv)
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--method", "M9"],
+        ["--fps", "0"],
+        ["--fps", "nan"],
+        ["--fps", "300"],
+        ["--detect-every", "0"],
+        ["--jpeg-quality", "100"],
+        ["--padding", "-1"],
+        ["--confidence", "2"],
+        ["--preset", "placebo"],
+        ["--fit", "stretch"],
+        ["--pace", "fast"],
+        ["--candidates", "both"],
+        ["--camera-motion", "gps"],
+        ["--max-frames", "0"],
+        ["--seed", "-1"],
+        ["--keyframe-interval", "9" * 400],
+        ["--cooldown", "-2s"],
+    ],
+)
+def test_values_out_of_range_name_their_flag(argv):
+    """A typing error would start another flight than the one that was meant, or none, without a word why."""
+    with pytest.raises(UserError, match=argv[0]):
+        settled(*argv)
+
+
+def test_a_source_is_needed():
+    """The edge would start and send nothing."""
+    with pytest.raises(UserError, match="--source is missing"):
+        check(EdgeConfig())
+
+
+def test_every_flag_explains_itself(capsys):
+    """Somebody with a drone in the field would have to read the source."""
+    with pytest.raises(SystemExit):
+        load(EdgeConfig, ["--help"], program="hvt-edge", description="")
+    out = " ".join(capsys.readouterr().out.split())
+    for one in dataclasses.fields(EdgeConfig):
+        flag = "--" + one.name.replace("_", "-")
+        assert flag in out
+        assert len(one.metadata["help"]) > 8
+        if one.metadata.get("switch"):
+            continue
+        shown = one.metadata["shown_default"] or one.default not in (None, ())
+        optional = one.default is None or one.default == ()
+        assert shown or optional, f"{flag} does not say its default"
+    assert "[800kbps]" in out
+    assert "[1280x720]" in out
+    assert "[15.0]" in out
+
+
+_RATE = st.integers(800_000, 10**9)  # enough for the largest size and rate below, at the least share
+
+
+@given(
+    st.builds(
+        EdgeConfig,
+        source=st.sampled_from(
+            ["demo", "rtsp://host/a?b=c#d", "/dev/video0", 'a "quoted" clip.mp4', "ünïcode\\x"]
+        ),
+        edge_id=st.from_regex(r"[a-z0-9-]{1,32}", fullmatch=True),
+        size=st.tuples(st.integers(32, 640), st.integers(32, 360)).map(lambda one: (2 * one[0], 2 * one[1])),
+        fps=st.floats(5, 60),
+        budget=_RATE,
+        video_share=st.floats(0.6, 1),
+        window=st.floats(0.5, 60),
+        method=st.sampled_from(sorted(METHODS)),
+        cooldown=st.floats(0, 1e6),
+        keyframe_interval=st.floats(0, 1e6),
+        connect=st.lists(st.just("tcp/[::1]:7447#so_sndbuf=8192"), max_size=2).map(tuple),
+        quiet=st.booleans(),
+        max_frames=st.none() | st.integers(1, 10**9),
+    )
+)
+def test_what_is_printed_starts_the_same_flight(tmp_path_factory, config):
+    """``--print-config`` could not be kept and flown again."""
+    path = tmp_path_factory.getbasetemp() / "edge.toml"
+    path.write_text(to_toml(config), encoding="utf-8")
+    back = load(EdgeConfig, ["--config", str(path)], program="hvt-edge", description="")[0]
+    assert back == config
+    assert check(back) == check(config)
+
+
+def test_the_checked_settings_can_be_checked_again():
+    """The study, which starts from settled settings, would be refused."""
+    config = settled("--budget", "1Mbps")
+    assert check(config) == config
+
+
+def test_no_setting_is_accepted_and_ignored():
+    """A flag that changes nothing is worse than none: its user believes in it."""
+    import hvt_edge
+
+    folder = Path(hvt_edge.__file__).parent
+    code = {file.name: file.read_text(encoding="utf-8") for file in folder.rglob("*.py")}
+    own = code.pop("config.py")  # its properties derive from settings
+    others = "\n".join(code.values())
+    names = [one.name for one in dataclasses.fields(EdgeConfig)]
+    unread = [
+        name
+        for name in names
+        if not re.search(rf"config\.{name}\b", others) and not re.search(rf"(config|self)\.{name}\b", own)
+    ]
+    assert unread == []
+
+
+def test_the_least_gain_reaches_the_suppression():
+    """`--min-gain` decides how much bits go to tracks that look the same as before."""
+    from hvt_edge.wiring import make_suppression
+
+    config = check(load(EdgeConfig, ["--source", "demo", "--min-gain", "3"], program="p", description="")[0])
+    assert make_suppression(config).min_gain == 3
+    plain = check(load(EdgeConfig, ["--source", "demo", "--cooldown", "0"], program="p", description="")[0])
+    assert make_suppression(plain).min_gain == 1

@@ -1,0 +1,126 @@
+"""What is asked of x265, and what it then puts on the line."""
+
+from __future__ import annotations
+
+import pytest
+
+from clips import framed, hard_pictures, real_pictures
+from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.ledger import overhead_bytes
+from hvt_edge.link.transmitter import BASE_ATTACHMENT_BYTES, STATUS_BYTES
+from hvt_edge.video.least_rate import PULSE_VBV_S, encoder_settings, least_base_bps
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings, minimum_bps
+
+SIZE, FPS = (1280, 720), 15
+KEYFRAMES = (20, 46, 95, 125)
+"""A second or more apart."""
+
+
+def asked(base_bps: int, total_bps: int) -> EncoderSettings:
+    """The encoder's settings for a budget."""
+    return encoder_settings(
+        size=SIZE, fps=FPS, preset="veryfast", total_bps=total_bps, base_bps=base_bps, edge_id="edge-1"
+    )
+
+
+def line_bits(pictures, settings: EncoderSettings, *, keyframes=KEYFRAMES) -> list[int]:
+    """Bits on the line of each frame's message, and of the status once a second."""
+    encoder, key = BaseEncoder(settings), EdgeKeys("edge-1")
+    bits = []
+    for frame in framed(pictures):
+        data = encoder.encode(frame, keyframe=frame.index in keyframes).data
+        header = BASE_ATTACHMENT_BYTES - 8
+        around = header + overhead_bytes(len(data), header, key=key.key(Row.BASE), encoding="video/h265")
+        if frame.index % FPS == 0:
+            around += STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=key.key(Row.STATUS))
+        bits.append(8 * (len(data) + around))
+    return bits
+
+
+def fullest_second(bits: list[int]) -> int:
+    """Most bits in any second."""
+    return max(sum(bits[start : start + FPS]) for start in range(len(bits) - FPS + 1))
+
+
+@pytest.mark.parametrize(("base_bps", "count"), [(300_000, 150), (1_138_000, 90)])
+def test_the_base_stays_within_its_share(base_bps, count):
+    """Stills would pay for what the base overspends, or the picture would come late."""
+    bits = line_bits(hard_pictures(count, size=SIZE), asked(base_bps, round(base_bps / 0.8125)))
+    assert 0.92 * base_bps <= sum(bits) / (count / FPS) <= 1.02 * base_bps
+    assert fullest_second(bits) <= 1.15 * base_bps
+
+
+@pytest.mark.realdata
+def test_the_base_stays_within_its_share_on_a_real_clip(data):
+    """As above, on what the product is for."""
+    pictures = real_pictures(data / "clips" / "drone_carpark.mp4", 120, size=SIZE)
+    bits = line_bits(pictures, asked(650_000, 800_000))
+    assert 0.92 * 650_000 <= sum(bits) / (len(bits) / FPS) <= 1.02 * 650_000
+    assert fullest_second(bits) <= 1.15 * 650_000
+
+
+def test_video_alone_stays_within_the_total():
+    """In M0 there are no stills that could yield: each burst would make the picture late."""
+    bits = line_bits(hard_pictures(60, size=SIZE), asked(800_000, 800_000))
+    assert fullest_second(bits) <= 1.08 * 800_000
+    assert sum(bits) / 4 >= 0.85 * 800_000
+
+
+def test_headers_and_status_are_taken_off_the_target():
+    """The stream would exceed its share by what Zenoh and TCP add."""
+    settings = asked(650_000, 800_000)
+    assert 600_000 < settings.bitrate_bps < 625_000
+    assert settings.vbv_s == 0.15
+    tight = asked(800_000, 800_000)
+    assert tight.vbv_s < 0.15
+    assert tight.bitrate_bps < 0.97 * 800_000
+
+
+def test_the_least_share_leaves_x265_its_minimum():
+    """A budget would be accepted of which headers leave less than a picture needs."""
+    least = least_base_bps(SIZE, FPS, edge_id="edge-1")
+    assert asked(least, 2 * least).bitrate_bps >= 0.99 * minimum_bps(SIZE, FPS)
+    assert least < 100_000
+
+
+def test_the_least_share_is_kept():
+    """The smallest budget that is accepted would be overspent in every second."""
+    size, count = (640, 360), 150
+    least = least_base_bps(size, FPS, edge_id="edge-1")
+    settings = encoder_settings(
+        size=size, fps=FPS, preset="veryfast", total_bps=2 * least, base_bps=least, edge_id="edge-1"
+    )
+    assert (
+        sum(line_bits(hard_pictures(count, size=size), settings, keyframes=(100,))) / (count / FPS)
+        <= 1.05 * least
+    )
+
+
+@pytest.mark.parametrize("every_n", [3, 5])
+def test_fewer_frames_leave_more_for_each_and_keep_the_share(every_n):
+    """With ``--fps auto`` the base would overspend, or waste what headers no longer take."""
+    fps = FPS / every_n
+    settings = encoder_settings(
+        size=SIZE, fps=fps, preset="veryfast", total_bps=400_000, base_bps=320_000, edge_id="edge-1"
+    )
+    assert settings.bitrate_bps > asked(320_000, 400_000).bitrate_bps + 3_000
+    assert settings.vbv_s * fps >= 0.999, "x265 takes no VBV that holds less than a frame"
+    pictures = hard_pictures(300, size=SIZE)[::every_n]
+    encoder = BaseEncoder(settings)
+    payload = sum(len(encoder.encode(frame).data) for frame in framed(pictures, fps=fps))
+    header = len(pictures) * 110
+    assert 0.85 * 320_000 <= 8 * (payload + header) / (len(pictures) / fps) <= 1.03 * 320_000
+    assert least_base_bps(SIZE, fps, edge_id="edge-1") < 0.6 * least_base_bps(SIZE, FPS, edge_id="edge-1")
+
+
+def test_whole_frame_pulses_get_the_buffer_they_need():
+    """The pulse would be asked for and not happen."""
+    both = [
+        encoder_settings(
+            size=SIZE, fps=FPS, preset="veryfast", total_bps=400_000, base_bps=base, edge_id="a", pulses=True
+        )
+        for base in (320_000, 400_000)
+    ]
+    assert [one.vbv_s for one in both] == [PULSE_VBV_S] * 2
+    assert all(one.side_data for one in both)
+    assert not asked(320_000, 400_000).side_data

@@ -1,0 +1,143 @@
+"""The Matroska file of the base stream."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from clips import START_NS, framed, smooth_pictures
+from hvt_common.errors import UserError
+from hvt_common.values import AccessUnit
+from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+
+SIZE = (320, 192)
+TESTS = Path(__file__).resolve().parents[3] / "tests" / "support"
+
+
+def units(count: int, *, fps: float = 15.0) -> list[AccessUnit]:
+    """Access units of an easy clip, a keyframe each ten."""
+    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=fps, bitrate_bps=200_000, preset="ultrafast"))
+    frames = framed(smooth_pictures(count, size=SIZE), fps=fps)
+    return [encoder.encode(frame, keyframe=frame.index % 10 == 0) for frame in frames]
+
+
+def played(path: Path) -> tuple[list[float], list[np.ndarray], list[bool]]:
+    """(time in s, picture, keyframe) of all frames, by a player that knows nothing of HVT."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "hevc"
+        frames = list(container.decode(stream))
+    return (
+        [float(frame.pts * frame.time_base) for frame in frames],
+        [frame.to_ndarray(format="bgr24") for frame in frames],
+        [frame.key_frame for frame in frames],
+    )
+
+
+def test_any_player_shows_every_frame_at_its_time(tmp_path):
+    """The flight's only video on the drone could not be watched, or at the wrong speed."""
+    path = tmp_path / "base.mkv"
+    coded = units(24)
+    with BaseRecorder(path) as recorder:
+        for unit in coded:
+            recorder.write(unit)
+    times, pictures, keyframes = played(path)
+    assert len(pictures) == 24
+    np.testing.assert_allclose(times, [(unit.capture_ns - START_NS) / 1e9 for unit in coded], atol=0.001)
+    assert [index for index, one in enumerate(keyframes) if one] == [0, 10, 20]
+    assert pictures[0].shape == (192, 320, 3)
+    red = np.argwhere(
+        (pictures[20][..., 2] > 170) & (pictures[20][..., 0] < 100) & (pictures[20][..., 1] < 120)
+    )
+    assert abs(red[:, 1].min() - 140) <= 4, "the square is where frame 20 had it"
+
+
+def test_the_bytes_are_those_that_were_sent(tmp_path):
+    """The record would be of something else than the ground saw."""
+    path = tmp_path / "base.mkv"
+    coded = units(5)
+    with BaseRecorder(path) as recorder:
+        for unit in coded:
+            recorder.write(unit)
+    assert path.stat().st_size < sum(len(unit.data) for unit in coded) + 3_000
+    with av.open(str(path)) as container:
+        sizes = [packet.size for packet in container.demux(video=0) if packet.size]
+    assert len(sizes) == 5
+    # Start codes become lengths, byte for byte as long or one longer.
+    for size, unit in zip(sizes, coded, strict=True):
+        assert abs(size - len(unit.data)) <= 8
+
+
+def test_one_can_jump_into_the_middle(tmp_path):
+    """To look at minute 40 one would have to watch 39 others."""
+    path = tmp_path / "base.mkv"
+    with BaseRecorder(path) as recorder:
+        for unit in units(30):
+            recorder.write(unit)
+    with av.open(str(path)) as container:
+        container.seek(1_400_000)  # of 2 s; the keyframes are at 0, 0.67 and 1.33 s
+        first = next(container.decode(video=0))
+    assert float(first.pts * first.time_base) == pytest.approx(20 / 15, abs=0.002)
+
+
+def test_dropped_frames_and_equal_times_do_not_spoil_the_file(tmp_path):
+    """A busy drone's record would end at the first dropped frame, or at two frames in one millisecond."""
+    path = tmp_path / "base.mkv"
+    coded = [
+        AccessUnit(number, START_NS + 300_000 * number, unit.data, unit.keyframe)
+        for number, unit in zip([0, 1, 2, 3, 60, 61, 62, 63, 64, 65], units(10), strict=True)
+    ]
+    with BaseRecorder(path) as recorder:
+        for unit in coded:
+            recorder.write(unit)
+    times, pictures, _ = played(path)
+    assert len(pictures) == 10
+    assert times == sorted(set(times))
+
+
+def test_a_run_without_a_frame_leaves_no_error(tmp_path):
+    """Ctrl-C before the first frame would end in a traceback."""
+    with BaseRecorder(tmp_path / "base.mkv"):
+        pass
+
+
+@pytest.mark.parametrize("name", ["none/base.mkv", "."])
+def test_where_it_cannot_be_written_is_one_sentence(tmp_path, name):
+    """A traceback out of a C library in place of the file's name."""
+    recorder = BaseRecorder(tmp_path / name)
+    with pytest.raises(UserError, match=r"--record-base .* cannot be written"):
+        recorder.write(units(1)[0])
+
+
+def test_a_killed_process_leaves_a_file_that_plays(tmp_path):
+    """The record of a crash would be missing just when it is wanted."""
+    path = tmp_path / "base.mkv"
+    program = f"""
+        import sys, time
+        sys.path[:0] = [{str(TESTS)!r}, {str(TESTS / "edge")!r}]
+        from pathlib import Path
+        from test_record_base import BaseRecorder, units
+        recorder = BaseRecorder(Path({str(path)!r}))
+        for unit in units(45):
+            recorder.write(unit)
+        print("written", flush=True)
+        time.sleep(60)
+    """
+    with subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout.readline() == b"written\n"
+        time.sleep(0.1)
+        os.kill(process.pid, signal.SIGKILL)
+    _, pictures, _ = played(path)
+    assert len(pictures) >= 45 - 4, "no more than a fifth of a second may be lost"

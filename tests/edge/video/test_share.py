@@ -1,0 +1,173 @@
+"""``--video-share auto``: the split follows the scene, at keyframes, and does not waver."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvt_edge.perception.base_loss import BaseLoss
+from hvt_edge.perception.candidates import Belief, Candidate
+from hvt_edge.stills.policy.base import Step
+from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.video.share import FIRST_SHARE, Split, SplitSettings
+
+SECOND = 1_000_000_000
+
+
+def moment(seconds: float, *, from_source: bool = False) -> Step:
+    """A decision step."""
+    return Step(
+        frame_index=round(seconds * 15),
+        now_ns=round(seconds * SECOND),
+        fps=15.0,
+        base_size=(1280, 720),
+        cost=CostEstimate(150, 0.1, 700),
+        room_bytes=2000,
+        from_source=from_source,
+    )
+
+
+def car(track_id: int, *, lost: float, confidence: float = 0.6, side: float = 30, **changes) -> Candidate:
+    """A track, and what the base lost of it."""
+    plain = Candidate(
+        frame_index=0,
+        track_id=track_id,
+        box_base_px=(100, 100, 100 + side, 100 + side),
+        box_source_px=(100, 100, 100 + side, 100 + side),
+        class_id=0,
+        class_name="car",
+        confidence=confidence,
+        area_share=side * side / (1280 * 720),
+        crop_area_px=1.69 * side * side,
+        born_frame=0,
+        loss=lambda: BaseLoss(28.0, lost),
+    )
+    return replace(plain, **changes)
+
+
+def split(total_bps: int, **changes) -> Split:
+    """At 720p15."""
+    return Split(SplitSettings(total_bps=total_bps, least_base_bps=90_000, **changes))
+
+
+def after(
+    one: Split, scene: list[Candidate], *, seconds: float = 10, start: float = 0, **kind
+) -> float | None:
+    """What is proposed when the scene was like that for some seconds, three steps a second."""
+    for number in range(round(seconds * 3)):
+        one.observe(scene, moment(start + number / 3, **kind))
+    return one.propose()
+
+
+def test_an_empty_scene_gives_the_bits_to_the_base_and_a_crowd_to_stills():
+    """Bits would lie idle where nothing is to refine, or a crowd of blurs would stay one."""
+    assert after(split(300_000), []) == 0.95
+    crowd = [car(number, lost=0.9, side=90) for number in range(1, 60)]
+    assert after(split(300_000), crowd, from_source=True) == 0.65
+    few = after(split(300_000), crowd[:8], from_source=True)
+    assert few is not None
+    assert 0.85 < few < 0.95
+
+
+def test_settled_tracks_give_their_bits_back():
+    """The base would stay poor for the sake of classes that are already known."""
+    one = split(300_000)
+    crowd = [car(number, lost=0.9, side=90) for number in range(1, 60)]
+    assert after(one, crowd, from_source=True) == 0.65
+    known = [
+        replace(
+            track,
+            sent_count=1,
+            last_sent_ns=10 * SECOND,
+            last_sent_area_px=track.area_px,
+            posterior=Belief("car", 0.97, 0.1),
+        )
+        for track in crowd
+    ]
+    share = after(one, known, start=10, seconds=8, from_source=True)
+    assert share is not None
+    assert share > 0.8
+    assert one.share == share
+
+
+def test_at_a_thin_rate_the_base_keeps_what_it_needs_to_show_objects():
+    """At 150 kbps every bit taken from a base that still shows its cars costs more cars than stills give back."""
+    seen = [car(number, lost=0.2, confidence=0.75, side=60) for number in range(1, 60)]
+    share = after(split(150_000), seen)
+    assert share is not None
+    assert share * 150_000 > 140_000
+    # A base that shows none of its objects has nothing to lose: down to what x265 can follow.
+    blind = [car(number, lost=0.98, confidence=0.5, side=12) for number in range(1, 200)]
+    share = after(split(150_000), blind, from_source=True)
+    assert share is not None
+    assert 90_000 <= share * 150_000 < 110_000
+
+
+def test_the_tracks_channel_comes_out_of_the_total():
+    """Base, stills and tracks together would be promised more than there is."""
+    assert after(split(200_000, metadata_bps=10_000), []) == 0.9
+    crowd = [car(number, lost=0.95) for number in range(1, 90)]
+    share = after(split(200_000, metadata_bps=10_000), crowd, from_source=True)
+    assert share is not None
+    assert 1 - share - 0.05 <= 0.35 + 1e-9
+
+
+def test_nothing_is_proposed_before_the_scene_is_known_or_for_a_trifle():
+    """The encoder would be opened anew at every keyframe, 35 ms and a poor first picture each time."""
+    one = split(300_000)
+    assert one.propose() is None
+    assert one.share == FIRST_SHARE
+    scene = [car(number, lost=0.9, side=60) for number in range(1, 41)]
+    after(one, scene, from_source=True)
+    settled = one.share
+    assert after(one, scene[:-2], start=10, from_source=True) is None
+    assert after(one, [*scene, car(99, lost=0.9, side=60)], start=20, from_source=True) is None
+    assert one.share == settled
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    total=st.sampled_from([100_000, 150_000, 300_000, 800_000]),
+    metadata=st.sampled_from([0, 8_000]),
+    scenes=st.lists(
+        st.tuples(st.integers(0, 120), st.floats(0, 1), st.floats(0.1, 1), st.booleans()),
+        min_size=1,
+        max_size=6,
+    ),
+)
+def test_the_share_is_the_same_every_time_and_leaves_x265_what_it_needs(total, metadata, scenes):
+    """A flight could not be repeated, or would end because x265 cannot follow its rate."""
+
+    def flight() -> list[float | None]:
+        one, shares = split(total, metadata_bps=metadata), []
+        for number, (count, lost, confidence, source) in enumerate(scenes):
+            scene = [car(track, lost=lost, confidence=confidence) for track in range(1, count + 1)]
+            shares.append(after(one, scene, seconds=2, start=2 * number, from_source=source))
+        return shares
+
+    shares = flight()
+    assert flight() == shares
+    for share in shares:
+        if share is not None:
+            assert 0 < share <= 1
+            assert share * total >= min(90_000, total - metadata) - 0.005 * total - 1
+            assert share <= 1 - metadata / total + 0.005
+            assert share == pytest.approx(round(share, 2))
+
+
+def test_a_scene_that_has_changed_is_worth_a_keyframe_of_its_own_now_and_then():
+    """On a thin link scheduled keyframes are a minute apart: the split would follow the scene of a minute ago."""
+    one = split(300_000)
+    assert not one.wants_keyframe(60 * SECOND), "nothing is known of the scene"
+    crowd = [car(number, lost=0.9, side=90) for number in range(1, 60)]
+    one.observe(crowd, moment(0, from_source=True))
+    assert not one.wants_keyframe(19 * SECOND), "not so soon"
+    assert one.wants_keyframe(20 * SECOND)
+    assert one.propose() == 0.65
+    assert not one.wants_keyframe(60 * SECOND), "it is as it should be"
+    for number in range(60):
+        one.observe([], moment(1 + number / 3, from_source=True))
+    assert one.wants_keyframe(40 * SECOND), "the crowd has gone"

@@ -1,0 +1,196 @@
+"""One frame of the base stream after the other: real encoder, real budget, real file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import av
+import numpy as np
+import pytest
+
+from clips import START_NS, framed, hard_pictures, smooth_pictures
+from hvt_common.protocol.channels import Row
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.values import Tracks
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import Sender
+from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
+from hvt_edge.video.frame_skip import Cadence, MeasuredCadence
+from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.quality_refresh import RollingPlan
+from hvt_edge.video.regions import Region
+from hvt_edge.video.stage import BaseStage
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+
+SIZE = (320, 192)
+SECOND_NS = 1_000_000_000
+SETTINGS = EncoderSettings(size=SIZE, fps=15.0, bitrate_bps=50_000, preset="ultrafast", side_data=True)
+
+
+class Kept:
+    """Where bytes go."""
+
+    def __init__(self) -> None:
+        self.units: list[bytes] = []
+
+    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+        """Keep the base stream's."""
+        if row is Row.BASE:
+            self.units.append(payload)
+
+
+class Rig:
+    """A base stage with all that it needs."""
+
+    def __init__(self, *, cadence=None, plan=None, recorder=None, interval_s=10.0) -> None:
+        self.kept = Kept()
+        self.opened: list[int] = []
+        self.cadence = cadence or Cadence()
+        self.keyframes = KeyframePlan(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
+        self.stage = BaseStage(
+            BaseEncoder(replace(SETTINGS, fps=15.0 / self.cadence.every_n)),
+            keyframes=self.keyframes,
+            sender=Sender(
+                self.kept,
+                ledger=Ledger(),
+                budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=15)),
+                edge_id="uav-1",
+                session_id=1,
+                lockstep=True,
+                wait_until=lambda _at_ns: None,
+            ),
+            recorder=recorder,
+            first_keyframe_bytes=5000,
+            plan=plan,
+            cadence=self.cadence,
+            renew=self._renew,
+        )
+
+    def play(self, pictures, *, asks=(), tracks=None) -> list[int]:
+        """Ticks that were coded."""
+        coded = []
+        for frame in framed(pictures):
+            if frame.index in asks:
+                self.keyframes.request(frame.capture_ns)
+            unit = self.stage.encode(frame, now_ns=frame.capture_ns, tracks=tracks)
+            if unit is not None:
+                assert unit.frame_index == frame.index
+                self.stage.send(unit, now_ns=frame.capture_ns)
+                coded.append(frame.index)
+        return coded
+
+    def _renew(self, every_n: int, now_ns: int) -> BaseEncoder | None:
+        assert now_ns >= START_NS
+        if every_n == (self.opened or [1])[-1]:
+            return None
+        self.opened.append(every_n)
+        return BaseEncoder(replace(SETTINGS, fps=15.0 / every_n))
+
+
+class Asked:
+    """A plan that keeps what it was asked."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[int, Tracks | None, bool]] = []
+
+    def regions(self, tick: int, tracks: Tracks | None, *, keyframe: bool = False) -> list[Region]:
+        """Nothing special."""
+        self.calls.append((tick, tracks, keyframe))
+        return []
+
+
+def test_ticks_that_are_not_coded_cost_nothing():
+    """``--fps auto`` would save no bit."""
+    rig = Rig(cadence=Cadence(3))
+    rig.opened.append(3)
+    assert rig.play(smooth_pictures(10, size=SIZE)) == [0, 3, 6, 9]
+    assert len(rig.kept.units) == 4
+
+
+def test_a_keyframe_on_demand_does_not_wait_for_its_tick():
+    """At three frames a second a ground that joins would look at nothing for longer than promised."""
+    rig = Rig(cadence=Cadence(8))
+    rig.opened.append(8)
+    assert rig.play(smooth_pictures(30, size=SIZE), asks=(10,)) == [0, 8, 10, 18, 26]
+    assert BaseDecoder().decode(rig.kept.units[2]) is not None, "it is a keyframe"
+
+
+def test_the_plan_is_asked_for_coded_ticks_and_told_the_tracks():
+    """Pulses would fall on ticks that nobody sees, and R0 would know of no track."""
+    plan = Asked()
+    known = Tracks(0, **_no_tracks())
+    rig = Rig(cadence=Cadence(4), plan=plan)
+    rig.opened.append(4)
+    rig.play(smooth_pictures(9, size=SIZE), tracks=known)
+    assert [(tick, keyframe) for tick, _, keyframe in plan.calls] == [(0, True), (4, False), (8, False)]
+    assert all(tracks is known for _, tracks, _ in plan.calls)
+
+
+def _no_tracks() -> dict[str, np.ndarray]:
+    """The arrays of no tracks."""
+    empty = np.empty(0, np.int64)
+    return {
+        "ids": empty,
+        "boxes_xyxy_px": np.empty((0, 4), np.float32),
+        "confidences": np.empty(0, np.float32),
+        "class_ids": np.empty(0, np.int32),
+        "born_frames": empty,
+        "seen_frames": empty,
+        "started": np.empty(0, np.bool_),
+    }
+
+
+def starving() -> MeasuredCadence:
+    """Decides after a second; the clip below never reaches a fine quantiser."""
+    return MeasuredCadence(1, most_every_n=5, rest_ticks=15)
+
+
+def test_the_rate_changes_with_a_keyframe_and_every_decoder_follows():
+    """The picture would freeze, or turn to garbage, as soon as ``--fps auto`` decides."""
+    rig = Rig(cadence=starving(), interval_s=2.0)
+    pictures = hard_pictures(150, size=SIZE)
+    coded = rig.play(pictures)
+    assert rig.opened
+    assert rig.cadence.every_n > 1
+    assert len(coded) < 150
+    decoder = BaseDecoder()
+    for index, data in zip(coded, rig.kept.units, strict=True):
+        decoded = decoder.decode(data)
+        assert decoded is not None
+        assert np.abs(decoded.astype(np.float64) - pictures[index]).mean() < 40
+    gaps = np.diff(coded)
+    changed = int(np.argmax(gaps > 1))
+    later = BaseDecoder()
+    assert all(later.decode(data) is not None for data in rig.kept.units[changed:]), "a ground may join there"
+
+
+def test_the_same_frames_give_the_same_bytes():
+    """In lockstep no table could be repeated."""
+    runs = []
+    for _ in range(2):
+        rig = Rig(cadence=starving(), plan=RollingPlan(SIZE, columns=4, rows=3, depth=0.1), interval_s=2.0)
+        runs.append((rig.play(hard_pictures(100, size=SIZE), asks=(40,)), rig.kept.units))
+    assert runs[0] == runs[1]
+
+
+def test_a_recording_keeps_its_times_across_a_change(tmp_path):
+    """The flight's video on the drone would run at the wrong speed after the first change."""
+    path = tmp_path / "base.mkv"
+    with BaseRecorder(path) as recorder:
+        rig = Rig(cadence=starving(), recorder=recorder, interval_s=2.0)
+        coded = rig.play(hard_pictures(90, size=SIZE))
+    assert rig.opened
+    with av.open(str(path)) as container:
+        frames = list(container.decode(video=0))
+    assert len(frames) == len(coded)
+    shown_s = [float(frame.pts * frame.time_base) for frame in frames]
+    np.testing.assert_allclose(shown_s, np.array(coded) / 15, atol=0.002)
+
+
+def test_a_change_without_a_new_encoder_is_a_bug_that_shows():
+    """x265 would go on as if all frames came, and spend a third of its bits."""
+    rig = Rig(cadence=starving(), interval_s=2.0)
+    rig.stage._renew = None
+    with pytest.raises(AssertionError, match="another encoder"):
+        rig.play(hard_pictures(120, size=SIZE))

@@ -1,0 +1,426 @@
+"""What an edge kept while its link was away: put together again, bounded, acknowledged, each once."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
+
+from flight import Flight
+from hvt_common.protocol.messages import (
+    MAX_PAST_BYTES,
+    Flags,
+    Info,
+    PastHave,
+    PastHeader,
+    PastStill,
+    WireError,
+    pack_past_still,
+)
+from hvt_ground.backlog import PastAssembly, StoredStill, past_content
+from hvt_ground.link.sequence_window import NumbersSeen
+from hvt_ground.sinks.rerun.backlog_stills import PastGallery, Shown
+from past_pieces import info_object, still_object, video_object
+
+
+def header(offset: int = 0, total: int = 10, *, kind="still", number=3, session=7) -> PastHeader:
+    """Of a piece."""
+    return PastHeader(
+        session_id=session, kind=kind, number=number, offset=offset, total_bytes=total, send_ns=0
+    )
+
+
+def have(number: int, have_bytes: int, *, kind="still", session=7) -> PastHave:
+    """What the edge hears."""
+    return PastHave(session_id=session, kind=kind, number=number, have_bytes=have_bytes)
+
+
+KEY = (7, "still", 3)
+TEN = b"0123456789"
+
+
+def test_pieces_in_order_become_the_object():
+    """Nothing of an outage would ever be seen, or the edge would send it for ever."""
+    assembly = PastAssembly()
+    assert assembly.piece(header(), TEN[:4]) is None
+    assert assembly.take_haves(16) == (have(3, 4),)
+    assert assembly.piece(header(4), TEN[4:]) == TEN
+    assert assembly.take_haves(16) == (have(3, 9),), "it is not where it belongs yet"
+    assembly.settle(KEY, usable=True)
+    assert assembly.take_haves(16) == (have(3, 10),)
+    assert (assembly.in_progress, assembly.size_bytes) == (0, 0)
+
+
+def test_an_object_is_acknowledged_when_it_is_settled_however_long_that_takes():
+    """The edge forgets what it hears of: on a slow ground, a still that nobody has read is lost with the session."""
+    assembly = PastAssembly()
+    assert assembly.piece(header(), TEN) == TEN
+    for _ in range(100):  # the edge asks every two seconds, with the last byte
+        assert assembly.piece(header(9), TEN[9:]) is None
+        assert assembly.take_haves(16) == (have(3, 9),), "somebody is there, and has it all but finished"
+    assert assembly.piece(header(total=9), TEN[:9]) is None
+    assert assembly.take_haves(16) == (have(3, 0),), "another one of the same name has to wait"
+    assembly.settle(KEY, usable=True)
+    assert assembly.take_haves(16) == (have(3, 10),)
+
+
+def test_what_is_in_progress_is_not_settled_by_a_word_too_late():
+    """An object that begins again after a session has ended would lose what has come of it."""
+    assembly = PastAssembly()
+    assembly.piece(header(), TEN)
+    assert assembly.drop_handed() == 1
+    assembly.piece(header(), TEN[:6])
+    assembly.settle(KEY, usable=True)
+    assembly.drop(KEY)
+    assert assembly.piece(header(6), TEN[6:]) == TEN
+    assembly.drop(KEY)
+    assert (assembly.in_progress, assembly.take_haves(16)) == (0, ()), (
+        "nobody can take it: nothing is said of it"
+    )
+
+
+def test_only_the_run_without_a_hole_is_held():
+    """An object with a hole in it would be taken for a whole one."""
+    assembly = PastAssembly()
+    assembly.piece(header(), TEN[:3])
+    assembly.piece(header(6), TEN[6:8])
+    assert assembly.take_haves(16) == (have(3, 3),)
+    assembly.piece(header(1), TEN[1:5])  # it overlaps and goes on
+    assembly.piece(header(0), TEN[:2])  # old
+    assert assembly.take_haves(16) == (have(3, 5),)
+    assert assembly.piece(header(2), TEN[2:]) == TEN
+
+
+def test_what_was_delivered_is_acknowledged_again_and_not_delivered_again():
+    """Where a report is lost the still would be in the gallery twice, or sent until the store is full."""
+    assembly = PastAssembly(remember=3)
+    for number in range(5):
+        assert assembly.piece(header(number=number), TEN) == TEN
+        assert assembly.piece(header(number=number), TEN) is None, "it is being worked on"
+        assembly.settle((7, "still", number), usable=True)
+    assert len(assembly.take_haves(3)) == 3
+    assembly.take_haves(16)
+    assert assembly.piece(header(number=4), TEN) is None
+    assert assembly.piece(header(3, number=3), TEN[3:5]) is None
+    assert assembly.take_haves(16) == (have(4, 10), have(3, 10))
+    assert assembly.piece(header(total=9, number=4), TEN[:9]) == TEN[:9], "another one of the same name"
+    assert assembly.piece(header(number=0), TEN) == TEN, "what is known again is bounded"
+
+
+def test_another_size_begins_anew():
+    """Two halves of two objects would be one."""
+    assembly = PastAssembly()
+    assembly.piece(header(), TEN[:6])
+    assembly.piece(header(6, 12), b"xy")
+    assert assembly.take_haves(16) == (have(3, 0),)
+    assert assembly.piece(header(0, 12), TEN + b"xy") == TEN + b"xy"
+
+
+@pytest.mark.parametrize(
+    ("offset", "total", "payload", "kind", "number"),
+    [
+        (0, 10, b"", "still", 1),
+        (8, 10, b"abc", "still", 1),
+        (0, 10, b"abc", "info", 1),
+        (0, Info.MAX_BYTES + 1, b"abc", "info", 0),
+    ],
+)
+def test_a_piece_that_cannot_be_one_is_refused(offset, total, payload, kind, number):
+    """Memory would follow whatever a stranger sends."""
+    assembly = PastAssembly()
+    with pytest.raises(WireError):
+        assembly.piece(header(offset, total, kind=kind, number=number), payload)
+    assert (assembly.in_progress, assembly.take_haves(16)) == (0, ())
+
+
+def test_an_unusable_object_is_asked_for_again_but_not_for_ever():
+    """One bad object would take the link for the rest of the flight."""
+    assembly = PastAssembly()
+    for _ in range(2):
+        assert assembly.piece(header(), TEN) == TEN
+        assembly.settle(KEY, usable=False)
+        assert assembly.take_haves(16) == (have(3, 0),)
+    assert assembly.piece(header(), TEN) == TEN
+    assembly.settle(KEY, usable=False)
+    assert assembly.take_haves(16) == (have(3, 10),)
+    assert assembly.refused == 3
+
+
+def test_what_cannot_be_taken_now_comes_again():
+    """While much waits, or a session is not known, an object would be acknowledged and lost."""
+    assembly = PastAssembly()
+    assembly.piece(header(), TEN[:4], may_finish=False)
+    assert assembly.piece(header(4), TEN[4:], may_finish=False) is None
+    assembly.want_info(7)
+    assert assembly.take_haves(16) == (have(3, 4), have(0, 0, kind="info"))
+    assert assembly.piece(header(4), TEN[4:]) == TEN
+    assembly.drop_handed()  # the session that had it is gone
+    assembly.settle(KEY, usable=True)
+    assert assembly.take_haves(16) == (have(3, 0),)
+    assembly.piece(header(4), TEN[4:])
+    assert assembly.take_haves(16) == (have(3, 0),)
+
+
+def test_facts_of_a_session_are_delivered_as_often_as_they_come():
+    """A ground that has forgotten them would ask for ever, and hear that it has them."""
+    assembly = PastAssembly()
+    for _ in range(2):
+        assert assembly.piece(header(kind="info", number=0), TEN) == TEN
+        assembly.settle((7, "info", 0), usable=True)
+        assert assembly.take_haves(16) == (have(0, 10, kind="info"),)
+
+
+def test_a_full_assembly_gives_up_what_has_waited_longest():
+    """Objects that never end would fill the ground's memory, or keep out all others."""
+    assembly = PastAssembly(max_objects=3, max_bytes=MAX_PAST_BYTES)
+    for number in range(5):
+        assembly.piece(header(number=number), TEN[:2])
+    assert assembly.in_progress == 3
+    assert len(assembly.take_haves(16)) == 5
+    assembly.piece(header(2, number=0), TEN[2:4])
+    assert assembly.take_haves(16) == (have(0, 0),)
+    assert assembly.piece(header(2, number=4), TEN[2:]) == TEN
+    big = bytes(MAX_PAST_BYTES)
+    assert assembly.piece(header(total=MAX_PAST_BYTES, number=9), big) is None, "one is being worked on"
+    assembly.settle((7, "still", 4), usable=True)
+    assert assembly.piece(header(total=MAX_PAST_BYTES, number=9), big) == big
+    assert assembly.size_bytes <= MAX_PAST_BYTES
+
+
+QUARTER = MAX_PAST_BYTES // 4
+ZEROS = bytes(MAX_PAST_BYTES)
+piece_of = st.tuples(
+    st.integers(0, 5),  # number
+    st.sampled_from([None, None, None, 0, 1, 2, 3]),  # where it begins, quarters; None goes on
+    st.integers(0, 4),  # how long it is
+    st.integers(1, 4),  # of how many
+    st.booleans(),
+    st.sampled_from(["settle", "refuse", "drop", "keep", "keep"]),
+)
+
+
+@given(told=st.lists(piece_of, max_size=40))
+@settings(max_examples=60, deadline=None)
+def test_whatever_comes_it_stays_within_bounds(told):
+    """A hostile sender would crash the ground or make it grow."""
+    assembly = PastAssembly(max_objects=3, max_bytes=MAX_PAST_BYTES + QUARTER, remember=2)
+    fullest, heard = 0, {}
+    for number, begins, length, total, may_finish, then in told:
+        offset = heard.get(number, 0) if begins is None else begins * QUARTER
+        try:
+            whole = assembly.piece(
+                header(offset, total * QUARTER, number=number),
+                ZEROS[: min(length * QUARTER, total * QUARTER - offset)],
+                may_finish=may_finish,
+            )
+        except WireError:
+            continue
+        heard |= {said.number: said.have_bytes for said in assembly.take_haves(16)}
+        fullest = max(fullest, assembly.size_bytes)
+        assert assembly.in_progress <= 3
+        assert assembly.size_bytes <= MAX_PAST_BYTES + QUARTER
+        if whole is None:
+            continue
+        assert len(whole) == total * QUARTER
+        if then == "drop":
+            assembly.drop((7, "still", number))
+        elif then != "keep":
+            assembly.settle((7, "still", number), usable=then == "settle")
+    event("full" if fullest > MAX_PAST_BYTES else "not full")
+
+
+def test_acknowledgements_that_nobody_fetches_are_bounded():
+    """While the way back is away, memory would follow what comes."""
+    assembly = PastAssembly()
+    for number in range(2000):
+        assembly.piece(header(number=number), TEN[:3])
+    said = 0
+    while taken := assembly.take_haves(16):
+        assert len(taken) <= 16
+        said += len(taken)
+    assert said == 512
+
+
+def test_no_more_than_the_bound_is_held_to_the_byte():
+    """The bound would be there, and one object more would go beyond it."""
+    assembly = PastAssembly(max_bytes=MAX_PAST_BYTES + 10)
+    half = MAX_PAST_BYTES // 2
+    assert len(assembly.piece(header(total=half), ZEROS[:half])) == half, (
+        "handed out: it takes its bytes still"
+    )
+    assert assembly.piece(header(total=half + 20, number=4), ZEROS[: half + 10]) is None
+    assert assembly.size_bytes == MAX_PAST_BYTES + 10
+    assert assembly.piece(header(half + 10, half + 20, number=4), ZEROS[:1]) is None
+    assert assembly.take_haves(16) == (have(3, half - 1), have(4, half + 10)), "no byte more"
+    assembly.piece(header(number=5), TEN)  # what waits gives way, what is worked on does not
+    assert assembly.size_bytes == half + 10
+
+
+@given(
+    data=st.binary(min_size=1, max_size=300),
+    cuts=st.lists(st.integers(1, 299), max_size=6),
+    seed=st.integers(0, 2**32),
+)
+@settings(max_examples=150, deadline=None)
+def test_an_edge_that_follows_the_acknowledgements_gets_everything_across(data, cuts, seed):
+    """Lost, doubled or reordered pieces would leave an object unfinished for ever."""
+    assembly, chance = PastAssembly(), random.Random(seed)
+    size = max(1, len(data) // (len(cuts) + 1))
+    at, whole = 0, None
+    for _ in range(2000):
+        burst = list(range(at, len(data), size)[:3])
+        chance.shuffle(burst)
+        for offset in burst:
+            if chance.random() < 0.3:
+                continue
+            whole = whole or assembly.piece(header(offset, len(data)), data[offset : offset + size])
+        if whole is not None:
+            break
+        for said in assembly.take_haves(16):
+            at = said.have_bytes
+    assert whole == data
+
+
+# What is in an object
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """Two seconds."""
+    return Flight(30, keyframes=(20,))
+
+
+def test_objects_are_read(flight):
+    """Nothing of an outage could be shown."""
+    sid = flight.session_id
+    still = past_content((sid, "still", 4), still_object(flight, 6, 4, flags=0), edge="uav-1")
+    assert isinstance(still, StoredStill)
+    assert (still.header.sequence, still.header.frame_index, still.encoding) == (4, 6, "image/jpeg")
+    assert still.header.flags & Flags.STORED
+    assert still.data.startswith(b"\xff\xd8")
+    units = past_content((sid, "base", 20), video_object(flight, range(20, 25)), edge="uav-1")
+    assert [unit.frame_index for unit in units] == list(range(20, 25))
+    info = past_content((sid, "info", 0), info_object(flight), edge="uav-1")
+    assert info.session_id == sid
+
+
+def test_objects_that_are_another_inside_are_refused(flight):
+    """A still would be shown in the wrong session, or under the wrong number."""
+    sid = flight.session_id
+    still, video, info = still_object(flight, 6, 4), video_object(flight, [20]), info_object(flight)
+    broken = flight.still(6, 4)
+    damaged = pack_past_still(PastStill(broken.attachment, broken.encoding, broken.payload + b"x"))
+    for key, data, edge in (
+        ((sid, "still", 5), still, "uav-1"),
+        ((sid + 1, "still", 4), still, "uav-1"),
+        ((sid, "still", 4), damaged, "uav-1"),
+        ((sid, "still", 4), video, "uav-1"),
+        ((sid, "base", 21), video, "uav-1"),
+        ((sid, "base", 20), still, "uav-1"),
+        ((sid + 1, "info", 0), info, "uav-1"),
+        ((sid, "info", 0), info, "uav-2"),
+    ):
+        with pytest.raises(WireError):
+            past_content(key, data, edge=edge)
+
+
+@given(data=st.binary(max_size=400), kind=st.sampled_from(["info", "still", "base"]))
+@settings(max_examples=300, deadline=None)
+def test_any_bytes_are_refused_or_read(data, kind):
+    """One hostile object would end the ground."""
+    with pytest.raises(WireError):
+        past_content((7, kind, 0), data, edge="uav-1")
+
+
+# What has been
+
+
+@given(numbers=st.lists(st.integers(0, 20_000), max_size=80))
+@settings(max_examples=100, deadline=None)
+def test_numbers_are_known_again_in_any_order(numbers):
+    """A still that was missed long ago would be taken for one that has been shown."""
+    seen, plain = NumbersSeen(), set()
+    for number in numbers:
+        assert (number in seen) == (number in plain)
+        assert seen.add([number]) == (number not in plain)
+        plain.add(number)
+    assert seen.count == len(plain)
+
+
+def test_forged_numbers_neither_fill_the_memory_nor_silence_those_that_come():
+    """Somebody who makes up numbers would have every still that is sent afterwards taken for an old one."""
+    seen = NumbersSeen(pages=4)
+    for number in range(40):
+        assert seen.add([number]) == 1, "it has not been, whatever else has"
+        assert seen.add([(number + 1) << 20]) == 1
+        assert len(seen._pages) <= 4
+    assert all(number in seen for number in range(40)), "what goes on is remembered"
+    assert seen.add([39]) == 0
+    assert seen.add([2**32 - 1]) == 1
+
+
+# Its place in the gallery
+
+
+class Replay:
+    """What a viewer shows of the gallery: the latest row of each before a moment."""
+
+    def __init__(self, slots: int) -> None:
+        self.slots = slots
+        self.pictures: dict[tuple[int, int], str] = {}
+        self.captions: dict[int, tuple[str, ...]] = {}
+
+    def write(self, slot: int, frame: int, name: str, rows) -> None:
+        """Log a pair."""
+        self.pictures[slot, frame] = name
+        for row in rows:
+            self.captions[row.frame_index] = row.captions
+
+    def agrees(self, frame: int) -> bool:
+        """Whether each picture stands over its own words."""
+        known = [at for at in self.captions if at <= frame]
+        captions = self.captions[max(known)] if known else ("",) * self.slots
+        for slot in range(self.slots):
+            shown = [at for of, at in self.pictures if of == slot and at <= frame]
+            if captions[slot] != (self.pictures[slot, max(shown)] if shown else ""):
+                return False
+        return True
+
+
+@given(told=st.lists(st.tuples(st.booleans(), st.integers(0, 60), st.integers(0, 2)), max_size=30))
+@settings(max_examples=300, deadline=None)
+def test_pictures_and_captions_agree_at_every_moment(told):
+    """The gallery would show a lorry under the words of a bus."""
+    gallery, replay = PastGallery(("",) * 3, hold_ns=2), Replay(3)
+    now, newest, taken = ("",) * 3, 0, set()
+    for live, number, slot in told:
+        # Stills of now come in their order, those of the past at any time between them.
+        frame = newest + 1 + number % 5 if live else number
+        if frame in taken or (not live and frame > newest):
+            continue
+        taken.add(frame)
+        if live:
+            newest, now = frame, (*now[:slot], f"live {frame}", *now[slot + 1 :])
+            gallery.note(slot, Shown(frame, frame, now))
+            replay.write(slot, frame, f"live {frame}", [Shown(frame, frame, now)])
+            continue
+        put = gallery.put(frame, frame, f"late {frame}")
+        if put is not None:
+            replay.write(put.slot, frame, f"late {frame}", put.rows)
+            if put.stays:
+                now = (*now[: put.slot], f"late {frame}", *now[put.slot + 1 :])
+    assert all(replay.agrees(frame) for frame in range(newest + 2))
+
+
+def test_an_old_still_holds_its_slot_for_a_while_only_where_one_is_free():
+    """Pairs would flicker by, or an old one would push out what is shown now."""
+    gallery = PastGallery(("", ""), hold_ns=10)
+    gallery.note(0, Shown(0, 0, ("a", "")))
+    gallery.note(0, Shown(100, 100, ("b", "")))
+    put = gallery.put(50, 50, "x")
+    assert (put.slot, put.stays) == (0, False)
+    assert gallery.put(55, 55, "y").slot == 1
+    assert gallery.put(57, 57, "z") is None
+    assert gallery.put(95, 95, "z").slot == 1

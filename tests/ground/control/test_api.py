@@ -1,0 +1,244 @@
+"""Asking from the ground, against a scripted edge on a real link: what is believed, what is said, what is written."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+import messages
+from hvt_common.errors import UserError
+from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeader
+from hvt_common.transport.session import declare_publisher, open_session, serve
+from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.video.still_codecs import JpegCodec
+from hvt_ground.cli import main
+from hvt_ground.control import AskedStill, EdgeClient, RefusedError
+from hvt_ground.control.command import run
+
+KEYS = EdgeKeys("uav-1")
+PICTURE = cv2.resize(
+    np.random.default_rng(1).integers(0, 255, (8, 12, 3), np.uint8), (96, 64), interpolation=cv2.INTER_CUBIC
+)
+DATA = JpegCodec().encode(PICTURE, quality_pct=90).data
+INFO = replace(
+    messages.INFO, source_size=(960, 540), base_size=(640, 360), view_scale=2 / 3, class_names=("car",)
+)
+YES = ControlAnswer(session_id=7, accepted=True, reason="", still_ask=3, frame_index=40, tracks=())
+HEADER = RoiHeader(
+    session_id=7,
+    sequence=9,
+    frame_index=40,
+    capture_ns=5,
+    send_delay_ns=1,
+    flags=0,
+    track_id=-1,
+    box_source_px=(10.0, 20.0, 106.0, 84.0),
+    crop_source_px=(10, 20, 106, 84),
+    class_name="",
+    confidence=0.0,
+    reason="asked",
+    codec="jpeg",
+    quality_pct=90,
+    parameters={"ask": 3},
+    also=(),
+)
+
+
+class ScriptedEdge:
+    """Answers everything with ``answer``; for a still it publishes ``puts`` first."""
+
+    def __init__(self, port: int) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{port}"
+        self.answer, self.fate = YES, YES
+        self.puts: list[tuple[bytes, bytes]] = [(DATA, HEADER.pack(DATA))]
+        self.asked: list[ControlRequest] = []
+        self._publisher = None
+
+    def control(self, question: bytes) -> bytes:
+        """Note the request; the stills come a little later, as they do."""
+        request = ControlRequest.parse(question)
+        self.asked.append(request)
+        if request.command == "still" and self.answer.accepted:
+            threading.Timer(0.1, self._put).start()
+        return (self.fate if request.command == "still-fate" else self.answer).pack()
+
+    def _put(self) -> None:
+        for payload, attachment in self.puts:
+            self._publisher.put(payload, attachment=attachment, encoding="image/jpeg")
+
+    def fly(self, up: threading.Event, stop: threading.Event) -> None:
+        """Listen, as an edge with --listen does."""
+        with open_session(LinkSettings("edge", listen=(self.endpoint,))) as session:
+            self._publisher = declare_publisher(session, Row.ROI, keys=KEYS)
+            serve(session, Row.INFO, keys=KEYS, answer=lambda _question: INFO.pack())
+            serve(session, Row.CONTROL, keys=KEYS, answer=self.control)
+            token = session.liveliness().declare_token(KEYS.key(Row.ALIVE))
+            up.set()
+            stop.wait(60)
+            token.undeclare()
+            time.sleep(0.05)
+
+
+@pytest.fixture
+def edge(free_port) -> Iterator[ScriptedEdge]:
+    """One that listens."""
+    scripted, up, stop = ScriptedEdge(free_port), threading.Event(), threading.Event()
+    thread = threading.Thread(target=scripted.fly, args=(up, stop))
+    thread.start()
+    assert up.wait(10)
+    yield scripted
+    stop.set()
+    thread.join(10)
+
+
+def test_the_still_of_the_number_is_the_one_that_is_returned(edge):
+    """Another's still, or one made up by a stranger, would be shown as the answer."""
+    other = np.zeros_like(PICTURE)
+    black = JpegCodec().encode(other, quality_pct=90).data
+    edge.puts = [
+        (black, replace(HEADER, parameters={"ask": 2}).pack(black)),
+        (black, replace(HEADER, parameters={}).pack(black)),
+        (black, replace(HEADER, session_id=8).pack(black)),
+        (black, b"nonsense"),
+        (black[:-9], HEADER.pack(black)),
+        *edge.puts,
+    ]
+    with EdgeClient.connect(edge.endpoint) as edges:
+        assert edges.names() == ["uav-1"]
+        still = edges["uav-1"].still(box=(10, 20, 96, 64), at_s=-1.5, quality_pct=90)
+    assert edge.asked[0].arguments == {"x": 10, "y": 20, "w": 96, "h": 64, "at_ms": -1500, "quality": 90}
+    assert (still.edge, still.header, still.data) == ("uav-1", HEADER, DATA)
+    assert cv2.PSNR(still.image_bgr, PICTURE) > 30
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        replace(HEADER, crop_source_px=(0, 0, 5000, 5000)),
+        replace(HEADER, crop_source_px=(10, 20, 500, 400)),
+        replace(HEADER, codec="residual"),
+        replace(HEADER, codec="own"),
+    ],
+)
+def test_a_still_that_cannot_be_one_is_a_sentence(edge, header):
+    """A hostile edge could make the operator's machine decode anything, or end in a traceback."""
+    edge.puts = [(DATA, header.pack(DATA))]
+    with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(UserError, match="cannot be decoded"):
+        edges["uav-1"].still()
+
+
+def test_refusals_are_the_edges_own_words(edge):
+    """The operator would not know what to ask instead."""
+    edge.answer = replace(YES, accepted=False, reason="there is no track 9 at frame 4")
+    with EdgeClient.connect(edge.endpoint) as edges:
+        with pytest.raises(RefusedError, match="uav-1 refuses: there is no track 9 at frame 4"):
+            edges["uav-1"].still(track=9)
+        with pytest.raises(RefusedError):
+            edges["uav-1"].set_budget(5)
+
+
+def test_a_still_that_was_given_up_is_not_waited_for(edge):
+    """The operator would look at nothing until the timeout, and then not know why."""
+    edge.puts = []
+    edge.fate = replace(YES, accepted=False, reason="in 10 s the budget had no room for it")
+    with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(RefusedError, match="no room for it"):
+        edges["uav-1"].still(timeout_s=30)
+    assert [one.command for one in edge.asked] == ["still", "still-fate"]
+    assert edge.asked[1].arguments == {"ask": 3}
+
+
+def test_one_that_never_comes_ends_with_the_timeout(edge):
+    """A program that asks would hang with the link."""
+    edge.puts = []
+    with (
+        EdgeClient.connect(edge.endpoint) as edges,
+        pytest.raises(UserError, match=r"not come within 0\.5 s"),
+    ):
+        edges["uav-1"].still(timeout_s=0.5)
+
+
+def test_an_answer_that_is_none_is_a_sentence(edge):
+    """A traceback would say nothing of the edge that is not there."""
+    with EdgeClient.connect(edge.endpoint) as edges:
+        with pytest.raises(UserError, match="edge 'uav-9' does not answer"):
+            edges["uav-9"].keyframe()
+        with pytest.raises(UserError, match="edge id 'UAV 1'"):
+            edges["UAV 1"].keyframe()
+
+
+def test_the_command_finds_the_only_edge_and_writes_the_file_as_it_came(edge, tmp_path, capsys):
+    """The picture on disk would have lost twice; `--at -3s` would be taken for a flag."""
+    out = tmp_path / "crop.jpg"
+    words = ["still", "--connect", edge.endpoint, "--track", "17", "--at", "-3s", "--out", str(out)]
+    assert main(words) == 0
+    assert out.read_bytes() == DATA
+    assert edge.asked[0].arguments == {"track": 17, "at_ms": -3000}
+    assert "frame 40, 96x64 pixels at 10,20" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "asked"),
+    [
+        (["keyframe"], ("keyframe", {})),
+        (["set-budget", "600kbps"], ("set-budget", {"bps": 600_000})),
+        (["set-method", "M6"], ("set-method", {"method": "M6"})),
+        (["tracks"], ("tracks", {})),
+    ],
+)
+def test_the_other_commands_ask_what_they_say(edge, words, asked):
+    """The edge would do something else."""
+    assert run([*words, "--connect", edge.endpoint, "--edge", "uav-1"]) == 0
+    assert [(one.command, one.arguments) for one in edge.asked] == [asked]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["still", "--out", "crop.tif"], "crop.tif is not a picture that can be written"),
+        (["still"], "--out"),
+        (["still", "--box", "1,2,3", "--out", "a.png"], "--box '1,2,3' is not a box"),
+        (["still", "--box", "1,2,3,4", "--track", "5", "--out", "a.png"], "not allowed with"),
+        (["still", "--at", "soon", "--out", "a.png"], "--at 'soon' is not a duration"),
+        (["set-budget", "much"], "the budget 'much' is not a bitrate"),
+        (["keyframe", "--connect", "nowhere"], "endpoint 'nowhere' is not usable"),
+        (["still", "--track", "x", "--out", "a.png"], "invalid int value"),
+    ],
+)
+def test_wrong_words_are_one_sentence_before_anybody_is_asked(words, said, capsys):
+    """The user would wait for a link to be told of a typing error."""
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_where_nobody_listens_it_says_so(free_port, capsys):
+    """The command would hang."""
+    assert main(["keyframe", "--connect", f"tcp/127.0.0.1:{free_port}"]) == 2
+    assert f"nobody answers at tcp/127.0.0.1:{free_port}" in capsys.readouterr().err
+
+
+def test_an_asker_never_listens():
+    """A command would open a door on the operator's machine."""
+    config, listen = configure(LinkSettings("asker"))
+    assert listen == ()
+    assert config.get_json("mode") == '"client"'
+    assert config.get_json("connect/endpoints") == '["tcp/127.0.0.1:7447"]'
+
+
+def test_a_png_holds_the_very_pixels(tmp_path):
+    """A program that measures on the file would measure another loss."""
+    still = AskedStill("uav-1", replace(HEADER, codec="h264-intra"), b"h264", PICTURE)
+    still.save(tmp_path / "a.png")
+    assert (cv2.imread(str(tmp_path / "a.png")) == PICTURE).all()
+    still.save(tmp_path / "a.jpg")
+    assert cv2.PSNR(cv2.imread(str(tmp_path / "a.jpg")), PICTURE) > 35
+    with pytest.raises(UserError, match="cannot be written"):
+        still.save(tmp_path / "none" / "a.png")

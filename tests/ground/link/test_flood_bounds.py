@@ -1,0 +1,126 @@
+"""A session that is flooded with valid messages: what it keeps, and that it finds its way back to the real ones."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+
+from flight import Flight, sight_of
+from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, TrackStep
+from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.worker import RealtimeEyes
+from hvt_ground.session.session import GroundSession
+
+BOX = {1: (30.0, 60.0, 62.0, 96.0)}
+SECOND_NS = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """A second of video."""
+    return Flight(15, pace="lockstep")
+
+
+class Rig:
+    """A session whose clock the test turns."""
+
+    def __init__(self, flight: Flight) -> None:
+        self.now_ns = 1_790_000_000 * SECOND_NS
+        self.session = GroundSession(
+            flight.info(),
+            recorder=None,
+            recording=None,
+            sight_of=sight_of,
+            to_local_ns=int,
+            clock=lambda: self.now_ns,
+            report=lambda: None,
+        )
+        for index in range(3):
+            item = flight.base(index)
+            header = BaseHeader.parse(item.attachment, item.payload)
+            assert self.session.base(header, item, decode=True, starts_run=index == 0)
+
+    def step(self, item, **lies) -> int:
+        """Take a report of tracks; how many there have been."""
+        self.session.tracks(replace(TrackStep.parse(item.payload), **lies), item)
+        return self.session.steps_received
+
+
+@pytest.fixture
+def rig(flight):
+    """Three frames into a session."""
+    rig = Rig(flight)
+    yield rig
+    rig.session.close()
+
+
+def test_a_forged_status_number_does_not_silence_the_edge_for_good(rig, flight):
+    """The ground would never hear that the session has ended, nor what the edge has dropped."""
+    item = flight.status(base=3)
+    real = Status.parse(item.payload)
+    rig.session.status(replace(real, sequence=2**32 - 1), item)
+    rig.now_ns += SECOND_NS
+    rig.session.status(replace(real, sequence=real.sequence + 1), item)
+    assert rig.session.last_status.sequence == 2**32 - 1, "late ones are left out as ever"
+    rig.now_ns += 5 * SECOND_NS
+    rig.session.status(replace(real, sequence=real.sequence + 6, state="ended"), item)
+    assert rig.session.last_status.state == "ended"
+
+
+def test_a_forged_step_number_does_not_end_the_tracks_for_good(rig, flight):
+    """The edge's own tracks would be missing for the rest of the flight."""
+    items = [flight.step(index, BOX) for index in (3, 4, 5)]  # the first stands by itself
+    assert TrackStep.parse(items[1].payload).reference >= 0
+    assert rig.step(items[0], sequence=2**32 - 1, frame_index=2**32 - 1) == 1
+    rig.now_ns += 6 * SECOND_NS
+    assert rig.step(items[1]) == 1, "it builds on one that is not known"
+    assert rig.step(items[0], sequence=40, frame_index=50) == 2
+    assert rig.session._step_decoder.predicted(frame_index=50).ids.tolist() == [1]
+
+
+def test_results_that_nobody_fetches_do_not_pile_up(rig, flight):
+    """Stills by the thousand would each leave an answer behind."""
+    for sequence in range(5000):
+        item = flight.still(1, sequence, data=b"no picture")
+        header = RoiHeader.parse(item.attachment, item.payload)
+        rig.session.still(header, item, media_type="image/jpeg")
+    assert len(rig.session.take_results(100_000)) <= 4096
+    assert rig.session.stills_dropped["undecodable"] > 4900
+
+
+def test_broken_stills_are_not_all_looked_into(rig, flight):
+    """Each costs a line in the recording and one on stderr; a few thousand a second would fill both."""
+    notices = []
+    rig.session._emit = notices.append
+    rig.session.sight._stills._emit = notices.append
+    for sequence in range(200):
+        item = flight.still(1, sequence, data=b"no picture")
+        rig.session.still(RoiHeader.parse(item.attachment, item.payload), item, media_type="image/jpeg")
+    rig.session.close()
+    assert sum("cannot be decoded" in getattr(one, "text", "") for one in notices) == 32
+
+
+def test_stills_that_wait_to_be_read_have_a_bound_in_bytes():
+    """256 of the largest would be a quarter of a gigabyte for each edge."""
+    busy, begun = threading.Event(), threading.Event()
+
+    def read(_stills) -> None:
+        begun.set()
+        busy.wait(20)
+
+    eyes = RealtimeEyes(lambda *_: None, lambda *_: None, read, name="test")
+    flight = Flight(2)
+    header = RoiHeader.parse(*((one := flight.still(1, 0)).attachment, one.payload))
+    try:
+        eyes.still(ReceivedStill(header, b"x", "image/jpeg"))
+        assert begun.wait(10)
+        for _ in range(64):
+            eyes.still(ReceivedStill(header, bytes(2**20), "image/jpeg"))
+        assert eyes.dropped["overflow"] == 32
+    finally:
+        busy.set()
+        time.sleep(0.05)
+        eyes.close()

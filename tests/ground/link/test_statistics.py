@@ -1,0 +1,180 @@
+"""What the receiver measures for the edge's rate."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
+from hvt_ground.link.statistics import REPORT_LINE_BYTES, Reception
+
+MS = 1_000_000
+S = 1_000_000_000
+
+
+def header(sequence: int) -> BaseHeader:
+    """Of a base message."""
+    return BaseHeader(
+        session_id=7, sequence=sequence, frame_index=sequence, capture_ns=0, send_delay_ns=0, flags=0
+    )
+
+
+def test_the_newest_message_and_its_time_are_reported():
+    """The edge would take the delay of one message for that of another."""
+    reception = Reception()
+    reception.base(header(4), size_bytes=5_000, arrived_ns=10 * MS, delay_ms=40.0)
+    reception.base(header(5), size_bytes=5_000, arrived_ns=70 * MS, delay_ms=60.0)
+    reception.base(header(3), size_bytes=5_000, arrived_ns=90 * MS, delay_ms=900.0)  # overtaken
+    reception.still(9, size_bytes=900, arrived_ns=95 * MS)
+    reception.still(8, size_bytes=900, arrived_ns=96 * MS)
+    measured = reception.take(100 * MS)
+    assert (measured.base_sequence, measured.base_held_us, measured.still_sequence) == (5, 30_000, 9)
+    assert measured.delay_p50_ms == 60.0
+    assert reception.take(200 * MS).delay_p50_ms is None  # since the last report
+
+
+def test_before_anything_has_come():
+    """A first report would acknowledge what never arrived."""
+    measured = Reception().take(5 * S)
+    assert (measured.base_sequence, measured.base_held_us, measured.still_sequence) == (-1, 0, -1)
+
+
+@pytest.mark.parametrize(
+    ("rate_bps", "least_s", "most_s"), [(8e5, 0.1, 0.1), (2e5, 0.2, 0.3), (3e4, 0.5, 0.5)]
+)
+def test_reports_take_a_small_share_of_the_way_back(rate_bps, least_s, most_s):
+    """On a thin radio, half duplex, the reports would take what the picture needs."""
+    reception, now_ns, reports = Reception(), 0, []
+    for sequence in range(150):
+        now_ns += S // 15
+        reception.base(header(sequence), size_bytes=round(rate_bps / 8 / 15), arrived_ns=now_ns)
+        if reception.due(now_ns):
+            reception.take(now_ns)
+            reports.append(now_ns)
+    assert least_s <= reception.interval_ns(now_ns) / S <= most_s
+    later = [at for at in reports if at > 3 * S]
+    share = len(later) * REPORT_LINE_BYTES * 8 / 7 / rate_bps
+    assert share < 0.1 if rate_bps < 1e5 else share < 0.035
+    assert len(later) >= 12
+
+
+def test_without_news_reports_are_rare():
+    """A paused edge would hear ten reports a second that say nothing."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=100_000, arrived_ns=0)
+    reception.take(0)
+    assert not reception.due(400 * MS)
+    assert reception.due(500 * MS)
+    reception.base(header(1), size_bytes=100_000, arrived_ns=100 * MS)
+    assert reception.due(101 * MS)
+
+
+def test_lockstep_reports_do_not_hang_on_the_clock_of_arrival():
+    """More reports would be sent than an edge in lockstep has use for."""
+    reception = Reception(lockstep=True)
+    reception.take(0)
+    for sequence in range(6):
+        reception.base(header(sequence), size_bytes=50_000, arrived_ns=sequence * 10 * MS)
+    assert not reception.due(400 * MS)
+    assert reception.due(500 * MS)
+
+
+def test_memory_is_bounded():
+    """A flood would let the ground grow."""
+    reception = Reception()
+    for sequence in range(20_000):
+        reception.base(header(sequence), size_bytes=10, arrived_ns=sequence, delay_ms=1.0)
+    assert len(reception._sizes) <= 4096
+    assert len(reception._delays_ms) <= 256
+
+
+def missing(reception: Reception, *, now_s: float = 1.0) -> tuple[int, ...]:
+    """What a report would name."""
+    return reception.take(round(now_s * S)).missing_stills
+
+
+def test_stills_that_never_came_are_named_until_they_come():
+    """The edge would take them for received, and never send them again."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    reception.still(1, size_bytes=900, arrived_ns=S // 2)
+    reception.still(4, size_bytes=900, arrived_ns=S)
+    assert missing(reception) == (0, 2, 3)
+    reception.still(2, size_bytes=900, arrived_ns=S)
+    reception.still(2, size_bytes=900, arrived_ns=S)
+    assert missing(reception) == (0, 3)
+    assert missing(reception, now_s=6.9) == (3,)
+    assert missing(reception, now_s=7.1) == ()
+
+
+def test_a_still_that_comes_with_what_was_kept_is_missed_no_more():
+    """The edge would send it a second time, on the way that is for now."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    reception.still(2, size_bytes=900, arrived_ns=0)
+    reception.stored_still(1)
+    reception.stored_still(7)
+    measured = reception.take(S)
+    assert (measured.missing_stills, measured.still_sequence) == ((0,), 2)
+
+
+def test_pieces_of_the_past_are_reported_on_as_often_as_anything():
+    """An edge that hears nothing of its pieces sends them again."""
+    reception = Reception()
+    reception.take(0)
+    for number in range(100):
+        reception.past(size_bytes=1_000, arrived_ns=number * 10 * MS)
+    assert reception.due(S)
+    assert reception.interval_ns(S) <= 150 * MS
+
+
+def test_a_ground_that_joins_late_misses_nothing_of_before():
+    """It would ask for stills of a past that nobody there has seen, on the thin link."""
+    reception = Reception()
+    reception.base(header(700), size_bytes=500, arrived_ns=0)
+    reception.still(90, size_bytes=900, arrived_ns=0)
+    assert missing(reception) == ()
+    reception.still(92, size_bytes=900, arrived_ns=0)
+    assert missing(reception) == (91,)
+
+
+def test_what_is_missing_is_bounded():
+    """A forged number would make reports too long to be sent, or the ground grow."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    reception.still(2**32 - 2, size_bytes=900, arrived_ns=0)
+    assert missing(reception) == tuple(range(2**32 - 2 - MAX_MISSING_STILLS, 2**32 - 2))
+    reception.still(2**32 - 1, size_bytes=900, arrived_ns=0)
+    assert len(missing(reception)) == MAX_MISSING_STILLS
+
+
+class Moment(int):
+    """A time that somebody reckons with just when a still comes in another thread."""
+
+    reception: Reception
+    threads: list[threading.Thread]
+
+    def __sub__(self, other):
+        sequence = 100 + 2 * len(self.threads)
+        came = threading.Thread(
+            target=self.reception.still, args=(sequence,), kwargs={"size_bytes": 1, "arrived_ns": S}
+        )
+        came.start()
+        came.join(0.1)  # it has to wait its turn
+        self.threads.append(came)
+        return int(self) - other
+
+
+def test_a_still_may_come_while_a_report_is_made():
+    """Stills are read in a thread of their own, which reports them at once: the ground would end with an error."""
+    reception = Reception()
+    reception.base(header(0), size_bytes=500, arrived_ns=0)
+    reception.still(4, size_bytes=900, arrived_ns=0)
+    now = Moment(S)
+    now.reception, now.threads = reception, []
+    assert reception.take(now).missing_stills == (0, 1, 2, 3)
+    assert now.threads
+    for came in now.threads:
+        came.join()
+    assert reception.take(S).still_sequence == 100 + 2 * (len(now.threads) - 1)

@@ -1,0 +1,348 @@
+"""One list from our own tracks, the edge's and the stills: each object once, under one id, where it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight import tracks_at
+from hvt_common.values import Detections, Tracks
+from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+
+A = (100.0, 100.0, 140.0, 130.0)
+B = (300.0, 100.0, 340.0, 130.0)
+C = (500.0, 100.0, 540.0, 130.0)
+
+
+def moved(box, dx, dy=0.0):
+    """A box elsewhere."""
+    return (box[0] + dx, box[1] + dy, box[2] + dx, box[3] + dy)
+
+
+class Ground:
+    """A fusion with our tracks of every frame."""
+
+    def __init__(self, *, own=("car", "bus"), edge=("car", "bus"), **options) -> None:
+        self.path = CameraPath(ahead_ticks=15)
+        self.names, places = unified_names(own, edge)
+        self.fusion = Fusion(fps=15, edge_classes=places, path=self.path, **options)
+
+    def own(self, index, boxes, **more):
+        """A frame of ours."""
+        tracks = tracks_at(index, boxes, **more)
+        self.fusion.take_own(tracks)
+        return self.fusion.listed(tracks)
+
+    def step(self, index, boxes, **more):
+        """A step of the edge."""
+        self.fusion.take_step(tracks_at(index, boxes, **more), own=self.fusion.own_at(index))
+
+    def found(self, index, *boxes):
+        """Objects in a still of a frame, buses."""
+        count = len(boxes)
+        found = Detections(
+            np.array(boxes, np.float32), np.full(count, 0.9, np.float32), np.ones(count, np.int32)
+        )
+        self.fusion.take_found(found, known=self.fusion.listed(self.fusion.own_at(index)).tracks)
+
+
+def brief(fused):
+    """Origin and box of each id, whole pixels."""
+    rows = zip(fused.tracks.ids.tolist(), fused.origins, fused.tracks.boxes_xyxy_px, strict=True)
+    return {i: (origin, tuple(np.rint(box).astype(int).tolist())) for i, origin, box in rows}
+
+
+def whole(box):
+    """Of a box in this file."""
+    return tuple(round(side) for side in box)
+
+
+@pytest.fixture
+def ground():
+    """Nothing known yet."""
+    return Ground()
+
+
+def test_without_an_edge_the_list_is_our_trackers(ground):
+    """Whoever flies without the tracks channel would get other boxes, confidences or fewer tracks than before."""
+    almost = moved(A, 1)  # two classes on one object: it is not for us to judge here
+    ours = tracks_at(0, {3: A, 8: almost, 9: B})
+    ours.class_ids[1] = 1
+    ground.fusion.take_own(ours)
+    fused = ground.fusion.listed(ours)
+    assert fused.tracks.ids.tolist() == [1, 2, 3]
+    assert fused.origins == ("base",) * 3
+    for name in ("boxes_xyxy_px", "confidences", "class_ids", "born_frames", "seen_frames", "started"):
+        np.testing.assert_array_equal(getattr(fused.tracks, name), getattr(ours, name), err_msg=name)
+
+
+def test_each_object_is_listed_once_with_who_knows_of_it(ground):
+    """Every car that both sides see would be counted twice."""
+    ground.own(0, {1: A, 2: B})
+    ground.step(0, {70: moved(A, 2), 71: C})
+    after = brief(ground.own(1, {1: A, 2: B}))
+    assert {i: origin for i, (origin, _) in after.items()} == {1: "edge+base", 2: "base", 3: "edge"}
+    assert after[3][1] == whole(C)
+
+
+def test_an_object_keeps_its_id_whoever_saw_it_first(ground):
+    """The operator would lose the car that he follows, and its refined class, whenever the base gets better."""
+    ground.own(0, {1: A})
+    ground.step(0, {70: B})
+    assert brief(ground.own(1, {1: A}))[2] == ("edge", whole(B))
+    both = ground.own(2, {1: A, 5: B})
+    assert brief(both)[2][0] == "edge+base"
+    assert both.tracks.ids.tolist() == [1, 2]
+    lost = ground.own(3, {1: A})
+    assert brief(lost)[2][0] == "edge"
+    renamed = ground.own(4, {1: A, 9: B})  # our tracker has begun anew
+    assert brief(renamed)[2][0] == "edge+base"
+    assert renamed.tracks.ids.tolist() == [1, 2]
+
+
+def test_the_edges_tracker_may_begin_anew_too(ground):
+    """One car would become two for as long as the old number is believed in."""
+    ground.own(0, {})
+    for index in range(0, 20, 5):
+        ground.step(index, {70: moved(A, 3 * index)})
+    ground.own(20, {})
+    ground.step(20, {88: moved(A, 60)})
+    assert brief(ground.own(21, {})) == {1: ("edge", whole(moved(A, 63)))}
+
+
+def test_two_neighbours_are_not_taken_for_one(ground):
+    """The edge sees one of two parked cars, we see the other: one of them would vanish."""
+    beside = moved(A, 24)  # IoU 0.25
+    ground.own(0, {1: A})
+    ground.step(0, {70: beside})
+    assert {origin for origin, _ in brief(ground.own(1, {1: A})).values()} == {"base", "edge"}
+
+
+def test_of_two_that_fit_the_nearer_pair_is_one(ground):
+    """Ids and classes of neighbours would be exchanged."""
+    ground.own(0, {1: A, 2: moved(A, 20)})
+    ground.step(0, {70: moved(A, 17), 71: moved(A, -3)})
+    # If they were crossed, the boxes would be means of boxes 17 and 23 pixels apart.
+    after = brief(ground.own(0 + 1, {1: A, 2: moved(A, 20)}))
+    assert len(after) == 2
+    assert abs(after[1][1][0] - 100) < 4
+    assert abs(after[2][1][0] - 120) < 4
+
+
+def test_between_steps_a_track_moves_on_with_its_own_velocity(ground):
+    """Boxes of the edge would stand still and jump three times a second."""
+    ground.own(0, {})
+    ground.step(0, {70: A})
+    ground.step(5, {70: moved(A, 20)})
+    assert brief(ground.own(8, {}))[1][1] == whole(moved(A, 32))
+    late = Ground()
+    for index in range(9):  # the same, but the step comes three frames after its tick
+        late.own(index, {})
+    late.step(0, {70: A})
+    late.step(5, {70: moved(A, 20)})
+    assert brief(late.own(9, {}))[1][1] == whole(moved(A, 36))
+
+
+def test_between_steps_a_track_moves_along_with_the_camera(ground):
+    """When the drone turns, the edge's boxes would lie beside their objects until the next step."""
+    ground.own(0, {})
+    ground.step(0, {70: A})
+    for index in range(1, 4):
+        ground.path.add(np.array([[1.0, 0, 10], [0, 1, -4]]), start=index - 1, end=index)
+        fused = ground.own(index, {})
+    assert brief(fused)[1][1] == whole(moved(A, 30, -12))
+    ground.step(5, {70: moved(A, 50, -20)})  # it stands; all of its motion was the camera's
+    ahead = ground.fusion.listed(tracks_at(6, {}))
+    assert brief(ahead)[1][1] == whole(moved(A, 60, -24))
+
+
+def test_the_edges_knowledge_ends(ground):
+    """Cars that have driven away, or the list of an edge that has gone silent, would stay on the screen."""
+    ground.own(0, {})
+    ground.step(0, {70: A, 71: B})
+    ground.step(5, {71: B})
+    assert len(brief(ground.own(6, {}))) == 2, "one missing step may be a flicker"
+    ground.step(10, {71: B})
+    assert brief(ground.own(11, {})) == {2: ("edge", whole(B))}
+    assert len(brief(ground.own(40, {}))) == 1
+    assert brief(ground.own(41, {})) == {}, "31 ticks without a step"
+
+
+def test_where_the_edge_lets_go_our_track_stays(ground):
+    """A track that we see well would vanish with the edge's report."""
+    ground.own(0, {1: A})
+    ground.step(0, {70: A})
+    ground.step(5, {})
+    ground.step(10, {})
+    assert brief(ground.own(11, {1: A})) == {1: ("base", whole(A))}
+
+
+def test_witnesses_that_lie_apart_part(ground):
+    """Two cars that once overlapped would share one box between them for ever."""
+    ground.own(0, {1: A})
+    ground.step(0, {70: A})
+    for index in range(1, 12):
+        ours = {1: moved(A, 10 * index)}
+        if index in (5, 10):
+            ground.own(index, ours)
+            ground.step(index, {70: A})
+        else:
+            ground.own(index, ours)
+    after = brief(ground.own(12, {1: moved(A, 120)}))
+    assert after == {1: ("edge", whole(A)), 2: ("base", whole(moved(A, 120)))}
+
+
+def test_two_boxes_of_one_vehicle_count_once(ground):
+    """A detector that says car and bus of one thing would cost precision twice."""
+    ours = tracks_at(0, {1: A, 2: moved(A, 2), 3: B})
+    ours.class_ids[1] = 1
+    ground.fusion.take_own(ours)
+    ground.step(0, {70: A, 71: C})
+    fused = ground.fusion.listed(ours)
+    assert brief(fused) == {
+        1: ("edge+base", whole(A)),
+        3: ("base", whole(B)),
+        4: ("edge", whole(C)),
+    }
+
+
+def test_the_class_is_that_of_the_surer_side():
+    """The edge, which saw the source, would be overruled by what a blurred base suggests; or never be."""
+    ground = Ground()
+    ours = tracks_at(0, {1: A, 2: B})
+    ours.confidences[:] = (0.4, 0.95)
+    theirs = tracks_at(0, {70: A, 71: B}, class_id=1)
+    theirs.confidences[:] = 0.6
+    ground.fusion.take_own(ours)
+    ground.fusion.take_step(theirs, own=ours)
+    fused = ground.fusion.listed(ours)
+    assert [ground.names[i] for i in fused.tracks.class_ids] == ["bus", "car"]
+    np.testing.assert_allclose(fused.tracks.confidences, [0.6, 0.95])
+
+
+def test_names_that_only_the_edge_has_are_added():
+    """A class of the edge's detector would be shown under the name of another."""
+    names, places = unified_names(("car", "bus"), ("Bus ", "truck", "car", "truck"))
+    assert names == ("car", "bus", "truck")
+    assert places.tolist() == [1, 2, 0, 2]
+    ground = Ground(edge=("Bus", "truck"))
+    ground.own(0, {})
+    ground.step(0, {70: A}, class_id=1)
+    fused = ground.own(1, {})
+    assert [ground.names[i] for i in fused.tracks.class_ids] == ["truck"]
+
+
+def test_both_boxes_are_weighed_by_age_and_confidence(ground):
+    """The fresh box from the source would be dragged away by an old one on a bad base, or the other way round."""
+    ground.own(0, {1: A})
+    ground.step(0, {70: moved(A, 10)})
+    fresh = ground.fusion.listed(tracks_at(0, {1: A})).tracks.boxes_xyxy_px[0, 0]
+    assert fresh == pytest.approx(108), "the edge's counts four times"
+    for index in range(1, 16):
+        fused = ground.own(index, {1: A})
+    assert fused.tracks.boxes_xyxy_px[0, 0] < 103, "ours is seen in every frame, theirs is a second old"
+
+
+def test_what_a_still_shows_besides_becomes_a_track_for_a_while(ground):
+    """Objects that only the sharp picture shows would never be listed."""
+    ground.own(0, {1: A})
+    ground.found(0, moved(A, 3), B)
+    assert brief(ground.own(1, {1: A})) == {1: ("base", whole(A)), 2: ("still", whole(B))}
+    assert brief(ground.own(30, {1: A}))[2][0] == "still"
+    assert 2 not in brief(ground.own(31, {1: A})), "two seconds, and nobody has confirmed it"
+    ground.found(31, B)
+    assert brief(ground.own(32, {1: A, 7: B}))[3] == ("base", whole(B)), "the base has found it"
+    edge = Ground()
+    edge.own(0, {})
+    edge.found(0, B)
+    edge.step(5, {70: B})
+    assert brief(edge.own(6, {})) == {1: ("edge", whole(B))}
+
+
+def test_a_stills_box_moves_the_track(ground):
+    """The refined box would be thrown away, and the one on the bad base shown on."""
+    ground.own(0, {1: A})
+    ground.fusion.take_box(1, moved(A, 8), frame_index=0)
+    first = ground.own(1, {1: A}).tracks.boxes_xyxy_px[0, 0]
+    assert 102 < first <= 104
+    later = ground.own(20, {1: A}).tracks.boxes_xyxy_px[0, 0]
+    assert later < 100.5, "our tracker has seen it often since"
+    ground.fusion.take_box(99, A, frame_index=20)  # a track that nobody knows
+    ground.found(20, B)
+    ground.fusion.take_box(2, moved(B, 6), frame_index=20)
+    assert brief(ground.own(21, {}))[2] == ("still", whole(B)), "no newer than the find"
+
+
+def test_two_that_turn_out_to_be_one_are_told(ground):
+    """What stills have said of the one that goes would be lost."""
+    apart = moved(A, 30)
+    ground.own(0, {1: A})
+    ground.step(0, {70: apart})
+    assert set(brief(ground.own(1, {1: A}))) == {1, 2}
+    assert ground.fusion.take_merged() == []
+    ground.own(2, {1: apart})
+    assert ground.fusion.take_merged() == [(1, 2)]
+    assert ground.fusion.take_merged() == []
+    assert {i: origin for i, (origin, _) in brief(ground.own(3, {1: apart})).items()} == {1: "edge+base"}
+
+
+def test_looking_ahead_changes_nothing(ground):
+    """What a study asks for at one tick would change what is shown at the next."""
+    ground.own(0, {1: A})
+    ground.step(0, {70: A, 71: B})
+    before = brief(ground.fusion.listed(tracks_at(1, {1: A})))
+    for index in (1, 5, 100, 3):
+        ground.fusion.listed(tracks_at(index, {1: A}))
+    assert brief(ground.fusion.listed(tracks_at(1, {1: A}))) == before
+
+
+def test_steps_that_go_back_or_make_no_sense_are_left_out(ground):
+    """One foreign message would crash the ground or bring back the past."""
+    ground.own(0, {})
+    ground.step(5, {70: A})
+    ground.step(5, {70: B})
+    ground.step(3, {70: B})
+    odd = tracks_at(6, {70: (9.0, 9, 5, 5), 71: B, 72: (np.nan, 0, 1, 1)})
+    odd.class_ids[1] = 500
+    ground.fusion.take_step(odd, own=None)
+    assert brief(ground.own(6, {})) == {1: ("edge", whole(A))}
+
+
+def test_memory_is_bounded(ground):
+    """An edge whose tracker renumbers at each step would fill the ground's memory."""
+    for index in range(60):
+        ground.own(index, {})
+        boxes = {1000 * index + i: (10.0 * i, 0.0, 10.0 * i + 5, 5.0 + index * 20) for i in range(200)}
+        ground.step(index, {key: (b[0], b[3] - 5, b[2], b[3]) for key, b in boxes.items()})
+    assert len(ground.fusion._entities) <= 2048
+    assert len(ground.fusion._by_edge) <= 2048
+    assert len(ground.fusion._own) <= 64
+    for index in range(60, 400):
+        ground.own(index, {})
+    assert not ground.fusion._entities
+
+
+def test_random_scenes_never_list_an_object_twice_or_an_id_twice():
+    """Some order of events would give two tracks one id."""
+    random = np.random.default_rng(5)
+    for _ in range(20):
+        ground = Ground()
+        homes = {i: (60.0 * i, 50.0, 60.0 * i + 30, 80.0) for i in range(8)}
+        for index in range(40):
+            seen = [i for i in homes if random.random() < 0.7]
+            ours = {i + 10 * int(random.random() < 0.1): homes[i] for i in seen}
+            fused = ground.own(index, ours)
+            assert len(set(fused.tracks.ids.tolist())) == len(fused.tracks)
+            assert fused.tracks.ids.tolist() == sorted(fused.tracks.ids.tolist())
+            assert len(fused.tracks) <= len(homes)
+            if index % 5 == 0:
+                numbers = {i: i + 100 * int(random.random() < 0.2) for i in homes}
+                jitter = {i: random.normal(0, 1.5, 4) for i in homes}
+                step = {
+                    numbers[i]: tuple((np.array(homes[i]) + jitter[i]).tolist())
+                    for i in homes
+                    if random.random() < 0.8
+                }
+                ground.step(index, step)
+                assert isinstance(ground.fusion.own_at(index), Tracks)

@@ -1,0 +1,290 @@
+"""Small messages that would be large pictures: refused by their headers, before memory is taken for them.
+
+Each bomb is decoded in a process of its own, which says by how much its peak of memory rose. The bounds are generous:
+a bomb that went off would take hundreds of megabytes.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image as Pillow
+
+from clips import framed
+from crops import textured
+from hvt_common.protocol.messages import RoiHeader, WireError
+from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.still_codecs import StillError, still_codec, still_codec_names
+from hvt_common.video.still_codecs.avif import av1_data, avif_file
+from hvt_common.video.still_codecs.bits import BitWriter
+from hvt_common.video.still_codecs.h264_syntax import parameter_sets
+from hvt_common.video.still_codecs.hevc_syntax import coded_picture
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+
+SIZE = (56, 40)
+_MOST_MB = 48
+
+_STILLS = """
+import pickle, resource, sys
+from hvt_common.video.still_codecs import StillError, still_codec
+name, size, good, bombs = pickle.load(sys.stdin.buffer)
+codec = still_codec(name)
+codec.decode(good, size=size)
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before, said = peak(), []
+for bomb in bombs:
+    try:
+        codec.decode(bomb, size=size)
+    except StillError as error:
+        said.append(str(error))
+print((peak() - before) // 1024, len(said))
+"""
+
+_SESSION = """
+import pickle, resource, sys, time
+sys.path[:0] = sys.argv[1:]
+from dataclasses import replace
+from flight import Flight, sight_of
+from hvt_common.protocol.messages import BaseHeader
+from hvt_ground.session.session import GroundSession
+(bomb,) = pickle.load(sys.stdin.buffer)
+flight = Flight(2)
+session = GroundSession(
+    flight.info(), recorder=None, recording=None, sight_of=sight_of, to_local_ns=int, clock=time.time_ns,
+    report=lambda: None,
+)
+first = flight.base(0)
+header = BaseHeader.parse(first.attachment, first.payload)
+assert session.base(header, first, decode=True, starts_run=True)
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before = peak()
+item = replace(first, payload=bomb)
+shown = sum(session.base(replace(header, frame_index=n), item, decode=True, starts_run=True) for n in range(1, 5))
+session.close()
+print((peak() - before) // 1024, shown)
+"""
+
+_PAST = """
+import pickle, resource, sys
+from hvt_common.protocol.messages import PastUnit
+from hvt_ground.backlog.video import PastVideo
+size, good, bombs = pickle.load(sys.stdin.buffer)
+video = PastVideo(base_size=size)
+unit = lambda number, data: PastUnit(number, number, True, data)
+shown = lambda units: sum(one is not None and one[1] is not None for one in video.pictures(units))
+assert shown([unit(0, good)]) == 1
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before = peak()
+count = shown([unit(number, bomb) for number, bomb in enumerate(bombs)])
+print((peak() - before) // 1024, count)
+"""
+
+_BASE = """
+import pickle, resource, sys
+from hvt_common.video.hevc import BaseDecoder
+size, good, bombs = pickle.load(sys.stdin.buffer)
+decoder = BaseDecoder(size=size)
+assert decoder.decode(good) is not None
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before = peak()
+shown = sum(decoder.decode(bomb) is not None for bomb in bombs)
+decoder.reset()
+assert decoder.decode(good) is not None
+print((peak() - before) // 1024, shown)
+"""
+
+
+def defused(script: str, *values: object, paths: tuple[str, ...] = ()) -> tuple[int, int]:
+    """(megabytes by which the peak of memory rose, a count) of a process that was given these values."""
+    command = [sys.executable, "-c", script, *paths]
+    ended = subprocess.run(
+        command, input=pickle.dumps(values), stdout=subprocess.PIPE, check=True, timeout=120
+    )
+    risen_mb, count = ended.stdout.split()[-2:]
+    return int(risen_mb), int(count)
+
+
+def saved(kind: str, size: tuple[int, int], **options) -> bytes:
+    """A picture of one colour as Pillow writes it: a large one is a small file."""
+    buffer = io.BytesIO()
+    Pillow.new("RGB", size, (40, 90, 160)).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def jpeg_bombs() -> list[bytes]:
+    """A real picture of many pixels, one whose header says 65500x65500, and scans without number."""
+    large = saved("JPEG", (6000, 6000), quality=10)
+    header = large.index(b"\xff\xc0") + 5
+    largest = large[:header] + (65500).to_bytes(2, "big") * 2 + large[header + 4 :]
+    small = cv2.imencode(".jpg", textured(*SIZE))[1].tobytes()
+    scan = b"\xff\xda\x00\x08\x01\x01\x00\x00\x3f\x00"
+    scans = small[: small.index(b"\xff\xda")] + scan * 50_000 + b"\xff\xd9"
+    behind = small[:-2] + b"\xff\xda\x00\x0c\x03\x01\x00\x02\x11\x03\x11\x00\x3f\x00" * 50_000 + b"\xff\xd9"
+    disguised = b"\xff\xd8" + largest[2:header] + largest[header:]
+    progressive = saved("JPEG", SIZE, quality=10, progressive=True)
+    return [large, largest, scans, behind, disguised, progressive]
+
+
+def webp_bombs() -> list[bytes]:
+    """A lossy picture of 16383x16383 by its header, a lossless one, one with an extended header."""
+    small = saved("WEBP", SIZE, quality=50)
+    largest = small[:26] + (16383).to_bytes(2, "little") * 2 + small[30:]
+    extended = bytearray(saved("WEBP", SIZE, quality=50, icc_profile=b"x" * 20))
+    at = extended.index(b"VP8X") + 12
+    extended[at : at + 6] = (16382).to_bytes(3, "little") * 2
+    return [largest, saved("WEBP", (4000, 4000), lossless=True), bytes(extended)]
+
+
+def avif_bombs() -> list[bytes]:
+    """A real picture of many pixels, AV1 data that says another size than the boxes, and as large a one as can be."""
+    large = cv2.imencode(".avif", np.full((3000, 3000, 3), 90, np.uint8))[1].tobytes()
+    lying = avif_file(av1_data(large), size=SIZE)
+    return [large, lying, avif_file(av1_announced(65536), size=SIZE)]
+
+
+def av1_announced(side: int) -> bytes:
+    """AV1 data whose sequence header announces a square picture: 16 bits for each side."""
+    header = BitWriter().u(0b00011, 5).u(0, 5).u(15, 4).u(15, 4).u(side - 1, 16).u(side - 1, 16).ended()
+    return b"\x0a" + bytes([len(header)]) + header + b"\x32\x10" + bytes(16)
+
+
+def jxl_bombs() -> list[bytes]:
+    """A real picture of many pixels, and the header of one of 2^30 pixels a side."""
+    from pillow_jxl import Encoder
+
+    pixels = np.full((3000, 3000, 3), 90, np.uint8)
+    encoder = Encoder(mode="RGB", lossless=False, quality=50, decoding_speed=0, effort=3, use_container=False)
+    large = encoder(pixels.tobytes(), 3000, 3000, jpeg_encode=False)
+    side = 0b11 | (2**30 - 1) << 2
+    announced = (side << 1 | side << 36).to_bytes(12, "little")
+    return [large, b"\xff\x0a" + announced + large[14:]]
+
+
+BOMBS = {"jpeg": jpeg_bombs, "webp": webp_bombs, "avif": avif_bombs, "jxl": jxl_bombs}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_still_that_says_another_size_costs_nothing(name):
+    """A few kilobytes would make the ground take gigabytes, or minutes."""
+    if name not in still_codec_names():
+        pytest.skip(f"{name} is not installed")
+    codec, bombs = still_codec(name), BOMBS[name]()
+    good = codec.encode(textured(*SIZE), quality_pct=60).data
+    risen_mb, refused = defused(_STILLS, name, SIZE, good, bombs)
+    assert refused == len(bombs)
+    assert risen_mb < _MOST_MB
+
+
+@pytest.mark.skipif("avif" not in still_codec_names(), reason="OpenCV without AVIF")
+def test_boxes_that_announce_a_huge_avif_do_not_count():
+    """A decoder that believes the boxes takes memory for 16384x16384 pixels; ours gets boxes of our own."""
+    codec = still_codec("avif")
+    good = codec.encode(textured(*SIZE), quality_pct=60).data
+    at = good.index(b"ispe") + 8
+    bomb = good[:at] + (16384).to_bytes(4, "big") * 2 + good[at + 8 :]
+    assert np.array_equal(codec.decode(bomb, size=SIZE), codec.decode(good, size=SIZE))
+    risen_mb, refused = defused(_STILLS, "avif", SIZE, good, [bomb] * 4)
+    assert refused == 0
+    assert risen_mb < _MOST_MB
+
+
+@pytest.mark.parametrize("name", ["h264-intra", "hevc-intra"])
+def test_parameter_sets_inside_a_slice_do_not_count(name):
+    """The slice is said to be of one size, and brings along the header of another."""
+    codec = still_codec(name)
+    good = codec.encode(textured(*SIZE), quality_pct=60).data
+    announced = parameter_sets((8192, 8192)) + coded_picture(b"\x80" * 9, size=(8192, 8192), qp=30)
+    bombs = [good[:1] + announced, good[:1] + announced + good[1:], good + announced]
+    risen_mb, _ = defused(_STILLS, name, SIZE, good, bombs)
+    assert risen_mb < _MOST_MB
+
+
+@pytest.mark.parametrize("size", [(8192, 4320), (8192, 8192), (16384, 16384), (16384, 64)])
+def test_parameter_sets_of_the_base_that_announce_a_huge_picture_cost_nothing(size):
+    """One message would take 200 to 400 MB at the ground, and sixteen kept references many times that."""
+    good = coded_picture(b"\x80" * 20, size=(640, 384), qp=30)
+    bomb = coded_picture(b"\x80" * 20, size=size, qp=30)
+    assert len(bomb) < 150
+    risen_mb, shown = defused(_BASE, (640, 360), good, [bomb] * 8)
+    assert shown == 0
+    assert risen_mb < _MOST_MB
+
+
+def test_a_ground_session_takes_no_base_of_another_size():
+    """The bound would be there, and nobody would say to the decoder what it is."""
+    bomb = coded_picture(b"\x80" * 20, size=(8192, 4320), qp=30)
+    risen_mb, shown = defused(_SESSION, bomb, paths=(str(Path(__file__).parents[4] / "tests" / "support"),))
+    assert shown == 0
+    assert risen_mb < _MOST_MB
+
+
+def test_kept_video_of_another_size_costs_nothing():
+    """The same message would go off, sent as one of an outage."""
+    good = coded_picture(b"\x80" * 20, size=(640, 384), qp=30)
+    bomb = coded_picture(b"\x80" * 20, size=(8192, 4320), qp=30)
+    risen_mb, shown = defused(_PAST, (640, 384), good, [bomb] * 8)
+    assert shown == 0
+    assert risen_mb < _MOST_MB
+
+
+def test_without_a_size_the_base_takes_what_hevc_has_and_no_more():
+    """A study or a tool that knows no size would fill the memory."""
+    decoder = BaseDecoder()
+    assert decoder.decode(coded_picture(b"\x80" * 20, size=(8192, 4400), qp=30)) is None
+    assert decoder.decode(coded_picture(b"\x80" * 20, size=(1920, 1088), qp=30)).shape == (1088, 1920, 3)
+
+
+@pytest.mark.parametrize("size", [(320, 180), (1280, 720), (322, 178), (64, 64)])
+def test_a_base_of_the_announced_size_is_shown_whatever_fills_it_up(size):
+    """Sizes that are no multiple of a block would stay dark."""
+    encoder = BaseEncoder(EncoderSettings(size=size, fps=15, bitrate_bps=300_000, preset="ultrafast"))
+    (frame,) = framed([np.full((size[1], size[0], 3), 90, np.uint8)])
+    assert BaseDecoder(size=size).decode(encoder.encode(frame).data).shape == (size[1], size[0], 3)
+
+
+def test_a_still_of_more_bytes_than_any_has_is_not_taken():
+    """A few hundred of them in a queue would be a gigabyte."""
+    header = RoiHeader(
+        session_id=1,
+        sequence=0,
+        frame_index=0,
+        capture_ns=0,
+        send_delay_ns=0,
+        flags=0,
+        track_id=-1,
+        box_source_px=(0, 0, 8, 8),
+        crop_source_px=(0, 0, 8, 8),
+        class_name="",
+        confidence=0,
+        reason="",
+        codec="jpeg",
+        quality_pct=65,
+        parameters={},
+        also=(),
+    )
+    largest = bytes(RoiHeader.MAX_PAYLOAD)
+    assert RoiHeader.parse(header.pack(largest), largest) == header
+    with pytest.raises(WireError, match="longer than"):
+        RoiHeader.parse(header.pack(b""), largest + b"\0")
+
+
+def test_a_broken_picture_says_nothing_on_stderr(capfd):
+    """Whoever sends them by the thousand would fill the log: OpenCV has a line for each."""
+    if "avif" not in still_codec_names():
+        pytest.skip("OpenCV without AVIF")
+    file = still_codec("avif").encode(textured(*SIZE), quality_pct=60).data
+    for at in range(40):
+        broken = bytearray(file)
+        broken[-1 - at] ^= 0xFF
+        try:
+            still_codec("avif").decode(bytes(broken), size=SIZE)
+        except StillError:
+            continue
+    assert capfd.readouterr().err == ""

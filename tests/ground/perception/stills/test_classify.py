@@ -1,0 +1,268 @@
+"""How stills are named: on the crop alone, or on the picture with the crops pasted in."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import av
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hvt_common.boxes import iou
+from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.detect import open_detector
+from hvt_common.values import Detections, Image, View
+from hvt_ground.perception.stills.classify import (
+    CropReader,
+    Decoded,
+    NoReader,
+    Reading,
+    Redetection,
+    object_crops,
+)
+from hvt_ground.perception.stills.composite import composite
+from onnx_models import colour_classifier
+
+SOURCE, BASE = (1280, 720), (320, 180)
+VIEW = View.fitted(SOURCE, BASE, fit="letterbox")
+GREY = np.full((180, 320, 3), 100, np.uint8)
+
+
+def decoded(
+    crop: tuple[int, int, int, int], *, colour=(0, 0, 255), size: tuple[int, int] | None = None
+) -> Decoded:
+    """A still of one colour; ``size`` as coded."""
+    width, height = size or (crop[2] - crop[0], crop[3] - crop[1])
+    image = np.full((height, width, 3), colour, np.uint8)
+    x1, y1, x2, y2 = VIEW.to_base(np.array([crop], np.float32))[0].tolist()
+    return Decoded(image, crop, (x1, y1, x2, y2), 0)
+
+
+class Bright:
+    """Detects what is saturated: red is a car, green a bus."""
+
+    class_names = ("car", "bus", "van")
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """Boxes of coloured areas."""
+        boxes, classes = [], []
+        for class_id, channel in ((0, 2), (1, 1)):
+            others = [one for one in range(3) if one != channel]
+            mask = (image_bgr[..., channel] > 180) & (image_bgr[..., others].max(axis=2) < 90)
+            count, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+            for x, y, width, height, area in stats[1:count]:
+                if area > 20:
+                    boxes.append([x, y, x + width, y + height])
+                    classes.append(class_id)
+        return Detections(
+            np.array(boxes, np.float32).reshape(-1, 4),
+            np.full(len(boxes), 0.8, np.float32),
+            np.array(classes, np.int32),
+        )
+
+
+def test_redetection_names_each_still_by_what_is_found_at_its_place():
+    """The class of the neighbour would be taken for the object's own."""
+    base = GREY.copy()
+    base[100:120, 200:220] = (0, 255, 0)  # another object, in the base itself
+    stills = [
+        decoded((400, 200, 480, 280)),
+        decoded((40, 40, 120, 120), colour=(0, 255, 0)),
+        decoded((1000, 40, 1080, 120), colour=(100, 100, 100)),  # shows nothing
+    ]
+    read = Redetection(Bright(), view=VIEW).read(stills, base)
+    (first,), (second,), (third,) = read.objects
+    assert (first.posterior.class_name, first.posterior.confidence) == ("car", pytest.approx(0.8))
+    assert first.box_base_px == pytest.approx((100, 50, 120, 70), abs=1)
+    assert second.posterior.class_name == "bus"
+    assert third == Reading(None, None)
+    np.testing.assert_allclose(first.posterior.probabilities, [0.8, 0.1, 0.1], atol=1e-6)
+    entropy = -(0.8 * np.log(0.8) + 0.2 * np.log(0.1))
+    assert first.posterior.entropy_nats == pytest.approx(entropy, abs=1e-5)
+    assert len(read.found) == 0, "what the base shows elsewhere is not news"
+
+
+class Says:
+    """A detector that gives the same answer for every picture, and keeps the pictures."""
+
+    class_names = ("car", "bus", "van")
+
+    def __init__(self, *rows: tuple[tuple[float, float, float, float], float, int]) -> None:
+        self.rows = rows
+        self.seen: list[Image] = []
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """The rows, each a box, a confidence and a class."""
+        self.seen.append(image_bgr)
+        return Detections(
+            np.array([box for box, _, _ in self.rows], np.float32).reshape(-1, 4),
+            np.array([confidence for _, confidence, _ in self.rows], np.float32),
+            np.array([class_id for _, _, class_id in self.rows], np.int32),
+        )
+
+
+def test_all_stills_of_a_frame_are_one_run():
+    """Four stills a frame would cost the ground four networks' time."""
+    detector = Says(((100, 50, 120, 70), 0.6, 0))
+    stills = [decoded((400, 200, 480, 280)), decoded((40, 40, 120, 120))]
+    Redetection(detector, view=VIEW).read(stills, GREY)
+    assert len(detector.seen) == 1
+    assert detector.seen[0][60, 110].tolist() == detector.seen[0][20, 20].tolist() == [0, 0, 255]
+    assert Redetection(detector, view=VIEW).read([], GREY).objects == ()
+    assert len(detector.seen) == 1
+
+
+def test_a_second_opinion_at_the_same_place_counts():
+    """A van that is nearly a car would be told to the policy as certain, or as any of ten classes."""
+    detector = Says(((101, 50, 121, 70), 0.4, 0), ((100, 50, 120, 70), 0.5, 2), ((100, 50, 120, 60), 0.9, 1))
+    ((reading,),) = Redetection(detector, view=VIEW).read([decoded((400, 200, 480, 280))], GREY).objects
+    # The bus covers half of the place only: it casts doubt, and does not name the object.
+    assert reading.posterior.class_name == "van"
+    assert reading.box_base_px == (100, 50, 120, 70)
+    np.testing.assert_allclose(reading.posterior.probabilities, np.array([0.4, 0.5, 0.5]) / 1.4, atol=1e-6)
+    detector.rows = detector.rows[:2]
+    ((reading,),) = Redetection(detector, view=VIEW).read([decoded((400, 200, 480, 280))], GREY).objects
+    assert (reading.posterior.class_name, reading.posterior.confidence) == ("van", pytest.approx(0.5))
+    np.testing.assert_allclose(reading.posterior.probabilities, [0.4, 0.1, 0.5], atol=1e-6)
+
+
+def test_a_detection_speaks_for_one_object_only():
+    """The car in front would give its class to the one that it hides."""
+    near, behind = (100.0, 50.0, 120.0, 70.0), (108.0, 50.0, 128.0, 70.0)
+    still = dataclasses.replace(decoded((400, 200, 520, 280)), box_base_px=near, also_boxes_base_px=(behind,))
+    ((lead, also),) = Redetection(Says((near, 0.6, 0)), view=VIEW).read([still], GREY).objects
+    assert lead.posterior.class_name == "car"
+    assert also == Reading()
+
+
+def test_what_nobody_named_inside_a_still_is_found():
+    """A pedestrian beside the car, sharp in its still, would never become a track."""
+    named = (100.0, 50.0, 120.0, 70.0)
+    detector = Says(
+        (named, 0.9, 0),
+        ((102, 52, 122, 72), 0.6, 1),  # the named object once more
+        ((121, 51, 127, 60), 0.7, 2),  # new
+        ((122, 62, 127, 69), 0.3, 2),  # new, and hardly there
+        ((124, 40, 134, 60), 0.9, 0),  # mostly beside the still: the base shows it
+        ((200, 50, 220, 70), 0.9, 0),  # elsewhere
+    )
+    still = dataclasses.replace(decoded((396, 196, 516, 284)), box_base_px=named)
+    found = Redetection(detector, view=VIEW).read([still], GREY).found
+    assert found.boxes_xyxy_px.tolist() == [[121, 51, 127, 60]]
+    assert found.class_ids.tolist() == [2]
+    assert found.confidences.tolist() == [pytest.approx(0.7)]
+    keen = Redetection(detector, view=VIEW, new_confidence=0.2).read([still], GREY).found
+    assert len(keen) == 2
+
+
+@pytest.mark.realdata
+def test_a_network_larger_than_the_base_gets_the_stills_detail(data, monkeypatch):
+    """At a 640 base every still would be blurred to it before the network looks."""
+    detector = open_detector(str(data / "models" / "yolov5su_visdrone_736x1280.onnx"), confidence=0.1)
+    with av.open(str(data / "clips" / "drone_carpark.mp4")) as clip:
+        source = next(clip.decode(video=0)).to_ndarray(format="bgr24")
+    size = (source.shape[1], source.shape[0])
+    view = View.fitted(size, (640, 384), fit="letterbox")
+    truth = detector.detect(source)
+    base = composite(
+        np.zeros((384, 640, 3), np.uint8),
+        [Decoded(source, (0, 0, *size), (0, 0, 1, 1), 0)],
+        view=view,
+    )
+    base = cv2.resize(cv2.resize(base, (160, 96), interpolation=cv2.INTER_AREA), (640, 384))
+    stills = []
+    for box in truth.boxes_xyxy_px[:12]:
+        x1, y1, x2, y2 = np.clip(box + np.array([-8, -8, 8, 8]), 0, [*size, *size]).astype(int).tolist()
+        place = tuple(view.to_base(box[None])[0].tolist())
+        stills.append(Decoded(source[y1:y2, x1:x2], (x1, y1, x2, y2), place, 0))
+    seen, detect = [], detector.detect
+    monkeypatch.setattr(detector, "detect", lambda image_bgr: seen.append(image_bgr) or detect(image_bgr))
+    readings = [reading for (reading,) in Redetection(detector, view=view).read(stills, base).objects]
+    right = [
+        reading.posterior is not None
+        and reading.posterior.class_name == detector.class_names[class_id]
+        and iou(np.array([reading.box_base_px]), np.array([still.box_base_px]))[0, 0] > 0.75
+        for reading, class_id, still in zip(readings, truth.class_ids, stills, strict=False)
+    ]
+    assert sum(right) >= 11
+    assert [picture.shape for picture in seen] == [(720, 1200, 3)], (
+        "as large as the source, not as the network"
+    )
+
+
+def test_redetection_without_the_picture_says_nothing():
+    """A still whose frame was lost would be named by a picture of another moment."""
+    reader = Redetection(Bright(), view=VIEW)
+    read = reader.read([decoded((400, 200, 480, 280))], None)
+    assert read.objects == ((Reading(),),)
+    assert len(read.found) == 0
+    assert reader.class_names == ("car", "bus", "van")
+
+
+def test_a_certain_detector_has_no_entropy():
+    """A logarithm of nothing would end the ground."""
+
+    class Sure(Bright):
+        class_names = ("car",)
+
+        def detect(self, image_bgr):
+            found = super().detect(image_bgr)
+            return Detections(
+                found.boxes_xyxy_px, np.ones_like(found.confidences), np.zeros_like(found.class_ids)
+            )
+
+    ((reading,),) = Redetection(Sure(), view=VIEW).read([decoded((400, 200, 480, 280))], GREY).objects
+    answer = reading.posterior
+    assert (answer.class_name, answer.entropy_nats) == ("car", 0.0)
+    assert answer.probabilities.tolist() == [1.0]
+
+
+def test_the_crop_reader_gives_the_classifiers_answers_in_order(tmp_path):
+    """Two objects of one frame would swap their classes."""
+    names = tmp_path / "names.txt"
+    names.write_text("red\ngreen\nblue\n")
+    model = colour_classifier(tmp_path / "colour.onnx")
+    reader = CropReader(open_classifier(str(model), labels=names), view=VIEW)
+    stills = [decoded((0, 0, 40, 40), colour=colour) for colour in ((255, 0, 0), (0, 255, 0), (0, 0, 255))]
+    read = reader.read(stills, None)
+    assert [one.posterior.class_name for (one,) in read.objects] == ["blue", "green", "red"]
+    assert reader.class_names == ("red", "green", "blue")
+
+
+def test_the_crop_reader_shows_each_object_of_a_shared_still_by_itself(tmp_path):
+    """A van and the car beside it would share one class."""
+    names = tmp_path / "names.txt"
+    names.write_text("red\ngreen\nblue\n")
+    reader = CropReader(
+        open_classifier(str(colour_classifier(tmp_path / "colour.onnx")), labels=names), view=VIEW
+    )
+    image = np.zeros((50, 100, 3), np.uint8)  # coded at half the size of its crop
+    image[:, :50], image[:, 50:] = (0, 0, 255), (255, 0, 0)
+    still = Decoded(image, (400, 200, 600, 300), (102.0, 52.0, 123.0, 73.0), 0, ((127.0, 52.0, 148.0, 73.0),))
+    ((lead, also),) = reader.read([still], None).objects
+    assert (lead.posterior.class_name, also.posterior.class_name) == ("red", "blue")
+    first, second = object_crops(still, view=VIEW)
+    assert first.shape[:2] == (50, 53)
+    assert second.shape[:2] == (50, 53)
+
+
+@given(st.lists(st.tuples(*[st.floats(-50, 400, width=32)] * 4), min_size=1, max_size=3))
+def test_no_box_of_a_still_is_too_odd_to_cut(corners):
+    """A header with a box outside its crop would end the ground."""
+    boxes = [(min(a, c), min(b, d), max(a, c), max(b, d)) for a, b, c, d in corners]
+    still = Decoded(np.zeros((40, 60, 3), np.uint8), (400, 200, 460, 240), boxes[0], 0, tuple(boxes[1:]))
+    for crop in object_crops(still, view=VIEW):
+        assert crop.shape[0] >= 1
+        assert crop.shape[1] >= 1
+
+
+def test_without_any_model_stills_have_no_name():
+    """A ground without models would not start."""
+    both = dataclasses.replace(decoded((0, 0, 9, 9)), also_boxes_base_px=((0.0, 0.0, 1.0, 1.0),))
+    assert NoReader().read([decoded((0, 0, 9, 9)), both], GREY).objects == (
+        (Reading(),),
+        (Reading(), Reading()),
+    )

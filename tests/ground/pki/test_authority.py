@@ -1,0 +1,228 @@
+"""``hvt-ground keys``: what it writes, whom it lets do what, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import json5
+import pytest
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+
+from fleet_keys import Fleet
+from hvt_common.errors import UserError
+from hvt_common.transport.rights import Rights
+from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_ground.cli import main
+from hvt_ground.pki.command import run
+from hvt_ground.pki.roster import Roster
+
+DEPLOY = Path(__file__).resolve().parents[3] / "deploy"
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Fleet:
+    """Two edges, a ground that commands, one that watches one of them, and a router."""
+    fleet = Fleet(tmp_path / "keys")
+    fleet.keys("add-edge", "uav-1")
+    fleet.keys("add-edge", "rov-1", "--host", "198.51.100.4")
+    fleet.keys("add-ground", "base", "--host", "192.0.2.1", "--host", "base.example")
+    fleet.keys("add-ground", "guest", "--watch-only", "--edges", "uav-*")
+    fleet.keys("add-router", "hub", "--host", "hub.example")
+    return fleet
+
+
+def _rights(fleet: Fleet, name: str) -> Rights:
+    settings = LinkSettings("ground", connect=("tls/192.0.2.1:7447",), zenoh_config=fleet.file(name))
+    return Rights.of(configure(settings)[0])
+
+
+def _certificate(fleet: Fleet, name: str) -> x509.Certificate:
+    return x509.load_pem_x509_certificate((fleet.folder / f"{name}.pem").read_bytes())
+
+
+def test_private_keys_are_private(fleet: Fleet) -> None:
+    """A key that other users of the machine can read is no key."""
+    made = {file.name for file in fleet.folder.glob("*.key")}
+    assert made == {"ca.key", "uav-1.key", "rov-1.key", "base.key", "guest.key", "hub.key"}
+    assert {file.stat().st_mode & 0o077 for file in fleet.folder.glob("*.key")} == {0}
+    assert fleet.folder.stat().st_mode & 0o077 == 0
+
+
+def test_a_certificate_says_who_and_where(fleet: Fleet) -> None:
+    """Access control goes by the common name; who connects compares the address: one missing, and nothing works."""
+    certificate = _certificate(fleet, "base")
+    assert [one.value for one in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)] == ["base"]
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert names.get_values_for_type(x509.DNSName) == ["base", "base.example"]
+    assert [str(one) for one in names.get_values_for_type(x509.IPAddress)] == ["192.0.2.1"]
+    ca = _certificate(fleet, "ca")
+    certificate.verify_directly_issued_by(ca)
+    assert ca.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    assert not certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+
+
+@pytest.mark.parametrize("name", ["base", "hub"])
+def test_an_edge_may_write_under_its_own_id_only(fleet: Fleet, name: str) -> None:
+    """One captured drone could else show the operator another drone's picture."""
+    rights = _rights(fleet, name)
+    for row in ("base", "roi", "tracks", "status"):
+        assert rights.allow("uav-1", flow="ingress", message="put", key=f"hvt/uav-1/{row}")
+        assert not rights.allow("uav-1", flow="ingress", message="put", key=f"hvt/rov-1/{row}")
+        assert not rights.allow("uav-9", flow="ingress", message="put", key=f"hvt/uav-9/{row}")
+        assert not rights.allow("uav-1", flow="egress", message="put", key=f"hvt/rov-1/{row}")
+    assert not rights.allow("uav-1", flow="ingress", message="put", key="hvt/uav-1/feedback")
+    assert not rights.allow("uav-1", flow="ingress", message="query", key="hvt/rov-1/control")
+    assert not rights.allow("uav-1", flow="ingress", message="liveliness_token", key="hvt/rov-1/alive")
+    assert rights.knows("uav-1")
+    assert not rights.knows("uav-9")
+
+
+@pytest.mark.parametrize("name", ["uav-1", "hub"])
+def test_a_ground_that_watches_may_not_command(fleet: Fleet, name: str) -> None:
+    """A guest with a screen must not be able to spend the drone's budget."""
+    rights = _rights(fleet, name)
+    for ground, commands in (("base", True), ("guest", False)):
+        assert rights.allow(ground, flow="egress", message="put", key="hvt/uav-1/base")
+        assert rights.allow(ground, flow="ingress", message="query", key="hvt/uav-1/info")
+        asks = rights.allow(ground, flow="ingress", message="query", key="hvt/uav-1/control")
+        assert asks is commands
+        assert not rights.allow(ground, flow="ingress", message="put", key="hvt/uav-1/base")
+    own = _rights(fleet, "guest")
+    assert not own.allow_somebody(flow="egress", message="query", key="hvt/uav-1/control")
+    assert _rights(fleet, "base").allow_somebody(flow="egress", message="query", key="hvt/uav-1/control")
+
+
+def test_a_ground_sees_the_edges_that_it_may_see(fleet: Fleet) -> None:
+    """Two customers on one router must not watch each other."""
+    hub, rover = _rights(fleet, "hub"), _rights(fleet, "rov-1")
+    assert hub.allow("guest", flow="egress", message="put", key="hvt/uav-1/base")
+    assert not hub.allow("guest", flow="egress", message="put", key="hvt/rov-1/base")
+    assert not hub.allow("guest", flow="egress", message="liveliness_token", key="hvt/rov-1/alive")
+    assert not hub.allow("guest", flow="ingress", message="query", key="hvt/rov-1/info")
+    assert rover.knows("base")
+    assert not rover.knows("guest")
+
+
+def test_a_machine_that_is_removed_has_no_rights_anywhere(fleet: Fleet) -> None:
+    """A lost drone's key is good for years: it must be worth nothing."""
+    fleet.keys("remove", "uav-1")
+    assert not (fleet.folder / "uav-1.key").exists()
+    assert not fleet.file("uav-1").exists()
+    for name in ("base", "guest", "hub"):
+        assert not _rights(fleet, name).knows("uav-1")
+        assert "uav-1" not in fleet.file(name).read_text()
+    with pytest.raises(UserError, match="'uav-1' is not in this fleet: rov-1, base, guest, hub is"):
+        fleet.keys("remove", "uav-1")
+
+
+def test_a_new_machine_names_the_files_that_change(fleet: Fleet, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whoever copies only the new edge's files wonders why its ground sees nothing."""
+    capsys.readouterr()
+    fleet.keys("add-edge", "rov-2")
+    said = capsys.readouterr().out
+    assert "rov-2: copy ca.pem, rov-2.pem, rov-2.key and rov-2.json5 from" in said
+    assert said.endswith("changed with it, copy again and restart what uses them: base.json5, hub.json5\n")
+
+
+def test_list_says_who_may_what_until_when(fleet: Fleet, capsys: pytest.CaptureFixture[str]) -> None:
+    """The only place to see the rights of a fleet at a glance."""
+    capsys.readouterr()
+    run(["list", "--dir", str(fleet.folder)])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines] == [
+        ["edge", "rov-1"],
+        ["edge", "uav-1"],
+        ["ground", "base"],
+        ["ground", "guest"],
+        ["router", "hub"],
+    ]
+    assert re.search(r"key until \d{4}-\d\d-\d\d  watches and commands \*$", lines[2])
+    assert lines[3].endswith("watches uav-*")
+
+
+def test_the_order_of_adding_does_not_matter(tmp_path: Path) -> None:
+    """The roster decides, not who was there first: else some pair could not talk."""
+    orders = [("uav-1", "base", "uav-2"), ("uav-2", "uav-1", "base")]
+    texts = []
+    for number, order in enumerate(orders):
+        fleet = Fleet(tmp_path / str(number))
+        for name in order:
+            fleet.keys("add-ground" if name == "base" else "add-edge", name)
+        texts.append([fleet.file(name).read_text().replace(str(fleet.folder), "") for name in sorted(order)])
+    assert texts[0] == texts[1]
+
+
+def test_the_router_with_keys_is_the_router_with_keys_added(fleet: Fleet) -> None:
+    """Two files that drift apart would make a router behave differently for being secured."""
+    plain = json5.loads((DEPLOY / "zenoh" / "router.json5").read_text(encoding="utf-8"))
+    keyed = json5.loads(fleet.file("hub").read_text(encoding="utf-8"))
+    assert keyed["transport"]["link"].pop("tls")["enable_mtls"] is True
+    assert keyed.pop("access_control")["default_permission"] == "deny"
+    assert plain.pop("listen") == {"endpoints": ["tcp/127.0.0.1:7447"]}
+    assert keyed.pop("listen") == {"endpoints": ["tls/0.0.0.0:7447"]}
+    assert keyed == plain
+
+
+def test_zenoh_reads_every_file_also_of_a_fleet_of_one(tmp_path: Path) -> None:
+    """Zenoh refuses empty lists: the first machine of a fleet must start all the same."""
+    fleet = Fleet(tmp_path / "keys")
+    for command, name in (("add-edge", "uav-1"), ("remove", "uav-1"), ("add-ground", "base")):
+        fleet.keys(command, name)
+        if command != "remove":
+            assert _rights(fleet, name).enabled
+            assert not _rights(fleet, name).knows("anybody")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["add-edge", "ca"], "'ca' is reserved"),
+        (["add-edge", "base"], "'base' is the name of a ground"),
+        (["add-ground", "uav-1"], "'uav-1' is the name of a edge"),
+        (["add-router", "base", "--host", "h"], "'base' is the name of a ground"),
+        (["add-edge", "../ca"], "edge id '../ca' is not usable"),
+        (["add-edge", "UAV"], "edge id 'UAV' is not usable"),
+        (["add-ground", "two", "--edges", "a/b"], "edge pattern 'a/b' is not usable"),
+        (["add-ground", "two", "--host", "bä\u00dfe"], "--host 'bäße' is neither an address nor a host name"),
+        (["add-router", "two"], "the following arguments are required: --host"),
+        (["new-ca"], "already holds a CA"),
+        (["frobnicate"], "invalid choice"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_a_sentence_and_changes_nothing(
+    fleet: Fleet, arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`add-edge ca` would overwrite the key that signs for the whole fleet."""
+    before = {file: file.read_bytes() for file in fleet.folder.iterdir()}
+    capsys.readouterr()
+    assert main(["keys", *arguments, "--dir", str(fleet.folder)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert says in said
+    assert {file: file.read_bytes() for file in fleet.folder.iterdir()} == before
+
+
+def test_a_folder_without_a_ca_or_with_a_foreign_roster_is_a_sentence(tmp_path: Path) -> None:
+    """Run in the wrong folder, it must not begin a second fleet."""
+    with pytest.raises(UserError, match="holds no CA: make one with hvt-ground keys new-ca"):
+        run(["add-edge", "uav-1", "--dir", str(tmp_path)])
+    assert list(tmp_path.iterdir()) == []
+    for text in ("[]", "{", json.dumps({"edges": ["A B"], "grounds": [], "routers": []})):
+        (tmp_path / "fleet.json").write_text(text)
+        with pytest.raises(UserError, match="is not a roster as hvt-ground keys writes it"):
+            Roster.read(tmp_path)
+
+
+def test_keys_need_no_models_and_no_viewer() -> None:
+    """Keys are made on an office machine: `keys` must not wait for, or need, what only a flight needs."""
+    code = (
+        "import sys; from hvt_ground.cli import main; main(['keys', 'list', '--dir', '/nowhere']); "
+        "print(sorted({'rerun', 'onnxruntime', 'av'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

@@ -1,0 +1,583 @@
+"""Messages of an edge in, sessions out: real access units through the real threads."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import replace
+from typing import Self
+
+import pytest
+
+from flight import Flight, Port, RedSquares, SameAnswer, sight_of, square_box
+from handled import WatchedInbox, end
+from hvt_common.protocol.ledger import Channel, overhead_bytes
+from hvt_common.protocol.messages import Info
+from hvt_common.transport.inbox import Inbox, Received
+from hvt_ground.session.receiver import EdgeReceiver
+from hvt_ground.session.session import GroundSession
+from hvt_ground.status import summary, table
+
+
+def wait_for(condition, *, timeout_s: float = 30) -> None:
+    """Poll until true; a test that waits in vain fails here."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.005)
+
+
+def never_gives_up(monkeypatch) -> None:
+    """A session ends because all of it has come, and for no other reason."""
+    monkeypatch.setattr("hvt_ground.session.receiver._ENDED_PATIENCE_NS", 3_600_000_000_000)
+
+
+class Rig:
+    """A receiver with a port; sessions without a recording."""
+
+    def __init__(self, *, detector=None, reader=None, patience_s=5.0, clock=None) -> None:
+        self.port = Port()
+        self.port.inbox = self.inbox = WatchedInbox()
+        self.reader = reader or SameAnswer()
+        self.detector = detector
+        self.opened: list[GroundSession] = []
+        self.receiver = EdgeReceiver(self.port, open_session=self._open, patience_s=patience_s, clock=clock)
+
+    def _open(self, info: Info, receiver: EdgeReceiver) -> GroundSession:
+        session = GroundSession(
+            info,
+            recorder=None,
+            recording=None,
+            sight_of=lambda emit: sight_of(emit, detector=self.detector, reader=self.reader),
+            to_local_ns=receiver.clock_offset.to_local_ns,
+            clock=time.time_ns,
+            report=receiver.report_now,
+        )
+        self.opened.append(session)
+        return session
+
+    def put(self, *items: Received) -> None:
+        """What Zenoh's callback does."""
+        for item in items:
+            self.inbox.put(item)
+
+    def settle(self) -> None:
+        """All that was put has been handled and seen."""
+        wait_for(lambda: self.inbox.handled or self.receiver.error is not None)
+        for session in self.opened:
+            wait_for(lambda one=session: one.idle or self.receiver.error is not None)
+        if self.receiver.error is not None:
+            raise self.receiver.error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind, *_) -> None:
+        end(self.receiver, failing=kind is not None)
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """Two seconds, a second keyframe at frame 20."""
+    return Flight(30, keyframes=(20,))
+
+
+def bases(flight: Flight, *indices: int) -> list[Received]:
+    """Access units of frames."""
+    return [flight.base(index) for index in indices]
+
+
+def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
+    """The operator would not see all there is; or the two sides' accounts would differ."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        items = [
+            *bases(flight, *range(30)),
+            flight.still(4, 0),
+            flight.still(9, 1),
+            flight.status(base=30, roi=2),
+        ]
+        rig.put(*items)
+        rig.settle()
+        session = rig.receiver.session
+        assert (session.frames_received, session.frames_decoded) == (30, 30)
+        assert session.stills_received == 2
+        assert session.duration_s == pytest.approx(2.0)
+        expected = sum(
+            len(one.payload)
+            + len(one.attachment)
+            + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
+            for one in items
+        )
+        assert session.ledger.line_bytes == expected
+        assert session.sight.tracks >= 1
+        wait_for(lambda: rig.port.reports and rig.port.reports[-1].last_frame_index == 29)
+        last = rig.port.reports[-1]
+        assert (last.base_messages, last.roi_messages, last.lost, last.corrupt) == (30, 2, 0, 0)
+        assert last.session_id == flight.session_id
+        results = [one for report in rig.port.reports for one in report.stills]
+        assert [(one.still_sequence, one.class_name, one.track_id) for one in results] == [
+            (0, "bus", 1),
+            (1, "bus", 1),
+        ]
+        assert rig.port.keyframe_requests == 0
+
+
+@pytest.mark.parametrize("pace", ["realtime", "lockstep"])
+def test_the_edges_tracks_are_counted_and_shown(pace):
+    """The two sides' accounts would differ, or the third channel would be paid for and not used."""
+    flight = Flight(20, pace=pace)
+    far = (220.0, 20.0, 250.0, 50.0)
+    with Rig() as rig:
+        rig.port.flight = flight
+        steps = [flight.step(index, {31: square_box(index), 32: far}) for index in (0, 5, 10)]
+        items = [*bases(flight, *range(6)), *steps[:2], *bases(flight, *range(6, 12)), steps[2]]
+        items += bases(flight, *range(12, 20))
+        for item in items:
+            rig.put(item)
+            rig.settle()
+        session = rig.receiver.session
+        assert (session.steps_received, session.ledger.messages(Channel.META)) == (3, 3)
+        assert session.ledger.line_bytes == sum(
+            len(one.payload)
+            + len(one.attachment)
+            + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
+            for one in items
+        )
+        assert session.sight.tracks == 2
+        assert session.sight.steps_used == 3
+        assert session.sight.list_at(19).origins == ("edge+base", "edge")
+
+
+def test_tracks_that_make_no_sense_are_counted_and_skipped():
+    """One damaged report would end the ground, or show boxes that nobody saw."""
+    flight, stranger = Flight(10), Flight(2)
+    with Rig() as rig:
+        rig.port.flight = flight
+        good = [flight.step(index, {31: square_box(index)}) for index in (2, 3)]
+        rig.put(*bases(flight, 0, 1, 2, 3), good[0], good[0])
+        rig.put(flight.step(4, {31: square_box(4)}, boxes=b"\xff" * 40, reference=-1))
+        rig.put(stranger.step(0, {1: square_box(0)}), Received(good[1].key, b"\x93\x02", b"", "", 1))
+        rig.settle()
+        session = rig.receiver.session
+        assert (session.steps_received, session.sight.steps_used) == (2, 1)
+        assert rig.receiver.unusable == 3
+        rig.put(*bases(flight, *range(4, 10)), flight.status(base=10))
+        rig.settle()
+        assert session.last_frame_index == 9
+
+
+def test_the_end_waits_for_the_last_tracks(monkeypatch):
+    """The ground's account would lack the last tracks: the report of the end overtakes them."""
+    never_gives_up(monkeypatch)
+    flight = Flight(3)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2), flight.status(base=3, meta=1, state="ended"))
+        rig.settle()
+        assert not rig.receiver.idle
+        rig.put(flight.step(2, {31: square_box(2)}))
+        wait_for(lambda: rig.receiver.done)
+        rig.settle()
+        (session,) = rig.receiver.done
+        assert (session.steps_received, session.sight.steps_used) == (1, 1)
+
+
+def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
+    """One lost message would freeze the picture, or fill it with garbage that looks like a picture."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2, *range(5, 14)))
+        rig.settle()
+        session = rig.receiver.session
+        assert session.frames_decoded == 3
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(*bases(flight, *range(14, 30)))
+        rig.settle()
+        assert session.frames_decoded == 3 + 10
+        assert session.frames_received == 28
+        assert session.last_frame_index == 29
+        asked = rig.port.keyframe_requests
+        time.sleep(0.4)
+        assert rig.port.keyframe_requests == asked, "what is shown again is not asked for"
+    content = summary(rig.receiver.done[0], unusable=rig.receiver.unusable)
+    assert (content["gaps"], content["lost"], content["keyframe_requests"]) == (1, 2, asked)
+    assert (content["frames"], content["frames_decoded"]) == (28, 13)
+
+
+def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
+    """One bad message would end the ground, spoil the picture, or count twice."""
+    broken = flight.base(3)
+    broken = Received(broken.key, broken.payload[:-1] + b"?", broken.attachment, broken.encoding, 1)
+    nonsense = Received("hvt/uav-1/roi", b"x", b"\x93\x01", "", 1)
+    other = Received("hvt/uav-1/tracks", b"x", b"", "", 1)
+    stranger = Flight(2)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2, 1, 0), nonsense, other)
+        rig.put(flight.still(1, 0), flight.still(1, 0), stranger.still(0, 5), *bases(stranger, 1))
+        rig.put(status := flight.status(base=3, roi=1), status)
+        rig.settle()
+        session = rig.receiver.session
+        assert (session.frames_received, session.frames_decoded, session.stills_received) == (3, 3, 1)
+        assert session.ledger.messages(Channel.META) == 1
+        assert rig.receiver.unusable == 3
+        rig.put(broken)
+        rig.settle()
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(flight.base(3))  # the very unit, whole this time
+        rig.settle()
+        assert session.frames_decoded == 4
+    counters = rig.receiver.done[0].counters
+    assert (counters.corrupt, counters.duplicates + counters.replayed, counters.foreign) == (1, 2, 1)
+
+
+def test_a_still_that_came_twice_is_shown_once_and_counted_twice(flight):
+    """The gallery would show it twice, or the two sides' accounts of the line would differ."""
+    item = flight.still(1, 0)
+    once = len(item.payload) + len(item.attachment)
+    once += overhead_bytes(len(item.payload), len(item.attachment), key=item.key, encoding=item.encoding)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2))
+        rig.settle()
+        session = rig.receiver.session
+        before = session.ledger.line_bytes
+        later = flight.still(1, 0, send_delay_ns=1_030_000_000)
+        for one, copies in (
+            (item, 1),
+            (item, 1),
+            (later, 2),
+            (later, 2),
+        ):  # repeated, somebody else's, not the edge's
+            rig.put(one)
+            rig.settle()
+            assert session.ledger.messages(Channel.ROI) == copies
+            assert session.ledger.line_bytes - before == pytest.approx(copies * once, abs=8)
+        assert session.stills_received == 1
+        assert session.ledger.fates("received") == {"utility": 1}
+        results = [one for report in rig.port.reports for one in report.stills]
+        assert [one.still_sequence for one in results] == [0]
+
+
+def test_a_still_that_never_came_is_reported_missing(flight):
+    """The edge would take it for received, and never send it again."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2), flight.still(1, 1), flight.still(2, 4))
+        rig.settle()
+        wait_for(lambda: rig.port.reports[-1].missing_stills == (0, 2, 3))
+        rig.put(flight.still(0, 2))
+        rig.settle()
+        wait_for(lambda: rig.port.reports[-1].missing_stills == (0, 3))
+        assert rig.port.reports[-1].still_sequence == 4
+
+
+def test_a_second_edge_of_one_id_is_told_of_and_not_shown(flight, caplog):
+    """Two drones of one name would share a screen, a recording and an account, and nobody would be told why."""
+    caplog.set_level(logging.WARNING)
+    other, text = Flight(30, keyframes=range(0, 30, 5)), "two edges call themselves uav-1"
+    now_ns = time.time_ns()  # of a clock of its own: on a busy machine both would fall silent
+    with Rig(clock=lambda: now_ns) as rig:
+        rig.port.flight = flight
+        for index in range(30):
+            items = [flight.base(index)]
+            if index > 0:
+                items += other.base(index - 1), other.still(index, index), other.status(base=index)
+            rig.put(*(replace(item, received_ns=now_ns) for item in items))
+            rig.settle()
+            now_ns += 66_000_000
+        assert rig.opened == [session := rig.receiver.session]
+        assert session.info.session_id == flight.session_id
+        assert (session.frames_decoded, session.stills_received, session.last_status) == (30, 0, None)
+        assert rig.port.keyframe_requests == 0
+    said = [one.getMessage() for one in caplog.records if text in one.getMessage()]
+    assert len(said) == 1
+    assert f"{flight.session_id:016x} is shown" in said[0]
+    assert f"{other.session_id:016x} is not" in said[0]
+    assert "--edge-id" in said[0]
+    assert len(caplog.records) <= 7, "a drone's whole flight would be in the log, message by message"
+
+
+def test_a_session_that_the_edge_does_not_know_ends_nothing():
+    """In any pause of the edge a forged keyframe would close the recording, and hide the drone."""
+    flight, forged = Flight(30, keyframes=(20,)), Flight(8, keyframes=range(8))
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, *range(5)))
+        rig.settle()
+        time.sleep(1.1)  # a pause in which a restart would be believed
+        for index in range(8):
+            rig.put(forged.base(index))
+            rig.settle()
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(*bases(flight, *range(5, 30)))
+        rig.settle()
+        assert rig.opened == [session := rig.receiver.session]
+        # Shown again from the keyframe that was asked for.
+        assert (session.frames_received, session.frames_decoded) == (30, 15)
+
+
+def test_an_edge_that_restarts_gets_a_session_of_its_own(flight):
+    """The second flight's picture and numbers would end up in the first one's recording, or nowhere."""
+    second = Flight(8)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2), *bases(flight, 5, 6, 7, 8))  # with a loss
+        rig.settle()
+        rig.port.flight = second
+        time.sleep(1.1)  # the first one is silent: it is over
+        rig.put(*bases(second, *range(8)), second.still(2, 0))
+        rig.settle()
+        assert [one.info.session_id for one in rig.opened] == [flight.session_id, second.session_id]
+        assert rig.receiver.session is rig.opened[1]
+        assert rig.opened[1].frames_decoded == 8
+    first, last = (summary(one, unusable=0) for one in rig.receiver.done)
+    assert (first["frames"], first["gaps"], first["lost"]) == (7, 1, 2)
+    assert (last["frames"], last["gaps"], last["lost"], last["stills"]["received"]) == (8, 0, 0, 1)
+
+
+def test_a_session_ends_when_all_of_it_has_arrived(flight, monkeypatch):
+    """``--once`` would cut the last pictures off, or never end."""
+    never_gives_up(monkeypatch)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, *range(5)))
+        rig.put(flight.status(base=6, roi=1, state="ended"))
+        rig.settle()
+        assert not rig.receiver.idle, "a picture and a still are on their way"
+        rig.put(flight.base(5))
+        rig.settle()
+        assert not rig.receiver.idle
+        rig.put(flight.still(3, 0))
+        wait_for(lambda: rig.receiver.done)
+        (session,) = rig.receiver.done
+        assert (session.frames_received, session.stills_received) == (6, 1)
+        asked = rig.port.asked
+        rig.put(flight.base(20), flight.still(3, 1))  # a keyframe after the end does not begin it again
+        rig.settle()
+        assert rig.receiver.idle
+        assert rig.port.asked == asked
+
+
+def test_a_session_whose_rest_is_lost_ends_after_two_seconds(flight):
+    """``--once`` would wait for ever for a message that is gone."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        began = time.monotonic()
+        rig.put(*bases(flight, 0, 1), flight.status(base=9, state="ended"))
+        wait_for(lambda: rig.receiver.done)
+        assert time.monotonic() - began >= 2.0
+
+
+def test_a_still_that_comes_before_its_session_is_open_is_taken(flight):
+    """The first stills of every flight would be skipped as a stranger's, and the two accounts differ by them."""
+    other = Flight(8)
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(flight.still(0, 0), other.still(0, 0))
+        rig.settle()
+        assert rig.receiver.unusable == 0
+        rig.put(*bases(flight, *range(6)))
+        rig.settle()
+        session = rig.receiver.session
+        assert (session.stills_received, session.frames_received) == (1, 6)
+        assert session.ledger.messages(Channel.ROI) == 1
+        assert rig.receiver.unusable == 1, "the other one's"
+
+
+def test_a_lost_answer_does_not_lose_the_flight(flight):
+    """Where the link loses the one answer to ``info``, nothing of the whole flight would be shown."""
+    with Rig() as rig:
+        rig.put(*bases(flight, 0, 1, 2))  # nobody answers yet
+        wait_for(lambda: rig.port.asked >= 3)
+        rig.settle()
+        assert rig.receiver.session is None
+        rig.port.flight = flight
+        rig.put(*bases(flight, 3, 4))
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(*bases(flight, *range(5, 30)))
+        rig.settle()
+        assert rig.receiver.session.info.session_id == flight.session_id
+        assert rig.receiver.session.frames_decoded == 10
+
+
+def test_a_flight_goes_on_after_an_outage(flight):
+    """After ten seconds without a link the picture would never come back although the edge flies on."""
+    with Rig(patience_s=0.2) as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, *range(6)))
+        rig.settle()
+        rig.port.present.clear()
+        wait_for(lambda: rig.receiver.idle)
+        assert len(rig.receiver.done) == 1
+        rig.port.present.set()
+        requests = rig.port.keyframe_requests
+        rig.put(*bases(flight, *range(6, 10)))  # not one is missing, but the decoder has been closed
+        wait_for(lambda: rig.port.keyframe_requests > requests)
+        rig.put(*bases(flight, *range(10, 30)))
+        rig.settle()
+        assert rig.receiver.session is not None
+        assert rig.receiver.session.frames_decoded == 10
+
+
+def test_slow_detection_never_holds_up_decoding(flight):
+    """With a large model the ground would fall behind the flight, more with every second."""
+    with Rig(detector=RedSquares(takes_s=0.3)) as rig:
+        rig.port.flight = flight
+        began = time.monotonic()
+        rig.put(*bases(flight, *range(30)))
+        wait_for(lambda: rig.opened and rig.opened[0].frames_decoded == 30)
+        assert rig.opened[0].sight.detections_run <= 2 + (time.monotonic() - began) / 0.3
+        rig.settle()
+    (session,) = rig.receiver.done
+    assert session.last_frame_index == 29, "the newest is tracked, whatever is left out"
+    assert session.frames_untracked + session.sight.detections_run < 30
+
+
+def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
+    """A still would be read without the picture around it, or held against the wrong one."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        for index in range(20):
+            rig.put(flight.base(index), flight.still(index, index))
+        rig.settle()
+        wait_for(lambda: len(rig.reader.had_base) == 20)
+        assert all(rig.reader.had_base)
+        assert rig.receiver.session.sight.refined >= 1  # a busy machine may lose the track between
+
+
+def test_a_still_before_its_frame_waits_for_its_track(flight):
+    """On two links stills overtake pictures: they would refine nothing."""
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2), flight.still(6, 0))
+        rig.settle()
+        assert rig.receiver.session.sight.refined == 0
+        rig.put(*bases(flight, *range(3, 12)))
+        rig.settle()
+        wait_for(lambda: rig.receiver.session.sight.refined == 1)
+
+
+def test_lockstep_sees_every_frame_and_answers_every_still():
+    """The same clip would give other tracks in each run, or the edge would wait for an answer that never comes."""
+    outcomes = []
+    for _ in range(2):
+        flight = Flight(20, pace="lockstep")
+        with Rig(detector=RedSquares(takes_s=0.01)) as rig:
+            rig.port.flight = flight
+            for index in range(20):
+                rig.put(
+                    flight.base(index), flight.still(index, index, data=b"no jpeg" if index == 7 else None)
+                )
+            rig.settle()
+            session = rig.receiver.session
+            assert session.sight.detections_run == 20
+            answered = [one.still_sequence for report in rig.port.reports for one in report.stills]
+            assert answered == list(range(20))
+            frames = [report.last_frame_index for report in rig.port.reports]
+            assert frames == sorted(frames)
+            assert set(range(20)) <= set(frames)
+        content = summary(rig.receiver.done[0], unusable=0)
+        outcomes.append((content["tracks"], content["tracks_refined"], content["stills"]))
+    assert outcomes[0] == outcomes[1]
+    assert outcomes[0][2]["dropped"] == 1
+
+
+def test_another_picture_size_under_the_same_session_is_not_shown(flight):
+    """A forged or broken unit would end the ground in the middle of tracking."""
+    large = Flight(3, size=(384, 256))
+    large.session_id = flight.session_id
+    with Rig() as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, 0, 1, 2))
+        rig.settle()
+        forged = Flight(5, keyframes=(3,), size=(384, 256))
+        forged.session_id = flight.session_id
+        rig.put(forged.base(3))
+        rig.settle()
+        assert rig.receiver.session.frames_decoded == 3
+        wait_for(lambda: rig.port.keyframe_requests >= 1)
+        rig.put(*bases(flight, *range(4, 30)))
+        rig.settle()
+        assert rig.receiver.session.last_frame_index == 29
+
+
+def test_a_crash_of_the_eyes_ends_the_process_and_not_in_silence(flight):
+    """The ground would go on looking alive and track nothing."""
+
+    class Broken(RedSquares):
+        def detect(self, image_bgr):
+            raise RuntimeError("model is gone")
+
+    rig = Rig(detector=Broken())
+    rig.port.flight = flight
+    rig.put(*bases(flight, *range(10)))
+    wait_for(lambda: rig.receiver.error is not None)
+    assert str(rig.receiver.error) == "model is gone"
+    rig.receiver.close()
+
+
+def test_closing_keeps_what_has_arrived_and_ends(flight, monkeypatch):
+    """Ctrl-C would throw away the last second, or hang."""
+    # What a second or two are enough for is the machine's affair.
+    monkeypatch.setattr("hvt_ground.session.receiver._DRAIN_NS", 20_000_000_000)
+    monkeypatch.setattr("hvt_ground.perception.worker._FINISH_S", 20.0)
+    rig = Rig(detector=RedSquares(takes_s=0.05))
+    rig.port.flight = flight
+    rig.put(flight.base(0))
+    wait_for(lambda: bool(rig.opened))
+    rig.put(*bases(flight, *range(1, 30)))
+    rig.receiver.close()
+    rig.receiver._thread.join(60)
+    assert not rig.receiver._thread.is_alive()
+    (session,) = rig.receiver.done
+    assert session.frames_decoded == 30
+    assert session.last_frame_index == 29
+
+
+def test_the_summary_can_be_written_and_read(flight):
+    """Programs that compare runs would miss a field."""
+    with Rig(reader=SameAnswer(knows=False)) as rig:
+        rig.port.flight = flight
+        rig.put(*bases(flight, *range(10)), flight.still(2, 0), flight.still(3, 1, data=b"junk"))
+        rig.settle()
+    content = summary(rig.receiver.done[0], unusable=3)
+    assert content["stills"]["received"] == 2
+    assert content["stills"]["unread"] == 1
+    assert content["stills"]["dropped"] == 1
+    assert content["stills"]["deferred"] == 0
+    assert content["unusable_messages"] == 3
+    assert content["latency_ms"]["p50"] is not None
+    assert (content["edge"], content["method"], content["recording"]) == ("uav-1", "M5", None)
+    rows = dict(table(content))
+    assert rows["frames"].startswith("10 decoded in 0.7 s, no gaps")
+
+
+def test_an_inbox_is_bounded_in_bytes():
+    """A flood of large messages would fill the ground's memory: a thousand of them have four gigabytes."""
+
+    def item(size: int, number: int = 0) -> Received:
+        return Received("k", bytes(size), b"ab", "", number)
+
+    inbox = Inbox(capacity=1000, overflow="newest", capacity_bytes=1_000)
+    for number in range(5):
+        inbox.put(item(298, number))
+    assert (len(inbox), inbox.dropped) == (3, 2)
+    assert inbox.get(timeout_s=0).received_ns == 0
+    inbox.put(item(298, 9))
+    assert [inbox.get(timeout_s=0).received_ns for _ in range(3)] == [1, 2, 9]
+    inbox.put(item(2_000))
+    assert (len(inbox), inbox.dropped) == (0, 3)
+    latest = Inbox(capacity=1000, overflow="oldest", capacity_bytes=1_000)
+    for number in range(5):
+        latest.put(item(298, number))
+    latest.put(item(600, 7))
+    assert [latest.get(timeout_s=0).received_ns for _ in range(len(latest))] == [4, 7]
+    latest.put(item(2_000))
+    assert len(latest) == 0
+    for _ in range(100):
+        latest.put(item(300))
+        latest.get(timeout_s=0)
+    latest.put(item(900))
+    assert len(latest) == 1, "what was taken out counts no more"

@@ -1,0 +1,70 @@
+"""What a session leaves behind at the ground when it has ended: its numbers, and nothing large."""
+
+from __future__ import annotations
+
+from flight import Flight, sight_of
+from hvt_common.protocol.messages import Info
+from hvt_common.video.hevc import BaseDecoder
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.perception.pipeline import GroundSight, Picture
+from hvt_ground.wiring import Models, make_sight
+
+
+def test_pictures_are_let_go_of():
+    """A ground whose edges come and go would grow by a hundred megabytes each time."""
+    flight, decoder, sight = Flight(6), BaseDecoder(), sight_of(lambda _event: None)
+    for unit in flight.units:
+        image = decoder.decode(unit.data)
+        sight.see(Picture(unit.frame_index, unit.capture_ns, unit.capture_ns, image), hurry=False)
+    assert sight._history.size_bytes > 0
+    sight.end()
+    assert sight._history.size_bytes == 0
+    assert sight.tracks == 1
+
+
+def test_the_next_session_gets_the_same_models():
+    """Each reconnection would cost another set of networks, their memory and their threads."""
+    models = Models(check(GroundConfig()))
+    first, other = models.take(), models.take()
+    assert first[0] is not other[0]
+    models.give_back(*first)
+    again = models.take()
+    assert again[0] is first[0]
+    assert again[1] is first[1]
+
+
+def eyes_of(config: GroundConfig) -> tuple[Models, GroundSight, Info]:
+    """The eyes of a session of an edge."""
+    models, info = Models(config), Flight(1).info()
+    return models, make_sight(config, models, info=info, emit=lambda _event: None), info
+
+
+def test_what_looks_at_the_past_uses_the_models_of_now():
+    """The first still of an outage would stop the picture for as long as it takes to load a network."""
+    models, sight, info = eyes_of(check(GroundConfig()))
+    for _ in range(2):  # twice at a time: a stretch of video waits while a still is read
+        with models.lender(info.edge).borrow() as (detector, classifier):
+            assert detector is sight._parts.detector
+            with models.lender(info.edge).borrow() as again:
+                assert again == (detector, classifier)
+    with models.lender("uav-9").borrow() as other:
+        assert other[0] is not detector, "another edge's is used by another thread"
+    sight.end()
+    assert {id(models.take()[0]), id(models.take()[0])} == {id(detector), id(other[0])}
+
+
+def test_a_detector_of_motion_does_not_see_the_past():
+    """The picture of now would be compared with one of an hour ago: all of it moves."""
+    models, sight, info = eyes_of(check(GroundConfig(detector="motion", classifier="none")))
+    with models.lender(info.edge).borrow() as (detector, classifier):
+        assert isinstance(detector, type(sight._parts.detector))
+        assert detector is not sight._parts.detector
+        assert classifier is None
+
+
+def test_a_detector_that_remembers_the_scene_is_not_passed_on():
+    """One flight's background would be the next one's."""
+    models = Models(check(GroundConfig(detector="motion", classifier="none")))
+    first = models.take()
+    models.give_back(*first)
+    assert models.take()[0] is not first[0]

@@ -1,0 +1,505 @@
+"""The recording: whole at every moment, small, and telling what was logged."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_ground.events.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.sinks.rerun.gallery import CANVAS, SLOTS, Gallery, frame_of, placed
+from hvt_ground.sinks.rerun.live_view import LiveView, free_port, listening
+from hvt_ground.sinks.rerun.overlay_encoding import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
+from hvt_ground.sinks.rerun.palette import class_colour
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session
+from rrd import Recording
+
+SIZE = (320, 192)
+FRAMES = 45
+TRACKS = 12
+
+
+def settings(path: Path | None, **changes: object) -> RecorderSettings:
+    """Settings of a small recording."""
+    values = {
+        "path": path,
+        "edge_id": "uav-1",
+        "session": "00ff",
+        "base_size": SIZE,
+        "fps": 15.0,
+        "budget_bps": 400_000.0,
+        "facts": {"method": "M5"},
+    }
+    return RecorderSettings(**(values | changes))
+
+
+@pytest.fixture(scope="module")
+def units() -> list[tuple[bytes, bool]]:
+    """Three seconds of real x265 access units, a keyframe every 20."""
+    return coded(drawn_frames(FRAMES), kbps=300, keyint=20)
+
+
+@pytest.fixture(scope="module")
+def events(units: list[tuple[bytes, bool]]) -> list[Event]:
+    """A session made of them."""
+    return [event for event, _ in session(drawn_frames(FRAMES), units, tracks=TRACKS, total_kbps=500)]
+
+
+def of(kind: type, events: list[Event]) -> list:
+    """The events of one kind."""
+    return [event for event in events if isinstance(event, kind)]
+
+
+@pytest.fixture(scope="module")
+def recording(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The session, recorded and read back."""
+    path = tmp_path_factory.mktemp("rrd") / "flight.rrd"
+    with Recorder(settings(path)) as recorder:
+        for event in events:
+            recorder.log(event)
+    return Recording(path)
+
+
+def test_the_video_is_the_stream_as_received(recording: Recording, events: list[Event]) -> None:
+    """Otherwise the recording would not show what the link carried, or not at its time."""
+    logged = [(s.frame_index, s.capture_ns, s.data) for s in of(VideoSample, events)]
+    assert recording.video() == logged
+    assert recording.rows("/base/video", "VideoStream:codec")[0][2] == [int.from_bytes(b"hev1")]
+
+
+def test_the_video_decodes_in_order_from_the_file(recording: Recording) -> None:
+    """A recording whose video no decoder can play is worth nothing."""
+    decoder = av.CodecContext.create("hevc", "r")
+    decoder.thread_type = "SLICE"
+    pictures = [p for _, _, data in recording.video() for p in decoder.decode(av.Packet(data))]
+    assert len(pictures) == FRAMES
+    assert (pictures[0].width, pictures[0].height) == SIZE
+
+
+def test_only_the_two_timelines_are_there(recording: Recording) -> None:
+    """A third timeline would cost bytes in every row and offer the viewer's user a time that means nothing."""
+    assert recording.timelines == {"frame", "capture_time"}
+
+
+def test_it_opens_as_a_screen(recording: Recording) -> None:
+    """Without its blueprint the file opens as a heap of entities."""
+    assert recording.blueprints == 1
+    text = recording.rows("/session", "TextDocument:text")[0][2][0]
+    assert "uav-1" in text
+    assert "method **M5**" in text
+    assert "400" in text
+
+
+def test_every_frame_shows_the_boxes_that_were_logged(recording: Recording, events: list[Event]) -> None:
+    """Boxes that lag or drift would put a class on the wrong car."""
+    limit = CENTRE_STEP_PX + HALF_SIZE_STEP_PX + 0.01
+    for overlay in of(Overlay, events):
+        boxes = recording.boxes(overlay.frame_index)
+        assert sorted(boxes) == overlay.track_ids.tolist()
+        for i, track in enumerate(overlay.track_ids.tolist()):
+            read = boxes[track]
+            assert np.abs(np.array(read.box_px) - overlay.boxes_base_px[i]).max() <= limit
+            assert (read.class_before, read.class_after) == (overlay.base_classes[i], overlay.classes[i])
+            assert abs(read.confidence_pct / 100 - overlay.confidences[i]) < 0.055
+            assert read.refined == overlay.refined[i]
+
+
+def test_a_refined_track_says_so(recording: Recording, events: list[Event]) -> None:
+    """The user must see in the picture which classes rest on a still, and what they were before."""
+    last = of(Overlay, events)[-1]
+    boxes = recording.boxes(last.frame_index)
+    labels = {
+        t: boxes[t].label for t, refined in zip(last.track_ids.tolist(), last.refined, strict=True) if refined
+    }
+    assert len(labels) >= 3
+    for track, label in labels.items():
+        read = boxes[track]
+        if read.class_before == read.class_after:
+            assert label == f"{track} ✓"
+        else:
+            assert label == f"{track} {read.class_before} → {read.class_after} .90"
+
+
+def test_every_still_is_there_beside_its_base_crop(recording: Recording, events: list[Event]) -> None:
+    """The gallery is how a user judges what the stills are worth."""
+    refinements = of(Refinement, events)
+    assert len(refinements) > SLOTS
+    stills = recording.stills()
+    assert sorted(stills) == sorted((r.frame_index, r.still) for r in refinements)
+    crops = recording.base_crops()
+    assert len(crops) >= SLOTS
+    by_frame = {r.frame_index: r for r in refinements}
+    for frame, data in crops:
+        crop = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        candidates = [r.base_crop_bgr for r in refinements if r.frame_index == frame]
+        assert any(crop.shape == c.shape and np.abs(crop.astype(int) - c).mean() < 12 for c in candidates)
+        assert frame in by_frame
+
+
+def test_a_finer_still_is_shown_beside_an_enlarged_crop(events: list[Event], tmp_path: Path) -> None:
+    """Side by side at different sizes the eye compares size, not detail."""
+    refinement = of(Refinement, events)[0]
+    large = cv2.resize(refinement.base_crop_bgr, None, fx=3, fy=3)
+    still = cv2.imencode(".png", large)[1].tobytes()
+    path = tmp_path / "a.rrd"
+    with Recorder(settings(path)) as recorder:
+        recorder.log(dataclasses.replace(refinement, still=still, media_type="image/png"))
+        recorder.log(
+            dataclasses.replace(
+                refinement, still_sequence=1, still=still, media_type="image/png", base_crop_bgr=None
+            )
+        )
+    read = Recording(path)
+    shapes = [cv2.imdecode(np.frombuffer(data, np.uint8), 1).shape for _, data in read.base_crops()]
+    assert large.shape in shapes
+    assert (3, 4, 3) in shapes  # a frame that was gone is a blank, not the crop of the still before
+    assert all(data[:2] == b"\xff\xd8" for _, data in read.stills())  # the viewer knows them for JPEG
+
+
+def test_traffic_and_tracks_are_plotted(recording: Recording, events: list[Event]) -> None:
+    """The user checks the budget on this plot."""
+    traffic = of(Traffic, events)
+    rates = recording.lines("/link/bitrate")
+    assert rates == [
+        (t.frame_index, [t.total_bps / 1e3, t.base_bps / 1e3, t.roi_bps / 1e3, t.budget_bps / 1e3])
+        for t in traffic
+    ]
+    latencies = recording.lines("/link/latency")
+    assert [values[0] for _, values in latencies] == [40.0] * len(traffic)
+    assert all(np.isnan(values[1]) for _, values in latencies)
+    assert recording.lines("/link/tracks")[-1][1] == [TRACKS, traffic[-1].tracks_refined]
+
+
+def test_events_name_the_still_that_caused_a_refinement(recording: Recording, events: list[Event]) -> None:
+    """Whoever doubts a class must find the still behind it."""
+    logged = recording.events()
+    first = of(Refinement, events)[0]
+    texts = [text for frame, _, text in logged if frame == first.frame_index]
+    wanted = f"still #0 → track {first.track_id}: {first.class_before} → {first.class_after} .90"
+    assert any(text.startswith(wanted) and "small" in text for text in texts)
+    assert (FRAMES - 1, "WARN", "edge gone") in logged
+    assert len(logged) == len(of(Refinement, events)) + 1
+
+
+def test_nothing_undecodable_is_logged(units: list[tuple[bytes, bool]], tmp_path: Path) -> None:
+    """Rerun shows garbage for an access unit before the first keyframe, and restarts when time runs backwards."""
+    path = tmp_path / "late.rrd"
+    with Recorder(settings(path)) as recorder:
+        for index in [3, 4, 20, 21, 21, 20, 22]:
+            recorder.log(VideoSample(index, START_NS + index * STEP_NS, *units[index]))
+        recorder.log(VideoSample(23, START_NS + 23 * STEP_NS, b"", keyframe=False))
+    assert [frame for frame, _, _ in Recording(path).video()] == [20, 21, 22]
+
+
+def test_a_keyframe_without_parameter_sets_does_not_begin_a_recording(
+    units: list[tuple[bytes, bool]], tmp_path: Path
+) -> None:
+    """No decoder can start there, whatever the flag says."""
+    path = tmp_path / "a.rrd"
+    with Recorder(settings(path)) as recorder:
+        recorder.log(VideoSample(1, START_NS, units[1][0], keyframe=True))
+        recorder.log(VideoSample(20, START_NS, *units[20]))
+    assert [frame for frame, _, _ in Recording(path).video()] == [20]
+
+
+def test_folding_changes_nothing_but_the_size(
+    events: list[Event], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The journal is rewritten while recording; a row lost or doubled there would be lost for good."""
+    plain, folded = tmp_path / "plain.rrd", tmp_path / "folded.rrd"
+    sizes: list[int] = []
+    for path, limit in ((plain, 1 << 40), (folded, 20_000)):
+        monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.FOLD_BYTES", limit)
+        with Recorder(settings(path)) as recorder:
+            for event in events:
+                recorder.log(event)
+            assert recorder.size_bytes == path.stat().st_size
+            sizes.append(recorder.size_bytes)
+    one, other = Recording(plain), Recording(folded)
+    assert one.video() == other.video()
+    assert one.events() == other.events()
+    assert one.stills() == other.stills()
+    assert one.boxes(FRAMES - 1) == other.boxes(FRAMES - 1)
+    assert sizes[1] < 0.8 * sizes[0]
+
+
+def test_two_recorders_do_not_mix(events: list[Event], tmp_path: Path) -> None:
+    """One ground serves several edges at once, one recording each."""
+    a = Recorder(settings(tmp_path / "a.rrd", edge_id="a"))
+    b = Recorder(settings(tmp_path / "b.rrd", edge_id="b"))
+    for event in of(VideoSample, events)[:30]:
+        a.log(event)
+        if event.frame_index < 10:
+            b.log(event)
+        b.log(Notice(event.frame_index, event.capture_ns, "info", "only b"))
+    a.close()
+    b.close()
+    one, other = Recording(tmp_path / "a.rrd"), Recording(tmp_path / "b.rrd")
+    assert (len(one.video()), len(one.events())) == (30, 0)
+    assert (len(other.video()), len(other.events())) == (10, 30)
+
+
+def test_closing_twice_is_fine_and_nothing_is_written_after(events: list[Event], tmp_path: Path) -> None:
+    """Ctrl-C during the end closes twice, and a late thread may still log."""
+    path = tmp_path / "a.rrd"
+    recorder = Recorder(settings(path))
+    recorder.log(events[0])
+    recorder.close()
+    size = path.stat().st_size
+    recorder.close()
+    recorder.log(events[1])
+    assert path.stat().st_size == size
+
+
+def test_without_a_file_nothing_is_written(events: list[Event]) -> None:
+    """Looking on without recording must not leave files behind."""
+    with Recorder(settings(None)) as recorder:
+        recorder.log(events[0])
+        assert recorder.size_bytes == 0
+
+
+@pytest.mark.parametrize(("name", "said"), [("no/such/f.rrd", "does not exist"), ("", "is a folder")])
+def test_a_path_that_cannot_be_written_is_one_sentence(tmp_path: Path, name: str, said: str) -> None:
+    """The user mistyped --record and should read what to mend."""
+    with pytest.raises(UserError, match=said):
+        Recorder(settings(tmp_path / name))
+
+
+def test_a_full_disk_is_one_sentence(events: list[Event]) -> None:
+    """A recording that silently stops is found out when it is needed."""
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full on this system")
+    with pytest.raises(UserError, match="No space left"):
+        Recorder(settings(Path("/dev/full")))
+
+
+KILLED = """
+import sys, pickle, time
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+events = pickle.loads(Path({feed!r}).read_bytes())
+recorder = Recorder(RecorderSettings(path=Path({out!r}), edge_id="k", session="1", base_size=(320, 192), fps=15.0,
+                                     budget_bps=4e5))
+for event in events:
+    recorder.log(event)
+    print(event.frame_index, flush=True)
+    time.sleep(0.002)
+time.sleep(60)
+"""
+
+
+def test_a_killed_process_leaves_all_that_was_logged(events: list[Event], tmp_path: Path) -> None:
+    """A ground station's power goes when it likes."""
+    import pickle
+
+    feed, out = tmp_path / "feed", tmp_path / "killed.rrd"
+    feed.write_bytes(pickle.dumps(events))
+    script = KILLED.format(
+        tests=str(Path(__file__).parents[4] / "tests" / "support"), feed=str(feed), out=str(out)
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    last = -1
+    for line in process.stdout:
+        last = int(line)
+        if last >= 30:
+            break
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    read = Recording(out)
+    frames = [frame for frame, _, _ in read.video()]
+    assert frames[: last + 1] == list(range(last + 1))
+    assert len(read.boxes(last)) == TRACKS
+
+
+def test_a_footer_makes_a_recording_that_verifies(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tools that index recordings refuse a file without a footer; a short flight must not grow by one."""
+    from hvt_ground.sinks.rerun.live_view import viewer_program
+    from hvt_ground.sinks.rerun.rrd.footer import add_footer
+
+    path = tmp_path / "copy.rrd"
+    path.write_bytes(Path(recording.reader.path).read_bytes())
+    plain_bytes = path.stat().st_size
+    assert not add_footer(path)
+    assert path.stat().st_size == plain_bytes
+    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd.footer._MOST_GROWTH", 10)
+    assert add_footer(path)
+    subprocess.run([viewer_program(), "rrd", "verify", path], check=True, capture_output=True)
+    assert Recording(path).video() == recording.video()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(("base_kbps", "total_kbps"), [(240, 300), (650, 800)])
+def test_a_recording_is_at_most_half_as_large_again_as_what_was_received(
+    data: Path, tmp_path: Path, base_kbps: int, total_kbps: int
+) -> None:
+    """A recording that outgrows its link cannot be kept, sent or archived."""
+    frames = _carpark(data, 150)
+    units = coded(frames, kbps=base_kbps)
+    frames, units = frames * 2, units * 2  # 20 s; the second half begins at a keyframe as the first
+    path = tmp_path / "a.rrd"
+    received = 0
+    with Recorder(settings(path, base_size=(1280, 720), budget_bps=total_kbps * 1000)) as recorder:
+        for event, size_bytes in session(frames, units, tracks=58, total_kbps=total_kbps):
+            recorder.log(event)
+            received += size_bytes
+    assert len(Recording(path).video()) == 300
+    assert path.stat().st_size <= 1.5 * received
+
+
+def _carpark(data: Path, count: int) -> list[np.ndarray]:
+    frames = []
+    with av.open(str(data / "clips" / "drone_carpark.mp4")) as container:
+        for frame in container.decode(video=0):
+            picture = np.zeros((720, 1280, 3), np.uint8)
+            picture[:, 90:1190] = frame.to_ndarray(format="bgr24")
+            frames.append(picture)
+            if len(frames) == count:
+                break
+    return frames
+
+
+def test_a_dead_viewer_does_not_stop_the_recording(
+    events: list[Event], tmp_path: Path, free_port: int
+) -> None:
+    """Closing the window must not cost the flight."""
+    path = tmp_path / "a.rrd"
+    with LiveView("serve", port=free_port, web_port=_another(free_port)) as view:
+        recorder = Recorder(settings(path, live_url=view.url))
+        for event in events[:30]:
+            recorder.log(event)
+    time.sleep(1.1)  # the recorder looks once a second
+    assert not listening(free_port)
+    for event in events[30:]:
+        recorder.log(event)
+    recorder.close()
+    assert len(Recording(path).video()) == FRAMES
+
+
+def test_a_taken_port_is_one_sentence(free_port: int) -> None:
+    """Two grounds on one machine: the second must say why it cannot show."""
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", free_port))
+        taken.listen()
+        with pytest.raises(UserError, match=f"port {free_port}"):
+            LiveView("serve", port=free_port, web_port=_another(free_port))
+
+
+def _another(port: int) -> int:
+    other = free_port()
+    return other if other != port else free_port()
+
+
+# -- the pure parts -------------------------------------------------------------------------------------------------
+
+
+def overlay(frame: int, boxes: np.ndarray, *, refined: bool = False, confidence: float = 0.8) -> Overlay:
+    """Cars 1, 2, 3 … at the boxes."""
+    count = len(boxes)
+    return Overlay(
+        frame,
+        START_NS + frame * STEP_NS,
+        np.arange(1, count + 1),
+        boxes.astype(np.float32),
+        ("car",) * count,
+        ("car",) * count,
+        np.full(count, confidence, np.float32),
+        np.full(count, refined),
+    )
+
+
+def test_an_overlay_that_shows_the_same_writes_nothing() -> None:
+    """Jitter below what one can see would be most of the recording."""
+    encoder = OverlayEncoder()
+    boxes = moving_boxes(0, 5, (640, 360))
+    assert encoder.encode(overlay(0, boxes))
+    assert encoder.encode(overlay(1, boxes + 0.3, confidence=0.82)) == []
+    moved = encoder.encode(overlay(2, boxes + 2.0))
+    assert [u.layer for u in moved] == ["tracks"]
+    assert moved[0].identity is None
+    assert moved[0].geometry is not None
+
+
+def test_slow_drift_is_followed() -> None:
+    """Held against jitter must not mean left behind."""
+    encoder = OverlayEncoder()
+    boxes = moving_boxes(0, 5, (640, 360))
+    centres = None
+    for i in range(50):
+        for update in encoder.encode(overlay(i, boxes + 0.1 * i)):
+            centres = update.geometry.centres_px
+        wanted = (boxes[:, :2] + boxes[:, 2:]) / 2 + 0.1 * i
+        assert np.abs(centres - wanted).max() <= CENTRE_STEP_PX + 1e-3
+
+
+def test_tracks_that_end_leave_the_screen() -> None:
+    """A box that stays after its car has gone is a ghost."""
+    encoder = OverlayEncoder()
+    encoder.encode(overlay(0, moving_boxes(0, 5, (640, 360))))
+    (update,) = encoder.encode(overlay(1, np.empty((0, 4))))
+    assert len(update.geometry.centres_px) == 0
+    assert update.identity.track_ids == ()
+
+
+def test_movement_yields_to_the_allowance_but_news_does_not() -> None:
+    """Fifty boxes in motion at a low rate would otherwise outweigh the video."""
+    encoder = OverlayEncoder(share=0.1, credit_bytes=1000)
+    boxes = moving_boxes(0, 50, (1280, 720))
+    written = sum(bool(encoder.encode(overlay(i, boxes + 3.0 * i))) for i in range(30))
+    assert 1 <= written < 10
+    assert encoder.encode(overlay(31, boxes, refined=True))
+    encoder.earn(20_000)
+    assert encoder.encode(overlay(32, boxes + 50, refined=True))
+
+
+def test_the_gallery_holds_what_one_is_looking_at() -> None:
+    """Pairs that flicker by cannot be compared; a changed class is worth the place of one that was confirmed."""
+    gallery = Gallery(hold_s=1.0)
+    slots = [gallery.take(i, changed=i == 0) for i in range(SLOTS)]
+    assert sorted(slots) == list(range(SLOTS))
+    assert gallery.take(500_000_000, changed=False) is None
+    assert gallery.take(500_000_000, changed=True) == slots[1]  # the oldest that only confirmed
+    assert gallery.take(1_200_000_000, changed=False) == slots[0]
+
+
+def test_a_picture_fits_its_half_of_the_slot() -> None:
+    """Pictures that overlap or leave the canvas cannot be compared."""
+    for slot in range(SLOTS):
+        x1, y1, x2, y2 = frame_of(slot)
+        assert 0 <= x1 < x2 <= CANVAS[0]
+        assert 0 <= y1 < y2 <= CANVAS[1]
+        for size in ((20, 200), (400, 30), (90, 60)):
+            left, right = (placed(slot, size, right=side) for side in (False, True))
+            assert left.x >= x1 - 0.01
+            assert left.x + size[0] * left.scale <= right.x + 0.01
+            assert right.x + size[0] * right.scale <= x2 + 0.01
+            assert right.y >= y1 - 0.01
+            assert right.y + size[1] * right.scale <= y2 + 0.01
+
+
+def test_colours_tell_kinds_apart() -> None:
+    """A van of the detector and a minivan of the classifier are the same kind; a car and a truck are not."""
+    assert class_colour("van") == class_colour("minivan")
+    assert class_colour("sports car, sport car") == class_colour("car")
+    kinds = {
+        class_colour(n) for n in ("car", "van", "truck", "bus", "pedestrian", "bicycle", "motor", "tricycle")
+    }
+    assert len(kinds) == 8
+    assert class_colour("dragonfly") == class_colour("dragonfly")

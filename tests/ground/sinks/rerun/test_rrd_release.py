@@ -1,0 +1,54 @@
+"""A recording that is closed leaves nothing behind in the process."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.rrd import release as rrd_release
+from processes import eventually
+from rrd import Recording
+
+
+def settings_of(folder: Path, number: int = 0) -> RecorderSettings:
+    """A small recording."""
+    return RecorderSettings(
+        path=folder / "flight.rrd",
+        edge_id="uav-1",
+        session=f"{number:x}",
+        base_size=(320, 192),
+        fps=15,
+        budget_bps=800_000,
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
+def test_many_recordings_leave_no_threads(tmp_path):
+    """A ground that runs for weeks opens one for each session: it would end with thousands of threads."""
+
+    def threads() -> set[str]:
+        return {one.name for one in Path("/proc/self/task").iterdir()}
+
+    def recorded(*numbers: int) -> None:
+        for number in numbers:
+            with Recorder(settings_of(tmp_path, number)):
+                pass
+
+    recorded(0, 1)  # what is shared by all is there now
+    before = threads()
+    recorded(2, 3, 4, 5)
+    eventually(lambda: threads() <= before, within_s=20, what="no thread of the four is left")
+
+
+@pytest.mark.parametrize("bindings", [None, object()], ids=["no such module", "no such names"])
+def test_a_sdk_with_other_names_inside_still_records(tmp_path, monkeypatch, bindings):
+    """With the next version of the SDK the ground would not even start, for the sake of its tidiness."""
+    monkeypatch.setattr(rrd_release, "bindings", bindings)
+    with Recorder(settings_of(tmp_path)) as recorder:
+        assert recorder is not None
+    rrd_release.release_recordings()
+    assert (tmp_path / "flight.rrd").stat().st_size > 0
+    assert Recording(tmp_path / "flight.rrd").events() is not None

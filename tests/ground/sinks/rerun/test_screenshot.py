@@ -1,0 +1,50 @@
+"""A picture of the finished screen, taken without a screen."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.screenshot import main, screenshot
+from recorded_feed import coded, drawn_frames, session
+
+needs_viewer = pytest.mark.skipif(
+    shutil.which("ffmpeg") is None or not list(Path("/usr/share/vulkan/icd.d").glob("*.json")),
+    reason="the headless viewer needs ffmpeg and a Vulkan driver (Debian: ffmpeg, mesa-vulkan-drivers)",
+)
+
+
+@needs_viewer
+def test_the_screen_shows_video_gallery_and_boxes(tmp_path: Path) -> None:
+    """A recording that opens as an error message or an empty grid is not finished."""
+    frames = drawn_frames(30, (640, 384))
+    path, out = tmp_path / "a.rrd", tmp_path / "a.png"
+    settings = RecorderSettings(
+        path=path, edge_id="uav-1", session="1", base_size=(640, 384), fps=15.0, budget_bps=600_000.0
+    )
+    with Recorder(settings) as recorder:
+        for event, _ in session(frames, coded(frames, kbps=400), tracks=6, total_kbps=900):
+            recorder.log(event)
+    assert main([str(path), "--frame", "25", "--out", str(out), "--size", "1280x800"]) == 0
+    picture = cv2.imread(str(out))
+    assert picture.shape[1] == 1280
+    assert 700 < picture.shape[0] < 800
+    video = picture[60:500, 30:760]
+    # The ground of the scene is grey noise of middle brightness; the viewer's own background is nearly black.
+    assert np.median(video) > 60
+    gallery = picture[40:420, 830:1260]
+    assert (gallery.max(axis=2) > 60).mean() > 0.15
+    box_blue = np.array([233, 180, 86])  # BGR of the class "car"
+    assert (np.abs(picture.astype(int) - box_blue).max(axis=2) < 12).sum() > 200
+
+
+def test_a_missing_recording_is_one_sentence(tmp_path: Path) -> None:
+    """A mistyped path must not start a viewer and wait."""
+    with pytest.raises(UserError, match="does not exist"):
+        screenshot(tmp_path / "none.rrd", frame=0, out=tmp_path / "a.png")

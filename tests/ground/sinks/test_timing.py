@@ -1,0 +1,130 @@
+"""The table of ``--timing``: what a user reads the latency of each message from."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.ledger import overhead_bytes
+from hvt_common.transport.inbox import Received
+from hvt_ground.sinks.timing import COLUMNS, SessionTiming, TimingTable
+
+KEY = "hvt/uav-1/base"
+
+
+def received(size: int = 5000, *, at_ns: int = 2_000) -> Received:
+    """A message."""
+    return Received(KEY, bytes(size), bytes(60), "video/h265", at_ns)
+
+
+def session(table: TimingTable, *, now_ns: int = 3_000) -> SessionTiming:
+    """The lines of one session, seen at this moment."""
+    return SessionTiming(table, edge="uav-1", session_id=0xA1, clock=lambda: now_ns, offset_ns=lambda: -7)
+
+
+def lines(path: Path) -> list[dict[str, str]]:
+    """What a program would read."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_line_says_all_of_a_message(tmp_path):
+    """A latency would be computed from the wrong times, or from two clocks as if they were one."""
+    table = TimingTable(tmp_path / "t.csv")
+    one = session(table)
+    one.message("base", received(), sequence=4, frame_index=5, capture_ns=1_000, send_ns=1_500)
+    one.message("base", received(), sequence=5, send_ns=1_500, shown=False)
+    first, second = lines(tmp_path / "t.csv")
+    assert first == {
+        "kind": "base",
+        "sequence": "4",
+        "frame_index": "5",
+        "capture_ns": "1000",
+        "send_ns": "1500",
+        "received_ns": "2000",
+        "shown_ns": "3000",
+        "line_bytes": str(5060 + overhead_bytes(5000, 60, key=KEY, encoding="video/h265")),
+        "clock_offset_ns": "-7",
+        "edge": "uav-1",
+        "session": "00000000000000a1",
+    }
+    assert tuple(first) == COLUMNS
+    assert (second["shown_ns"], second["frame_index"], second["capture_ns"]) == ("0", "-1", "0")
+
+
+def test_a_still_has_its_line_when_it_was_read_or_never_will_be(tmp_path):
+    """What came and was never looked at would count as seen, or not at all."""
+    table = TimingTable(tmp_path / "t.csv")
+    one = session(table)
+    for sequence in range(3):
+        one.still(received(), sequence=sequence, frame_index=9, capture_ns=1, send_ns=2)
+    assert lines(tmp_path / "t.csv") == []
+    one.read([1])
+    assert [(row["sequence"], row["shown_ns"]) for row in lines(tmp_path / "t.csv")] == [("1", "3000")]
+    one.close()
+    one.read([2])  # eyes that did not come back in time
+    assert [(row["sequence"], row["shown_ns"]) for row in lines(tmp_path / "t.csv")][1:] == [
+        ("0", "0"),
+        ("2", "0"),
+    ]
+
+
+def test_stills_that_are_never_read_do_not_gather(tmp_path):
+    """An edge that sends what nobody can read would fill the ground's memory."""
+    table = TimingTable(tmp_path / "t.csv")
+    one = session(table)
+    for sequence in range(2000):
+        one.still(received(), sequence=sequence, frame_index=9, capture_ns=1, send_ns=2)
+    assert len(one._unread) < 1000
+    assert len(lines(tmp_path / "t.csv")) == 2000 - len(one._unread)
+
+
+def test_nothing_is_written_after_the_end(tmp_path):
+    """A late thread would write into whatever file has the number now."""
+    table = TimingTable(tmp_path / "t.csv")
+    table.close()
+    other = os.open(tmp_path / "other", os.O_WRONLY | os.O_CREAT)
+    session(table).message("base", received(), sequence=4, send_ns=1)
+    table.close()
+    os.close(other)
+    assert (tmp_path / "other").read_bytes() == b""
+
+
+def test_a_file_that_cannot_be_is_one_sentence(tmp_path):
+    """A flight would begin without its table."""
+    with pytest.raises(UserError, match=r"--timing .*cannot be written"):
+        TimingTable(tmp_path)
+
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from hvt_ground.sinks.timing import TimingTable
+table = TimingTable(Path(sys.argv[1]))
+for number in range(10**9):
+    table.line(["base", number])
+    if number == 2000:
+        print("on", flush=True)
+"""
+
+
+def test_a_killed_ground_leaves_whole_lines(tmp_path):
+    """What led to the crash would be missing, or the last line cut."""
+    path = tmp_path / "t.csv"
+    with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"on\n"
+        time.sleep(0.05)
+        writer.send_signal(signal.SIGKILL)
+    text = path.read_text()
+    assert text.endswith("\n")
+    numbers = [int(line.split(",")[1]) for line in text.splitlines()[1:]]
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) > 2000

@@ -1,0 +1,37 @@
+"""The table of tracks for programs that come after."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from hvt_ground.events.events import Overlay
+from hvt_ground.sinks.tracks_table import TrackTable
+
+
+@pytest.mark.parametrize(("origins", "expected"), [((), ["base", "base"]), (("edge+base", "still"),) * 2])
+def test_each_line_says_who_knows_of_the_track(tmp_path, origins, expected):
+    """A program could not leave out what only the edge reports, or count what it brings."""
+    path = tmp_path / "tracks.csv"
+    table = TrackTable(path)
+    overlay = Overlay(
+        frame_index=4,
+        capture_ns=0,
+        track_ids=np.array([3, 9]),
+        boxes_base_px=np.array([[1, 2, 11, 22], [5, 5, 6, 7]], np.float32),
+        base_classes=("car", "van"),
+        classes=("car", "bus"),
+        confidences=np.array([0.5, 0.75], np.float32),
+        refined=np.array([False, True]),
+        origins=origins,
+    )
+    table.log(overlay)
+    table.close()
+    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    assert [row["origin"] for row in rows] == list(expected)
+    assert [(row["frame"], row["id"], row["class"], row["refined"]) for row in rows] == [
+        ("5", "3", "car", "0"),
+        ("5", "9", "bus", "1"),
+    ]

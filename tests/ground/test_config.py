@@ -1,0 +1,112 @@
+"""Every setting of hvt-ground, and the names of its recordings."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hvt_common.config import load, to_toml
+from hvt_common.errors import UserError
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.wiring import output_path
+
+
+def read(*argv: str) -> GroundConfig:
+    """What a command line gives."""
+    return check(load(GroundConfig, list(argv), program="hvt-ground", description="")[0])
+
+
+def test_without_flags_it_listens_and_needs_no_model():
+    """``hvt-ground`` alone would not start."""
+    config = read()
+    assert (config.detector, config.edges, config.refine, config.once) == (
+        "aerial-nano",
+        "*",
+        "replace",
+        False,
+    )
+    assert (config.listen, config.connect, config.record) == ((), (), None)
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--view", "--serve"], "--view and --serve are both given"),
+        (["--labels", "names.txt"], "--labels names.txt names a classifier's classes"),
+        (["--labels", "names.txt", "--classifier", "detector"], "--classifier is no file"),
+        (["--refine", "vote"], "choose one of replace, fuse"),
+        (["--timing", "a.csv", "--tracks", "./a.csv"], "--tracks and --timing both name a.csv: give each"),
+        (["--timing", "a.csv", "--summary", "b/../a.csv"], "--timing and --summary both name b/../a.csv"),
+        (["--record", "a.rrd", "--summary", "a.rrd"], "--record and --summary both name a.rrd"),
+        (["--detect-every", "0"], "whole number from 1"),
+        (["--threads", "many"], "whole number from 1"),
+    ],
+)
+def test_settings_that_contradict_are_one_sentence(argv, said):
+    """The user would guess which of two settings won."""
+    with pytest.raises(UserError, match=said):
+        read(*argv)
+
+
+def test_folders_and_devices_may_be_named_twice(tmp_path):
+    """``--record out --tracks out`` would be refused, though each file in it has a name of its own."""
+    read("--record", str(tmp_path), "--tracks", str(tmp_path), "--timing", str(tmp_path / "a.csv"))
+    read("--record", "out", "--tracks", "out")
+    read("--timing", "/dev/null", "--summary", "/dev/null")
+
+
+def test_every_flag_explains_itself(capsys):
+    """Somebody at a ground station would have to read the source."""
+    with pytest.raises(SystemExit):
+        load(GroundConfig, ["--help"], program="hvt-ground", description="")
+    out = " ".join(capsys.readouterr().out.split())
+    for one in dataclasses.fields(GroundConfig):
+        assert "--" + one.name.replace("_", "-") in out
+        assert len(one.metadata["help"]) > 8
+    assert "[aerial-nano]" in out
+    assert "[hvt-<edge>-<time>.rrd here]" in out
+
+
+@given(
+    st.builds(
+        GroundConfig,
+        listen=st.lists(st.sampled_from(["tcp/127.0.0.1:7447", "tls/[::1]:7448"]), max_size=2).map(tuple),
+        edges=st.sampled_from(["*", "uav-*", "a"]),
+        detector=st.sampled_from(["motion", "a b.onnx"]),
+        detect_every=st.integers(1, 1000),
+        confidence=st.floats(0.01, 1),
+        nms_iou=st.floats(0.01, 1),
+        classifier=st.none() | st.just("c.onnx"),
+        record=st.none() | st.sampled_from(["out.rrd", "folder/with space", "[1].rrd"]).map(Path),
+        refine=st.sampled_from(["replace", "fuse"]),
+        wait=st.floats(0, 1e6),
+        once=st.booleans(),
+        view=st.booleans(),
+    )
+)
+def test_what_is_printed_reads_back_the_same(tmp_path_factory, config):
+    """``--print-config`` could not be kept and used again."""
+    path = tmp_path_factory.getbasetemp() / "ground.toml"
+    path.write_text(to_toml(config), encoding="utf-8")
+    assert load(GroundConfig, ["--config", str(path)], program="hvt-ground", description="")[0] == config
+
+
+def test_no_recording_is_written_over_another(tmp_path):
+    """A restart of the edge would destroy the recording of the flight before."""
+    taken: set[Path] = set()
+    folder = [output_path(tmp_path, suffix=".rrd", edge="uav-1", stamp="t", taken=taken) for _ in range(3)]
+    assert [one.name for one in folder] == ["hvt-uav-1-t.rrd", "hvt-uav-1-t-1.rrd", "hvt-uav-1-t-2.rrd"]
+    (tmp_path / "hvt-uav-2-t.rrd").touch()  # of an earlier process
+    assert (
+        output_path(tmp_path, suffix=".rrd", edge="uav-2", stamp="t", taken=taken).name == "hvt-uav-2-t-1.rrd"
+    )
+    named = tmp_path / "flight.rrd"
+    named.touch()  # the user named it: it is written anew, once
+    edges = ["uav-1", "uav-2", "uav-2", "uav-1"]
+    names = [output_path(named, suffix=".rrd", edge=edge, stamp="t", taken=taken).name for edge in edges]
+    assert names == ["flight.rrd", "flight-uav-2.rrd", "flight-uav-2-2.rrd", "flight-uav-1.rrd"]
+    assert len(set(names)) == 4

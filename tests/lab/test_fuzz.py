@@ -1,0 +1,96 @@
+"""A short run of the fuzzer's targets in the normal tests, what it once found, and the fuzzer itself.
+
+`make fuzz` is the long run. The short one takes the same targets and seeds with mutations of its own: no libFuzzer,
+no coverage, the same inputs every time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from hvt_common.protocol.messages import Status
+from lab.fuzz.mutate import plain, resealed, sealed_values
+from lab.fuzz.parts import joined, parted
+from lab.fuzz.table import PLANTED, TARGETS
+
+FOUND = Path(__file__).parents[2] / "lab" / "fuzz" / "found"
+TESTS = Path(__file__).resolve().parents[2] / "tests" / "support"
+NAMES = [name for name, target in TARGETS.items() if target is not PLANTED]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_input_breaks_anything(name):
+    """Whoever reaches the link, or leaves a file where it is read, could end the process."""
+    target, rng = TARGETS[name], Random(7)
+    seeds = list(target.seeds())
+    for seed in seeds:
+        target.run(seed)
+    for number in range(target.short):
+        data = target.mutate(rng.choice(seeds), rng, plain(rng))[: target.most_bytes]
+        try:
+            target.run(data)
+        except Exception as error:
+            kept = Path("build/fuzz/found") / f"{name}-short"
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_bytes(data)
+            raise AssertionError(f"input {number} of {name}, kept in {kept}: {error!r}") from error
+
+
+@pytest.mark.parametrize(
+    "path",
+    [one for one in sorted(FOUND.glob("*/*")) if one.is_file()],
+    ids=lambda path: f"{path.parent.name}/{path.name}",
+)
+def test_what_was_found_once_stays_mended(path):
+    """It would come back with the next change."""
+    TARGETS[path.parent.name].run(path.read_bytes())
+
+
+def test_mutations_get_past_the_checksum():
+    """The fuzzer would see the checksum refuse a million inputs, and nothing behind it."""
+    rng = Random(3)
+    (seed,) = TARGETS["status"].seeds()
+    mutated = [sealed_values(seed, rng, plain(rng)) for _ in range(300)]
+    sealed = [data for data in mutated if resealed(data[:-5]) == data]
+    assert len(sealed) > 0.8 * len(mutated)
+    assert len(set(sealed)) > 200
+    assert Status.parse(seed)
+
+
+def test_parts_come_back():
+    """A part of an input could not be changed by itself."""
+    parts = [b"", b"ab", bytes(300)]
+    assert parted(joined(parts)) == parts
+    assert parted(b"\0\0\x09cut", least=2) == [b"cut", b""]
+    assert parted(b"") == [b""]
+
+
+@pytest.mark.skipif(find_spec("atheris") is None, reason="atheris is not installed: dependency group 'fuzz'")
+def test_the_fuzzer_finds_a_planted_bug_and_keeps_its_input(tmp_path):
+    """A million inputs would be reported as harmless by a fuzzer that sees nothing."""
+    command = [sys.executable, "-m", "fuzz", "--runs", "4000", "--folder", str(tmp_path)]
+    command += ["--target", "planted", "--findings", "1"]
+    ended = subprocess.run(
+        command,
+        env={**os.environ, "PYTHONPATH": str(TESTS)},
+        capture_output=True,
+        text=True,
+        timeout=250,
+        check=False,
+    )
+    assert ended.returncode == 1, ended.stderr
+    (planted,) = json.loads((tmp_path / "summary.json").read_text())
+    assert planted["inputs"] < 4000
+    assert planted["coverage"] > 0, "edges of our own code are counted"
+    assert "here to be found" in planted["findings"][0]
+    kept = next((tmp_path / "found").glob("planted-crash-*"))
+    with pytest.raises(ValueError, match="here to be found"):
+        PLANTED.run(kept.read_bytes())

@@ -1,0 +1,116 @@
+"""``kill -9`` in the air: four flights here, fifty by `make kills`; and that its judgement can be a bad one."""
+
+from __future__ import annotations
+
+import pytest
+
+from clips import framed, smooth_pictures
+from flight import Flight
+from hvt_edge.backlog.disk import Folder
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from lab.link.kills import (
+    BARS,
+    Trial,
+    Verdict,
+    in_matroska,
+    in_recording,
+    missing_s,
+    plan,
+    rows_of,
+    run_all,
+)
+from lab.link.store_left import StoreLeft, store_left
+from lab.link.timing import Arrival
+
+KILLS = 4
+SIZE = (320, 192)
+
+
+@pytest.fixture(scope="module")
+def verdicts(tmp_path_factory):
+    """Both sides killed twice, one of the grounds while it ends."""
+    return run_all(plan(KILLS, seed=0), tmp_path_factory.mktemp("kills"), at_once=2)
+
+
+@pytest.mark.integration
+@pytest.mark.timeout(170)
+def test_a_kill_costs_next_to_nothing(verdicts):
+    """The crash that one wants to look into would have taken its recording with it."""
+    rows = {row["measure"]: row for row in rows_of(verdicts)}
+    assert [one for one in rows.values() if one["holds"] is False] == [], verdicts
+    assert {name for name, row in rows.items() if row["holds"]} == set(BARS)
+    assert all(one.frames > 0 for one in verdicts)
+
+
+def test_the_kills_come_from_the_seed_and_hit_both_sides():
+    """A failure could not be seen again; or one side would never be tried."""
+    trials = plan(50, seed=3)
+    assert trials == plan(50, seed=3)
+    assert [one.after_s for one in trials] != [one.after_s for one in plan(50, seed=4)]
+    assert sum(one.victim == "edge" for one in trials) == 25
+    ending = [one.victim for one in trials if one.ending_s is not None]
+    assert (ending.count("edge"), ending.count("ground")) == (5, 5)
+
+
+def arrival(index: int) -> Arrival:
+    """A frame of ten a second."""
+    at_s = 1_790_000_000 + index / 10
+    return Arrival("base", index, index, at_s, at_s + 0.01, at_s + 0.05, True, 1000)
+
+
+def test_what_is_missing_counts_from_the_first_hole():
+    """A recording with a hole in its middle would pass for one that lacks its last frame."""
+    frames = [arrival(index) for index in range(40)]
+    times = [one.capture_s for one in frames]
+    assert missing_s(frames, [at_s + 0.0004 for at_s in times]) == 0
+    assert missing_s(frames, times[:-2]) == pytest.approx(0.2)
+    assert missing_s(frames, [*times[:10], *times[11:]]) == pytest.approx(3.0)
+    assert missing_s(frames, []) == pytest.approx(4.0)
+
+
+def test_what_cannot_be_read_is_noticed(tmp_path, capsys):
+    """The bar would hold whatever the files are."""
+    for name in ("run.rrd", "base.mkv"):
+        (tmp_path / name).write_bytes(b"\x1aE\xdf\xa3" + bytes(5000))
+    assert in_recording(tmp_path / "run.rrd") is None
+    assert in_recording(tmp_path / "absent.rrd") is None
+    assert in_matroska(tmp_path / "base.mkv") is None
+    assert in_matroska(tmp_path / "absent.mkv") is None
+    assert "absent.mkv" in capsys.readouterr().err
+
+
+def test_a_store_is_read_as_the_next_start_would(tmp_path):
+    """What the edge kept through the outage would be lost at its crash, and the bar hold."""
+    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=10, bitrate_bps=200_000, preset="ultrafast"))
+    frames = framed(smooth_pictures(30, size=SIZE), fps=10)
+    units = [encoder.encode(frame, keyframe=frame.index % 10 == 0) for frame in frames]
+    info = Flight(1).info().pack()
+    with Folder(tmp_path / "store", max_bytes=10**8, session_id=7, info=lambda: info) as folder:
+        for unit in units:
+            folder.add_unit(unit, parameter_sets=units[0].data)
+    whole = store_left(tmp_path / "store")
+    assert (whole.objects, whole.unreadable, whole.missing_s) == (1, 0, 0)
+    (video,) = (tmp_path / "store").glob("*/base-*.mkv")
+    video.write_bytes(video.read_bytes()[: video.stat().st_size * 2 // 3])
+    cut = store_left(tmp_path / "store")
+    assert cut.unreadable == 0
+    assert 0.5 < cut.missing_s < 2
+    video.write_bytes(bytes(video.stat().st_size))
+    assert store_left(tmp_path / "store").unreadable == 1
+
+
+def test_a_store_that_was_never_needed_is_whole(tmp_path):
+    """Each flight without an outage would count against it."""
+    assert store_left(tmp_path / "none") == StoreLeft(0, 0, 0.0)
+
+
+def test_a_bad_end_holds_no_bar():
+    """The table would say yes to everything."""
+    trial = Trial(0, "edge", 1.0, None)
+    kept, spoilt = StoreLeft(3, 0, 0.2), StoreLeft(3, 1, 0.5)
+    good = Verdict(trial, 10, 0.0, 0.1, 0.2, ended=False, store=kept, survivor=0)
+    bad = Verdict(trial, 10, None, 0.4, 0.2, ended=True, store=spoilt, survivor=None)
+    rows = {row["measure"]: row for row in rows_of([good, bad])}
+    assert rows["kills"]["value"] == 1
+    for name in set(BARS) - {"kills", "missing from a recording at most, s", "Matroska files unreadable"}:
+        assert rows[name]["holds"] is False, name

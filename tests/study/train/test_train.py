@@ -1,0 +1,262 @@
+"""Training of the embedded models: pictures, labels, loss, export. What needs PyTorch is skipped without it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hvt_common.values import Detections
+from hvt_train.evaluate import average_precision, evaluate_drawn, evaluate_real, overlaps
+from hvt_train.fleet import make_solid
+from hvt_train.places import Picture, draw_place
+from hvt_train.views import ViewSettings, ViewSource, degrade
+
+CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
+
+
+@pytest.fixture(scope="module")
+def place():
+    """Draw one small place."""
+    return draw_place(np.random.default_rng(3), size=512)
+
+
+def save(folder, picture, name="place-00000"):
+    """Write a picture as the pool does."""
+    path = folder / f"{name}.npz"
+    np.savez(
+        path,
+        image=picture.image_bgr,
+        boxes=picture.boxes_px,
+        classes=picture.class_ids,
+        visible=picture.visible,
+    )
+    return path
+
+
+def test_a_place_is_the_same_every_time_and_its_boxes_are_in_it(place):
+    """A training set could not be made again, or would teach boxes that lie beside their objects."""
+    again = draw_place(np.random.default_rng(3), size=512)
+    assert np.array_equal(place.image_bgr, again.image_bgr)
+    assert np.array_equal(place.boxes_px, again.boxes_px)
+    assert len(place.boxes_px) > 5
+    assert (place.boxes_px >= 0).all()
+    assert (place.boxes_px <= 512).all()
+    assert ((place.visible >= 0) & (place.visible <= 1)).all()
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_every_class_can_be_made_and_has_its_size(name):
+    """A class would be missing from training, or as large as another one."""
+    most = {
+        "car": 5.3,
+        "van": 6.9,
+        "truck": 12.1,
+        "bus": 13.1,
+        "motor": 2.4,
+        "pedestrian": 0.7,
+        "other": 12.3,
+    }[name]
+    lengths = []
+    for seed in range(12):
+        solid = make_solid(name, np.random.default_rng(seed))
+        assert solid.class_name == name
+        lengths.append(np.ptp(solid.foot_m[:, 0]))
+    assert max(lengths) <= most
+    assert len(set(lengths)) > 1 or name == "pedestrian"
+
+
+def test_a_view_keeps_boxes_on_their_objects(tmp_path):
+    """Labels would drift from the pixels when a picture is cut, scaled, mirrored and turned."""
+    image = np.full((300, 400, 3), 30, np.uint8)
+    image[100:160, 200:240] = 250
+    boxes = np.array([[200, 100, 240, 160]], np.float32)
+    picture = Picture(image, boxes, np.array([3], np.int32), np.ones(1, np.float32))
+    pool = [save(tmp_path, picture)]
+    source = ViewSource(pool, seed=5, settings=ViewSettings(side=128))
+    checked = 0
+    for _ in range(40):
+        view = source.next()
+        assert view.image_bgr.shape == (128, 128, 3)
+        for (x0, y0, x1, y1), kind in zip(view.boxes_px.round().astype(int), view.class_ids, strict=True):
+            if kind != 3 or min(x1 - x0, y1 - y0) < 12 or min(x0, y0) < 6 or max(x1, y1) > 122:
+                continue
+            inner = view.image_bgr[y0 + 3 : y1 - 3, x0 + 3 : x1 - 3].mean()
+            frame = view.image_bgr[max(y0 - 8, 0) : y1 + 8, max(x0 - 8, 0) : x1 + 8].astype(float)
+            area = (x1 - x0 - 6) * (y1 - y0 - 6)
+            ring = (frame.sum() / 3 - inner * area) / (frame.size / 3 - area)
+            assert inner > ring + 15
+            checked += 1
+    assert checked > 5
+
+
+def test_what_is_hidden_is_neither_object_nor_background(tmp_path, place):
+    """The detector would be told that a car under a tree is ground, or must be found where nothing shows."""
+    hidden = Picture(place.image_bgr, place.boxes_px, place.class_ids, np.zeros_like(place.visible))
+    view = ViewSource([save(tmp_path, hidden)], seed=1, settings=ViewSettings(side=128)).next()
+    assert (view.class_ids == -1).all()
+
+
+def test_degrading_keeps_the_size_and_changes_the_picture():
+    """Training would see only clean pictures, which the base never shows."""
+    image = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    changed = [degrade(image, np.random.default_rng(seed), strength=1.0, compress=0.6) for seed in range(8)]
+    assert all(one.shape == image.shape and one.dtype == np.uint8 for one in changed)
+    assert sum(not np.array_equal(one, image) for one in changed) >= 7
+
+
+# --- measuring -----------------------------------------------------------------------------------------------------
+
+
+class Fixed:
+    """Say the same of every picture."""
+
+    class_names = CLASSES
+
+    def __init__(self, boxes, scores, kinds):
+        self.found = Detections(
+            np.array(boxes, np.float32).reshape(-1, 4),
+            np.array(scores, np.float32),
+            np.array(kinds, np.int32),
+        )
+
+    def detect(self, image_bgr):
+        """Return what was given."""
+        return self.found
+
+
+def test_average_precision_of_known_lists():
+    """Every quality figure in the documentation would be wrong."""
+    scores = np.array([0.9, 0.8, 0.7], np.float32)
+    assert average_precision(scores, np.array([True, True, True]), 3) == pytest.approx(1.0)
+    assert average_precision(scores, np.array([True, False, True]), 2) == pytest.approx(0.5 + 0.5 * 2 / 3)
+    assert average_precision(scores, np.array([False, False, False]), 2) == 0.0
+    assert average_precision(scores[:0], np.array([], bool), 2) == 0.0
+
+
+def test_doubles_and_misses_cost_and_hidden_objects_do_not():
+    """A detector that answers twice, or is punished for what nobody can see, would look other than it is."""
+    boxes = np.array([[0, 0, 20, 20], [40, 0, 60, 20], [80, 0, 100, 20]], np.float32)
+    picture = Picture(
+        np.zeros((32, 128, 3), np.uint8),
+        boxes,
+        np.array([0, 0, 0], np.int32),
+        np.array([1, 1, 0.1], np.float32),
+    )
+    both = Fixed(boxes, [0.9, 0.8, 0.7], [0, 0, 0])
+    assert evaluate_drawn(both, [picture]).by_class == {"car": pytest.approx(1.0)}
+    doubled = Fixed([boxes[0], boxes[0], boxes[1]], [0.9, 0.8, 0.7], [0, 0, 0])
+    assert evaluate_drawn(doubled, [picture]).mean == pytest.approx(0.5 + 0.5 * 2 / 3)
+    assert evaluate_drawn(Fixed(boxes[:1], [0.9], [0]), [picture]).mean == pytest.approx(0.5)
+    assert evaluate_drawn(Fixed(boxes[:2], [0.9, 0.8], [1, 1]), [picture]).mean == 0.0
+
+
+def test_real_agreement_counts_any_vehicle_and_no_person():
+    """The figure on real pixels would depend on whether a pickup is called car or truck."""
+    boxes = np.array([[0, 0, 20, 20], [40, 0, 60, 20], [80, 0, 100, 20]], np.float32)
+    result = evaluate_real(
+        Fixed(boxes, [0.9, 0.8, 0.7], [2, 1, 5]), [np.zeros((8, 8, 3), np.uint8)], [boxes[[0, 2]]]
+    )
+    assert (result.recall, result.precision, result.objects) == (0.5, 0.5, 2)
+    assert overlaps(boxes[:1], boxes[:1] + 10)[0, 0] == pytest.approx(100 / 700)
+
+
+# --- what needs PyTorch --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def torch():
+    """PyTorch, one thread, seeded."""
+    torch = pytest.importorskip("torch")
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    return torch
+
+
+@pytest.fixture
+def batch(torch, tmp_path, place):
+    """Eight views of one place."""
+    from hvt_train.train_detector import batch_of
+
+    source = ViewSource([save(tmp_path, place)], seed=2, settings=ViewSettings(side=128))
+    return batch_of([source.next() for _ in range(8)])
+
+
+def test_training_lowers_the_loss(torch, batch):
+    """The recipe would run for an hour and learn nothing."""
+    from hvt_train.detector import DetectorNet
+    from hvt_train.train_detector import loss_of
+
+    net = DetectorNet(len(CLASSES)).train()
+    optimizer = torch.optim.AdamW(net.parameters(), lr=2e-3)
+    losses = []
+    for _ in range(12):
+        loss, _ = loss_of(net, batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.detach().item())
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def test_perfect_answers_cost_next_to_nothing(torch):
+    """The loss would pull right answers away from where they belong."""
+    from hvt_train.loss import Targets, detector_loss
+
+    maps = [torch.full((1, 12, side, side), -12.0) for side in (16, 8, 4)]
+    for level in maps:
+        level[:, :2], level[:, 2:4] = 0.0, -5.0
+    target = torch.tensor([[32.0, 32.0, 56.0, 56.0]])  # centre 44, 44: cell 5, 5 of stride 8
+    for column, shift in ((5, 0.5), (4, 1.5)):  # two cells are asked at least
+        answer = [shift, 0.5, np.log(3), np.log(3), 12, 12, -12, -12, -12, -12, -12, -12]
+        maps[0][0, :, 5, column] = torch.tensor(answer)
+    right = Targets(torch.tensor([0]), target, torch.tensor([0]))
+    loss, parts = detector_loss(maps, right)
+    assert parts["cells"] == 2
+    assert loss.item() < 0.02
+    ignored, _ = detector_loss(maps, Targets(torch.tensor([0]), target, torch.tensor([-1])))
+    assert ignored.item() < 0.02
+    missed, _ = detector_loss(
+        maps, Targets(torch.tensor([]).long(), torch.zeros(0, 4), torch.tensor([]).long())
+    )
+    assert missed.item() > 5
+
+
+def test_the_onnx_file_answers_as_the_network_does(torch, tmp_path):
+    """What was measured in training would not be what flies."""
+    pytest.importorskip("onnx")
+    from hvt_common.inference.detect import open_detector
+    from hvt_common.inference.runtimes.model import open_model
+    from hvt_train.detector import DetectorNet, ExportedDetector
+    from hvt_train.train_detector import export_detector
+
+    net = DetectorNet(len(CLASSES)).eval()
+    for level in net.modules():
+        if isinstance(level, torch.nn.BatchNorm2d):
+            level.running_mean.normal_(0, 0.1)
+            level.running_var.uniform_(0.5, 1.5)
+    path = tmp_path / "net.onnx"
+    export_detector(net, path, properties={"names": str(dict(enumerate(CLASSES)))})
+    images = torch.randint(0, 255, (1, 3, 96, 160)).float()
+    with torch.no_grad():
+        expected = ExportedDetector(net)(images).numpy()
+    answer = open_model(path).run(images.numpy())[0]
+    assert answer.shape == expected.shape == (1, 12 * 20 + 6 * 10 + 3 * 5, 12)
+    assert np.abs(answer - expected).max() < 0.02  # weights are stored as float16
+    assert open_detector(str(path)).class_names == CLASSES
+
+
+def test_the_classifier_file_answers_as_the_network_does(torch, tmp_path):
+    """Crops would be prepared otherwise in the air than in training."""
+    pytest.importorskip("onnx")
+    from hvt_common.inference.classify import open_classifier
+    from hvt_train.classifier import MEAN, SCALE, ClassifierNet, export_classifier
+
+    net = ClassifierNet(len(CLASSES)).eval()
+    path = tmp_path / "cls.onnx"
+    export_classifier(net, path, properties={"names": str(dict(enumerate(CLASSES)))})
+    crops = np.random.default_rng(0).integers(0, 255, (3, 96, 96, 3), np.uint8)
+    values = (torch.from_numpy(crops).permute(0, 3, 1, 2).float() - MEAN) * SCALE
+    with torch.no_grad():
+        expected = net(values).softmax(1).numpy()
+    posteriors = open_classifier(str(path)).classify(list(crops))
+    assert np.abs(np.stack([p.probabilities for p in posteriors]) - expected).max() < 0.01

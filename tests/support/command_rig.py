@@ -1,0 +1,140 @@
+"""The side channel of an edge under its commands, frame by frame, with its real parts and a real budget."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import cv2
+import numpy as np
+
+from base_coded import StandIn
+from clips import START_NS
+from flight import tracks_at
+from hvt_common.protocol.channels import Row
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeader
+from hvt_common.units import parse_bitrate
+from hvt_common.values import Frame, View
+from hvt_common.video.still_codecs import JpegCodec
+from hvt_edge.config import EdgeConfig, check
+from hvt_edge.control.commands import Commands, Served
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import Sender
+from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.candidates import TrackMemory
+from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.on_demand import OnDemand
+from hvt_edge.stills.policy.registry import method
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.suppression import Suppression
+from hvt_edge.video.reconfigure import Renewal
+
+SOURCE, BASE = (960, 540), (640, 360)
+VIEW = View.fitted(SOURCE, BASE, fit="letterbox")
+TICK_NS = 66_666_667
+_NOISE = np.random.default_rng(3).integers(0, 255, (SOURCE[1] // 6, SOURCE[0] // 6, 3), np.uint8)
+WORLD = cv2.resize(_NOISE, SOURCE, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
+SESSION = 77
+
+
+def picture(index: int) -> np.ndarray:
+    """The source frame of this tick: no two are alike."""
+    return np.ascontiguousarray(np.roll(WORLD, 4 * index, axis=1))
+
+
+class Out:
+    """Keeps the stills that were sent."""
+
+    def __init__(self) -> None:
+        self.stills: list[tuple[RoiHeader, bytes]] = []
+
+    def put(self, row, payload, *, attachment=None, encoding="") -> None:
+        """Keep it, if it is a still."""
+        if row is Row.ROI:
+            self.stills.append((RoiHeader.parse(attachment, payload), payload))
+
+
+class Rig:
+    """The side channel of an edge, tick by tick; a car drives from left to right."""
+
+    def __init__(self, budget="400kbps", *, share=0.75, name="M1", codec="jpeg", ring_s=5.0) -> None:
+        argv = {"source": "demo", "size": BASE, "budget": parse_bitrate(budget, name="b"), "method": name}
+        self.config = check(EdgeConfig(**argv, video_share=share, preset="ultrafast"))
+        self.out, self.fates, self.keyframes = Out(), Counter(), KeyframePlan()
+        self.budget = RollingBudget(BudgetSettings(self.config.budget_bps, self.config.base_bps, fps=15))
+        self.sender = Sender(
+            self.out,
+            ledger=Ledger(),
+            budget=self.budget,
+            edge_id="edge-1",
+            session_id=SESSION,
+            lockstep=False,
+            wait_until=lambda _at: None,
+        )
+        maker = StillMaker(codec=StandIn(), fallback=JpegCodec()) if codec == "residual" else StillMaker()
+        self.on_demand = OnDemand(
+            FrameRing(RingSettings(max_age_ns=round(ring_s * 1e9))),
+            maker=maker,
+            view=VIEW,
+            class_names=("car",),
+            most_bytes=self.sender.most_still_bytes,
+        )
+        self.chooser = Chooser(
+            method(name),
+            suppression=Suppression.for_cooldown(0),
+            maker=maker,
+            memory=TrackMemory(),
+            view=VIEW,
+            class_names=("car",),
+            settings=ChooserSettings(fps=15, most_bytes=self.sender.most_still_bytes()),
+            on_fate=lambda *fate: self.fates.update([fate]),
+            asked=self.on_demand,
+        )
+        self.renewal = Renewal(self.config, size=BASE, every_n=1, sender=self.sender, split=None)
+        self.tick, self.request_ns = -1, 0
+        self.commands = Commands(
+            self.config,
+            session_id=SESSION,
+            keyframes=self.keyframes,
+            clock=lambda: self.request_ns,
+            window_ns=lambda: self.now_ns,
+        )
+        self.commands.serve(Served(self.on_demand, self.renewal, self.chooser, base_size=BASE))
+        self.keyframes.done(START_NS)
+
+    @property
+    def now_ns(self) -> int:
+        """Time of the newest tick."""
+        return START_NS + max(0, self.tick) * TICK_NS
+
+    def box(self, tick: int) -> tuple[float, float, float, float]:
+        """Where the car is, base pixels."""
+        return 20.0 + 3 * tick, 100.0, 80.0 + 3 * tick, 140.0
+
+    def run(self, ticks: int, *, others: bool = False) -> None:
+        """So many ticks; with ``others`` the method's own stills are sent as well."""
+        for _ in range(ticks):
+            self.tick += 1
+            pixels = picture(self.tick)
+            base = cv2.blur(cv2.resize(pixels, BASE, interpolation=cv2.INTER_AREA), (31, 31))
+            tracks = tracks_at(self.tick, {5: self.box(self.tick)})
+            seen = Seen(Frame(self.tick, self.now_ns, pixels, base), base, tracks, detected=others)
+            self.budget.record_base(int(self.budget.base_step_bytes), now_ns=self.now_ns)
+            self.chooser.consider(seen, now_ns=self.now_ns, room_bytes=1000)
+            for still in self.chooser.stills(
+                now_ns=self.now_ns, room=lambda one: self.sender.still_room_bytes(self.now_ns, still=one)
+            ):
+                self.sender.still(still, now_ns=self.now_ns)
+
+    def ask(self, command: str, **arguments) -> ControlAnswer:
+        """One request, a tenth of a second after the last, through the wire and back."""
+        self.request_ns += 100_000_000
+        request = ControlRequest(session_id=SESSION, command=command, arguments=arguments)
+        answer = self.commands.answer(ControlRequest.parse(request.pack()))
+        return ControlAnswer.parse(answer.pack())
+
+    def asked(self) -> list[tuple[RoiHeader, bytes]]:
+        """Those of the stills that were asked for."""
+        return [(header, data) for header, data in self.out.stills if header.reason == "asked"]

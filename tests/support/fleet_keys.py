@@ -1,0 +1,72 @@
+"""A fleet's keys for tests, made by the command that users run, with copies that have one fault each."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import shutil
+from pathlib import Path
+from typing import Any, Literal
+
+import json5
+
+from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_ground.pki.authority import Authority
+from hvt_ground.pki.command import run
+
+__all__ = ["EXPIRED", "Fleet"]
+
+EXPIRED = dt.datetime.now(dt.UTC) - dt.timedelta(days=1000)
+"""Keys made then have ended since."""
+
+
+class Fleet:
+    """A folder of keys as ``hvt-ground keys`` leaves it; the files name the keys where they lie."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        run(["new-ca", "--dir", str(folder)])
+
+    def keys(self, command: str, name: str, *arguments: str) -> None:
+        """``hvt-ground keys COMMAND NAME …``."""
+        run([command, name, "--dir", str(self.folder), "--keys-folder", str(self.folder), *arguments])
+
+    def file(self, name: str) -> Path:
+        """The Zenoh configuration of a machine."""
+        return self.folder / f"{name}.json5"
+
+    def settings(
+        self,
+        name: str,
+        role: Literal["edge", "ground"],
+        *,
+        listen: tuple[str, ...] = (),
+        connect: tuple[str, ...] = (),
+    ) -> LinkSettings:
+        """How this machine takes part."""
+        return LinkSettings(role, listen, connect, self.file(name), name=name if role == "edge" else None)
+
+    def copy(self, folder: Path) -> Fleet:
+        """The same fleet in another folder, with files that name the keys there."""
+        shutil.copytree(self.folder, folder)
+        for file in folder.glob("*.json5"):
+            file.write_text(file.read_text().replace(str(self.folder), str(folder)))
+        other = object.__new__(Fleet)
+        other.folder = folder
+        return other
+
+    def reissue(self, name: str, *hosts: str, now: dt.datetime | None = None) -> None:
+        """Another pair of that name."""
+        Authority.open(self.folder).issue(name, hosts=hosts, now=now)
+
+    def changed(self, name: str, **tls: Any) -> Path:
+        """The configuration of a machine with other values in its ``tls`` part; None takes one out."""
+        said = json5.loads(self.file(name).read_text())
+        part = said["transport"]["link"]["tls"]
+        for key, value in tls.items():
+            part[key] = value
+            if value is None:
+                del part[key]
+        file = self.folder / f"{name}-{'-'.join(tls)}.json5"
+        file.write_text(json.dumps(said))
+        return file

@@ -1,0 +1,288 @@
+"""A small real flight for the ground: access units and stills with their headers, as the link delivers them."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from clips import START_NS, framed, smooth_pictures
+from hvt_common.protocol.channels import MSGPACK_ENCODING
+from hvt_common.protocol.messages import (
+    BaseHeader,
+    Feedback,
+    Flags,
+    Health,
+    Info,
+    RoiHeader,
+    Status,
+    TrackStepEncoder,
+)
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.values import Detections, Image, Posterior, Tracks, View
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.pipeline import GroundSight, SightParts
+from hvt_ground.perception.stills.classify import Decoded, Reading, Readings
+from hvt_ground.perception.stills.refine import Refiner
+
+__all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "sight_of", "square_box", "tracks_at"]
+
+SIZE = (320, 192)
+CLASSES = ("car", "bus")
+_ids = itertools.count(1000)
+
+
+def square_box(index: int) -> tuple[float, float, float, float]:
+    """Where `smooth_pictures` draws the red square in this picture."""
+    left = (7 * index) % (SIZE[0] - 40)
+    return float(left), SIZE[1] / 3, left + 32.0, SIZE[1] / 3 + 32.0
+
+
+def tracks_at(index: int, boxes: dict[int, tuple[float, float, float, float]], *, class_id=0) -> Tracks:
+    """A tracker's list at a frame: all of one class, at 0.8."""
+    ids = np.array(sorted(boxes), np.int64)
+    return Tracks(
+        frame_index=index,
+        ids=ids,
+        boxes_xyxy_px=np.array([boxes[i] for i in ids.tolist()], np.float32).reshape(-1, 4),
+        confidences=np.full(len(ids), 0.8, np.float32),
+        class_ids=np.full(len(ids), class_id, np.int32),
+        born_frames=np.full(len(ids), index, np.int64),
+        seen_frames=np.full(len(ids), index, np.int64),
+        started=np.zeros(len(ids), np.bool_),
+    )
+
+
+class RedSquares:
+    """A detector of red things; it may be slow."""
+
+    class_names = CLASSES
+
+    def __init__(self, *, takes_s: float = 0.0) -> None:
+        self.takes_s = takes_s
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """One car, or nothing."""
+        time.sleep(self.takes_s)
+        low, high = np.array([0, 0, 170], np.uint8), np.array([110, 130, 255], np.uint8)
+        ys, xs = np.nonzero(cv2.inRange(image_bgr, low, high))
+        if len(xs) < 100:
+            return Detections.none()
+        box = np.array([[xs.min(), ys.min(), xs.max() + 1, ys.max() + 1]], np.float32)
+        return Detections(box, np.array([0.9], np.float32), np.zeros(1, np.int32))
+
+
+@dataclass
+class SameAnswer:
+    """Reads every object in a still as a bus, or as nothing; keeps which frames' pictures it was given."""
+
+    class_names: tuple[str, ...] = CLASSES
+    knows: bool = True
+    had_base: list[bool] = field(default_factory=list)
+    found: Detections = field(default_factory=Detections.none)
+    """What it sees besides, in each frame with stills."""
+    at: tuple[float, float, float, float] | None = None
+    """Where it sees every object."""
+
+    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:
+        """The same for each."""
+        self.had_base += [base_bgr is not None] * len(stills)
+        answer = Posterior(self.class_names[1], 0.9, 0.3, np.array([0.1, 0.9], np.float32))
+        reading = Reading(answer, self.at) if self.knows else Reading()
+        return Readings(tuple((reading,) * len(one.boxes_base_px) for one in stills), self.found)
+
+
+def sight_of(
+    emit,
+    *,
+    detector=None,
+    reader=None,
+    detect_every: int = 1,
+    edge_classes: Sequence[str] = CLASSES,
+    wants_base: bool = False,
+) -> GroundSight:
+    """Eyes of a session of this flight."""
+    reader = reader or SameAnswer()
+    names, places = unified_names(CLASSES, edge_classes)
+    path = CameraPath(ahead_ticks=15)
+    parts = SightParts(
+        detector=detector or RedSquares(),
+        tracker=ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+        reader=reader,
+        refiner=Refiner("replace", fps=15, detector_classes=names, classifier_classes=reader.class_names),
+        fusion=Fusion(fps=15, edge_classes=places, path=path),
+        path=path,
+        camera=None,
+    )
+    view = View.fitted(SIZE, SIZE, fit="letterbox")
+    return GroundSight(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)
+
+
+class Flight:
+    """One session of an edge: its messages by frame."""
+
+    def __init__(
+        self, count: int, *, keyframes: Sequence[int] = (), pace: str = "realtime", size=SIZE
+    ) -> None:
+        self.session_id, self.pace, self.size = next(_ids), pace, size
+        encoder = BaseEncoder(EncoderSettings(size=size, fps=15, bitrate_bps=300_000, preset="ultrafast"))
+        self.pictures = smooth_pictures(count, size=size)
+        self.units = [
+            encoder.encode(frame, keyframe=frame.index in keyframes) for frame in framed(self.pictures)
+        ]
+        self._statuses = 0
+        self._steps = TrackStepEncoder(session_id=self.session_id)
+
+    def info(self) -> Info:
+        """What the edge answers."""
+        now = time.time_ns()
+        return Info(
+            session_id=self.session_id,
+            edge="uav-1",
+            software="0",
+            started_ns=START_NS,
+            source_size=SIZE,
+            base_size=SIZE,
+            view_scale=1.0,
+            view_offset_px=(0.0, 0.0),
+            fps=15.0,
+            codec="hevc",
+            pace=self.pace,
+            method="M5",
+            budget_bps=800_000,
+            base_bps=650_000,
+            window_ns=1_000_000_000,
+            class_names=CLASSES,
+            received_ns=now,
+            answered_ns=now,
+        )
+
+    def base(self, index: int) -> Received:
+        """The access unit of a frame."""
+        unit = self.units[index]
+        header = BaseHeader(
+            session_id=self.session_id,
+            sequence=index,
+            frame_index=index,
+            capture_ns=unit.capture_ns,
+            send_delay_ns=20_000_000,
+            flags=int(Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0,
+        )
+        return _received("base", unit.data, header.pack(unit.data), "video/h265")
+
+    def still(self, index: int, sequence: int, *, data: bytes | None = None, **changes) -> Received:
+        """A still of the red square in a frame."""
+        x1, y1, x2, y2 = square_box(index)
+        crop = (int(x1), int(y1), int(x2), int(y2))
+        if data is None:
+            pixels = self.pictures[index][crop[1] : crop[3], crop[0] : crop[2]]
+            data = cv2.imencode(".jpg", pixels)[1].tobytes()
+        fields = {
+            "session_id": self.session_id,
+            "sequence": sequence,
+            "frame_index": index,
+            "capture_ns": self.units[index].capture_ns,
+            "send_delay_ns": 30_000_000,
+            "flags": 0,
+            "track_id": 1,
+            "box_source_px": (x1, y1, x2, y2),
+            "crop_source_px": crop,
+            "class_name": "car",
+            "confidence": 0.5,
+            "reason": "utility",
+            "codec": "jpeg",
+            "quality_pct": 65,
+            "parameters": {},
+            "also": (),
+        }
+        return _received("roi", data, RoiHeader(**(fields | changes)).pack(data), "image/jpeg")
+
+    def step(self, index: int, listed: dict[int, tuple[float, float, float, float]], **changes) -> Received:
+        """What the edge tracked at a frame, ``{track id: box}``: all cars at 0.8."""
+        tracks = tracks_at(index, listed)
+        step = self._steps.encode(tracks, capture_ns=self.units[index].capture_ns, send_delay_ns=25_000_000)
+        return _received("tracks", replace(step, **changes).pack(), b"", MSGPACK_ENCODING)
+
+    def status(
+        self, *, base: int, roi: int = 0, past: int = 0, state: str = "running", meta: int = 0
+    ) -> Received:
+        """The edge's report after so many messages."""
+        self._statuses += 1
+        report = Status(
+            session_id=self.session_id,
+            sequence=self._statuses,
+            state=state,
+            send_ns=START_NS + self._statuses * 1_000_000_000,
+            media_ns=0,
+            last_base_sequence=base - 1,
+            last_still_sequence=roi - 1,
+            base_bytes=0,
+            roi_bytes=0,
+            past_bytes=0,
+            meta_bytes=0,
+            overhead_bytes=0,
+            base_messages=base,
+            roi_messages=roi,
+            past_messages=past,
+            meta_messages=meta,
+            worst_window_bps=(0, 0, 0),
+            sent={},
+            deferred={},
+            dropped={},
+            health=Health(
+                frames_captured=base,
+                frames_encoded=base,
+                frames_dropped=0,
+                keyframes=1,
+                tracks=0,
+                base_queue=0,
+                still_queue=0,
+                encode_ms=0.0,
+                detect_ms=0.0,
+                feedback_age_ms=-1,
+            ),
+        )
+        return _received("status", report.pack(), b"", "")
+
+
+def _received(row: str, payload: bytes, attachment: bytes, encoding: str) -> Received:
+    return Received(f"hvt/uav-1/{row}", payload, attachment, encoding, time.time_ns())
+
+
+class Port:
+    """An edge as the link knows it, in this process: what `EdgePort` is over Zenoh."""
+
+    def __init__(self) -> None:
+        self.edge = "uav-1"
+        self.inbox = Inbox(capacity=1024, overflow="newest")
+        self.present = threading.Event()
+        self.present.set()
+        self.flight: Flight | None = None
+        """Who answers; None is silence."""
+        self.asked = 0
+        self.keyframe_requests = 0
+        self.reports: list[Feedback] = []
+
+    def ask_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
+        """The flight's facts, where it is the one that is asked for."""
+        self.asked += 1
+        now = time.time_ns()
+        if self.flight is None or session_id not in (None, self.flight.session_id):
+            return None
+        return self.flight.info(), now, time.time_ns()
+
+    def request_keyframe(self) -> None:
+        """Counts."""
+        self.keyframe_requests += 1
+
+    def report(self, feedback: Feedback) -> None:
+        """Keeps it, as it would be on the wire."""
+        self.reports.append(Feedback.parse(feedback.pack()))

@@ -1,0 +1,42 @@
+"""What a test of the receiving thread can wait for, however slow the machine is: all is handled, and it has ended."""
+
+from __future__ import annotations
+
+from hvt_common.transport.inbox import Inbox, Received
+from hvt_ground.session.receiver import EdgeReceiver
+
+__all__ = ["WatchedInbox", "end"]
+
+
+class WatchedInbox(Inbox):
+    """An edge's inbox with one thread that takes: it has done with an item when it asks for the next."""
+
+    def __init__(self) -> None:
+        super().__init__(capacity=1024, overflow="newest")
+        self._handled = True
+
+    @property
+    def handled(self) -> bool:
+        """Whether that thread has asked for more, and found none, since the last item was put."""
+        return self._handled
+
+    def put(self, item: Received) -> None:
+        """As any inbox does."""
+        with self._changed:
+            super().put(item)
+            self._handled = False
+
+    def get(self, *, timeout_s: float) -> Received | None:
+        """As any inbox does."""
+        with self._changed:
+            self._handled |= not self._items
+            return super().get(timeout_s=timeout_s)
+
+
+def end(receiver: EdgeReceiver, *, failing: bool) -> None:
+    """Close it, and raise what ended it; ``failing``: the test has failed already, and that is what is to be seen."""
+    receiver.close()
+    receiver._thread.join(60)  # on a busy machine it takes longer than `close` waits
+    assert not receiver._thread.is_alive(), "the receiver did not end"
+    if not failing and receiver.error is not None:
+        raise receiver.error

@@ -1,0 +1,288 @@
+"""The frame loop's stages of an edge with a store, and a link that goes and comes, with a ground at its other end."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from clips import START_NS, framed, smooth_pictures
+from hvt_common.protocol.channels import Row
+from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import (
+    BaseHeader,
+    Feedback,
+    PastHeader,
+    PastKind,
+    RoiHeader,
+    parse_past_still,
+    parse_past_units,
+)
+from hvt_common.values import Still
+from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.stage import Keep
+from hvt_edge.config import EdgeConfig, check
+from hvt_edge.control.link_control import LinkFollower
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.unacknowledged import Unacknowledged
+from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
+from hvt_edge.video.reconfigure import Renewal
+from hvt_edge.video.stage import BaseStage
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_ground.backlog import PastAssembly
+from kept import INFO, S, opened
+from messages import feedback
+
+__all__ = ["FRAMES", "SIZE", "STILL", "Ground", "NoStills", "Out", "Rig"]
+
+SIZE = (320, 192)
+FRAMES = framed(smooth_pictures(150, size=SIZE))
+STILL = Still(
+    sequence=2**31,
+    frame_index=3,
+    capture_ns=START_NS,
+    track_id=1,
+    box_source_px=(10.0, 10.0, 42.0, 42.0),
+    crop_source_px=(6, 6, 46, 46),
+    class_name="car",
+    confidence=0.5,
+    reason="utility",
+    codec="jpeg",
+    quality_pct=65,
+    data=b"\xff" * 1500,
+)
+
+
+class Ground:
+    """What arrives, and what it says of that."""
+
+    def __init__(self) -> None:
+        self.base_sequence = self.still_sequence = self.number = -1
+        self.stills: set[int] = set()
+        self.frames: set[int] = set()
+        self.twice: Counter[tuple[int, str, int]] = Counter()
+        """Objects of what was kept, as often as they came."""
+        self.past_frames: dict[int, bytes] = {}
+        self.past_stills: set[int] = set()
+        self.assembly = PastAssembly()
+
+    def take(self, row: Row, payload: bytes, attachment: bytes) -> None:
+        """A message arrives."""
+        if row is Row.BASE:
+            base = BaseHeader.parse(attachment, payload)
+            self.base_sequence = max(self.base_sequence, base.sequence)
+            self.frames.add(base.frame_index)
+        elif row is Row.ROI:
+            still = RoiHeader.parse(attachment, payload)
+            self.still_sequence = max(self.still_sequence, still.sequence)
+            self.stills.add(still.sequence)
+        elif row is Row.PAST:
+            header = PastHeader.parse(attachment, payload)
+            whole = self.assembly.piece(header, payload)
+            if whole is not None:
+                self._content((header.session_id, header.kind, header.number), whole)
+
+    def _content(self, key: tuple[int, str, int], whole: bytes) -> None:
+        self.twice[key] += 1
+        self.assembly.settle(key, usable=True)
+        if key[1] == PastKind.BASE:
+            self.past_frames |= {unit.frame_index: unit.data for unit in parse_past_units(whole)}
+        elif key[1] == PastKind.STILL:
+            still = parse_past_still(whole)
+            self.past_stills.add(RoiHeader.parse(still.attachment, still.payload).sequence)
+
+    def report(self, now_ns: int) -> Feedback:
+        """What it says now."""
+        self.number += 1
+        missing = [one for one in range(self.still_sequence) if one not in self.stills]
+        return feedback(
+            sequence=self.number,
+            send_ns=now_ns,
+            base_messages=len(self.frames),
+            roi_messages=len(self.stills),
+            base_sequence=self.base_sequence,
+            still_sequence=self.still_sequence,
+            missing_stills=tuple(missing[-16:]),
+            past=self.assembly.take_haves(16),
+        )
+
+
+class Out:
+    """The link: what was put, and, unless it is dark, a ground that hears it."""
+
+    def __init__(self) -> None:
+        self.puts: list[tuple[Row, bytes, bytes]] = []
+        self.ground = Ground()
+        self.dark = False
+        self.before_put: Callable[[Row], None] = lambda _row: None
+
+    def put(self, row, payload, *, attachment=None, encoding="") -> None:
+        """Keep it, and let it arrive."""
+        self.before_put(row)
+        self.puts.append((row, payload, attachment or b""))
+        if not self.dark:
+            self.ground.take(row, payload, attachment or b"")
+
+    def listens(self, row) -> bool:
+        """Somebody does."""
+        return True
+
+    @property
+    def base(self) -> list[BaseHeader]:
+        """Headers of the base stream."""
+        return [BaseHeader.parse(extra, data) for row, data, extra in list(self.puts) if row is Row.BASE]
+
+    @property
+    def past(self) -> list[tuple[PastHeader, bytes]]:
+        """Pieces of what was kept."""
+        return [
+            (PastHeader.parse(extra, data), data) for row, data, extra in list(self.puts) if row is Row.PAST
+        ]
+
+
+class NoStills:
+    """An edge that makes none; ``live_waits`` is what it says."""
+
+    def __init__(self, *, live_waits: bool = False) -> None:
+        self.live_waits = live_waits
+
+    def without_base(self, still: Still, *, now_ns: int) -> Still:
+        """It is."""
+        return still
+
+
+class Rig:
+    """The frame loop's stages with a store. The clock stands still but for frames, and for `finish`."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        live: bool = False,
+        adapt: bool = False,
+        lend: bool = False,
+        info: Callable[[], bytes] = INFO.pack,
+        session_id: int = 7,
+        budget: tuple[int, int] = (800_000, 400_000),
+    ) -> None:
+        self.path, self.out, self.now_ns = folder, Out(), START_NS
+        self.linked = True
+        self.keyframes = KeyframePlan(KeyframeSettings(interval_ns=60 * S))
+        self.unacked, self.ledger = Unacknowledged(), Ledger()
+        pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))) if adapt else None
+        self.follower = LinkFollower(pacer, self.unacked, keyframes=self.keyframes)
+        self.sender = Sender(
+            self.out,
+            ledger=self.ledger,
+            budget=RollingBudget(BudgetSettings(*budget, fps=15, lend=lend)),
+            edge_id="uav-1",
+            session_id=session_id,
+            lockstep=False,
+            wait_until=lambda _at_ns: None,
+            pacer=pacer,
+            unacked=self.unacked,
+        )
+        self.fates: list[tuple[str, str]] = []
+        self.keep = Keep(
+            lambda: Folder(folder, max_bytes=50_000_000, session_id=session_id, info=info),
+            session_id=session_id,
+            live=live,
+            link=self.out,
+            sender=self.sender,
+            keyframes=self.keyframes,
+            clock=lambda: self.now_ns,
+            on_fate=lambda *fate: self.fates.append(fate),
+        )
+        config = check(EdgeConfig(source="demo", size=SIZE, budget=budget[0], preset="ultrafast"))
+        self.stills = NoStills()
+        self.follower.attach(
+            linked=lambda: self.linked,
+            sender=self.sender,
+            renewal=Renewal(config, size=SIZE, every_n=1, sender=self.sender, split=None, pacer=pacer),
+            stills=self.stills,
+            keep=self.keep,
+        )
+        self.asked: list[int] = []
+        """When the link was asked for room for a frame."""
+        self.admits: Callable[[int], bool] = self.follower.admits
+        self.stage = BaseStage(
+            BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast")),
+            keyframes=self.keyframes,
+            sender=self.sender,
+            recorder=None,
+            first_keyframe_bytes=5000,
+            admits=self._asked_to_admit,
+            keep=self.keep,
+        )
+        self.coded: dict[int, bytes] = {}
+
+    def play(self, first: int, end: int, *, linked: bool = True, reports: bool = False) -> None:
+        """Frames of that stretch; a ground that ``reports`` does so after each seventh."""
+        self.linked = linked
+        for frame in FRAMES[first:end]:
+            self.now_ns = frame.capture_ns
+            self.follower.before_frame(self.now_ns)
+            unit = self.stage.encode(frame, now_ns=self.now_ns)
+            if unit is not None:
+                self.coded[frame.index] = unit.data
+                self.stage.send(unit, now_ns=self.now_ns)
+            if reports and frame.index % 7 == 6:
+                self.report()
+
+    def _asked_to_admit(self, now_ns: int) -> bool:
+        self.asked.append(now_ns)
+        return self.admits(now_ns)
+
+    def report(self) -> None:
+        """The ground says what it has, unless nobody hears it."""
+        if not self.out.dark:
+            self.follower.hear(self.out.ground.report(self.now_ns), now_ns=self.now_ns)
+
+    def still(self, sequence: int, *, utility: float = 1.0) -> None:
+        """One goes out."""
+        still = _numbered(STILL, sequence)
+        self.sender.still(still, now_ns=self.now_ns, utility=utility)
+        self.keep.note_utility(still, utility)
+
+    def finish(self, *, reports: bool = True) -> list[str]:
+        """After the last frame, in a tenth of a second a turn; what the user is told."""
+        notes: list[str] = []
+        turns = 0
+
+        def linked() -> bool:
+            nonlocal turns
+            turns += 1
+            self.now_ns += S // 10
+            if reports and turns % 4 == 0:
+                self.report()
+            return self.linked
+
+        self.follower._linked = linked
+        self.follower.finish(stop=threading.Event(), note=notes.append)
+        return notes
+
+    def kept(self) -> list:
+        """What another start of the edge finds."""
+        self.keep.close()
+        with opened(self.path, session_id=8) as folder:
+            return [
+                unit
+                for entry in reversed(list(folder.newest_segments()))
+                for unit in parse_past_units(folder.read(entry))
+            ]
+
+    def kept_stills(self) -> dict[int, str]:
+        """Numbers and file names of the stills that another start of the edge finds."""
+        self.keep.close()
+        with opened(self.path, session_id=8) as folder:
+            return {entry.number: entry.path.name for entry in folder.best_stills()}
+
+
+def _numbered(still: Still, sequence: int) -> Still:
+    """The same of another number."""
+    return replace(still, sequence=sequence)

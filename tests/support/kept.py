@@ -1,0 +1,76 @@
+"""Things for an edge's store: real access units, stills as they are kept, and a folder to put them in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from clips import START_NS, framed, smooth_pictures
+from flight import Flight
+from hvt_common.protocol.messages import PastStill, RoiHeader, pack_past_still
+from hvt_common.values import AccessUnit
+from hvt_edge.backlog.disk import Folder
+from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+
+__all__ = ["INFO", "UNITS", "S", "add_stills", "add_units", "coded", "opened", "packed_still", "shifted"]
+
+SIZE = (320, 192)
+S = 1_000_000_000
+INFO = Flight(1).info()
+
+
+def coded(count: int, *, keyframe_each: int = 15) -> list[AccessUnit]:
+    """Access units at 15 fps."""
+    encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast"))
+    frames = framed(smooth_pictures(count, size=SIZE))
+    return [encoder.encode(frame, keyframe=frame.index % keyframe_each == 0) for frame in frames]
+
+
+UNITS = coded(60)
+
+
+def opened(path: Path, *, max_bytes: int = 50_000_000, session_id: int = 7, oldest_ns: int = 0) -> Folder:
+    """The folder, as a run of an edge opens it."""
+    return Folder(path, max_bytes=max_bytes, session_id=session_id, info=INFO.pack, oldest_ns=oldest_ns)
+
+
+def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int = 7) -> bytes:
+    """A still as it is kept."""
+    header = RoiHeader(
+        session_id=session_id,
+        sequence=number,
+        frame_index=3,
+        capture_ns=START_NS,
+        send_delay_ns=30_000_000,
+        flags=8,
+        track_id=1,
+        box_source_px=(10.0, 10.0, 42.0, 42.0),
+        crop_source_px=(6, 6, 46, 46),
+        class_name="car",
+        confidence=0.5,
+        reason="utility",
+        codec="jpeg",
+        quality_pct=65,
+        parameters={},
+        also=(),
+    )
+    return pack_past_still(PastStill(header.pack(data), "image/jpeg", data))
+
+
+def add_stills(folder: Folder, utilities: dict[int, float], *, capture_ns: int = START_NS) -> None:
+    """One of each number."""
+    for number, utility in utilities.items():
+        folder.add_still(number, packed_still(number), utility=utility, capture_ns=capture_ns)
+
+
+def add_units(folder: Folder, units: list[AccessUnit]) -> None:
+    """A run, ended."""
+    for unit in units:
+        folder.add_unit(unit, parameter_sets=UNITS[0].data)
+    folder.end_segment()
+
+
+def shifted(unit: AccessUnit, seconds: int) -> AccessUnit:
+    """The same picture some seconds later."""
+    return AccessUnit(
+        unit.frame_index + 15 * seconds, unit.capture_ns + seconds * S, unit.data, unit.keyframe
+    )

@@ -1,0 +1,177 @@
+"""One example of every message of the wire: a new field is filled in here, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from hvt_common.protocol.messages import (
+    AlsoShown,
+    BaseHeader,
+    ControlAnswer,
+    ControlRequest,
+    Feedback,
+    Flags,
+    Health,
+    Info,
+    Message,
+    PastHave,
+    PastHeader,
+    RoiHeader,
+    Status,
+    StillResult,
+    TrackNow,
+    TrackStep,
+)
+from hvt_common.protocol.messages.fields import I63, U32, U64
+
+BASE = BaseHeader(
+    session_id=0x1234567890ABCDEF,
+    sequence=9_000,
+    frame_index=9_100,
+    capture_ns=1_790_000_000_123_456_789,
+    send_delay_ns=31_000_000,
+    flags=Flags.KEYFRAME | Flags.PARAMETER_SETS,
+)
+ROI = RoiHeader(
+    session_id=0x1234567890ABCDEF,
+    sequence=311,
+    frame_index=9_100,
+    capture_ns=1_790_000_000_123_456_789,
+    send_delay_ns=-5,
+    flags=0,
+    track_id=57,
+    box_source_px=(-3.125, 10.0, 90.875, 64.5),
+    crop_source_px=(0, 2, 105, 73),
+    class_name="van",
+    confidence=0.613,
+    reason="small",
+    codec="jpeg",
+    quality_pct=65,
+    parameters={"base": 9_099, "gain": 1.5, "how": "residual"},
+    also=(AlsoShown(track_id=60, box_source_px=(40.0, 2.5, 104.875, 70.0)),),
+)
+STEP = TrackStep(
+    session_id=0x1234567890ABCDEF,
+    sequence=1_800,
+    frame_index=9_100,
+    capture_ns=1_790_000_000_123_456_789,
+    send_delay_ns=44_000_000,
+    reference=1_799,
+    boxes=bytes(range(120)),
+)
+HEALTH = Health(
+    frames_captured=9_101,
+    frames_encoded=9_001,
+    frames_dropped=100,
+    keyframes=61,
+    tracks=204,
+    base_queue=1,
+    still_queue=3,
+    encode_ms=36.4,
+    detect_ms=57.1,
+    feedback_age_ms=412,
+)
+STATUS = Status(
+    session_id=0x1234567890ABCDEF,
+    sequence=600,
+    state="running",
+    send_ns=1_790_000_600_000_000_000,
+    media_ns=606_000_000_000,
+    last_base_sequence=9_000,
+    last_still_sequence=311,
+    base_bytes=49_000_000,
+    roi_bytes=9_000_000,
+    past_bytes=0,
+    meta_bytes=500_000,
+    overhead_bytes=2_300_000,
+    base_messages=9_001,
+    roi_messages=312,
+    past_messages=0,
+    meta_messages=602,
+    worst_window_bps=(712_000, 148_000, 800_000),
+    sent={"small": 200, "uncertain": 112},
+    deferred={"budget": 1_900},
+    dropped={"stale": 44, "border": 3, "queue full": 2},
+    health=HEALTH,
+)
+INFO = Info(
+    session_id=7,
+    edge="uav-1",
+    software="0.1.0",
+    started_ns=1,
+    source_size=(3840, 2160),
+    base_size=(1280, 720),
+    view_scale=1 / 3,
+    view_offset_px=(0.0, 0.0),
+    fps=15.0,
+    codec="hevc",
+    pace="realtime",
+    method="M5",
+    budget_bps=800_000,
+    base_bps=650_000,
+    window_ns=1_000_000_000,
+    class_names=("pedestrian", "people", "bicycle", "Straßenbahn"),
+    received_ns=2,
+    answered_ns=3,
+)
+_SILENT = Feedback(
+    session_id=7,
+    receiver_id=1,
+    sequence=0,
+    send_ns=1,
+    last_frame_index=-1,
+    base_messages=0,
+    base_bytes=0,
+    roi_messages=0,
+    roi_bytes=0,
+    lost=0,
+    corrupt=0,
+    base_sequence=-1,
+    base_held_us=0,
+    still_sequence=-1,
+    missing_stills=(),
+    delay_p50_ms=-1.0,
+    clock_offset_ns=0,
+    clock_error_ns=-1,
+    stills=(),
+    past=(),
+)
+FEEDBACK = replace(
+    _SILENT,
+    receiver_id=U64,
+    sequence=1,
+    send_ns=5,
+    base_sequence=U32,
+    base_held_us=66_000,
+    missing_stills=(3, 7),
+    clock_offset_ns=-I63,
+    stills=(
+        StillResult(
+            still_sequence=4,
+            track_id=57,
+            class_name="minivan",
+            confidence=0.9,
+            entropy_nats=0.25,
+            ground_track_id=12,
+            again=False,
+        ),
+    ),
+    past=(PastHave(session_id=U64, kind="base", number=450, have_bytes=12_000),),
+)
+PAST = PastHeader(session_id=7, kind="still", number=31, offset=1400, total_bytes=5_000, send_ns=I63)
+REQUEST = ControlRequest(session_id=0, command="keyframe", arguments={})
+ANSWER = ControlAnswer(
+    session_id=7,
+    accepted=True,
+    reason="",
+    still_ask=3,
+    frame_index=9_100,
+    tracks=(TrackNow(track_id=57, class_id=3, confidence=0.613, box_source_px=(-3.125, 10.0, 90.875, 64.5)),),
+)
+EXAMPLES: tuple[Message, ...] = (BASE, ROI, STEP, INFO, STATUS, REQUEST, ANSWER, FEEDBACK, PAST)
+
+
+def feedback(**changes: Any) -> Feedback:
+    """A receiver report that says nothing, but for ``changes``."""
+    return replace(_SILENT, **changes)

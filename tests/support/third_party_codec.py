@@ -1,0 +1,60 @@
+"""A package as a third party would install it, with still codecs behind the entry point."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+
+__all__ = ["PIXELS", "install"]
+
+PIXELS = '''
+"""Zlib-packed pixels: a codec that knows nothing of HVT but the contract."""
+
+import zlib
+
+import numpy as np
+
+from hvt_common.video.still_codecs import CodedCrop, StillError
+
+
+class PixelCodec:
+    name = "acme-pixels"
+    media_type = "application/x-acme-pixels"
+    needs_base = False
+
+    def encode(self, crop_bgr, *, quality_pct, base_bgr=None):
+        step = 65 - quality_pct * 64 // 100
+        return CodedCrop(zlib.compress((crop_bgr // step).tobytes(), 9), {"step": step})
+
+    def decode(self, data, *, size, parameters={}, base_bgr=None):
+        step = parameters.get("step")
+        if not isinstance(step, int) or not 1 <= step <= 65:
+            raise StillError(f"step {step!r} is not within 1 and 65")
+        wanted = size[0] * size[1] * 3
+        try:
+            pixels = zlib.decompressobj().decompress(data, wanted + 1)
+        except zlib.error as error:
+            raise StillError(str(error)) from None
+        if len(pixels) != wanted:
+            raise StillError(f"{len(pixels)} bytes in place of {wanted}")
+        image = np.frombuffer(pixels, np.uint8).reshape(size[1], size[0], 3).astype(np.int16) * step + step // 2
+        return np.minimum(image, 255).astype(np.uint8)
+'''
+
+
+def install(
+    folder: Path, codecs: Mapping[str, str], *, module: str = "acme_codecs", source: str = PIXELS
+) -> Path:
+    """Lay out ``module`` and its metadata in ``folder``, as pip would; put the folder on the path to install it.
+
+    ``codecs`` maps the names of entry points to objects in the module.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{module}.py").write_text(textwrap.dedent(source))
+    information = folder / f"{module}-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    rows = [f"{name} = {module}:{target}" for name, target in codecs.items()]
+    (information / "entry_points.txt").write_text("\n".join(["[hvt.still_codecs]", *rows, ""]))
+    return folder
