@@ -26,7 +26,7 @@ from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.wiring import Models, make_sight
+from hvt_ground.wiring import Models, make_pipeline
 
 _FRAMES = 200
 _EVERY = 5
@@ -99,7 +99,7 @@ def _ground(units: list[AccessUnit]) -> float:
             info,
             recorder=Recorder(_recorder_settings(path, info)),
             recording=path,
-            sight_of=lambda emit: make_sight(config, models, info=info, emit=emit),
+            pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
             to_local_ns=lambda at_ns: at_ns,
             clock=time.time_ns,
             report=lambda: None,

@@ -23,9 +23,9 @@ from rich.progress import Progress
 from bench.material import ROOT, data
 from hvt_common.runtime.reporting import write_json
 from hvt_study.commands.sight import print_result
-from hvt_study.sight import SightPlan, SightResult, SightRow, compare
-from hvt_study.sight_methods import METHODS
-from hvt_study.sight_plot import plot
+from hvt_study.compare_methods import METHODS
+from hvt_study.compare_plot import plot
+from hvt_study.sight import ComparePlan, CompareResult, CompareRow, compare
 
 _RATES = (150_000, 200_000, 300_000, 400_000, 800_000)
 _CLIPS = {
@@ -67,7 +67,7 @@ def main(argv: list[str]) -> int:
 _WORDS = {True: "holds", False: "does not hold", None: "not judged"}
 
 
-def _fly(name: str) -> SightResult:
+def _fly(name: str) -> CompareResult:
     clip, models = _CLIPS[name], data() / "models"
     scheme, _, path = clip.rpartition(":")
     began_s = time.monotonic()
@@ -77,7 +77,7 @@ def _fly(name: str) -> SightResult:
         def on_step(what: str, done: int, of: int) -> None:
             progress.update(task, description=f"{name}: {what}", completed=done, total=of)
 
-        plan = SightPlan(
+        plan = ComparePlan(
             clip=f"{scheme}:{data() / path}" if scheme else str(data() / path),
             detector=str(models / "yolov5su_visdrone_736x1280.onnx"),
             edge_detector=str(models / "yolov5su_visdrone_640.onnx"),
@@ -95,7 +95,7 @@ def _fly(name: str) -> SightResult:
 # Goals
 
 
-def _goals(name: str, result: SightResult) -> Iterator[Goal]:
+def _goals(name: str, result: CompareResult) -> Iterator[Goal]:
     """All are of the second half."""
     rows = {(row.method, row.rate_kbps): row for row in result.rows if row.half == 2}
     if name == "carpark":
@@ -105,7 +105,7 @@ def _goals(name: str, result: SightResult) -> Iterator[Goal]:
     yield _never_worse(rows)
 
 
-def _half_the_bits(rows: dict[tuple[str, float], SightRow]) -> Iterator[Goal]:
+def _half_the_bits(rows: dict[tuple[str, float], CompareRow]) -> Iterator[Goal]:
     for rate in (300.0, 400.0, 800.0):  # half of less lies below the lowest rate
         asked = f"M6 needs at most 0.5 of the bits of M0-fps at {rate:g} kbps for its class agreement"
         row = rows.get(("M0-fps", rate))
@@ -120,7 +120,7 @@ def _half_the_bits(rows: dict[tuple[str, float], SightRow]) -> Iterator[Goal]:
             yield asked, f"{share:.2f} for {row.class_agreement:.3f}", share <= 0.5
 
 
-def _small_objects(rows: dict[tuple[str, float], SightRow]) -> Iterator[Goal]:
+def _small_objects(rows: dict[tuple[str, float], CompareRow]) -> Iterator[Goal]:
     best = rows.get(("M6", 200.0))
     for other, factor in (("M0", 5.0), ("M0-fps", 1.5)):
         row = rows.get((other, 200.0))
@@ -141,7 +141,7 @@ def _small_objects(rows: dict[tuple[str, float], SightRow]) -> Iterator[Goal]:
         )
 
 
-def _never_worse(rows: dict[tuple[str, float], SightRow]) -> Goal:
+def _never_worse(rows: dict[tuple[str, float], CompareRow]) -> Goal:
     """At the bits that R0 really spent, M6's curve in between its rates."""
     asked = "M6 never worse than R0 at equal bits (F1 and class agreement)"
     mine, theirs = _curve(rows, "M6"), _curve(rows, "R0")
@@ -157,11 +157,11 @@ def _never_worse(rows: dict[tuple[str, float], SightRow]) -> Goal:
     return asked, f"least gain {least:+.3f} ({measure} at {rate:g} kbps)", least >= 0
 
 
-def _curve(rows: dict[tuple[str, float], SightRow], method: str) -> list[SightRow]:
+def _curve(rows: dict[tuple[str, float], CompareRow], method: str) -> list[CompareRow]:
     return sorted((row for (name, _), row in rows.items() if name == method), key=lambda row: row.total_bps)
 
 
-def _bits_for(agreement: float, curve: list[SightRow]) -> float | None:
+def _bits_for(agreement: float, curve: list[CompareRow]) -> float | None:
     """The fewest bits at which a curve reaches a class agreement, straight lines over the logarithm of the bits."""
     for index, row in enumerate(curve):
         if row.class_agreement < agreement:
@@ -175,7 +175,7 @@ def _bits_for(agreement: float, curve: list[SightRow]) -> float | None:
     return None
 
 
-def _value_at(bps: float, curve: list[SightRow], value: Callable[[SightRow], float]) -> float | None:
+def _value_at(bps: float, curve: list[CompareRow], value: Callable[[CompareRow], float]) -> float | None:
     """What a curve says at so many bits; None below its beginning, its last value beyond its end."""
     if bps < curve[0].total_bps:
         return value(curve[0]) if bps > 0.97 * curve[0].total_bps else None
@@ -205,7 +205,7 @@ _HEADS = (
 )
 
 
-def _document(sections: list[tuple[str, SightResult, list[Goal]]]) -> None:
+def _document(sections: list[tuple[str, CompareResult, list[Goal]]]) -> None:
     images = ROOT / "docs" / "images"
     parts = []
     for name, result, goals in sections:
@@ -217,7 +217,7 @@ def _document(sections: list[tuple[str, SightResult, list[Goal]]]) -> None:
     _DOC.write_text(f"{before}{_BEGIN}\n\n" + "\n".join(parts) + f"\n{_END}{after}", encoding="utf-8")
 
 
-def _section(name: str, result: SightResult, goals: list[Goal]) -> str:
+def _section(name: str, result: CompareResult, goals: list[Goal]) -> str:
     lines = [
         f"### {name} ({result.labels} labels)\n",
         f"![F1 and class agreement over kbps](images/sight-{name}.png)\n",

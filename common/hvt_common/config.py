@@ -33,8 +33,8 @@ __all__ = [
     "SHARE",
     "SIZE",
     "TEXT",
-    "Kind",
     "Loaded",
+    "SettingType",
     "choice",
     "integer",
     "load",
@@ -53,7 +53,7 @@ class _Parse(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class SettingType:
     """How a setting's text becomes its value (`UserError` when it cannot), and the value text again."""
 
     metavar: str
@@ -83,16 +83,16 @@ def _decimal(number: float) -> str:
     return format(Decimal(repr(number)).normalize(), "f")
 
 
-TEXT = Kind("TEXT", _plain)
-PATH = Kind("FILE", _path)
-BITRATE = Kind("RATE", parse_bitrate, lambda bps: f"{_decimal(bps / 1000)}kbps")
-BYTES = Kind("SIZE", parse_bytes, lambda size: f"{_decimal(size / 1_000_000)}MB")
-DURATION = Kind("TIME", parse_duration_s, lambda seconds: f"{_decimal(seconds)}s")
-SHARE = Kind("SHARE", parse_share, float)
-SIZE = Kind("WxH", parse_size, lambda size: f"{size[0]}x{size[1]}")
+TEXT = SettingType("TEXT", _plain)
+PATH = SettingType("FILE", _path)
+BITRATE = SettingType("RATE", parse_bitrate, lambda bps: f"{_decimal(bps / 1000)}kbps")
+BYTES = SettingType("SIZE", parse_bytes, lambda size: f"{_decimal(size / 1_000_000)}MB")
+DURATION = SettingType("TIME", parse_duration_s, lambda seconds: f"{_decimal(seconds)}s")
+SHARE = SettingType("SHARE", parse_share, float)
+SIZE = SettingType("WxH", parse_size, lambda size: f"{size[0]}x{size[1]}")
 
 
-def integer(low: int, high: int, *, unit: str = "") -> Kind:
+def integer(low: int, high: int, *, unit: str = "") -> SettingType:
     """A whole number within ``low … high``."""
 
     def parse(text: str, *, name: str) -> int:
@@ -106,10 +106,10 @@ def integer(low: int, high: int, *, unit: str = "") -> Kind:
             )
         return value
 
-    return Kind("N", parse, int)
+    return SettingType("N", parse, int)
 
 
-def number(low: float, high: float, *, unit: str = "") -> Kind:
+def number(low: float, high: float, *, unit: str = "") -> SettingType:
     """A finite number within ``low … high``."""
 
     def parse(text: str, *, name: str) -> float:
@@ -121,10 +121,10 @@ def number(low: float, high: float, *, unit: str = "") -> Kind:
             raise UserError(f"{name} {text!r} is not accepted: give a number from {low:g} to {high:g}{unit}")
         return value
 
-    return Kind("X", parse, float)
+    return SettingType("X", parse, float)
 
 
-def choice(*accepted: str) -> Kind:
+def choice(*accepted: str) -> SettingType:
     """One of a few words."""
 
     def parse(text: str, *, name: str) -> str:
@@ -132,13 +132,13 @@ def choice(*accepted: str) -> Kind:
             raise UserError(f"{name} {text!r} is not known: choose one of {', '.join(accepted)}")
         return text
 
-    return Kind("|".join(accepted), parse)
+    return SettingType("|".join(accepted), parse)
 
 
 AUTO = "auto"
 
 
-def or_auto(kind: Kind) -> Kind:
+def or_auto(kind: SettingType) -> SettingType:
     """The same kind, or the word ``auto``, which stays as it is: the program finds the value itself."""
 
     def parse(text: str, *, name: str) -> Any:
@@ -147,10 +147,12 @@ def or_auto(kind: Kind) -> Kind:
     def show(value: Any) -> str | int | float:
         return AUTO if value == AUTO else kind.show(value)
 
-    return Kind(f"{kind.metavar}|{AUTO}", parse, show)
+    return SettingType(f"{kind.metavar}|{AUTO}", parse, show)
 
 
-def option(kind: Kind, default: Any, help_line: str, *, many: bool = False, shown_default: str = "") -> Any:
+def option(
+    kind: SettingType, default: Any, help_line: str, *, many: bool = False, shown_default: str = ""
+) -> Any:
     """Declare a dataclass field that is also a flag ``--its-name`` and a TOML key ``its-name``.
 
     With ``many`` the flag may be given several times and the value is a tuple.
@@ -249,7 +251,7 @@ def _flags(config_class: type, *, program: str, description: str) -> argparse.Ar
         if field.metadata.get("switch"):
             parser.add_argument(_flag(field), action=argparse.BooleanOptionalAction, help=help_line)
             continue
-        kind: Kind = field.metadata["kind"]
+        kind: SettingType = field.metadata["kind"]
         shown = field.metadata["shown_default"] or _shown(kind, field.default)
         parser.add_argument(
             _flag(field),
@@ -260,7 +262,7 @@ def _flags(config_class: type, *, program: str, description: str) -> argparse.Ar
     return parser
 
 
-def _shown(kind: Kind, default: object) -> str:
+def _shown(kind: SettingType, default: object) -> str:
     if default is None or default == ():
         return ""
     if isinstance(default, tuple) and kind.metavar != SIZE.metavar and not kind.metavar.startswith("WxH"):
@@ -273,7 +275,7 @@ def _value(field: dataclasses.Field[Any], given: Any, *, name: str) -> Any:
         if not isinstance(given, bool):
             raise UserError(f"{name} {given!r} is not accepted: give true or false")
         return given
-    kind: Kind = field.metadata["kind"]
+    kind: SettingType = field.metadata["kind"]
     if field.metadata["many"]:
         items = given if isinstance(given, list) else [given]
         return tuple(kind.parse(_one(item, name=name), name=name) for item in items)

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.channels import EdgeKeys
-from hvt_common.protocol.ledger import Channel, Ledger
+from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.protocol.messages import Feedback, Status
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.reporting import StatusLine
@@ -21,11 +21,11 @@ from hvt_common.transport.session import open_session
 from hvt_common.values import Fit
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.commands import Commands, Served
-from hvt_edge.control.link_control import LinkFollower, wait_for_ground
+from hvt_edge.control.link_control import LinkControl, wait_for_ground
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.link.tracks_channel import TrackReporter
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.link.unacknowledged import Unacknowledged
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
@@ -37,25 +37,25 @@ from hvt_edge.status import make_info, make_status, status_text
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.summary import EdgeRun, summary
 from hvt_edge.video.local_copy import BaseRecorder
-from hvt_edge.video.reconfigure import HeldCadence, Renewal
+from hvt_edge.video.reconfigure import EncoderReconfiguration, LimitedFrameSkip
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.wiring import (
     SECOND_NS,
     base_size,
     check_files,
-    first_every_n,
+    first_decimation,
+    make_analyzer,
+    make_backlog,
     make_budget,
-    make_cadence,
     make_chooser,
     make_detector,
     make_encoder,
-    make_keep,
+    make_frame_skip,
     make_keyframes,
     make_link_settings,
     make_on_demand,
     make_pacer,
     make_regions,
-    make_sight,
     make_split,
     warm_up_for,
 )
@@ -72,9 +72,9 @@ class _Flow:
 
     base: BaseStage
     stills: StillStage
-    sender: Sender
+    sender: Transmitter
     link: EdgeLink
-    renewal: Renewal
+    reconfiguration: EncoderReconfiguration
 
 
 class Edge:
@@ -94,7 +94,7 @@ class Edge:
         self._keyframes = make_keyframes(config)
         self._inbox = FeedbackInbox()
         unacked = None if self._lockstep else Unacknowledged()
-        self._following = LinkFollower(make_pacer(config), unacked, keyframes=self._keyframes)
+        self._link_control = LinkControl(make_pacer(config), unacked, keyframes=self._keyframes)
         self._commands = Commands(
             config,
             session_id=self._session_id,
@@ -136,15 +136,15 @@ class Edge:
 
     def _make_flow(self, stack: ExitStack, source: Source, detector: Detector) -> _Flow:
         """Everything between the source and the link."""
-        config, view, following = self._config, source.view, self._following
-        every_n = first_every_n(config, view.base_size)
-        encoder = make_encoder(config, size=view.base_size, every_n=every_n, base_bps=config.base_bps)
-        budget = make_budget(config, every_n=every_n)
+        config, view, link_control = self._config, source.view, self._link_control
+        decimation = first_decimation(config, view.base_size)
+        encoder = make_encoder(config, size=view.base_size, decimation=decimation, base_bps=config.base_bps)
+        budget = make_budget(config, decimation=decimation)
         link = self._open_link(stack, source, detector.class_names)
         # Files come after all that may be refused: a failed start leaves nothing behind.
-        write_truth_of(source, config.truth, fps=config.tick_fps)
+        write_truth_of(source, config.truth, fps=config.nominal_fps)
         recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
-        sender = Sender(
+        sender = Transmitter(
             link,
             ledger=self._ledger,
             budget=budget,
@@ -152,18 +152,18 @@ class Edge:
             session_id=self._session_id,
             lockstep=self._lockstep,
             wait_until=self._wait_until,
-            pacer=following.pacer,
-            unacked=following.unacked,
+            pacer=link_control.pacer,
+            unacked=link_control.unacked,
         )
-        renewal = Renewal(
+        reconfiguration = EncoderReconfiguration(
             config,
             size=view.base_size,
-            every_n=every_n,
+            decimation=decimation,
             sender=sender,
             split=make_split(config, view.base_size),
-            pacer=following.pacer,
+            pacer=link_control.pacer,
         )
-        keep = make_keep(
+        backlog = make_backlog(
             config,
             session_id=self._session_id,
             live=source.live,
@@ -173,8 +173,8 @@ class Edge:
             clock=self._clock,
             info=lambda: self._info(source, detector.class_names, self._clock()),
         )
-        if keep is not None:
-            stack.enter_context(keep)
+        if backlog is not None:
+            stack.enter_context(backlog)
         base = BaseStage(
             encoder,
             keyframes=self._keyframes,
@@ -182,10 +182,12 @@ class Edge:
             recorder=recorder,
             first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
             plan=make_regions(config, view.base_size),
-            cadence=HeldCadence(make_cadence(config, every_n), renewal.least_every_n),
-            renew=renewal,
-            admits=following.admits,
-            keep=keep,
+            frame_skip=LimitedFrameSkip(
+                make_frame_skip(config, decimation), reconfiguration.least_decimation
+            ),
+            renew=reconfiguration,
+            admits=link_control.admits,
+            backlog=backlog,
         )
         on_demand = make_on_demand(
             config, view=view, class_names=detector.class_names, most_bytes=sender.most_still_bytes
@@ -195,23 +197,27 @@ class Edge:
             view=view,
             class_names=detector.class_names,
             most_bytes=sender.most_still_bytes(),
-            on_fate=sender.fate,
-            observe=renewal.observe,
+            on_outcome=sender.outcome,
+            observe=reconfiguration.observe,
             asked=on_demand,
-            overdue=following.overdue_stills,
+            overdue=link_control.overdue_stills,
         )
-        renewal.on_change = lambda: chooser.set_most_bytes(sender.most_still_bytes())
-        self._commands.serve(Served(on_demand, renewal, chooser, base_size=view.base_size, keep=keep))
+        reconfiguration.on_change = lambda: chooser.set_most_bytes(sender.most_still_bytes())
+        self._commands.serve(
+            Served(on_demand, reconfiguration, chooser, base_size=view.base_size, backlog=backlog)
+        )
         stills = StillStage(
-            make_sight(config, detector=detector, view=view),
+            make_analyzer(config, detector=detector, view=view),
             chooser,
             sender=sender,
             keyframes=self._keyframes,
             reporter=TrackReporter(sender, session_id=self._session_id) if config.send_tracks else None,
-            keep=keep,
+            backlog=backlog,
         )
-        following.attach(linked=link.heard, sender=sender, renewal=renewal, stills=stills, keep=keep)
-        return _Flow(base, stills, sender, link, renewal)
+        link_control.attach(
+            linked=link.heard, sender=sender, reconfiguration=reconfiguration, stills=stills, backlog=backlog
+        )
+        return _Flow(base, stills, sender, link, reconfiguration)
 
     def _open_source(self) -> Source:
         config = self._config
@@ -219,7 +225,7 @@ class Edge:
         return open_source(
             config.source,
             size=base_size(config),
-            fps=config.tick_fps,
+            fps=config.nominal_fps,
             fit=cast("Fit", config.fit),
             seed=config.seed,
             max_frames=config.max_frames,
@@ -263,13 +269,13 @@ class Edge:
                 if self._now_ns >= next_status_ns:
                     next_status_ns = self._now_ns + SECOND_NS
                     self._report(flow, line)
-                    if flow.renewal.wants_keyframe(self._now_ns):
+                    if flow.reconfiguration.wants_keyframe(self._now_ns):
                         self._keyframes.renew(self._now_ns)
         if not source.live:
-            self._following.finish(stop=self._stop, note=line.note)
+            self._link_control.finish(stop=self._stop, note=line.note)
 
     def _make_pace(self, flow: _Flow, source: Source) -> LockstepPace | RealtimePace:
-        fps = self._config.tick_fps
+        fps = self._config.nominal_fps
         if self._lockstep:
             return LockstepPace(
                 flow.base,
@@ -290,7 +296,7 @@ class Edge:
             live=source.live,
             counts=self._counts,
             stop=self._stop,
-            follow=self._following.before_frame,
+            follow=self._link_control.before_frame,
         )
 
     def _wait_until(self, at_ns: int) -> None:
@@ -303,7 +309,7 @@ class Edge:
     def _hear(self, feedback: Feedback) -> None:
         if feedback.session_id == self._session_id:
             now_ns = self._clock()
-            self._following.hear(feedback, now_ns=now_ns)
+            self._link_control.hear(feedback, now_ns=now_ns)
             # Last: who waits there for the end goes on to keep what is not acknowledged.
             self._inbox.receive(feedback, now_ns=now_ns)
 
@@ -322,7 +328,7 @@ class Edge:
 
     def _report(self, flow: _Flow, line: StatusLine) -> None:
         self._send_status("running", flow)
-        pacer, watch = self._following.pacer, self._watch
+        pacer, watch = self._link_control.pacer, self._watch
         unlinked = watch is not None and watch.trouble  # which the log has said
         heard = "a ground listens" if flow.link.heard() else "no link" if unlinked else "no ground listens"
         line.show(
@@ -333,7 +339,7 @@ class Edge:
                 stills=flow.stills,
                 now_ns=self._now_ns,
                 allowed_bps=self._commands.config.budget_bps if pacer is None else pacer.rate_bps,
-                link=f"{heard}  {self._following.text()}".rstrip(),
+                link=f"{heard}  {self._link_control.text()}".rstrip(),
             )
         )
 
@@ -350,7 +356,7 @@ class Edge:
             sequence=self._status_sequence,
             at_ns=at_ns,
             started_ns=self._started_ns,
-            fps=self._config.tick_fps,
+            fps=self._config.nominal_fps,
             ledger=self._ledger,
             counts=self._counts,
             keyframes=self._keyframes,
@@ -363,12 +369,12 @@ class Edge:
     def _say_goodbye(self, flow: _Flow) -> None:
         """Let the ground finish, then tell it that this was all."""
         sender = flow.sender
-        if self._following.keep is not None:
-            self._following.keep.send_no_more()
+        if self._link_control.backlog is not None:
+            self._link_control.backlog.send_no_more()
         self._send_status("ended", flow)
         if flow.link.heard():  # what is still in a queue would be lost with the session
             self._inbox.wait_for_end(
-                base=self._ledger.messages(Channel.BASE),
+                base=self._ledger.messages(Account.BASE),
                 roi=sender.still_sequence + 1,
                 frame_index=self._counts.last_index,
                 still_sequence=sender.still_sequence,
@@ -376,23 +382,23 @@ class Edge:
             )
 
     def _facts(self, flow: _Flow) -> EdgeRun:
-        counts, config, keep = self._counts, self._config, self._following.keep
-        kept = 0 if keep is None else keep.frames
+        counts, config, backlog = self._counts, self._config, self._link_control.backlog
+        kept = 0 if backlog is None else backlog.frames
         return EdgeRun(
             edge=config.edge_id,
             session=f"{self._session_id:016x}",
             method=self._commands.config.method,
             frames=counts.encoded - kept,
-            frames_kept=kept,
+            frames_stored=kept,
             frames_dropped=counts.dropped,
-            duration_s=self._counts.duration_s(self._config.tick_fps),
+            duration_s=self._counts.duration_s(self._config.nominal_fps),
             budget_bps=self._commands.highest_budget_bps,
-            base_bps=flow.renewal.base_bps,
+            base_bps=flow.reconfiguration.base_bps,
             keyframes=self._keyframes.sent,
             keyframe_requests=self._keyframes.requests,
             tracks=flow.stills.tracks,
             encode_ms=counts.encode_ms,
-            sight_ms=flow.stills.sight_ms,
+            perception_ms=flow.stills.perception_ms,
             unusable_messages=flow.link.unusable,
-            store=None if keep is None else keep.numbers,
+            store=None if backlog is None else backlog.numbers,
         )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
-from hvt_common.runtime.allocator import keep_to_few_heaps
+from hvt_common.runtime.allocator import limit_malloc_arenas
 from hvt_common.runtime.reporting import print_table, start_log, write_json
 from hvt_common.runtime.stopping import stop_on_signals
 from hvt_edge.app import Edge
@@ -35,7 +35,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(to_toml(config), end="")
         return 0
     config = check(config)
-    keep_to_few_heaps()
+    limit_malloc_arenas()
     release_log = start_log("hvt-edge", quiet=config.quiet)
     stop = stop_on_signals()
     content = Edge(config, stop=stop, on_started=release_log).run()

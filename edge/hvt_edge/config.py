@@ -124,7 +124,7 @@ class EdgeConfig:
     tune: tuple[str, ...] = option(
         TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True
     )
-    lend: bool = switch("stills may use what the base stream leaves unspent, never beyond --budget")
+    borrow_unused: bool = switch("stills may use what the base stream leaves unspent, never beyond --budget")
     group_stills: bool = switch("neighbours share one still where that is cheaper")
     cooldown: float = option(
         DURATION, 2.0, "least time between two stills of a track; 0 for the paper's plain methods"
@@ -188,14 +188,14 @@ class EdgeConfig:
     )
 
     preset: str = option(choice(*PRESETS), "veryfast", "x265 preset")
-    pulse: float = option(DURATION, 0.0, "a whole frame at better quality once in so long; 0 for none")
-    pulse_depth: float = option(
+    refresh: float = option(DURATION, 0.0, "a whole frame at better quality once in so long; 0 for none")
+    refresh_depth: float = option(
         number(0.01, 1), 0.15, "how much better a pulse is; 1 is the whole quantiser range"
     )
-    rolling: str = option(
+    rolling_refresh: str = option(
         TEXT, "off", "pulses of one region a frame in rotation, grid CxR, tracks first; or off"
     )
-    rolling_depth: float = option(number(0.01, 1), 0.1, "how much better that region is")
+    rolling_refresh_depth: float = option(number(0.01, 1), 0.1, "how much better that region is")
     roi_depth: float = option(
         number(0, 1), 0.0, "quantise active tracks better by so much; 0 for not, 0.1 for --method R0"
     )
@@ -261,7 +261,7 @@ class EdgeConfig:
         return round(min(self.budget_bps * self.share, self.budget_bps - self.metadata_bps))
 
     @property
-    def tick_fps(self) -> float:
+    def nominal_fps(self) -> float:
         """Frames a second that the edge looks at; with ``--fps auto`` not all of them are sent."""
         return DEFAULT_FPS if isinstance(self.fps, str) else self.fps
 
@@ -281,13 +281,13 @@ def check(config: EdgeConfig) -> EdgeConfig:
     if config.source is None:
         raise UserError("--source is missing: give a clip, an image folder, rtsp://…, /dev/video0 or demo")
     EdgeKeys(config.edge_id)
-    check_shape(size=config.fixed_size or DEFAULT_SIZE, fps=config.tick_fps)
+    check_shape(size=config.fixed_size or DEFAULT_SIZE, fps=config.nominal_fps)
     if config.regime and (config.budget is not None or config.video_share is not None):
         raise UserError(
             f"--regime {config.regime} already sets --budget and --video-share: leave one or the other out"
         )
     config = _with_rates(config)
-    if not _LEAST_WINDOW_S <= config.window <= _MOST_WINDOW_S or config.window < 2 / config.tick_fps:
+    if not _LEAST_WINDOW_S <= config.window <= _MOST_WINDOW_S or config.window < 2 / config.nominal_fps:
         raise UserError(
             f"--window {config.window:g}s is not accepted: give {_LEAST_WINDOW_S:g}s to {_MOST_WINDOW_S:g}s, and two "
             f"frames at least (shorter, and a keyframe fills more than a window)"
@@ -311,7 +311,7 @@ def check(config: EdgeConfig) -> EdgeConfig:
 
 def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:
     """Raise `UserError` where x265 cannot follow what the budget leaves to the base stream at this size."""
-    fps = LEAST_FPS if config.auto_fps else config.tick_fps
+    fps = LEAST_FPS if config.auto_fps else config.nominal_fps
     least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
     if config.base_bps < least_bps:
         raise UserError(
@@ -344,9 +344,9 @@ def _check_stills(config: EdgeConfig) -> None:
 
 
 def _check_regions(config: EdgeConfig) -> None:
-    parse_grid(config.rolling)
-    if config.pulse and config.pulse < 2 / config.tick_fps:
-        raise UserError(f"--pulse {config.pulse:g}s is shorter than two frames: give more, or 0 for none")
+    parse_grid(config.rolling_refresh)
+    if config.refresh and config.refresh < 2 / config.nominal_fps:
+        raise UserError(f"--pulse {config.refresh:g}s is shorter than two frames: give more, or 0 for none")
 
 
 def parse_grid(text: str) -> tuple[int, int] | None:

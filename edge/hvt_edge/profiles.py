@@ -23,7 +23,7 @@ PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "send_tracks": True,
                 "fps": "auto",
                 "video_share": "auto",
-                "lend": True,
+                "borrow_unused": True,
                 "group_stills": True,
                 "gate": 32.0,
                 "fidelity": 36.0,

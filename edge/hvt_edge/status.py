@@ -8,7 +8,7 @@ from hvt_common.protocol.messages import Health, Info, Status, fitted_class_name
 from hvt_common.units import bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.operating.keyframes import KeyframePlan
 from hvt_edge.stills.stage import StillStage
@@ -39,7 +39,7 @@ def make_info(
         base_size=view.base_size,
         view_scale=view.scale,
         view_offset_px=view.offset_px,
-        fps=config.tick_fps,
+        fps=config.nominal_fps,
         codec="hevc",
         pace=config.pace,
         method=config.method,
@@ -63,7 +63,7 @@ def make_status(
     ledger: Ledger,
     counts: FrameCounts,
     keyframes: KeyframePlan,
-    sender: Sender,
+    sender: Transmitter,
     stills: StillStage,
     feedback_age_ms: int,
     measured: bool,
@@ -84,17 +84,17 @@ def make_status(
         last_still_sequence=sender.still_sequence,
         base_bytes=account.base_bytes,
         roi_bytes=account.roi_bytes,
-        past_bytes=account.past_bytes,
+        backlog_bytes=account.backlog_bytes,
         meta_bytes=account.meta_bytes,
         overhead_bytes=account.overhead_bytes,
         base_messages=account.messages["base"],
         roi_messages=account.messages["roi"],
-        past_messages=account.messages["past"],
+        backlog_messages=account.messages["backlog"],
         meta_messages=account.messages["meta"],
         worst_window_bps=(worst.base, worst.roi, worst.total),
-        sent=account.fates["sent"],
-        deferred=account.fates["deferred"],
-        dropped=account.fates["dropped"],
+        sent=account.outcomes["sent"],
+        deferred=account.outcomes["deferred"],
+        dropped=account.outcomes["dropped"],
         health=Health(
             frames_captured=counts.captured,
             frames_encoded=counts.encoded,
@@ -104,7 +104,7 @@ def make_status(
             base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
             still_queue=stills.waiting,
             encode_ms=counts.encode_ms if measured else 0.0,
-            detect_ms=stills.sight_ms if measured else 0.0,
+            detect_ms=stills.perception_ms if measured else 0.0,
             feedback_age_ms=feedback_age_ms if measured else -1,
         ),
     )
@@ -122,9 +122,9 @@ def status_text(
 ) -> str:
     """The status line; ``allowed_bps`` is what the budget or the link allows now."""
     rate_bps = ledger.window_bytes(None, now_ns) * 8 * _SECOND_NS / ledger.window_ns
-    sent = sum(ledger.fates("sent").values())
+    sent = sum(ledger.outcomes("sent").values())
     return (
-        f"{config.edge_id} {counts.duration_s(config.tick_fps):6.1f} s  {bitrate_text(rate_bps)} of "
+        f"{config.edge_id} {counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "
         f"{bitrate_text(allowed_bps)}  {config.method}  stills {sent}, {stills.waiting} waiting  "
         f"tracks {stills.tracks}  {link}"
     )

@@ -33,10 +33,10 @@ class EdgeRun:
     tracks: int
     encode_ms: float
     """Mean."""
-    sight_ms: float
+    perception_ms: float
     """Mean of decoding, detection and tracking over all frames."""
     unusable_messages: int
-    frames_kept: int = 0
+    frames_stored: int = 0
     """Encoded while the link was away, and not sent at once."""
     store: StoreNumbers | None = None
     """What was kept while the link was away; None where nothing ever is."""
@@ -46,10 +46,10 @@ def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
     """The JSON summary; rates count every byte on the line: payload, attachments, transport overhead."""
     account = ledger.summary(run.duration_s)
     stills: dict[str, Any] = {
-        fate: sum(account.fates[fate].values()) for fate in ("sent", "deferred", "dropped")
+        outcome: sum(account.outcomes[outcome].values()) for outcome in ("sent", "deferred", "dropped")
     }
-    stills["reasons"] = {fate: account.fates[fate] for fate in ("sent", "deferred", "dropped")}
-    on_roi = stills["sent"] - account.fates["sent"].get("stored", 0)
+    stills["reasons"] = {outcome: account.outcomes[outcome] for outcome in ("sent", "deferred", "dropped")}
+    on_roi = stills["sent"] - account.outcomes["sent"].get("stored", 0)
     stills["mean_bytes"] = round(account.roi_bytes / on_roi) if on_roi else 0
     stills["per_minute"] = round(60 * stills["sent"] / run.duration_s, 2) if run.duration_s else 0.0
     return {
@@ -57,12 +57,12 @@ def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
         "session": run.session,
         "method": run.method,
         "frames": run.frames,
-        "frames_kept": run.frames_kept,
+        "frames_stored": run.frames_stored,
         "frames_dropped": run.frames_dropped,
         "duration_s": round(run.duration_s, 3),
         "base_bytes": account.base_bytes,
         "roi_bytes": account.roi_bytes,
-        "past_bytes": account.past_bytes,
+        "backlog_bytes": account.backlog_bytes,
         "meta_bytes": account.meta_bytes,
         "overhead_bytes": account.overhead_bytes,
         "total_bps": account.total_bps,
@@ -80,7 +80,7 @@ def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
         "keyframes": run.keyframes,
         "keyframe_requests": run.keyframe_requests,
         "encode_ms": round(run.encode_ms, 2),
-        "sight_ms": round(run.sight_ms, 2),
+        "perception_ms": round(run.perception_ms, 2),
         "unusable_messages": run.unusable_messages,
         "store": None if run.store is None else asdict(run.store),
     }

@@ -15,14 +15,14 @@ from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.values import Still, View
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.backlog.disk import Folder, check_folder, default_folder
-from hvt_edge.backlog.stage import Keep, Link
+from hvt_edge.backlog.stage import BacklogStage, Link
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, parse_grid
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings, keyframe_interval_s
-from hvt_edge.perception.analyzer import Sight, SightSettings
+from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.source.resample import BaseSize
@@ -33,10 +33,10 @@ from hvt_edge.stills.policy.base import Step
 from hvt_edge.stills.policy.registry import method, tuning
 from hvt_edge.stills.scheduler import Asked, Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Suppression
-from hvt_edge.video.frame_skip import Cadence, MeasuredCadence
+from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.least_rate import encoder_settings, least_base_bps, payload_bps
-from hvt_edge.video.quality_refresh import PulsePlan, RegionPlan, RollingPlan, TrackRegions, combined
-from hvt_edge.video.rate_model import choose_base, most_every_n
+from hvt_edge.video.quality_refresh import RefreshPlan, RegionPlan, RollingRefreshPlan, TrackRegions, combined
+from hvt_edge.video.rate_model import choose_base, most_decimation
 from hvt_edge.video.share import Split, SplitSettings
 from hvt_edge.video.x265 import BaseEncoder
 
@@ -44,19 +44,19 @@ __all__ = [
     "SECOND_NS",
     "base_size",
     "check_files",
-    "first_every_n",
+    "first_decimation",
+    "make_analyzer",
+    "make_backlog",
     "make_budget",
-    "make_cadence",
     "make_chooser",
     "make_detector",
     "make_encoder",
-    "make_keep",
+    "make_frame_skip",
     "make_keyframes",
     "make_link_settings",
     "make_on_demand",
     "make_pacer",
     "make_regions",
-    "make_sight",
     "make_split",
     "make_suppression",
     "warm_up_for",
@@ -120,16 +120,16 @@ def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
         warm_up(detector, view.base_size)
 
 
-def make_sight(config: EdgeConfig, *, detector: Detector, view: View) -> Sight:
+def make_analyzer(config: EdgeConfig, *, detector: Detector, view: View) -> Analyzer:
     """Decoder, detector and tracker of the edge's own stream."""
     settings = TrackerSettings.starting_at(
         config.confidence, camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion)
     )
-    return Sight(
+    return Analyzer(
         detector,
-        ByteTracker(settings, fps=config.tick_fps),
+        ByteTracker(settings, fps=config.nominal_fps),
         view=view,
-        settings=SightSettings(
+        settings=AnalyzerSettings(
             detect_every=config.detect_every,
             candidates=cast('Literal["decoded", "source"]', config.candidates),
         ),
@@ -150,7 +150,7 @@ def make_chooser(
     view: View,
     class_names: tuple[str, ...],
     most_bytes: int,
-    on_fate: Callable[[str, str], None],
+    on_outcome: Callable[[str, str], None],
     observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
     asked: Asked | None = None,
     overdue: Callable[[int], Sequence[tuple[Still, float]]] = lambda _now_ns: (),
@@ -164,13 +164,13 @@ def make_chooser(
         view=view,
         class_names=class_names,
         settings=ChooserSettings(
-            fps=config.tick_fps,
+            fps=config.nominal_fps,
             most_bytes=most_bytes,
             gate=Gate(psnr_y_db=config.gate),
             share=config.group_stills,
             from_source=config.candidates == "source",
         ),
-        on_fate=on_fate,
+        on_outcome=on_outcome,
         observe=observe,
         asked=asked,
         overdue=overdue,
@@ -208,7 +208,7 @@ def base_size(config: EdgeConfig) -> BaseSize:
     return lambda source_size: _chosen(config, source_size, size=None)[0]
 
 
-def first_every_n(config: EdgeConfig, size: tuple[int, int]) -> int:
+def first_decimation(config: EdgeConfig, size: tuple[int, int]) -> int:
     """Each n-th tick is coded at the start."""
     return _chosen(config, size, size=size)[1]
 
@@ -219,37 +219,37 @@ def _chosen(
     rate_bps = payload_bps(
         config.base_bps,
         size=size or min(source_size, DEFAULT_SIZE),
-        fps=config.tick_fps,
+        fps=config.nominal_fps,
         edge_id=config.edge_id,
     )
     return choose_base(
         rate_bps,
         source_size,
         size=size,
-        fps=None if config.auto_fps else config.tick_fps,
-        most_fps=config.tick_fps,
+        fps=None if config.auto_fps else config.nominal_fps,
+        most_fps=config.nominal_fps,
         least_fps=LEAST_FPS,
     )
 
 
-def make_cadence(config: EdgeConfig, every_n: int) -> Cadence:
+def make_frame_skip(config: EdgeConfig, decimation: int) -> FrameSkip:
     """Which ticks are coded."""
     if not config.auto_fps:
-        return Cadence(every_n)
-    most = most_every_n(config.tick_fps, least_fps=LEAST_FPS)
-    return MeasuredCadence(every_n, most_every_n=most, rest_ticks=round(_REST_S * config.tick_fps))
+        return FrameSkip(decimation)
+    most = most_decimation(config.nominal_fps, least_fps=LEAST_FPS)
+    return MeasuredFrameSkip(decimation, most_decimation=most, rest_ticks=round(_REST_S * config.nominal_fps))
 
 
-def make_budget(config: EdgeConfig, *, every_n: int) -> RollingBudget:
+def make_budget(config: EdgeConfig, *, decimation: int) -> RollingBudget:
     """B_tot and B_v over the rolling window."""
     return RollingBudget(
         BudgetSettings(
             total_bps=config.budget_bps,
             base_bps=config.base_bps,
-            fps=config.tick_fps / every_n,
+            fps=config.nominal_fps / decimation,
             window_ns=round(config.window * SECOND_NS),
             metadata_bps=config.metadata_bps,
-            lend=config.lend,
+            borrow_unused=config.borrow_unused,
         )
     )
 
@@ -258,7 +258,7 @@ def make_split(config: EdgeConfig, size: tuple[int, int]) -> Split | None:
     """Who moves the base's share of the budget; None where it is fixed."""
     if not isinstance(config.video_share, str):
         return None
-    fps = LEAST_FPS if config.auto_fps else config.tick_fps
+    fps = LEAST_FPS if config.auto_fps else config.nominal_fps
     return Split(
         SplitSettings(
             total_bps=config.budget_bps,
@@ -268,17 +268,17 @@ def make_split(config: EdgeConfig, size: tuple[int, int]) -> Split | None:
     )
 
 
-def make_encoder(config: EdgeConfig, *, size: tuple[int, int], every_n: int, base_bps: int) -> BaseEncoder:
+def make_encoder(config: EdgeConfig, *, size: tuple[int, int], decimation: int, base_bps: int) -> BaseEncoder:
     """x265 at the rate that the budget leaves it; with several threads only where bytes need not repeat."""
     settings = encoder_settings(
         size=size,
-        fps=config.tick_fps / every_n,
+        fps=config.nominal_fps / decimation,
         preset=config.preset,
         total_bps=config.budget_bps - config.metadata_bps,
         base_bps=base_bps,
         edge_id=config.edge_id,
-        side_data=bool(config.roi_depth or parse_grid(config.rolling)),
-        pulses=config.pulse > 0,
+        side_data=bool(config.roi_depth or parse_grid(config.rolling_refresh)),
+        refreshes=config.refresh > 0,
     )
     threads = 1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1)
     return BaseEncoder(replace(settings, threads=threads))
@@ -286,16 +286,18 @@ def make_encoder(config: EdgeConfig, *, size: tuple[int, int], every_n: int, bas
 
 def make_regions(config: EdgeConfig, size: tuple[int, int]) -> RegionPlan | None:
     """Which regions of the base get more bits; None for none."""
-    grid = parse_grid(config.rolling)
-    pulse = rolling = tracks = None
-    if config.pulse:
-        period = max(1, round(config.pulse * config.tick_fps))
-        pulse = PulsePlan(size, period_ticks=period, depth=config.pulse_depth)
+    grid = parse_grid(config.rolling_refresh)
+    refresh = rolling_refresh = tracks = None
+    if config.refresh:
+        period = max(1, round(config.refresh * config.nominal_fps))
+        refresh = RefreshPlan(size, period_ticks=period, depth=config.refresh_depth)
     if grid is not None:
-        rolling = RollingPlan(size, columns=grid[0], rows=grid[1], depth=config.rolling_depth)
+        rolling_refresh = RollingRefreshPlan(
+            size, columns=grid[0], rows=grid[1], depth=config.rolling_refresh_depth
+        )
     if config.roi_depth:
         tracks = TrackRegions(size, depth=config.roi_depth)
-    return combined(pulse, rolling, tracks)
+    return combined(refresh, rolling_refresh, tracks)
 
 
 def make_keyframes(config: EdgeConfig) -> KeyframePlan:
@@ -316,23 +318,23 @@ def make_pacer(config: EdgeConfig) -> Pacer | None:
 # Keeping
 
 
-def make_keep(
+def make_backlog(
     config: EdgeConfig,
     *,
     session_id: int,
     live: bool,
     link: Link,
-    sender: Sender,
+    sender: Transmitter,
     keyframes: KeyframePlan,
     clock: Callable[[], int],
     info: Callable[[], bytes],
-) -> Keep | None:
+) -> BacklogStage | None:
     """Who keeps what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
     if not config.store or config.pace == "lockstep":
         return None
     path = config.store_folder or default_folder(config.edge_id)
     oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
-    return Keep(
+    return BacklogStage(
         lambda: Folder(path, max_bytes=config.store, session_id=session_id, info=info, oldest_ns=oldest_ns),
         session_id=session_id,
         live=live,
@@ -340,5 +342,5 @@ def make_keep(
         sender=sender,
         keyframes=keyframes,
         clock=clock,
-        on_fate=sender.fate,
+        on_outcome=sender.outcome,
     )

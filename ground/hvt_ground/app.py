@@ -20,7 +20,7 @@ from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_common.units import bitrate_text
-from hvt_ground.backlog.recordings import PastRecording
+from hvt_ground.backlog.recordings import BacklogRecording
 from hvt_ground.config import GroundConfig
 from hvt_ground.session.receiver import EdgeReceiver
 from hvt_ground.session.session import GroundSession
@@ -30,7 +30,7 @@ from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.timing import SessionTiming, TimingTable
 from hvt_ground.sinks.tracks_table import TrackTable
 from hvt_ground.status import summary
-from hvt_ground.wiring import Models, make_past_look, make_sight, output_path, past_path
+from hvt_ground.wiring import Models, backlog_path, make_backlog_perception, make_pipeline, output_path
 
 __all__ = ["Ground"]
 
@@ -154,7 +154,7 @@ class Ground:
                 port,
                 open_session=self._open_session,
                 clock=self._clock,
-                open_past=self._open_past,
+                open_backlog=self._open_backlog,
                 patience_s=self._config.patience_s,
             )
             port.in_use = partial(_is_in_use, receiver)
@@ -196,22 +196,22 @@ class Ground:
             recording=path,
             tables=self._open_tables(info, stamp),
             timing=self._session_timing(info, receiver),
-            sight_of=lambda emit: make_sight(config, models, info=info, emit=emit),
+            pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
             to_local_ns=receiver.clock_offset.to_local_ns,
             clock=self._clock,
             report=receiver.report_now,
-            past_look=make_past_look(config, models, info=info),
+            backlog_perception=make_backlog_perception(config, models, info=info),
         )
 
-    def _open_past(self, info: Info) -> PastRecording:
+    def _open_backlog(self, info: Info) -> BacklogRecording:
         """What was kept of a session that is over; not shown live, for the viewer shows what is now."""
         config, models = self._config, self._models
         assert models is not None, "run() opens them"
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        path = past_path(config.record, edge=info.edge, stamp=stamp, taken=self._paths)
+        path = backlog_path(config.record, edge=info.edge, stamp=stamp, taken=self._paths)
         settings = replace(self._recorder_settings(info, path), clocked=False, live_url=None)
-        look = make_past_look(config, models, info=info)
-        return PastRecording(info, path=path, recorder=Recorder(settings), look=look)
+        look = make_backlog_perception(config, models, info=info)
+        return BacklogRecording(info, path=path, recorder=Recorder(settings), look=look)
 
     def _recorder_settings(self, info: Info, path: Path) -> RecorderSettings:
         config = self._config
@@ -266,13 +266,13 @@ class Ground:
             parts.append(
                 f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
                 f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}  tracks "
-                f"{session.sight.tracks}, {session.sight.refined} refined{age}"
+                f"{session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
             )
         return " | ".join(parts)
 
     def _summaries(self) -> list[dict[str, Any]]:
         return [
-            summary(session, unusable=receiver.unusable, past_recordings=receiver.past.paths)
+            summary(session, unusable=receiver.unusable, backlog_recordings=receiver.backlog.paths)
             for _, receiver in sorted(self._receivers.items())
             for session in receiver.done
         ]
@@ -280,4 +280,4 @@ class Ground:
 
 def _is_in_use(receiver: EdgeReceiver) -> bool:
     """Whether there is or was more of this edge than messages under its name."""
-    return not receiver.idle or bool(receiver.done) or bool(receiver.past.paths)
+    return not receiver.idle or bool(receiver.done) or bool(receiver.backlog.paths)

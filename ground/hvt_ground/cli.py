@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
-from hvt_common.runtime.allocator import keep_to_few_heaps
+from hvt_common.runtime.allocator import limit_malloc_arenas
 from hvt_common.runtime.reporting import print_table, say, start_log, write_json
 from hvt_common.runtime.stopping import stop_on_signals
 from hvt_ground.config import GroundConfig, check
@@ -48,7 +48,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(to_toml(config), end="")
         return 0
     config = check(config)
-    keep_to_few_heaps()
+    limit_malloc_arenas()
     release_log = start_log("hvt-ground", quiet=config.quiet)
     stop = stop_on_signals()
     sessions = Ground(config, stop=stop, on_started=release_log).run()

@@ -12,19 +12,21 @@ from hvt_ground.session.session import GroundSession
 __all__ = ["summary", "table"]
 
 
-def summary(session: GroundSession, *, unusable: int, past_recordings: Sequence[Path] = ()) -> dict[str, Any]:
+def summary(
+    session: GroundSession, *, unusable: int, backlog_recordings: Sequence[Path] = ()
+) -> dict[str, Any]:
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do.
 
-    ``unusable`` counts messages of the edge that were skipped, over all its sessions; ``past_recordings`` are of
+    ``unusable`` counts messages of the edge that were skipped, over all its sessions; ``backlog_recordings`` are of
     sessions that it kept things of, and that were over when they came.
     """
-    info, sight, counters = session.info, session.sight, session.counters
+    info, pipeline, counters = session.info, session.pipeline, session.counters
     account = session.ledger.summary(session.duration_s)
     worst = account.worst_window_bps
-    unread = sight.outcomes.get("unread", 0)
-    past = session.past
-    came = session.stills_received + past.stills
-    waiting = came - sum(sight.outcomes.values()) - sum(session.stills_dropped.values())
+    unread = pipeline.outcomes.get("unread", 0)
+    backlog = session.backlog
+    came = session.stills_received + backlog.stills
+    waiting = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
     return {
         "edge": info.edge,
         "session": f"{info.session_id:016x}",
@@ -36,7 +38,7 @@ def summary(session: GroundSession, *, unusable: int, past_recordings: Sequence[
         "duration_s": round(session.duration_s, 3),
         "base_bytes": account.base_bytes,
         "roi_bytes": account.roi_bytes,
-        "past_bytes": account.past_bytes,
+        "backlog_bytes": account.backlog_bytes,
         "meta_bytes": account.meta_bytes,
         "overhead_bytes": account.overhead_bytes,
         "total_bps": account.total_bps,
@@ -51,25 +53,25 @@ def summary(session: GroundSession, *, unusable: int, past_recordings: Sequence[
             "dropped": sum(session.stills_dropped.values()),
             "unread": unread,
             "reasons": {
-                "received": account.fates["received"],
+                "received": account.outcomes["received"],
                 "dropped": dict(session.stills_dropped),
-                "outcomes": dict(sight.outcomes),
+                "outcomes": dict(pipeline.outcomes),
             },
             "mean_bytes": round(account.roi_bytes / session.stills_received)
             if session.stills_received
             else 0,
         },
-        "past": {
-            "stills": past.stills,
-            "frames": past.frames,
-            "frames_left_out": past.left_out,
-            "video_s": round(past.video_s, 3),
-            "recordings": [str(path) for path in past_recordings],
+        "backlog": {
+            "stills": backlog.stills,
+            "frames": backlog.frames,
+            "frames_left_out": backlog.left_out,
+            "video_s": round(backlog.video_s, 3),
+            "recordings": [str(path) for path in backlog_recordings],
         },
-        "tracks": sight.tracks,
-        "tracks_refined": sight.refined,
-        "class_changes": sight.class_changes,
-        "detections_run": sight.detections_run,
+        "tracks": pipeline.tracks,
+        "tracks_refined": pipeline.refined,
+        "class_changes": pipeline.class_changes,
+        "detections_run": pipeline.detections_run,
         "gaps": counters.gaps,
         "lost": counters.lost,
         "corrupt": counters.corrupt,
@@ -112,12 +114,12 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("keyframes", f"{content['keyframe_requests']} asked for"),
     ]
-    past = content["past"]
-    if past["stills"] or past["frames"]:
+    backlog = content["backlog"]
+    if backlog["stills"] or backlog["frames"]:
         rows.append(
-            ("outages", f"{past['stills']} stills and {past['video_s']:.1f} s of video came afterwards")
+            ("outages", f"{backlog['stills']} stills and {backlog['video_s']:.1f} s of video came afterwards")
         )
-    rows += [("former session", path) for path in past["recordings"]]
+    rows += [("former session", path) for path in backlog["recordings"]]
     if latency["p50"] is not None:
         since = "receiving" if content["pace"] == "lockstep" else "capture"
         spread = f"p50 {latency['p50']:.0f} ms, p95 {latency['p95']:.0f}, max {latency['max']:.0f}"

@@ -12,16 +12,16 @@ from hvt_common.inference.detect import Detector, open_detector, warm_up
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.tracking.camera_motion import CameraMotion
-from hvt_ground.backlog.perception import PastLook
+from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
 from hvt_ground.events.camera_path import CameraPath
 from hvt_ground.events.events import Event
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
-from hvt_ground.perception.pipeline import GroundSight, SightParts
+from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.perception.stills.refine import Refiner
 
-__all__ = ["Models", "make_past_look", "make_sight", "output_path", "past_path"]
+__all__ = ["Models", "backlog_path", "make_backlog_perception", "make_pipeline", "output_path"]
 
 
 _USUAL_SIZE = (1280, 720)
@@ -41,7 +41,7 @@ class Models:
         """By edge, what the session that is open has."""
 
     def take(self, edge: str | None = None) -> _Set:
-        """A detector, and a classifier where one is wanted, that no other session uses; ``edge`` may `lend` them."""
+        """A detector, and a classifier where one is wanted, that no other session uses."""
         try:
             taken = self._ready.pop()
         except IndexError:
@@ -59,7 +59,7 @@ class Models:
             self._ready.append((detector, classifier))
 
     @contextmanager
-    def lend(self, edge: str) -> Iterator[_Set]:
+    def checkout(self, edge: str) -> Iterator[_Set]:
         """What the open session of an edge has, for something else that is done in the thread that sees for it.
 
         Only a motion detector is a new one: it keeps what it saw, and opening it costs nothing.
@@ -76,9 +76,9 @@ class Models:
         else:
             yield serving
 
-    def lender(self, edge: str) -> EdgeLender:
+    def pool(self, edge: str) -> ModelPool:
         """The same, for one edge."""
-        return EdgeLender(self, edge)
+        return ModelPool(self, edge)
 
     def _open_detector(self) -> Detector:
         config = self._config
@@ -102,28 +102,28 @@ class Models:
         )
 
 
-class EdgeLender:
+class ModelPool:
     """Lends what serves one edge. For the thread that sees."""
 
     def __init__(self, models: Models, edge: str) -> None:
         self._models = models
         self._edge = edge
 
-    def borrow(self) -> AbstractContextManager[_Set]:
-        """See `Models.lend`."""
-        return self._models.lend(self._edge)
+    def checkout(self) -> AbstractContextManager[_Set]:
+        """See `Models.checkout`."""
+        return self._models.checkout(self._edge)
 
 
-def make_sight(
+def make_pipeline(
     config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]
-) -> GroundSight:
+) -> Pipeline:
     """The eyes of one session."""
     detector, classifier = models.take(info.edge)
     reader = _reader(config, detector, classifier, info=info)
     motion = cast('Literal["off", "flow", "ecc"]', config.camera_motion)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
     path = CameraPath(ahead_ticks=max(1, round(info.fps)))
-    parts = SightParts(
+    parts = PipelineParts(
         detector=detector,
         tracker=_tracker(config, info),
         reader=reader,
@@ -138,7 +138,7 @@ def make_sight(
         camera=None if motion == "off" else CameraMotion(motion, scale=None),
         release=lambda: models.give_back(detector, classifier),
     )
-    return GroundSight(
+    return Pipeline(
         parts,
         view=info.view,
         fps=info.fps,
@@ -148,11 +148,11 @@ def make_sight(
     )
 
 
-def make_past_look(config: GroundConfig, models: Models, *, info: Info) -> PastLook:
+def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info) -> BacklogPerception:
     """What looks at what was kept of a session."""
-    return PastLook(
+    return BacklogPerception(
         info,
-        models=models.lender(info.edge),
+        models=models.pool(info.edge),
         tracker_of=lambda: _tracker(config, info),
         reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
         detect_every=config.detect_every,
@@ -198,15 +198,15 @@ def output_path(wish: Path | None, *, suffix: str, edge: str, stamp: str, taken:
     return path
 
 
-def past_path(wish: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
+def backlog_path(wish: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
     """Where goes what was kept of a session that is over, beside the recording of the one that is open.
 
     Never over another file: its edge has forgotten what is in there.
     """
     if wish is not None and wish.suffix == ".rrd" and not wish.is_dir():
-        first = wish.with_name(f"{wish.stem}-{edge}-past.rrd")
+        first = wish.with_name(f"{wish.stem}-{edge}-backlog.rrd")
     else:
-        first = (wish or Path()) / f"hvt-{edge}-{stamp}-past.rrd"
+        first = (wish or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"
     count, path = 1, first
     while path in taken or path.exists():
         count += 1

@@ -124,7 +124,7 @@ def _run_worker(name: str, *, runs: int, folder: Path, seed: int) -> Path:
     command = [sys.executable, "-m", "lab.fuzz.worker", name, "--runs", str(runs)]
     command += ["--folder", str(folder), "--seed", str(seed)]
     root = Path(__file__).parents[2]
-    path = os.pathsep.join([str(root), str(root / "tests" / "support")])
+    path = os.pathsep.join([str(root), str(root / "tests" / "support"), *sys.path])
     with log.open("wb") as out:
         # What libjpeg has to say of each picture goes with it: a log of some megabytes at most.
         subprocess.run(

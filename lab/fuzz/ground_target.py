@@ -9,7 +9,7 @@ from random import Random
 from typing import NamedTuple
 from unittest.mock import patch
 
-from flight import SIZE, Flight, Port, sight_of
+from flight import SIZE, Flight, Port, pipeline_of
 from hvt_common.protocol.messages import Info, TrackStepEncoder
 from hvt_common.transport.inbox import Received
 from hvt_ground.session.receiver import EdgeReceiver
@@ -22,8 +22,8 @@ from lab.fuzz.scratch import scratch
 
 __all__ = ["TARGETS"]
 
-_ROWS = ("base", "roi", "tracks", "status", "past")
-_ATTACHED = ("base", "roi", "past")
+_ROWS = ("base", "roi", "tracks", "status", "backlog")
+_ATTACHED = ("base", "roi", "backlog")
 _PACES = ("realtime", "lockstep")
 _HEARD = 2
 """So many access units come unharmed before the rest."""
@@ -88,7 +88,7 @@ def _opened(info: Info, receiver: EdgeReceiver) -> GroundSession:
         info,
         recorder=Recorder(settings),
         recording=settings.path,
-        sight_of=sight_of,
+        pipeline_of=pipeline_of,
         to_local_ns=receiver.clock_offset.to_local_ns,
         clock=time.time_ns,
         report=receiver.report_now,

@@ -13,6 +13,9 @@ import messages
 from flight import tracks_at
 from hvt_common.protocol.channels import parse_key
 from hvt_common.protocol.messages import (
+    BacklogHeader,
+    BacklogStill,
+    BacklogUnit,
     BaseHeader,
     ControlAnswer,
     ControlRequest,
@@ -20,19 +23,16 @@ from hvt_common.protocol.messages import (
     Flags,
     Info,
     Message,
-    PastHeader,
-    PastStill,
-    PastUnit,
     RoiHeader,
     Status,
     TrackStep,
     TrackStepDecoder,
     TrackStepEncoder,
     WireError,
-    pack_past_still,
-    pack_past_units,
-    parse_past_still,
-    parse_past_units,
+    pack_backlog_still,
+    pack_backlog_units,
+    parse_backlog_still,
+    parse_backlog_units,
 )
 from lab.fuzz.contract import Target
 from lab.fuzz.mutate import Bytes, each_part, plain, resealed, sealed_values
@@ -49,11 +49,11 @@ REQUESTS = tuple(
         ("keyframe", {}),
         ("still", {"track": 5, "at_ms": -500, "quality": 80}),
         ("still", {"x": 100, "y": 80, "w": 64.0, "h": 48, "frame": 3}),
-        ("still-fate", {"ask": 1}),
+        ("still-outcome", {"ask": 1}),
         ("tracks", {}),
         ("set-budget", {"bps": 500_000}),
         ("set-method", {"method": "M5"}),
-        ("send-past", {}),
+        ("send-backlog", {}),
     )
 )
 
@@ -63,7 +63,7 @@ def feedback(**changes: object) -> Feedback:
     return replace(messages.FEEDBACK, **changes)  # type: ignore[arg-type]
 
 
-_UNITS = tuple(PastUnit(n, _NOW + n * 66_666_667, n == 0, bytes([n]) * (20 + n)) for n in range(6))
+_UNITS = tuple(BacklogUnit(n, _NOW + n * 66_666_667, n == 0, bytes([n]) * (20 + n)) for n in range(6))
 
 
 def _parsed(message: type[Message]) -> Callable[[bytes], None]:
@@ -135,18 +135,18 @@ def _step_seeds() -> list[bytes]:
     return seeds
 
 
-def _past_still(data: bytes) -> None:
+def _backlog_still(data: bytes) -> None:
     with contextlib.suppress(WireError):
-        still = parse_past_still(data)
-        assert parse_past_still(pack_past_still(still)) == still
+        still = parse_backlog_still(data)
+        assert parse_backlog_still(pack_backlog_still(still)) == still
         with contextlib.suppress(WireError):
             RoiHeader.parse(still.attachment, still.payload)
 
 
-def _past_units(data: bytes) -> None:
+def _backlog_units(data: bytes) -> None:
     with contextlib.suppress(WireError):
-        units = parse_past_units(data)
-        assert parse_past_units(pack_past_units(units)) == units
+        units = parse_backlog_units(data)
+        assert parse_backlog_units(pack_backlog_units(units)) == units
 
 
 def _key(data: bytes) -> None:
@@ -178,20 +178,20 @@ def _streamed(name: str, message: type[Message], seed: Message) -> Target:
     )
 
 
-def _past_still_seeds() -> list[bytes]:
+def _backlog_still_seeds() -> list[bytes]:
     payload = plain(Random(1))(b"\xff\xd8\xff" + bytes(40))
-    return [pack_past_still(PastStill(ROI.pack(payload), "image/jpeg", payload))]
+    return [pack_backlog_still(BacklogStill(ROI.pack(payload), "image/jpeg", payload))]
 
 
 TARGETS = (
     _streamed("base-header", BaseHeader, messages.BASE),
     _streamed("roi-header", RoiHeader, ROI),
-    _streamed("past-header", PastHeader, messages.PAST),
+    _streamed("backlog-header", BacklogHeader, messages.BACKLOG),
     _message("status", Status, [messages.STATUS]),
     _message("info", Info, [messages.INFO]),
     _message("control-request", ControlRequest, REQUESTS),
     _message("control-answer", ControlAnswer, [messages.ANSWER]),
-    _message("feedback", Feedback, [feedback(), feedback(stills=(), past=(), missing_stills=())]),
+    _message("feedback", Feedback, [feedback(), feedback(stills=(), backlog=(), missing_stills=())]),
     Target(
         "track-steps",
         _track_steps,
@@ -201,9 +201,12 @@ TARGETS = (
         short=250,
         most_bytes=6000,
     ),
-    Target("past-still", _past_still, _past_still_seeds, share=40),
+    Target("backlog-still", _backlog_still, _backlog_still_seeds, share=40),
     Target(
-        "past-units", _past_units, lambda: [pack_past_units(_UNITS), pack_past_units(_UNITS[:1])], share=40
+        "backlog-units",
+        _backlog_units,
+        lambda: [pack_backlog_units(_UNITS), pack_backlog_units(_UNITS[:1])],
+        share=40,
     ),
     Target("key", _key, lambda: [b"hvt/uav-1/base", b"hvt/a/alive", b"hvt//roi"], share=30, most_bytes=256),
 )

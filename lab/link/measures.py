@@ -23,7 +23,7 @@ _RESOURCES: Mapping[str, Callable[[Sample], float]] = {
     "descriptors": lambda sample: sample.descriptors,
     "threads": lambda sample: sample.threads,
 }
-KINDS = ("base", "roi", "tracks", "past-still", "past-base", "past-info")
+KINDS = ("base", "roi", "tracks", "backlog-still", "backlog-base", "backlog-info")
 """Of messages that the budget is for."""
 KEPT_FROM = 2**31
 """Number of the first still that was not sent but kept (`hvt_edge.stills.scheduler`)."""
@@ -55,7 +55,7 @@ _STORE = ("stills", "video_s", "evicted_stills", "evicted_segments", "unreadable
 _LIVE_S = 1.0
 """A picture that is older than this when it comes is not live."""
 _RATE_WINDOW_S = 2.0
-_ACCOUNTS = ("base_bytes", "roi_bytes", "past_bytes", "meta_bytes", "overhead_bytes")
+_ACCOUNTS = ("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes")
 _LEAST_WARM_S = 40.0
 _LEAST_SLOPE_S = 120.0
 _LEAST_SOAK_S = 1800.0
@@ -160,9 +160,13 @@ def _delays(outcome: Outcome) -> dict[str, float | None]:
 def _frame_floor_s(outcome: Outcome) -> float | None:
     """The 95th percentile of one frame alone on the link: encoded as fast as this edge does, sent, carried."""
     frames, state = outcome.frames, outcome.script.at(0)
-    carried = _percentile([8 * one.line_bytes / state.rate_bps for one in frames], 95)
+    wire_field = _percentile([8 * one.line_bytes / state.rate_bps for one in frames], 95)
     encoded = _percentile([one.send_s - one.capture_s for one in frames], 5)
-    return None if carried is None or encoded is None else encoded + carried + state.delay_s + state.jitter_s
+    return (
+        None
+        if wire_field is None or encoded is None
+        else encoded + wire_field + state.delay_s + state.jitter_s
+    )
 
 
 def _still_floor_s(
@@ -263,8 +267,8 @@ def _accounts(outcome: Outcome) -> dict[str, float | int | None]:
     }
     if any(store.values()):
         found |= {
-            "stills that came afterwards": ground["past"]["stills"],
-            "video that came afterwards, s": ground["past"]["video_s"],
+            "stills that came afterwards": ground["backlog"]["stills"],
+            "video that came afterwards, s": ground["backlog"]["video_s"],
             "stills still kept at the end": store["stills"],
             "video still kept at the end, s": store["video_s"],
             "given up by the store": given_up + store["evicted_segments"],
@@ -275,7 +279,7 @@ def _accounts(outcome: Outcome) -> dict[str, float | int | None]:
 def _stills_lost(outcome: Outcome) -> int:
     """Numbers that are nowhere: stills that are sent count from 0, those that are kept from `KEPT_FROM`."""
     came = {one.sequence for one in outcome.arrivals if one.kind == "roi"}
-    came |= {one.sequence for one in outcome.arrivals if one.kind == "past-still" and one.shown}
+    came |= {one.sequence for one in outcome.arrivals if one.kind == "backlog-still" and one.shown}
     have = came | outcome.kept.stills
     lost = 0
     for first, end in ((0, KEPT_FROM), (KEPT_FROM, 2**32)):

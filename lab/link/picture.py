@@ -65,10 +65,10 @@ def _rates(axes: Axes, outcome: Outcome) -> None:
     """The link's rate, and what was sent in each second, of all that came."""
     script, at_s = outcome.script, np.linspace(0, outcome.script.lasts_s, _SAMPLES)
     states = [script.at(float(t_s)) for t_s in at_s]
-    carried = [0.0 if one.dark or one.loss >= 1 else one.rate_bps * (1 - one.loss) / 1e3 for one in states]
-    axes.plot(at_s, carried, color=_LINK, lw=1, drawstyle="steps-post", label="link carries")
+    wire_field = [0.0 if one.dark or one.loss >= 1 else one.rate_bps * (1 - one.loss) / 1e3 for one in states]
+    axes.plot(at_s, wire_field, color=_LINK, lw=1, drawstyle="steps-post", label="link carries")
     sent = rate_over_time(outcome, of=lambda one: one.send_s)
-    stills = rate_over_time(outcome, of=lambda one: one.send_s, kinds=("roi", "past-still"))
+    stills = rate_over_time(outcome, of=lambda one: one.send_s, kinds=("roi", "backlog-still"))
     at_s = np.arange(len(sent) + 1)
     axes.stairs(np.array(sent) / 1e3, at_s, color=_BASE, lw=1.4, label="sent")
     axes.stairs(np.array(stills) / 1e3, at_s, color=_STILLS, lw=1, ls="--", label="of it stills")

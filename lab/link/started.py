@@ -63,7 +63,7 @@ def _summed(summaries: list[dict[str, Any]]) -> dict[str, Any] | None:
         for name, value in summaries[0].items()
         if isinstance(value, int | float)
     }
-    parts = {"stills": ("received",), "past": ("stills", "frames", "video_s")}
+    parts = {"stills": ("received",), "backlog": ("stills", "frames", "video_s")}
     return counts | {
         part: {name: sum(one[part][name] for one in summaries) for name in names}
         for part, names in parts.items()

@@ -7,7 +7,7 @@ import secrets
 from dataclasses import dataclass
 from pathlib import Path
 
-from hvt_common.protocol.messages import PastKind
+from hvt_common.protocol.messages import BacklogKind
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.segment import DamagedError, last_ns, read_segment
 
@@ -38,12 +38,12 @@ def store_left(path: Path, *, frame_s: float = 0.1) -> StoreLeft:
     with Folder(path, max_bytes=10**9, session_id=session_id, info=lambda: b"") as folder:
         entries = [*folder.best_stills(), *folder.newest_segments()]
         missing = {
-            one.path: _missing_s(one.path, frame_s=frame_s) for one in entries if one.kind is PastKind.BASE
+            one.path: _missing_s(one.path, frame_s=frame_s) for one in entries if one.kind is BacklogKind.BASE
         }
         unreadable = sum(
             folder.read(one) is None and missing.get(one.path, math.inf) > _BUFFERED_S for one in entries
         )
-    stills = frozenset(one.number for one in entries if one.kind is PastKind.STILL)
+    stills = frozenset(one.number for one in entries if one.kind is BacklogKind.STILL)
     return StoreLeft(len(entries), unreadable, max(missing.values(), default=0.0), stills)
 
 

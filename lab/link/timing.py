@@ -14,7 +14,7 @@ class Arrival:
     """One message as the ground got it. Times are Unix seconds; edge and ground share this machine's clock."""
 
     kind: str
-    """base, roi, tracks, status, past-still, past-base or past-info."""
+    """base, roi, tracks, status, backlog-still, backlog-base or backlog-info."""
     sequence: int
     frame_index: int
     capture_s: float

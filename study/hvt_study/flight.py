@@ -1,6 +1,6 @@
 """A whole flight in one process: the very edge and ground that fly, a simulated serial link between them, no clock.
 
-The edge is `hvt_edge.app.Edge` with its borders replaced: where frames come from (`TickSource`), where messages go
+The edge is `hvt_edge.app.Edge` with its borders replaced: where frames come from (`FrameSource`), where messages go
 (`SerialLink`), and when feedback comes back. The ground is `GroundSession`. Media time is the only
 time: a message acts at the ground when the link has delivered it and not before, and what the ground says of a still
 is heard at the edge as much later as that still took to cross. The same input gives the same flight, always.
@@ -25,7 +25,7 @@ import numpy as np
 
 from hvt_common.inference.detect import MOTION, Detector
 from hvt_common.inference.tiles import tiled
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import LedgerSummary, overhead_bytes
 from hvt_common.protocol.messages import BaseHeader, Info, RoiHeader, Status, StillResult, TrackStep
 from hvt_common.runtime.clock import SteadyClock
@@ -41,10 +41,10 @@ from hvt_edge.wiring import base_size
 from hvt_ground.config import GroundConfig
 from hvt_ground.wiring import Models
 from hvt_study.cached_detector import CachedDetector
+from hvt_study.compare_clip import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flight_ground import GroundSide, InlineExecutor
 from hvt_study.list_score import Listed
 from hvt_study.serial_link import LinkReport, SerialLink
-from hvt_study.sight_clip import TICK_FPS, Clip, TickSource
 
 __all__ = ["FlightPlan", "FlightReport", "coded_ticks", "fly", "weigh"]
 
@@ -91,7 +91,7 @@ class FlightReport:
     @property
     def duration_s(self) -> float:
         """Media time."""
-        return len(self.lists) / TICK_FPS
+        return len(self.lists) / NOMINAL_FPS
 
     def bps(self, *rows: str) -> int:
         """Line bits a second of these rows; of everything where none is named."""
@@ -101,8 +101,8 @@ class FlightReport:
 
 def coded_ticks(ticks: int, fps: float) -> frozenset[int]:
     """Which ticks a fixed frame rate codes: the first at or after each instant ``k / fps``."""
-    count = math.ceil(ticks * fps / TICK_FPS)
-    return frozenset(tick for k in range(count) if (tick := math.ceil(k * TICK_FPS / fps)) < ticks)
+    count = math.ceil(ticks * fps / NOMINAL_FPS)
+    return frozenset(tick for k in range(count) if (tick := math.ceil(k * NOMINAL_FPS / fps)) < ticks)
 
 
 def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport:
@@ -130,7 +130,7 @@ def weigh(plan: FlightPlan, *, detector: Detector) -> float:
     """
     edge = _Scales(plan, detector=detector)
     edge.run()
-    return edge.line_bytes * 8 / (plan.clip.ticks / TICK_FPS)
+    return edge.line_bytes * 8 / (plan.clip.ticks / NOMINAL_FPS)
 
 
 class _MediaClock(SteadyClock):
@@ -179,7 +179,9 @@ class _Outlet:
     def heard(self) -> bool:
         return True
 
-    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+    def put(
+        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
         """Hand over one message at the time that it says itself."""
         attached = attachment or b""
         key = self._keys.key(row)
@@ -190,30 +192,30 @@ class _Outlet:
         )
         self.line_bytes[row] += size_bytes
         self.messages[row] += 1
-        if row is not Row.STATUS:  # it counts what the machine did
+        if row is not Channel.STATUS:  # it counts what the machine did
             self._digest.update(payload)
         self._link.put(
             Received(key, payload, attached, encoding, 0),
             size_bytes=size_bytes,
             enter_ns=self._enter_ns(row, payload, attached),
-            urgent=row is Row.BASE,
+            urgent=row is Channel.BASE,
         )
 
     @property
     def digest(self) -> str:
         return self._digest.hexdigest()
 
-    def _enter_ns(self, row: Row, payload: bytes, attachment: bytes) -> int:
-        if row is Row.BASE:
+    def _enter_ns(self, row: Channel, payload: bytes, attachment: bytes) -> int:
+        if row is Channel.BASE:
             header = BaseHeader.parse(attachment, payload)
             self.last_frame = header.frame_index
             self.max_frame_bytes = max(self.max_frame_bytes, len(payload))
             return header.send_ns
-        if row is Row.ROI:
+        if row is Channel.ROI:
             return RoiHeader.parse(attachment, payload).send_ns
-        if row is Row.TRACKS:
+        if row is Channel.TRACKS:
             return TrackStep.parse(payload).send_ns
-        assert row is Row.STATUS, f"the edge sends no {row}"
+        assert row is Channel.STATUS, f"the edge sends no {row}"
         return Status.parse(payload).send_ns
 
 
@@ -224,7 +226,7 @@ class _Pace(LockstepPace):
         self, *stages: Any, inbox: _Inbox, ground: GroundSide, outlet: _Outlet, **named: Any
     ) -> None:
         super().__init__(*stages, inbox=inbox, **named)
-        self._eyes = InlineExecutor()
+        self._worker = InlineExecutor()
         self._feedback, self._ground, self._outlet = inbox, ground, outlet
         self._next_tick = 0
         self.cpu_s = 0.0
@@ -245,7 +247,7 @@ class _Pace(LockstepPace):
     def pass_over(self, until_tick: int) -> None:
         """The source did not give the ticks before this one."""
         for tick in range(self._next_tick, until_tick):
-            self._ground.pass_over(tick, capture_ns=_START_NS + round(tick * _SECOND_NS / TICK_FPS))
+            self._ground.pass_over(tick, capture_ns=_START_NS + round(tick * _SECOND_NS / NOMINAL_FPS))
         self._next_tick = max(self._next_tick, until_tick)
 
 
@@ -270,7 +272,7 @@ class _Edge(Edge):
         assert pace is not None, "run() makes it"
         return FlightReport(
             lists=tuple(self.ground.lists[tick] for tick in range(ticks)),
-            account=self._ledger.summary(ticks / TICK_FPS),
+            account=self._ledger.summary(ticks / NOMINAL_FPS),
             line_bytes=dict(outlet.line_bytes),
             messages=dict(outlet.messages),
             max_frame_bytes=outlet.max_frame_bytes,
@@ -286,18 +288,18 @@ class _Edge(Edge):
         own = tiled(self._detector, config.tiles) if config.candidates == "source" else self._detector
         return super()._make_flow(stack, source, own)
 
-    def _open_source(self) -> TickSource:
+    def _open_source(self) -> FrameSource:
         config, clip = self._plan.edge, self._plan.clip
         # With --fps auto the edge sees every tick, and leaves out by itself what it does not code.
-        fps = TICK_FPS if isinstance(config.fps, str) else config.fps
+        fps = NOMINAL_FPS if isinstance(config.fps, str) else config.fps
         resizer = Resizer(clip.source_size, base_size(config), fit=cast("Fit", config.fit))
-        return TickSource(clip, resizer, ticks=coded_ticks(clip.ticks, fps))
+        return FrameSource(clip, resizer, ticks=coded_ticks(clip.ticks, fps))
 
     def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> Any:  # noqa: ARG002
         link: SerialLink[Received] = SerialLink(rate_bps=self._plan.link_bps)
         info = Info.parse(self._info(source, class_names, _START_NS))
         self._outlet = _Outlet(link, edge_id=self._config.edge_id)
-        self.ground = self._make_ground(replace(info, fps=TICK_FPS, started_ns=_START_NS), link)
+        self.ground = self._make_ground(replace(info, fps=NOMINAL_FPS, started_ns=_START_NS), link)
         return self._outlet
 
     def _make_ground(self, info: Info, link: SerialLink[Received]) -> GroundSide:
@@ -315,7 +317,7 @@ class _Edge(Edge):
             ground=self.ground,
             outlet=self._outlet,
             keyframes=self._keyframes,
-            fps=TICK_FPS,  # frame indices count ticks
+            fps=NOMINAL_FPS,  # frame indices count ticks
             counts=self._counts,
             heard=self._outlet.heard,
             stop=self._stop,
@@ -330,7 +332,7 @@ class _Edge(Edge):
     def _picture_age_p95_ms(self) -> float:
         """Over the ticks from the first picture on."""
         shown = np.array(self.ground.shown_ns, np.int64).reshape(-1, 2)
-        at_ns = _START_NS + np.round(np.arange(self._plan.clip.ticks) * _SECOND_NS / TICK_FPS).astype(
+        at_ns = _START_NS + np.round(np.arange(self._plan.clip.ticks) * _SECOND_NS / NOMINAL_FPS).astype(
             np.int64
         )
         at_ns = at_ns[at_ns >= shown[0, 0]]

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
-from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row, parse_key
+from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys, parse_key
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.protocol.messages import (
     MAX_STILL_RESULTS,
@@ -26,12 +26,12 @@ from hvt_common.values import Tracks
 from hvt_ground.config import GroundConfig
 from hvt_ground.events.events import Event, Overlay, Refinement
 from hvt_ground.perception.pipeline import Picture, ReceivedStill
-from hvt_ground.perception.worker import LockstepEyes, Read, See, Step
+from hvt_ground.perception.worker import LockstepWorker, Read, See, Step
 from hvt_ground.session.session import GroundSession
-from hvt_ground.wiring import Models, make_sight
+from hvt_ground.wiring import Models, make_pipeline
 from hvt_study.flight_record import FlightRecord, Watch
 from hvt_study.metrics.contract import FrameView
-from hvt_study.metrics.seen import SeenTick
+from hvt_study.metrics.seen import ObservedFrame
 from hvt_study.serial_link import Arrival, SerialLink
 
 __all__ = ["GroundSide", "InlineExecutor", "SharedModels"]
@@ -68,7 +68,7 @@ class SharedModels(Models):
         """They were never away."""
 
 
-class _Eyes(LockstepEyes):
+class _Worker(LockstepWorker):
     """Sees at once; stills that come within one tick are read together, as in real time."""
 
     def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
@@ -101,8 +101,8 @@ class _Session(GroundSession):
 
     def __init__(self, info: Info, **named: Any) -> None:
         super().__init__(info, recorder=None, recording=None, **named)
-        self._inline = _Eyes(self._see, self._step, self._read, name=info.edge)
-        self._eyes = self._inline
+        self._inline = _Worker(self._see, self._step, self._read, name=info.edge)
+        self._worker = self._inline
 
     def read_stills(self) -> None:
         """Read those that have come since the last picture."""
@@ -126,24 +126,24 @@ class GroundSide:
         shared = SharedModels(detector, classifier)
         self._session = _Session(
             info,
-            sight_of=lambda emit: make_sight(config, shared, info=info, emit=self._heard_by(emit)),
+            pipeline_of=lambda emit: make_pipeline(config, shared, info=info, emit=self._heard_by(emit)),
             to_local_ns=lambda at_ns: at_ns,
             clock=lambda: self._now_ns,
             report=lambda: None,
         )
-        self._watch = Watch(self._session.sight)
+        self._watch = Watch(self._session.pipeline)
         self._record = FlightRecord(
             info.view,
             started_ns=info.started_ns,
             classes=len(detector.class_names),
             classifier=classifier,
         )
-        self._newest = SeenTick()
+        self._newest = ObservedFrame()
         self._decoded = False
         self._behind_ns = 0
         """By how much the newest picture came after its capture."""
         self._uncoded: deque[tuple[int, int]] = deque()
-        self.lists: dict[int, SeenTick] = {}
+        self.lists: dict[int, ObservedFrame] = {}
         """By tick."""
         self.results: deque[tuple[int, StillResult]] = deque()
         """What the edge is to hear, with the time at which it does."""
@@ -186,15 +186,15 @@ class GroundSide:
         """As `hvt_ground.session.receiver` hands on what is whole and in order."""
         item = arrival.message
         row = (parse_key(item.key) or ("", None))[1]
-        if row is Row.BASE:
+        if row is Channel.BASE:
             self._picture(BaseHeader.parse(item.attachment, item.payload), arrival)
-        elif row is Row.ROI:
+        elif row is Channel.ROI:
             header = RoiHeader.parse(item.attachment, item.payload)
             self._record.still(header, arrival)
             self._session.still(header, item, media_type=item.encoding)
-        elif row is Row.TRACKS:
+        elif row is Channel.TRACKS:
             self._session.tracks(TrackStep.parse(item.payload), item)
-        elif row is Row.STATUS:
+        elif row is Channel.STATUS:
             self._session.status(Status.parse(item.payload), item)
 
     def _answer(self, last: Arrival[Received]) -> None:
@@ -229,9 +229,9 @@ class GroundSide:
             clock_offset_ns=0,
             clock_error_ns=0,
             stills=results,
-            past=(),
+            backlog=(),
         ).pack()
-        key, encoding = EdgeKeys(self._info.edge).key(Row.FEEDBACK), DELIVERIES[Row.FEEDBACK].encoding
+        key, encoding = EdgeKeys(self._info.edge).key(Channel.FEEDBACK), DELIVERIES[Channel.FEEDBACK].encoding
         return len(payload) + overhead_bytes(len(payload), 0, key=key, encoding=encoding)
 
     def _picture(self, header: BaseHeader, arrival: Arrival[Received]) -> None:
@@ -261,7 +261,7 @@ class GroundSide:
     def _take_list(self, tick: int, *, at_ns: int) -> None:
         """What an operator is shown at a tick of which no picture comes."""
         if self._decoded:
-            self._note(self._session.sight.list_at(tick))
+            self._note(self._session.pipeline.list_at(tick))
         self._put_down(tick, at_ns=at_ns)
 
     def _put_down(self, tick: int, *, at_ns: int, detections: FrameView | None = None) -> None:

@@ -19,12 +19,12 @@ from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View
 from hvt_ground.events.events import Overlay, Refinement
-from hvt_ground.perception.pipeline import GroundSight
+from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.stills.classify import Decoded, object_crops
 from hvt_ground.perception.stills.refine import Refiner, Shown
 from hvt_study.metrics.contract import NO_ID, FrameView
 from hvt_study.metrics.proxy import score_entropy_nats
-from hvt_study.metrics.seen import SeenTick
+from hvt_study.metrics.seen import ObservedFrame
 from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival
 from hvt_study.serial_link import Arrival
 
@@ -37,12 +37,12 @@ _SAME_OBJECT_IOU = 0.4
 class Watch:
     """Between a ground's eyes and two of their parts."""
 
-    def __init__(self, sight: GroundSight) -> None:
-        parts = sight._parts  # noqa: SLF001 - events say neither raw detections nor confidences without refinement
+    def __init__(self, pipeline: Pipeline) -> None:
+        parts = pipeline._parts  # noqa: SLF001 - events say neither raw detections nor confidences without refinement
         self._detector = _WatchedDetector(parts.detector)
         self._refiner = _WatchedRefiner(parts.refiner)
         refiner = cast("Refiner[Any]", self._refiner)
-        sight._parts = replace(parts, detector=self._detector, refiner=refiner)  # noqa: SLF001
+        pipeline._parts = replace(parts, detector=self._detector, refiner=refiner)  # noqa: SLF001
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -172,10 +172,10 @@ class FlightRecord:
 
     # What is listed
 
-    def listed(self, overlay: Overlay, tracks: Tracks) -> SeenTick:
+    def listed(self, overlay: Overlay, tracks: Tracks) -> ObservedFrame:
         """A list, with the same tracks before refinement."""
         assert np.array_equal(overlay.track_ids, tracks.ids), "both are of the same list"
-        return SeenTick(
+        return ObservedFrame(
             self._inside(overlay.boxes_base_px),
             overlay.classes,
             ids=overlay.track_ids,
@@ -193,12 +193,12 @@ class FlightRecord:
 
     def complete(
         self,
-        seen: SeenTick,
+        seen: ObservedFrame,
         *,
-        lists: Mapping[int, SeenTick],
+        lists: Mapping[int, ObservedFrame],
         at_ns: int | None = None,
         detections: FrameView | None = None,
-    ) -> SeenTick:
+    ) -> ObservedFrame:
         """The list with everything that came since the last one was completed; ``lists`` are those before it.
 
         ``at_ns`` is when somebody can look at it; None: as it was.
@@ -230,7 +230,7 @@ class FlightRecord:
         base, still = self._classifier.classify(crops)
         return _opinion(base), _opinion(still)
 
-    def _with_opinions(self, one: _Pending, lists: Mapping[int, SeenTick]) -> RefinedObject:
+    def _with_opinions(self, one: _Pending, lists: Mapping[int, ObservedFrame]) -> RefinedObject:
         read = self._answers.pop((one.done.still_sequence, one.edge_track_id), None)
         if self._classifier is not None:
             return one.done

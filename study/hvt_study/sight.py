@@ -22,13 +22,13 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import same_kind
 from hvt_common.inference.detect import MOTION
 from hvt_common.inference.store import resolve_model
+from hvt_study.compare_clip import NOMINAL_FPS, clip_name, share_clip
+from hvt_study.compare_methods import MethodRow
+from hvt_study.compare_worker import Job, Refused, RunContext, class_names, fly_job, label_job, prepare
 from hvt_study.flight import FlightReport
 from hvt_study.list_score import Listed, ListScore, score_lists
-from hvt_study.sight_clip import TICK_FPS, clip_name, share_clip
-from hvt_study.sight_methods import MethodRow
-from hvt_study.sight_worker import Job, Refused, Workshop, class_names, fly_job, label_job, prepare
 
-__all__ = ["Missing", "SightPlan", "SightResult", "SightRow", "compare"]
+__all__ = ["ComparePlan", "CompareResult", "CompareRow", "Missing", "compare"]
 
 Labels = Literal["auto", "exact", "reference"]
 
@@ -36,7 +36,7 @@ _LABEL_CHUNK = 16
 
 
 @dataclass(frozen=True, slots=True)
-class SightPlan:
+class ComparePlan:
     """What to compare."""
 
     clip: str
@@ -54,7 +54,7 @@ class SightPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class SightRow:
+class CompareRow:
     """One half of one flight. What is not of the list counts for the whole clip, in both halves alike."""
 
     clip: str
@@ -98,16 +98,18 @@ class Missing:
 
 
 @dataclass(frozen=True, slots=True)
-class SightResult:
+class CompareResult:
     """All rows, by rate, then in the table's order of methods."""
 
-    rows: tuple[SightRow, ...]
+    rows: tuple[CompareRow, ...]
     missing: tuple[Missing, ...]
     labels: str
     clip: str
 
 
-def compare(plan: SightPlan, *, on_step: Callable[[str, int, int], None] = lambda *_: None) -> SightResult:
+def compare(
+    plan: ComparePlan, *, on_step: Callable[[str, int, int], None] = lambda *_: None
+) -> CompareResult:
     """Fly everything; ``on_step(what, done, of)`` is called as it goes on.
 
     Raises:
@@ -119,7 +121,7 @@ def compare(plan: SightPlan, *, on_step: Callable[[str, int, int], None] = lambd
         on_step("clip", 0, 1)
         clip = share_clip(plan.clip, max_frames=plan.max_frames, folder=Path(folder))
         on_step("clip", 1, 1)
-        shop = Workshop(
+        shop = RunContext(
             clip=clip,
             cache=Path(folder),
             detector=plan.detector,
@@ -146,7 +148,7 @@ def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _labels(
-    plan: SightPlan, shop: Workshop, pool: ProcessPoolExecutor, on_step: Callable[[str, int, int], None]
+    plan: ComparePlan, shop: RunContext, pool: ProcessPoolExecutor, on_step: Callable[[str, int, int], None]
 ) -> tuple[tuple[Listed, ...], str, Callable[[str, str], bool]]:
     """(what is there at every tick in source pixels, exact or reference, which class names agree)."""
     clip = shop.clip
@@ -160,7 +162,7 @@ def _labels(
 
 
 def _reference(
-    shop: Workshop, pool: ProcessPoolExecutor, on_step: Callable[[str, int, int], None]
+    shop: RunContext, pool: ProcessPoolExecutor, on_step: Callable[[str, int, int], None]
 ) -> tuple[Listed, ...]:
     starts = range(0, shop.clip.ticks, _LABEL_CHUNK)
     waiting = {pool.submit(label_job, shop, first, _LABEL_CHUNK): first for first in starts}
@@ -175,12 +177,12 @@ def _reference(
 
 
 def _fly_all(
-    plan: SightPlan, shop: Workshop, pool: ProcessPoolExecutor, on_step: Callable[[str, int, int], None]
+    plan: ComparePlan, shop: RunContext, pool: ProcessPoolExecutor, on_step: Callable[[str, int, int], None]
 ) -> dict[Job, FlightReport | Refused]:
     """Every flight that is needed, each once."""
     jobs = dict.fromkeys(job for rate in plan.rates_bps for row in plan.methods for job in jobs_of(row, rate))
     # The long ones first, so that no process is left with one at the end.
-    ordered = sorted(jobs, key=lambda job: ("M0" in job.flags, -(job.fps or TICK_FPS)))
+    ordered = sorted(jobs, key=lambda job: ("M0" in job.flags, -(job.fps or NOMINAL_FPS)))
     waiting: dict[Future[FlightReport | Refused], Job] = {
         pool.submit(fly_job, shop, job): job for job in ordered
     }
@@ -196,7 +198,7 @@ def jobs_of(row: MethodRow, rate_bps: int) -> tuple[Job, ...]:
     """The flights that one method needs at one rate; fixed 15 frames a second is what M0 flies anyhow."""
     if not row.fps_choices:
         return (Job(rate_bps, row.flags),)
-    return tuple(Job(rate_bps, row.flags, None if fps == TICK_FPS else fps) for fps in row.fps_choices)
+    return tuple(Job(rate_bps, row.flags, None if fps == NOMINAL_FPS else fps) for fps in row.fps_choices)
 
 
 # Scores
@@ -221,9 +223,9 @@ class _Judge:
 
 
 def _result(
-    plan: SightPlan, clip: str, reports: dict[Job, FlightReport | Refused], judge: _Judge
-) -> SightResult:
-    rows: list[SightRow] = []
+    plan: ComparePlan, clip: str, reports: dict[Job, FlightReport | Refused], judge: _Judge
+) -> CompareResult:
+    rows: list[CompareRow] = []
     missing: list[Missing] = []
     for rate in plan.rates_bps:
         digests: dict[str, str] = {}
@@ -242,12 +244,12 @@ def _result(
                 )
                 continue
             rows += _rows(clip, rate, row.name, best, judge)
-    return SightResult(tuple(rows), tuple(missing), judge.labels, clip)
+    return CompareResult(tuple(rows), tuple(missing), judge.labels, clip)
 
 
-def _rows(clip: str, rate_bps: int, method: str, report: FlightReport, judge: _Judge) -> list[SightRow]:
+def _rows(clip: str, rate_bps: int, method: str, report: FlightReport, judge: _Judge) -> list[CompareRow]:
     return [
-        SightRow(
+        CompareRow(
             clip=clip,
             rate_kbps=rate_bps / 1e3,
             method=method,

@@ -18,7 +18,7 @@ from hvt_common.config import (
     SHARE,
     SIZE,
     TEXT,
-    Kind,
+    SettingType,
     choice,
     integer,
     load,
@@ -210,7 +210,7 @@ def test_what_is_printed_reads_back_the_same(tmp_path_factory, config):
         assert getattr(back, one.name) == getattr(config, one.name), one.name
 
 
-KINDS: dict[str, Kind] = {
+KINDS: dict[str, SettingType] = {
     "text": TEXT,
     "path": PATH,
     "bitrate": BITRATE,

@@ -79,6 +79,6 @@ def test_what_is_copied_builds_the_wheel(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     (wheel,) = (tmp_path / "out").iterdir()
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {"hvt_edge/cli.py", "hvt_ground/cli.py", "hvt_common/link/session.py"} <= names
+    assert {"hvt_edge/cli.py", "hvt_ground/cli.py", "hvt_common/transport/session.py"} <= names
     (scripts,) = (name for name in names if name.endswith("entry_points.txt"))
     assert "hvt-edge = hvt_edge.cli:main" in zipfile.ZipFile(wheel).read(scripts).decode()

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from hvt_common.protocol.channels import EdgeKeys, Row, selector
+from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.session import ask, declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 
@@ -93,10 +93,10 @@ def test_messages_questions_and_presence_pass(free_port: int, receiver: str) -> 
         other = stack.enter_context(
             open_session(ground) if receiver != "client" else zenoh.open(_client(endpoint))
         )
-        samples = other.declare_subscriber(selector(Row.BASE))
-        publisher = declare_publisher(edge, Row.BASE, keys=KEYS)
-        serve(edge, Row.INFO, keys=KEYS, answer=lambda question: b"answer to " + question)
-        token = edge.liveliness().declare_token(KEYS.key(Row.ALIVE))
+        samples = other.declare_subscriber(selector(Channel.BASE))
+        publisher = declare_publisher(edge, Channel.BASE, keys=KEYS)
+        serve(edge, Channel.INFO, keys=KEYS, answer=lambda question: b"answer to " + question)
+        token = edge.liveliness().declare_token(KEYS.key(Channel.ALIVE))
         _wait_for(lambda: publisher.matching_status.matching)
         unit = bytes(range(256)) * 120
         sample = _first(samples, lambda: publisher.put(unit, attachment=b"header"))
@@ -104,7 +104,7 @@ def test_messages_questions_and_presence_pass(free_port: int, receiver: str) -> 
         assert sample.attachment is not None
         assert sample.attachment.to_bytes() == b"header"
         assert sample.timestamp is None, "a router that stamps adds 26 bytes to each message"
-        assert ask(other, Row.INFO, keys=KEYS, question=b"this", timeout_s=5) == b"answer to this"
+        assert ask(other, Channel.INFO, keys=KEYS, question=b"this", timeout_s=5) == b"answer to this"
         alive = [reply.ok.key_expr for reply in other.liveliness().get("hvt/*/alive") if reply.ok is not None]
         assert [str(key) for key in alive] == ["hvt/uav-1/alive"]
         token.undeclare()
@@ -117,8 +117,8 @@ def test_a_ground_that_comes_before_its_router_finds_it(free_port: int) -> None:
     with ExitStack() as stack:
         ground = stack.enter_context(open_session(ground_settings))
         edge = stack.enter_context(open_session(LinkSettings(role="edge", connect=(endpoint,))))
-        samples = ground.declare_subscriber(selector(Row.BASE))
-        publisher = declare_publisher(edge, Row.BASE, keys=KEYS)
+        samples = ground.declare_subscriber(selector(Channel.BASE))
+        publisher = declare_publisher(edge, Channel.BASE, keys=KEYS)
         stack.enter_context(_router("--listen", endpoint))
         _wait_for(lambda: publisher.matching_status.matching)
         assert _first(samples, lambda: publisher.put(b"first")).payload.to_bytes() == b"first"

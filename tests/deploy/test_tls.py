@@ -16,13 +16,13 @@ import zenoh
 
 from fleet_keys import Fleet
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import EdgeKeys, Row, selector
+from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.session import ask, declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 EDGES = ("rov-1", "uav-1")
-WRITTEN = (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS)
+WRITTEN = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.STATUS)
 
 pytestmark = pytest.mark.integration
 
@@ -46,12 +46,12 @@ class _Edge:
         self.session, self.keys = session, EdgeKeys(name)
         self.reports: list[bytes] = []
         self.publishers = {row: declare_publisher(session, row, keys=self.keys) for row in WRITTEN}
-        for row in (Row.INFO, Row.CONTROL):
+        for row in (Channel.INFO, Channel.CONTROL):
             serve(session, row, keys=self.keys, answer=lambda _question, row=row: f"{row} of {name}".encode())
         session.declare_subscriber(
-            self.keys.key(Row.FEEDBACK), lambda sample: self.reports.append(sample.payload.to_bytes())
+            self.keys.key(Channel.FEEDBACK), lambda sample: self.reports.append(sample.payload.to_bytes())
         )
-        self._token = session.liveliness().declare_token(self.keys.key(Row.ALIVE))
+        self._token = session.liveliness().declare_token(self.keys.key(Channel.ALIVE))
 
     def wanted(self) -> bool:
         return all(one.matching_status.matching for one in self.publishers.values())  # type: ignore[attr-defined]
@@ -67,19 +67,19 @@ class _Ground:
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
         self.came: list[str] = []
-        for row in (*WRITTEN, Row.ALIVE):
+        for row in (*WRITTEN, Channel.ALIVE):
             take = lambda sample: self.came.append(str(sample.key_expr))  # noqa: E731
-            if row is Row.ALIVE:
+            if row is Channel.ALIVE:
                 session.liveliness().declare_subscriber(selector(row), take, history=True)
             else:
                 session.declare_subscriber(selector(row), take)
 
-    def asked(self, row: Row) -> list[bytes | None]:
+    def asked(self, row: Channel) -> list[bytes | None]:
         return [ask(self.session, row, keys=EdgeKeys(edge), question=b"", timeout_s=1.5) for edge in EDGES]
 
     def report(self, text: bytes) -> None:
         for edge in EDGES:
-            self.session.put(EdgeKeys(edge).key(Row.FEEDBACK), text)
+            self.session.put(EdgeKeys(edge).key(Channel.FEEDBACK), text)
 
 
 def _until(true: Callable[[], object], what: str, *, within_s: float = 20.0) -> None:
@@ -102,7 +102,7 @@ def _router(file: Path, endpoint: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def _all(edges: tuple[str, ...]) -> set[str]:
-    return {EdgeKeys(edge).key(row) for edge in edges for row in (*WRITTEN, Row.ALIVE)}
+    return {EdgeKeys(edge).key(row) for edge in edges for row in (*WRITTEN, Channel.ALIVE)}
 
 
 @pytest.mark.parametrize("links", [1, 2])
@@ -122,15 +122,15 @@ def test_through_a_router_each_ground_gets_what_is_its_own(fleet: Fleet, free_po
         _until(
             lambda: all(len(edge.session.info.links()) == links for edge in edges.values()), "all links stand"
         )
-        _until(lambda: EdgeKeys("uav-1").key(Row.ALIVE) in guest.came, "the guest sees the edge")
+        _until(lambda: EdgeKeys("uav-1").key(Channel.ALIVE) in guest.came, "the guest sees the edge")
         for edge in edges.values():
             edge.write()
         _until(lambda: set(base.came) == _all(EDGES), "the ground has all rows of both")
         _until(lambda: set(guest.came) == _all(("uav-1",)), "the guest has all rows of its edge, and no more")
-        assert base.asked(Row.INFO) == [b"info of rov-1", b"info of uav-1"]
-        assert base.asked(Row.CONTROL) == [b"control of rov-1", b"control of uav-1"]
-        assert guest.asked(Row.INFO) == [None, b"info of uav-1"]
-        assert guest.asked(Row.CONTROL) == [None, None]
+        assert base.asked(Channel.INFO) == [b"info of rov-1", b"info of uav-1"]
+        assert base.asked(Channel.CONTROL) == [b"control of rov-1", b"control of uav-1"]
+        assert guest.asked(Channel.INFO) == [None, b"info of uav-1"]
+        assert guest.asked(Channel.CONTROL) == [None, None]
         guest.report(b"guest")
         base.report(b"base")
         _until(lambda: b"base" in edges["rov-1"].reports, "the ground's report arrives")
@@ -155,7 +155,7 @@ def test_direct_either_side_may_listen(fleet: Fleet, free_port: int, listens: st
         _until(edge.wanted, "the streams are wanted")
         edge.write()
         _until(lambda: set(ground.came) == _all(("uav-1",)), "all rows arrive")
-        assert ground.asked(Row.CONTROL) == [None, b"control of uav-1"]
+        assert ground.asked(Channel.CONTROL) == [None, b"control of uav-1"]
         ground.report(b"base")
         _until(lambda: edge.reports == [b"base"], "the report arrives")
 
@@ -172,8 +172,10 @@ def test_who_asks_by_way_of_a_ground_has_its_own_rights(
         open_session(LinkSettings("asker", connect=where, zenoh_config=fleet.file(who))) as asker,
     ):
         edge = _Edge(edge_session, "uav-1")
-        _until(lambda: ask(asker, Row.INFO, keys=edge.keys, question=b"", timeout_s=1), "info is answered")
-        answer = ask(asker, Row.CONTROL, keys=edge.keys, question=b"", timeout_s=1.5)
+        _until(
+            lambda: ask(asker, Channel.INFO, keys=edge.keys, question=b"", timeout_s=1), "info is answered"
+        )
+        answer = ask(asker, Channel.CONTROL, keys=edge.keys, question=b"", timeout_s=1.5)
         assert answer == said
 
 

@@ -20,94 +20,98 @@ import zenoh
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import (
+    BacklogHeader,
+    BacklogKind,
     BaseHeader,
     ControlRequest,
     Feedback,
-    PastHeader,
-    PastKind,
     RoiHeader,
     Status,
     TrackStep,
 )
 from outsider import Message, Tap, joined
 
-Said = tuple[Row, bytes, bytes | None]
+Said = tuple[Channel, bytes, bytes | None]
 
 
-def copies(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+def copies(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
     """Everything that was heard, over and over."""
-    rows = [row for row in (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS) if heard[row]]
+    rows = [row for row in (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.STATUS) if heard[row]]
     for number in count():
         row = rows[number % len(rows)]
         message = heard[row][number // len(rows) % len(heard[row])]
         yield row, message.payload, message.attachment or None
 
 
-def ahead(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+def ahead(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
     """The session carried on in its own name: numbers that nobody has used yet, each a little further."""
-    pictures, stills = heard[Row.BASE][-8:], heard[Row.ROI][-8:]
+    pictures, stills = heard[Channel.BASE][-8:], heard[Channel.ROI][-8:]
     for number in count(1):
         message = pictures[number % len(pictures)]
         header = BaseHeader.parse(message.attachment, message.payload)
         lie = replace(header, sequence=header.sequence + number, frame_index=header.frame_index + number)
-        yield Row.BASE, message.payload, lie.pack(message.payload)
+        yield Channel.BASE, message.payload, lie.pack(message.payload)
         if stills:
             message = stills[number % len(stills)]
             still = RoiHeader.parse(message.attachment, message.payload)
             lie_too = replace(still, sequence=still.sequence + 1000 + number)
-            yield Row.ROI, message.payload, lie_too.pack(message.payload)
+            yield Channel.ROI, message.payload, lie_too.pack(message.payload)
 
 
-def statuses(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+def statuses(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
     """Reports and tracks with numbers from far ahead."""
-    status = Status.parse(heard[Row.STATUS][-1].payload)
-    steps = [TrackStep.parse(one.payload) for one in heard[Row.TRACKS][-1:]]
+    status = Status.parse(heard[Channel.STATUS][-1].payload)
+    steps = [TrackStep.parse(one.payload) for one in heard[Channel.TRACKS][-1:]]
     for number in count(1):
-        yield Row.STATUS, replace(status, sequence=status.sequence + number).pack(), None
+        yield Channel.STATUS, replace(status, sequence=status.sequence + number).pack(), None
         for step in steps:
             further = {"sequence": step.sequence + number, "frame_index": step.frame_index + number}
-            yield Row.TRACKS, replace(step, **further).pack(), None
+            yield Channel.TRACKS, replace(step, **further).pack(), None
 
 
-def past(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+def past(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
     """First pieces of large objects, none of which ever gets its second."""
-    header = BaseHeader.parse(heard[Row.BASE][-1].attachment, heard[Row.BASE][-1].payload)
+    header = BaseHeader.parse(heard[Channel.BASE][-1].attachment, heard[Channel.BASE][-1].payload)
     payload = bytes(60_000)
     for number in count():
-        piece = PastHeader(
+        piece = BacklogHeader(
             session_id=header.session_id,
-            kind=PastKind.STILL if number % 2 else PastKind.BASE,
+            kind=BacklogKind.STILL if number % 2 else BacklogKind.BASE,
             number=number,
             offset=0,
             total_bytes=4_000_000,
             send_ns=header.send_ns,
         )
-        yield Row.PAST, payload, piece.pack(payload)
+        yield Channel.BACKLOG, payload, piece.pack(payload)
 
 
-def reports(heard: dict[Row, list[Message]]) -> Iterator[Said]:
+def reports(heard: dict[Channel, list[Message]]) -> Iterator[Said]:
     """Receiver reports in a real ground's name, and in names that nobody has."""
-    real = Feedback.parse(heard[Row.FEEDBACK][-1].payload)
+    real = Feedback.parse(heard[Channel.FEEDBACK][-1].payload)
     for number in count(1):
         receiver = real.receiver_id if number % 2 else number
-        yield Row.FEEDBACK, replace(real, sequence=real.sequence + number, receiver_id=receiver).pack(), None
+        yield (
+            Channel.FEEDBACK,
+            replace(real, sequence=real.sequence + number, receiver_id=receiver).pack(),
+            None,
+        )
 
 
-KINDS: dict[str, Callable[[dict[Row, list[Message]]], Iterator[Said]]] = {
+KINDS: dict[str, Callable[[dict[Channel, list[Message]]], Iterator[Said]]] = {
     "copies": copies,
     "ahead": ahead,
     "statuses": statuses,
-    "past": past,
+    "backlog": past,
     "reports": reports,
 }
 NEEDED = {
-    "copies": (Row.BASE, Row.ROI, Row.STATUS),
-    "ahead": (Row.BASE, Row.ROI),
-    "statuses": (Row.STATUS,),
-    "past": (Row.BASE,),
-    "reports": (Row.FEEDBACK,),
+    "copies": (Channel.BASE, Channel.ROI, Channel.STATUS),
+    "ahead": (Channel.BASE, Channel.ROI),
+    "statuses": (Channel.STATUS,),
+    "backlog": (Channel.BASE,),
+    "reports": (Channel.FEEDBACK,),
 }
 
 
@@ -131,21 +135,23 @@ def main() -> None:
     print(json.dumps(said))
 
 
-def listened(session: zenoh.Session, keys: EdgeKeys, needed: tuple[Row, ...]) -> dict[Row, list[Message]]:
+def listened(
+    session: zenoh.Session, keys: EdgeKeys, needed: tuple[Channel, ...]
+) -> dict[Channel, list[Message]]:
     """Some of each row, by row."""
     tap, end_s = Tap(session, f"hvt/{keys.edge}/**"), time.monotonic() + 40
     while time.monotonic() < end_s:
-        heard: dict[Row, list[Message]] = {row: [] for row in Row}
+        heard: dict[Channel, list[Message]] = {row: [] for row in Channel}
         for message in tap.messages:
-            heard[Row(message.key.rpartition("/")[2])].append(message)
-        if all(len(heard[row]) >= (12 if row is Row.BASE else 1) for row in needed):
+            heard[Channel(message.key.rpartition("/")[2])].append(message)
+        if all(len(heard[row]) >= (12 if row is Channel.BASE else 1) for row in needed):
             return heard
         time.sleep(0.1)
     sys.exit(f"nothing came on {', '.join(row for row in needed if not heard[row])}")
 
 
 def say(
-    kind: str, heard: dict[Row, list[Message]], session: zenoh.Session, keys: EdgeKeys, *, seconds: float
+    kind: str, heard: dict[Channel, list[Message]], session: zenoh.Session, keys: EdgeKeys, *, seconds: float
 ) -> dict[str, float]:
     """As fast as the link takes it."""
     end_s, said, size_bytes = time.monotonic() + seconds, 0, 0
@@ -177,7 +183,7 @@ def ask(session: zenoh.Session, keys: EdgeKeys, *, seconds: float) -> dict[str, 
         answered += 1
 
     while time.monotonic() < end_s:
-        session.get(keys.key(Row.CONTROL), heard, payload=questions[said % len(questions)], timeout=1.0)
+        session.get(keys.key(Channel.CONTROL), heard, payload=questions[said % len(questions)], timeout=1.0)
         said += 1
     time.sleep(1.2)
     return {"said": said, "answered": answered}

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row
+from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.transport.session import Inbox, LinkSettings, declare_publisher, open_session, subscribe
 
@@ -142,7 +142,7 @@ def send(endpoint: str, device: str, links: str) -> None:
         _segment_in_software(device)
     rows = []
     with open_session(LinkSettings("edge", connect=(endpoint,), links=int(links))) as session:
-        publisher = declare_publisher(session, Row.BASE, keys=KEYS)
+        publisher = declare_publisher(session, Channel.BASE, keys=KEYS)
         while not publisher.matching_status.matching:
             time.sleep(0.01)
         time.sleep(0.5)
@@ -154,7 +154,7 @@ def send(endpoint: str, device: str, links: str) -> None:
             time.sleep(0.1)
             device_bytes, packets = (now - then for now, then in zip(_counters(device), before, strict=True))
             overhead = overhead_bytes(
-                size, ATTACHMENT_BYTES, key=KEYS.key(Row.BASE), encoding=DELIVERIES[Row.BASE].encoding
+                size, ATTACHMENT_BYTES, key=KEYS.key(Channel.BASE), encoding=DELIVERIES[Channel.BASE].encoding
             )
             rows.append(
                 {

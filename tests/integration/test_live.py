@@ -159,7 +159,7 @@ def test_ctrl_c_ends_an_edge_with_a_summary_and_its_ground_with_it(late):
     assert late.edge_stop_s <= STOPPED_WITHIN_S
     assert 0 < late.edge["frames"] < LONG
     assert late.edge["worst_window_bps"]["total"] <= 300_000
-    assert count_frames(late.folder / "base.mkv") == late.edge["frames"] + late.edge["frames_kept"]
+    assert count_frames(late.folder / "base.mkv") == late.edge["frames"] + late.edge["frames_stored"]
 
 
 @dataclass
@@ -202,7 +202,7 @@ def test_each_session_of_each_edge_has_a_recording(fleet):
     files = {Path(fleet.folder / one["recording"]).resolve() for one in fleet.ground}
     written = {file.resolve() for file in (fleet.folder / "recordings").iterdir()}
     # What the killed edge had kept is sent by the next one, and is a recording of its own.
-    assert files == {file for file in written if not file.stem.endswith("-past")}
+    assert files == {file for file in written if not file.stem.endswith("-backlog")}
     assert len(files) == 3
     for one in fleet.ground:
         whole(Recording(fleet.folder / one["recording"]), one)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_ground.control import AskedStill, EdgeClient, EdgeTrack, RefusedError
+from hvt_ground.control import EdgeClient, EdgeTrack, RefusedError, RequestedStill
 from processes import Link, eventually
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
@@ -27,9 +27,9 @@ class Flight:
     """What was asked of one flight, and what the flight says of itself."""
 
     names: list[str]
-    box: AskedStill
-    past: AskedStill
-    track: AskedStill
+    box: RequestedStill
+    past: RequestedStill
+    track: RequestedStill
     tracks: list[EdgeTrack]
     refusals: list[str]
     before_kbps: int

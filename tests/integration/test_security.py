@@ -16,7 +16,7 @@ import zenoh
 
 import hvt_edge.cli
 from fleet_keys import EXPIRED, Fleet
-from hvt_common.protocol.channels import EdgeKeys, Row, selector
+from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.runtime.stopping import STOP_SIGNALS
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import ask, declare_publisher, open_session, serve
@@ -158,9 +158,9 @@ def _edge(fleet: Fleet, endpoint: str, *, name: str = "uav-1") -> Iterator[zenoh
     """A session of the edge uav-1 that listens, is present, and answers info and control."""
     settings = fleet.settings(name, "edge", listen=(endpoint,))
     with open_session(settings) as session:
-        serve(session, Row.INFO, keys=UAV1, answer=lambda _question: b"info")
-        serve(session, Row.CONTROL, keys=UAV1, answer=lambda _question: b"done")
-        token = session.liveliness().declare_token(UAV1.key(Row.ALIVE))
+        serve(session, Channel.INFO, keys=UAV1, answer=lambda _question: b"info")
+        serve(session, Channel.CONTROL, keys=UAV1, answer=lambda _question: b"done")
+        token = session.liveliness().declare_token(UAV1.key(Channel.ALIVE))
         with LinkWatch(session, settings, served=lambda _ground: False, patience_s=PATIENCE_S):
             yield session
         token.undeclare()  # type: ignore[no-untyped-call]
@@ -194,17 +194,17 @@ def test_an_edge_cannot_write_as_another(
                 patience_s=PATIENCE_S,
             )
         )
-        forger.liveliness().declare_token(UAV2.key(Row.ALIVE))
-        serve(forger, Row.INFO, keys=UAV2, answer=lambda _question: b"forged")
-        own = declare_publisher(forger, Row.STATUS, keys=UAV1)
+        forger.liveliness().declare_token(UAV2.key(Channel.ALIVE))
+        serve(forger, Channel.INFO, keys=UAV2, answer=lambda _question: b"forged")
+        own = declare_publisher(forger, Channel.STATUS, keys=UAV1)
         eventually(lambda: own.matching_status.matching, within_s=20, what="the edge's own stream is wanted")
-        for row in (Row.BASE, Row.ROI, Row.TRACKS, Row.STATUS, Row.FEEDBACK):
+        for row in (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.STATUS, Channel.FEEDBACK):
             forger.put(UAV2.key(row), b"forged")
         own.put(b"own")
         eventually(lambda: came, within_s=20, what="the edge's own message")
-        assert ask(ground, Row.INFO, keys=UAV2, question=b"", timeout_s=1) is None
+        assert ask(ground, Channel.INFO, keys=UAV2, question=b"", timeout_s=1) is None
         eventually(lambda: "'uav-1' is linked" in caplog.text, within_s=20, what="the ground is told")
-        assert came == [UAV1.key(Row.STATUS)]
+        assert came == [UAV1.key(Channel.STATUS)]
     assert "or it runs under another id than its certificate says, and all it sends is dropped" in caplog.text
 
 
@@ -231,17 +231,18 @@ def test_watching_commanding_and_being_a_stranger(
         came: dict[str, list[bytes]] = {name: [] for name in grounds}
         for name, ground in grounds.items():
             ground.declare_subscriber(
-                selector(Row.STATUS), lambda sample, name=name: came[name].append(sample.payload.to_bytes())
+                selector(Channel.STATUS),
+                lambda sample, name=name: came[name].append(sample.payload.to_bytes()),
             )
-        publisher = declare_publisher(edge, Row.STATUS, keys=UAV1)
+        publisher = declare_publisher(edge, Channel.STATUS, keys=UAV1)
         eventually(_linked(*grounds.values()), within_s=20, what="all three are linked")
         info = {
-            name: ask(ground, Row.INFO, keys=UAV1, question=b"", timeout_s=2)
+            name: ask(ground, Channel.INFO, keys=UAV1, question=b"", timeout_s=2)
             for name, ground in grounds.items()
         }
         assert info == {"base": b"info", "guest": b"info", "stranger": None}
         control = {
-            name: ask(ground, Row.CONTROL, keys=UAV1, question=b"do", timeout_s=2)
+            name: ask(ground, Channel.CONTROL, keys=UAV1, question=b"do", timeout_s=2)
             for name, ground in grounds.items()
         }
         assert control == {"base": b"done", "guest": None, "stranger": None}

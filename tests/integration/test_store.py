@@ -10,7 +10,7 @@ from typing import Any
 import av
 import pytest
 
-from hvt_edge.backlog.entry import FIRST_KEPT
+from hvt_edge.backlog.entry import FIRST_STORED
 from hvt_edge.backlog.segment import read_segment
 from lab.link.relay import Relay
 from lab.link.script import LinkState, Piece, Script
@@ -51,7 +51,7 @@ def stills_taken(timing: Path) -> tuple[set[int], set[int]]:
         for row in csv.DictReader(file):
             if row["kind"] == "roi":
                 live.add(int(row["sequence"]))
-            elif row["kind"] == "past-still" and row["shown_ns"] != "0":
+            elif row["kind"] == "backlog-still" and row["shown_ns"] != "0":
                 past.add(int(row["sequence"]))
     return live, past
 
@@ -61,7 +61,7 @@ def admitted(sent: dict[str, Any]) -> set[int]:
     reasons = sent["stills"]["reasons"]
     live = {why: n for why, n in reasons["sent"].items() if why not in {"again", "stored"}}
     kept = reasons["deferred"].get("stored", 0)
-    return set(range(sum(live.values()))) | {FIRST_KEPT + number for number in range(kept)}
+    return set(range(sum(live.values()))) | {FIRST_STORED + number for number in range(kept)}
 
 
 @pytest.mark.parametrize(
@@ -106,9 +106,9 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
     assert came == times_in(own), "each frame that was coded is in the recording, at its time"
     live, past = stills_taken(timing)
     assert live | past == admitted(sent), "each still that was admitted, by its number"
-    assert {number for number in past if number >= FIRST_KEPT} or dark_s < 5
+    assert {number for number in past if number >= FIRST_STORED} or dark_s < 5
     assert sent["worst_window_bps"]["total"] <= 800_000
-    assert said["past_bytes"] == sent["past_bytes"] > 0
+    assert said["backlog_bytes"] == sent["backlog_bytes"] > 0
 
 
 def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, scene):
@@ -123,13 +123,13 @@ def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, 
         first.until("a ground listens", within_s=60)
         ground.kill()
         eventually(
-            lambda: len(list(store.rglob("*.past"))) > 2 and list(store.rglob("base-*.mkv")),
+            lambda: len(list(store.rglob("*.still"))) > 2 and list(store.rglob("base-*.mkv")),
             within_s=60,
             what="the edge keeps what it sees",
         )
         first.kill()
         (session,) = [one for one in store.iterdir() if one.is_dir()]
-        stills = {int(one.name.split("-")[1]) for one in session.glob("still-*.past")}
+        stills = {int(one.name.split("-")[1]) for one in session.glob("still-*.still")}
         frames = {unit.frame_index for one in session.glob("base-*.mkv") for unit in read_segment(one)}
         ground = link.ground(
             "--detector", "motion", "--classifier", "none",
@@ -141,7 +141,7 @@ def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, 
         ground.stop()
         said = ground.summary()
     got = said[0] if isinstance(said, list) else said
-    (recording,) = got["past"]["recordings"]
+    (recording,) = got["backlog"]["recordings"]
     assert set(frames_shown([Path(recording)])) == frames
     assert stills_taken(tmp_path / "again.csv")[1] == stills
     assert len(stills) > 2

@@ -21,8 +21,9 @@ from lab.fuzz.mutate import plain, resealed, sealed_values
 from lab.fuzz.parts import joined, parted
 from lab.fuzz.table import PLANTED, TARGETS
 
-FOUND = Path(__file__).parents[2] / "lab" / "fuzz" / "found"
-TESTS = Path(__file__).resolve().parents[2] / "tests" / "support"
+ROOT = Path(__file__).resolve().parents[2]
+FOUND = ROOT / "lab" / "fuzz" / "found"
+TESTS = ROOT / "tests" / "support"
 NAMES = [name for name, target in TARGETS.items() if target is not PLANTED]
 
 
@@ -76,11 +77,11 @@ def test_parts_come_back():
 @pytest.mark.skipif(find_spec("atheris") is None, reason="atheris is not installed: dependency group 'fuzz'")
 def test_the_fuzzer_finds_a_planted_bug_and_keeps_its_input(tmp_path):
     """A million inputs would be reported as harmless by a fuzzer that sees nothing."""
-    command = [sys.executable, "-m", "fuzz", "--runs", "4000", "--folder", str(tmp_path)]
+    command = [sys.executable, "-m", "lab.fuzz", "--runs", "4000", "--folder", str(tmp_path)]
     command += ["--target", "planted", "--findings", "1"]
     ended = subprocess.run(
         command,
-        env={**os.environ, "PYTHONPATH": str(TESTS)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(TESTS), *sys.path])},
         capture_output=True,
         text=True,
         timeout=250,

@@ -31,7 +31,7 @@ def outcome(
     name: str, frames: list[Arrival], *, sent: int | None = None, store: dict[str, int] | None = None
 ) -> Outcome:
     """What a run with these arrivals would be."""
-    sums = {"base_bytes": 1000, "roi_bytes": 10, "past_bytes": 7, "meta_bytes": 0, "overhead_bytes": 5}
+    sums = {"base_bytes": 1000, "roi_bytes": 10, "backlog_bytes": 7, "meta_bytes": 0, "overhead_bytes": 5}
     edge = {
         **sums,
         "frames": len(frames) if sent is None else sent,
@@ -43,7 +43,7 @@ def outcome(
         **sums,
         "roi_bytes": 8,
         "stills": {"received": 4},
-        "past": {"stills": 2, "frames": 50, "video_s": 5.0},
+        "backlog": {"stills": 2, "frames": 50, "video_s": 5.0},
         "keyframe_requests": 2,
         "lost": 1,
     }
@@ -132,7 +132,11 @@ def test_what_is_still_kept_is_not_lost_and_what_was_given_up_is():
     """An edge that throws away what it kept would lose nothing."""
     first = KEPT_FROM
     came = [still(number) for number in (0, 1, 2, 4, 5)]
-    past = [still(first, "past-still"), still(first + 1, "past-still", shown=False), still(3, "past-base")]
+    past = [
+        still(first, "backlog-still"),
+        still(first + 1, "backlog-still", shown=False),
+        still(3, "backlog-base"),
+    ]
 
     def lost(kept: set[int], **store: int) -> float:
         result = outcome("outage-60s", [*came, *past], store=store)

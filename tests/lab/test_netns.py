@@ -56,7 +56,7 @@ ON_ETHERNET = 1448 / (1448 + 52 + 14)
 
 
 @pytest.fixture
-def carried():
+def wire_field():
     """Runs a sender as fast as TCP takes it over a script; returns when (after its begin) how many bytes came."""
 
     def run(script: Script, *, seconds: float) -> list[tuple[float, int]]:
@@ -95,19 +95,19 @@ def bps(got, begin_s: float, end_s: float) -> float:
     return 8 * sum(size for at, size in got if begin_s <= at < end_s) / (end_s - begin_s)
 
 
-def test_the_shaper_follows_the_script(carried):
+def test_the_shaper_follows_the_script(wire_field):
     """The one carrier with a real TCP would be another link than the relay's."""
     line = script((0, LinkState(1_000_000)), (3, LinkState(400_000)), lasts_s=6)
-    got = carried(line, seconds=6)
+    got = wire_field(line, seconds=6)
     assert bps(got, 1, 3) == pytest.approx(1_000_000 * ON_ETHERNET, rel=0.03)
     assert bps(got, 3.5, 6) == pytest.approx(400_000 * ON_ETHERNET, rel=0.03)
 
 
-def test_a_link_that_is_down_carries_nothing(carried):
+def test_a_link_that_is_down_carries_nothing(wire_field):
     """As the relay's darkness."""
     light = LinkState(2_000_000)
     line = script((0, light), (1, LinkState(2_000_000, dark=True)), (2, light), lasts_s=4)
-    got = carried(line, seconds=4)
+    got = wire_field(line, seconds=4)
     assert bps(got, 0.3, 1.0) > 1e6
     assert bps(got, 1.1, 2.0) == 0
     assert bps(got, 3.0, 4.0) > 1e6

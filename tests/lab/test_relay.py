@@ -290,9 +290,9 @@ def test_a_tcp_sender_is_held_to_the_rate(listener):
         relay.begin()
         got = exchange(relay, listener, seconds=4)
     began, ended = got[0][0] + 0.5, got[-1][0]
-    carried = sum(size for at, size in got if at > began) * 8 / (ended - began)
+    wire_field = sum(size for at, size in got if at > began) * 8 / (ended - began)
     goodput = 800_000 * 1448 / (1448 + SEGMENT_HEADER_BYTES)
-    assert carried == pytest.approx(goodput, rel=0.05), "segments are not all full, so a little less"
+    assert wire_field == pytest.approx(goodput, rel=0.05), "segments are not all full, so a little less"
     assert relay.up.passed_bytes * 8 / (ended - got[0][0]) == pytest.approx(800_000, rel=0.05)
 
 

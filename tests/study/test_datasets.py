@@ -19,6 +19,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_study.compare_clip import stage_clip
 from hvt_study.datasets import demo
 from hvt_study.datasets.annotation_rows import read_rows
 from hvt_study.datasets.content import content_hash
@@ -26,7 +27,6 @@ from hvt_study.datasets.mot import mot_table
 from hvt_study.datasets.uri import open_dataset, open_datasets
 from hvt_study.flight import FlightPlan, fly
 from hvt_study.flight_ground import SharedModels
-from hvt_study.sight_clip import stage_clip
 from layouts import SIZE, square_xywh, write_images, write_mot, write_uavdt, write_visdrone
 
 

@@ -12,10 +12,10 @@ from clips import hard_pictures, smooth_pictures
 from flight import CLASSES, SIZE, RedSquares, square_box
 from hvt_common.errors import UserError
 from hvt_common.values import Detections
+from hvt_study.compare_clip import Clip
 from hvt_study.list_score import Listed, score_lists
 from hvt_study.metrics.seen import detected_ticks
 from hvt_study.peers.dds import DdsSettings, fly_dds
-from hvt_study.sight_clip import Clip
 
 TICKS = 46
 BUDGET_BPS = 200_000
@@ -108,7 +108,7 @@ def test_every_byte_of_both_passes_counts_once(report):
     assert report.messages == {"base": TICKS, "roi": sent, "control": 4}
     account = report.account
     assert sum(report.line_bytes.values()) == account.line_bytes
-    assert account.messages == {"base": TICKS, "roi": sent, "past": 0, "meta": 4}
+    assert account.messages == {"base": TICKS, "roi": sent, "backlog": 0, "meta": 4}
     assert report.bps("base") == account.base_bps
     assert report.bps("roi") == account.roi_bps
     assert report.bps() == account.total_bps

@@ -14,10 +14,10 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_study.compare_clip import Clip
 from hvt_study.flight import FlightPlan, coded_ticks, fly
 from hvt_study.flight_ground import SharedModels
 from hvt_study.list_score import Listed, score_lists
-from hvt_study.sight_clip import Clip
 
 TICKS = 46
 
@@ -97,7 +97,7 @@ def test_stills_cross_and_are_counted(clip):
     """Without them the comparison would be of video with video."""
     report = flown(clip, "--method", "M5", "--cooldown", "0s")
     assert report.messages["roi"] > 0
-    assert sum(report.account.fates["sent"].values()) == report.messages["roi"]
+    assert sum(report.account.outcomes["sent"].values()) == report.messages["roi"]
     assert report.bps("roi") == report.account.roi_bps
 
 

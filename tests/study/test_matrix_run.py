@@ -10,15 +10,15 @@ import pytest
 
 from hvt_study.cli import main
 from hvt_study.commands import run_study as command
-from hvt_study.matrix import execute, workshop
+from hvt_study.matrix import execute, run_context
 from hvt_study.matrix.flights import flown
 from hvt_study.matrix.match import within
 from hvt_study.matrix.materials import open_materials
 from hvt_study.matrix.methods import chosen_methods
 from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
 from hvt_study.matrix.results import COLUMNS
+from hvt_study.matrix.run_context import open_run_context
 from hvt_study.matrix.spec import ModelChoice
-from hvt_study.matrix.workshop import open_workshop
 from layouts import write_images, write_visdrone
 from onnx_models import colour_classifier, colour_detector
 from small_study import PATIENT_S, SIZE, arguments, entries, flights, said, study, table, write_scene
@@ -122,7 +122,7 @@ def test_totals_are_of_the_bytes_that_were_sent(scene, done, tmp_path):
     asked = parser.parse_args(arguments(scene, tmp_path, *METHODS, "--max-frames", "30"))
     plan = study_plan(asked, open_sequences(asked))
     spec = next(one for one in first_runs(plan) if one.method == "M5")
-    report = flown(spec, open_workshop(spec, cache=done / "cache"), budget_bps=spec.budget_bps, fps=None)
+    report = flown(spec, open_run_context(spec, cache=done / "cache"), budget_bps=spec.budget_bps, fps=None)
     row = next(row for row in table(done) if row["method"] == "M5")
     assert row["digest"] == report.digest
     assert row["total_bps"] == round(sum(report.line_bytes.values()) * 8 / 2)
@@ -255,14 +255,14 @@ def test_a_classifier_names_the_reference_labels(scene, tmp_path):
     found = open_materials(spec, cache=plan.cache)
     assert found.classes.word("minivan") == found.classes.word("car") == "car"
     assert found.classes.word("pickup") == found.classes.word("truck") != "car"
-    first = open_workshop(spec, cache=plan.cache)
+    first = open_run_context(spec, cache=plan.cache)
     assert first.classifier is found.classifier
     said = {name for one in first.labels for name in one.class_names}
     assert said
     assert said <= set(names)
     shutil.rmtree(plan.cache / "detections")  # labels are remembered as they are
-    workshop._open.cache_clear()
-    again = open_workshop(spec, cache=plan.cache)
+    run_context._open.cache_clear()
+    again = open_run_context(spec, cache=plan.cache)
     assert not (plan.cache / "detections").exists()
     for one, other in zip(first.labels, again.labels, strict=True):
         assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)

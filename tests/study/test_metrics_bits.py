@@ -26,7 +26,7 @@ def named(number, track, *, share=0.01, base=None, seen=None):
 
 def test_the_parts_add_up_to_the_whole():
     """A channel that is forgotten would give its method free bits."""
-    rows = {"base": 150_000, "roi": 30_000, "tracks": 2_000, "status": 500, "past": 300}
+    rows = {"base": 150_000, "roi": 30_000, "tracks": 2_000, "status": 500, "backlog": 300}
     split = bit_split(rows, processed_s=2.0)
     assert (split.base_bps, split.roi_bps, split.track_bps, split.other_bps) == (
         600_000,

@@ -16,6 +16,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_study.compare_clip import NOMINAL_FPS, Clip
 from hvt_study.flight import FlightPlan, fly
 from hvt_study.flight_ground import SharedModels
 from hvt_study.list_score import Listed
@@ -35,7 +36,6 @@ from hvt_study.metrics.seen import (
     shown_times_s,
 )
 from hvt_study.metrics.tracking import tracking_score
-from hvt_study.sight_clip import TICK_FPS, Clip
 from metric_ticks import labels
 
 TICKS = 40
@@ -99,13 +99,13 @@ def test_classes_before_and_after_refinement(flight):
     assert before.counts.right == 0
     assert after.counts.right > 20
     shown_s = shown_times_s(flight.lists)
-    assert all(tick / TICK_FPS < at_s < tick / TICK_FPS + 1 for tick, at_s in enumerate(shown_s))
-    waits = first_correct(ticks, fps=TICK_FPS, shown_s=shown_s)
+    assert all(tick / NOMINAL_FPS < at_s < tick / NOMINAL_FPS + 1 for tick, at_s in enumerate(shown_s))
+    waits = first_correct(ticks, fps=NOMINAL_FPS, shown_s=shown_s)
     assert 0 < waits.median_s < 1
-    assert first_correct(ticks, fps=TICK_FPS, refined=False).never == 1
+    assert first_correct(ticks, fps=NOMINAL_FPS, refined=False).never == 1
     first = refined_objects(flight.lists)[0]
     # It is shown from the next list on.
-    assert first.at_s <= waits.median_s + 1 / TICK_FPS
+    assert first.at_s <= waits.median_s + 1 / NOMINAL_FPS
 
 
 def test_the_base_alone(flight):

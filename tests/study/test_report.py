@@ -23,6 +23,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_study import cli
 from hvt_study.cli import main
+from hvt_study.compare_clip import Clip
 from hvt_study.datasets.classes import map_classes
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.labels import FrameLabels
@@ -31,10 +32,10 @@ from hvt_study.flight_ground import SharedModels
 from hvt_study.list_score import Listed
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.matrix.results import COLUMNS
-from hvt_study.matrix.workshop import Workshop
+from hvt_study.matrix.run_context import RunContext
 from hvt_study.report.appendix_tables import failed_table
 from hvt_study.report.document import Drawing, Pictures
-from hvt_study.report.equal_sight import equal_sight, needed_bps
+from hvt_study.report.equal_quality import equal_quality, needed_bps
 from hvt_study.report.example_store import load_example, save_example
 from hvt_study.report.examples import (
     CropExample,
@@ -56,7 +57,6 @@ from hvt_study.report.sweep_table import sweep_table
 from hvt_study.report.table_file import read_results, write_results
 from hvt_study.report.tables import named_table, spent_table
 from hvt_study.report.write import write_report
-from hvt_study.sight_clip import Clip
 from study_rows import column, row, study
 
 # The file
@@ -252,7 +252,7 @@ def test_bits_at_equal_accuracy_are_read_between_points_only():
     assert needed_bps(curve, level=0.1) == 0
     assert math.isnan(needed_bps(curve[:1], level=0.3))
     (setting,) = settings(study())
-    one = equal_sight(setting, Arm("low", "M5", "jpeg"), reference="M0", column="top1_all")
+    one = equal_quality(setting, Arm("low", "M5", "jpeg"), reference="M0", column="top1_all")
     # M0 has 0.4 at 601 kbps and 0.9 at 800; sequence d has no curve.
     share = [(level - 0.4) / 0.5 for level in (0.5, 0.6, 0.7)]
     assert one.ratios == pytest.approx([601 * (800 / 601) ** part / 600 for part in share])
@@ -316,7 +316,7 @@ def test_a_flight_flown_again_is_the_same_and_shows_its_stills(tmp_path):
     truth = tuple(Listed(np.array([square_box(tick)], np.float32), ("car",)) for tick in range(ticks))
     clip = Clip("drawn", SIZE, ticks, tmp_path / "clip.bgr", truth, ("car", "bus"))
     flight = FlightPlan(clip, edge_config(), ground_config(), 200_000)
-    shop = workshop(clip)
+    shop = run_context(clip)
     found = example_of(flight, shop, key="k", rule="by rule", title="drawn")
     plain = fly(flight, detector=RedSquares(), models=SharedModels(RedSquares()))
     assert found.digest == plain.digest
@@ -351,7 +351,7 @@ def ground_config():
     return check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
 
 
-def workshop(clip):
+def run_context(clip):
     def labels(frame):
         boxes = np.array([square_box(frame)], np.float32)
         return FrameLabels(boxes, np.zeros(1, np.int64), ("car",))
@@ -359,7 +359,7 @@ def workshop(clip):
     sequence = Sequence("drawn", "demo", clip, clip.ticks, 15.0, SIZE, labels, ("bus", "car"))
     truth = tuple(map(labels, range(clip.ticks)))
     classes = map_classes(RedSquares().class_names, ("bus", "car"))
-    return Workshop(
+    return RunContext(
         sequence=sequence,
         labels=truth,
         classes=classes,

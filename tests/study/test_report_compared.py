@@ -17,7 +17,7 @@ from hvt_study.matrix.methods import METHODS
 from hvt_study.report.appendix_tables import failed_table, metrics_table
 from hvt_study.report.curve_figures import codec_figure, utility_figure
 from hvt_study.report.drawing import PALETTE, look_of
-from hvt_study.report.equal_sight import EqualSight
+from hvt_study.report.equal_quality import EqualQuality
 from hvt_study.report.example_figures import crop_pictures
 from hvt_study.report.examples import CropExample, Example, Timeline, choose_run
 from hvt_study.report.html_page import inline_svg
@@ -181,7 +181,7 @@ def test_brackets_and_bold_are_of_enough_sequences():
         (cell,) = column(differences_table(setting, list(pairs(setting))), "Δ found & named")
         assert (bool(cell.under), cell.strong) == (shown, shown)
         assert bool(column(named_table(setting), "found & named")[0].under) is shown
-        one = EqualSight(Arm("low", "M5", "jpeg"), "M0", (1.5,) * count, 0)
+        one = EqualQuality(Arm("low", "M5", "jpeg"), "M0", (1.5,) * count, 0)
         assert column(equal_table(setting, [one], column="top1_all"), "bits needed")[0].strong is shown
 
 

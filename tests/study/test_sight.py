@@ -12,9 +12,9 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_scene import Scene
 from hvt_study.cli import main
-from hvt_study.sight import Missing, SightResult, SightRow, jobs_of
-from hvt_study.sight_methods import FPS_CHOICES, METHODS, method_rows
-from hvt_study.sight_plot import plot
+from hvt_study.compare_methods import FPS_CHOICES, METHODS, method_rows
+from hvt_study.compare_plot import plot
+from hvt_study.sight import CompareResult, CompareRow, Missing, jobs_of
 
 FIRST_COLUMNS = [
     *("clip", "rate_kbps", "method", "half", "f1", "class_agreement", "total_bps", "base_bps", "roi_bps"),
@@ -100,7 +100,7 @@ def test_the_best_frame_rate_starts_from_what_m0_flies():
 def test_a_plot_of_what_there_is(tmp_path):
     """A method that is missing at some rates must not take the plot with it."""
     rows = [
-        SightRow(
+        CompareRow(
             "clip",
             rate,
             method,
@@ -126,5 +126,5 @@ def test_a_plot_of_what_there_is(tmp_path):
         for rate, method in ((150.0, "M0"), (800.0, "M0"), (800.0, "M6"))
         for half in (1, 2)
     ]
-    plot(SightResult(tuple(rows), (Missing(150.0, "M6", "why"),), "exact", "clip"), tmp_path / "plot.png")
+    plot(CompareResult(tuple(rows), (Missing(150.0, "M6", "why"),), "exact", "clip"), tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 20_000

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_study.sight_clip import clip_name, share_clip
+from hvt_study.compare_clip import clip_name, share_clip
 from hvt_study.virtual_camera import VirtualCamera, open_camera, read_annotations
 
 BOX = (300, 200, 40, 24)  # x, y, w, h of a white block

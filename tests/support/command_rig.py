@@ -10,7 +10,7 @@ import numpy as np
 from base_coded import StandIn
 from clips import START_NS
 from flight import tracks_at
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeader
 from hvt_common.units import parse_bitrate
@@ -19,9 +19,9 @@ from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.commands import Commands, Served
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan
-from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.maker import StillMaker
@@ -29,11 +29,11 @@ from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Suppression
-from hvt_edge.video.reconfigure import Renewal
+from hvt_edge.video.reconfigure import EncoderReconfiguration
 
 SOURCE, BASE = (960, 540), (640, 360)
 VIEW = View.fitted(SOURCE, BASE, fit="letterbox")
-TICK_NS = 66_666_667
+FRAME_NS = 66_666_667
 _NOISE = np.random.default_rng(3).integers(0, 255, (SOURCE[1] // 6, SOURCE[0] // 6, 3), np.uint8)
 WORLD = cv2.resize(_NOISE, SOURCE, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
 SESSION = 77
@@ -52,7 +52,7 @@ class Out:
 
     def put(self, row, payload, *, attachment=None, encoding="") -> None:
         """Keep it, if it is a still."""
-        if row is Row.ROI:
+        if row is Channel.ROI:
             self.stills.append((RoiHeader.parse(attachment, payload), payload))
 
 
@@ -62,9 +62,9 @@ class Rig:
     def __init__(self, budget="400kbps", *, share=0.75, name="M1", codec="jpeg", ring_s=5.0) -> None:
         argv = {"source": "demo", "size": BASE, "budget": parse_bitrate(budget, name="b"), "method": name}
         self.config = check(EdgeConfig(**argv, video_share=share, preset="ultrafast"))
-        self.out, self.fates, self.keyframes = Out(), Counter(), KeyframePlan()
+        self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframePlan()
         self.budget = RollingBudget(BudgetSettings(self.config.budget_bps, self.config.base_bps, fps=15))
-        self.sender = Sender(
+        self.sender = Transmitter(
             self.out,
             ledger=Ledger(),
             budget=self.budget,
@@ -89,10 +89,12 @@ class Rig:
             view=VIEW,
             class_names=("car",),
             settings=ChooserSettings(fps=15, most_bytes=self.sender.most_still_bytes()),
-            on_fate=lambda *fate: self.fates.update([fate]),
+            on_outcome=lambda *outcome: self.outcomes.update([outcome]),
             asked=self.on_demand,
         )
-        self.renewal = Renewal(self.config, size=BASE, every_n=1, sender=self.sender, split=None)
+        self.reconfiguration = EncoderReconfiguration(
+            self.config, size=BASE, decimation=1, sender=self.sender, split=None
+        )
         self.tick, self.request_ns = -1, 0
         self.commands = Commands(
             self.config,
@@ -101,13 +103,13 @@ class Rig:
             clock=lambda: self.request_ns,
             window_ns=lambda: self.now_ns,
         )
-        self.commands.serve(Served(self.on_demand, self.renewal, self.chooser, base_size=BASE))
+        self.commands.serve(Served(self.on_demand, self.reconfiguration, self.chooser, base_size=BASE))
         self.keyframes.done(START_NS)
 
     @property
     def now_ns(self) -> int:
         """Time of the newest tick."""
-        return START_NS + max(0, self.tick) * TICK_NS
+        return START_NS + max(0, self.tick) * FRAME_NS
 
     def box(self, tick: int) -> tuple[float, float, float, float]:
         """Where the car is, base pixels."""
@@ -120,7 +122,7 @@ class Rig:
             pixels = picture(self.tick)
             base = cv2.blur(cv2.resize(pixels, BASE, interpolation=cv2.INTER_AREA), (31, 31))
             tracks = tracks_at(self.tick, {5: self.box(self.tick)})
-            seen = Seen(Frame(self.tick, self.now_ns, pixels, base), base, tracks, detected=others)
+            seen = AnalyzedFrame(Frame(self.tick, self.now_ns, pixels, base), base, tracks, detected=others)
             self.budget.record_base(int(self.budget.base_step_bytes), now_ns=self.now_ns)
             self.chooser.consider(seen, now_ns=self.now_ns, room_bytes=1000)
             for still in self.chooser.stills(

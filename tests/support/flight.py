@@ -29,11 +29,11 @@ from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from hvt_ground.events.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
-from hvt_ground.perception.pipeline import GroundSight, SightParts
+from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import Decoded, Reading, Readings
 from hvt_ground.perception.stills.refine import Refiner
 
-__all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "sight_of", "square_box", "tracks_at"]
+__all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "pipeline_of", "square_box", "tracks_at"]
 
 SIZE = (320, 192)
 CLASSES = ("car", "bus")
@@ -100,7 +100,7 @@ class SameAnswer:
         return Readings(tuple((reading,) * len(one.boxes_base_px) for one in stills), self.found)
 
 
-def sight_of(
+def pipeline_of(
     emit,
     *,
     detector=None,
@@ -108,12 +108,12 @@ def sight_of(
     detect_every: int = 1,
     edge_classes: Sequence[str] = CLASSES,
     wants_base: bool = False,
-) -> GroundSight:
+) -> Pipeline:
     """Eyes of a session of this flight."""
     reader = reader or SameAnswer()
     names, places = unified_names(CLASSES, edge_classes)
     path = CameraPath(ahead_ticks=15)
-    parts = SightParts(
+    parts = PipelineParts(
         detector=detector or RedSquares(),
         tracker=ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader=reader,
@@ -123,7 +123,7 @@ def sight_of(
         camera=None,
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
-    return GroundSight(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)
+    return Pipeline(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)
 
 
 class Flight:
@@ -212,7 +212,7 @@ class Flight:
         return _received("tracks", replace(step, **changes).pack(), b"", MSGPACK_ENCODING)
 
     def status(
-        self, *, base: int, roi: int = 0, past: int = 0, state: str = "running", meta: int = 0
+        self, *, base: int, roi: int = 0, backlog: int = 0, state: str = "running", meta: int = 0
     ) -> Received:
         """The edge's report after so many messages."""
         self._statuses += 1
@@ -226,12 +226,12 @@ class Flight:
             last_still_sequence=roi - 1,
             base_bytes=0,
             roi_bytes=0,
-            past_bytes=0,
+            backlog_bytes=0,
             meta_bytes=0,
             overhead_bytes=0,
             base_messages=base,
             roi_messages=roi,
-            past_messages=past,
+            backlog_messages=backlog,
             meta_messages=meta,
             worst_window_bps=(0, 0, 0),
             sent={},

@@ -9,32 +9,32 @@ from dataclasses import replace
 from pathlib import Path
 
 from clips import START_NS, framed, smooth_pictures
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import (
+    BacklogHeader,
+    BacklogKind,
     BaseHeader,
     Feedback,
-    PastHeader,
-    PastKind,
     RoiHeader,
-    parse_past_still,
-    parse_past_units,
+    parse_backlog_still,
+    parse_backlog_units,
 )
 from hvt_common.values import Still
 from hvt_edge.backlog.disk import Folder
-from hvt_edge.backlog.stage import Keep
+from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.control.link_control import LinkFollower
+from hvt_edge.control.link_control import LinkControl
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.link.unacknowledged import Unacknowledged
 from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
-from hvt_edge.video.reconfigure import Renewal
+from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
-from hvt_ground.backlog import PastAssembly
+from hvt_ground.backlog import BacklogAssembly
 from kept import INFO, S, opened
 from messages import feedback
 
@@ -67,34 +67,34 @@ class Ground:
         self.frames: set[int] = set()
         self.twice: Counter[tuple[int, str, int]] = Counter()
         """Objects of what was kept, as often as they came."""
-        self.past_frames: dict[int, bytes] = {}
-        self.past_stills: set[int] = set()
-        self.assembly = PastAssembly()
+        self.backlog_frames: dict[int, bytes] = {}
+        self.backlog_stills: set[int] = set()
+        self.assembly = BacklogAssembly()
 
-    def take(self, row: Row, payload: bytes, attachment: bytes) -> None:
+    def take(self, row: Channel, payload: bytes, attachment: bytes) -> None:
         """A message arrives."""
-        if row is Row.BASE:
+        if row is Channel.BASE:
             base = BaseHeader.parse(attachment, payload)
             self.base_sequence = max(self.base_sequence, base.sequence)
             self.frames.add(base.frame_index)
-        elif row is Row.ROI:
+        elif row is Channel.ROI:
             still = RoiHeader.parse(attachment, payload)
             self.still_sequence = max(self.still_sequence, still.sequence)
             self.stills.add(still.sequence)
-        elif row is Row.PAST:
-            header = PastHeader.parse(attachment, payload)
-            whole = self.assembly.piece(header, payload)
+        elif row is Channel.BACKLOG:
+            header = BacklogHeader.parse(attachment, payload)
+            whole = self.assembly.chunk(header, payload)
             if whole is not None:
                 self._content((header.session_id, header.kind, header.number), whole)
 
     def _content(self, key: tuple[int, str, int], whole: bytes) -> None:
         self.twice[key] += 1
         self.assembly.settle(key, usable=True)
-        if key[1] == PastKind.BASE:
-            self.past_frames |= {unit.frame_index: unit.data for unit in parse_past_units(whole)}
-        elif key[1] == PastKind.STILL:
-            still = parse_past_still(whole)
-            self.past_stills.add(RoiHeader.parse(still.attachment, still.payload).sequence)
+        if key[1] == BacklogKind.BASE:
+            self.backlog_frames |= {unit.frame_index: unit.data for unit in parse_backlog_units(whole)}
+        elif key[1] == BacklogKind.STILL:
+            still = parse_backlog_still(whole)
+            self.backlog_stills.add(RoiHeader.parse(still.attachment, still.payload).sequence)
 
     def report(self, now_ns: int) -> Feedback:
         """What it says now."""
@@ -108,7 +108,7 @@ class Ground:
             base_sequence=self.base_sequence,
             still_sequence=self.still_sequence,
             missing_stills=tuple(missing[-16:]),
-            past=self.assembly.take_haves(16),
+            backlog=self.assembly.take_acknowledged_ranges(16),
         )
 
 
@@ -116,10 +116,10 @@ class Out:
     """The link: what was put, and, unless it is dark, a ground that hears it."""
 
     def __init__(self) -> None:
-        self.puts: list[tuple[Row, bytes, bytes]] = []
+        self.puts: list[tuple[Channel, bytes, bytes]] = []
         self.ground = Ground()
         self.dark = False
-        self.before_put: Callable[[Row], None] = lambda _row: None
+        self.before_put: Callable[[Channel], None] = lambda _row: None
 
     def put(self, row, payload, *, attachment=None, encoding="") -> None:
         """Keep it, and let it arrive."""
@@ -135,13 +135,15 @@ class Out:
     @property
     def base(self) -> list[BaseHeader]:
         """Headers of the base stream."""
-        return [BaseHeader.parse(extra, data) for row, data, extra in list(self.puts) if row is Row.BASE]
+        return [BaseHeader.parse(extra, data) for row, data, extra in list(self.puts) if row is Channel.BASE]
 
     @property
-    def past(self) -> list[tuple[PastHeader, bytes]]:
+    def backlog(self) -> list[tuple[BacklogHeader, bytes]]:
         """Pieces of what was kept."""
         return [
-            (PastHeader.parse(extra, data), data) for row, data, extra in list(self.puts) if row is Row.PAST
+            (BacklogHeader.parse(extra, data), data)
+            for row, data, extra in list(self.puts)
+            if row is Channel.BACKLOG
         ]
 
 
@@ -165,7 +167,7 @@ class Rig:
         *,
         live: bool = False,
         adapt: bool = False,
-        lend: bool = False,
+        borrow_unused: bool = False,
         info: Callable[[], bytes] = INFO.pack,
         session_id: int = 7,
         budget: tuple[int, int] = (800_000, 400_000),
@@ -175,11 +177,11 @@ class Rig:
         self.keyframes = KeyframePlan(KeyframeSettings(interval_ns=60 * S))
         self.unacked, self.ledger = Unacknowledged(), Ledger()
         pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))) if adapt else None
-        self.follower = LinkFollower(pacer, self.unacked, keyframes=self.keyframes)
-        self.sender = Sender(
+        self.link_control = LinkControl(pacer, self.unacked, keyframes=self.keyframes)
+        self.sender = Transmitter(
             self.out,
             ledger=self.ledger,
-            budget=RollingBudget(BudgetSettings(*budget, fps=15, lend=lend)),
+            budget=RollingBudget(BudgetSettings(*budget, fps=15, borrow_unused=borrow_unused)),
             edge_id="uav-1",
             session_id=session_id,
             lockstep=False,
@@ -187,8 +189,8 @@ class Rig:
             pacer=pacer,
             unacked=self.unacked,
         )
-        self.fates: list[tuple[str, str]] = []
-        self.keep = Keep(
+        self.outcomes: list[tuple[str, str]] = []
+        self.backlog = BacklogStage(
             lambda: Folder(folder, max_bytes=50_000_000, session_id=session_id, info=info),
             session_id=session_id,
             live=live,
@@ -196,20 +198,22 @@ class Rig:
             sender=self.sender,
             keyframes=self.keyframes,
             clock=lambda: self.now_ns,
-            on_fate=lambda *fate: self.fates.append(fate),
+            on_outcome=lambda *outcome: self.outcomes.append(outcome),
         )
         config = check(EdgeConfig(source="demo", size=SIZE, budget=budget[0], preset="ultrafast"))
         self.stills = NoStills()
-        self.follower.attach(
+        self.link_control.attach(
             linked=lambda: self.linked,
             sender=self.sender,
-            renewal=Renewal(config, size=SIZE, every_n=1, sender=self.sender, split=None, pacer=pacer),
+            reconfiguration=EncoderReconfiguration(
+                config, size=SIZE, decimation=1, sender=self.sender, split=None, pacer=pacer
+            ),
             stills=self.stills,
-            keep=self.keep,
+            backlog=self.backlog,
         )
         self.asked: list[int] = []
         """When the link was asked for room for a frame."""
-        self.admits: Callable[[int], bool] = self.follower.admits
+        self.admits: Callable[[int], bool] = self.link_control.admits
         self.stage = BaseStage(
             BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast")),
             keyframes=self.keyframes,
@@ -217,7 +221,7 @@ class Rig:
             recorder=None,
             first_keyframe_bytes=5000,
             admits=self._asked_to_admit,
-            keep=self.keep,
+            backlog=self.backlog,
         )
         self.coded: dict[int, bytes] = {}
 
@@ -226,7 +230,7 @@ class Rig:
         self.linked = linked
         for frame in FRAMES[first:end]:
             self.now_ns = frame.capture_ns
-            self.follower.before_frame(self.now_ns)
+            self.link_control.before_frame(self.now_ns)
             unit = self.stage.encode(frame, now_ns=self.now_ns)
             if unit is not None:
                 self.coded[frame.index] = unit.data
@@ -241,13 +245,13 @@ class Rig:
     def report(self) -> None:
         """The ground says what it has, unless nobody hears it."""
         if not self.out.dark:
-            self.follower.hear(self.out.ground.report(self.now_ns), now_ns=self.now_ns)
+            self.link_control.hear(self.out.ground.report(self.now_ns), now_ns=self.now_ns)
 
     def still(self, sequence: int, *, utility: float = 1.0) -> None:
         """One goes out."""
         still = _numbered(STILL, sequence)
         self.sender.still(still, now_ns=self.now_ns, utility=utility)
-        self.keep.note_utility(still, utility)
+        self.backlog.note_utility(still, utility)
 
     def finish(self, *, reports: bool = True) -> list[str]:
         """After the last frame, in a tenth of a second a turn; what the user is told."""
@@ -262,23 +266,23 @@ class Rig:
                 self.report()
             return self.linked
 
-        self.follower._linked = linked
-        self.follower.finish(stop=threading.Event(), note=notes.append)
+        self.link_control._linked = linked
+        self.link_control.finish(stop=threading.Event(), note=notes.append)
         return notes
 
     def kept(self) -> list:
         """What another start of the edge finds."""
-        self.keep.close()
+        self.backlog.close()
         with opened(self.path, session_id=8) as folder:
             return [
                 unit
                 for entry in reversed(list(folder.newest_segments()))
-                for unit in parse_past_units(folder.read(entry))
+                for unit in parse_backlog_units(folder.read(entry))
             ]
 
-    def kept_stills(self) -> dict[int, str]:
+    def stored_stills(self) -> dict[int, str]:
         """Numbers and file names of the stills that another start of the edge finds."""
-        self.keep.close()
+        self.backlog.close()
         with opened(self.path, session_id=8) as folder:
             return {entry.number: entry.path.name for entry in folder.best_stills()}
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from clips import START_NS, framed, smooth_pictures
 from flight import Flight
-from hvt_common.protocol.messages import PastStill, RoiHeader, pack_past_still
+from hvt_common.protocol.messages import BacklogStill, RoiHeader, pack_backlog_still
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
@@ -53,7 +53,7 @@ def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int =
         parameters={},
         also=(),
     )
-    return pack_past_still(PastStill(header.pack(data), "image/jpeg", data))
+    return pack_backlog_still(BacklogStill(header.pack(data), "image/jpeg", data))
 
 
 def add_stills(folder: Folder, utilities: dict[int, float], *, capture_ns: int = START_NS) -> None:

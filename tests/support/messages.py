@@ -6,7 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 from hvt_common.protocol.messages import (
+    AcknowledgedRange,
     AlsoShown,
+    BacklogHeader,
     BaseHeader,
     ControlAnswer,
     ControlRequest,
@@ -15,8 +17,6 @@ from hvt_common.protocol.messages import (
     Health,
     Info,
     Message,
-    PastHave,
-    PastHeader,
     RoiHeader,
     Status,
     StillResult,
@@ -82,12 +82,12 @@ STATUS = Status(
     last_still_sequence=311,
     base_bytes=49_000_000,
     roi_bytes=9_000_000,
-    past_bytes=0,
+    backlog_bytes=0,
     meta_bytes=500_000,
     overhead_bytes=2_300_000,
     base_messages=9_001,
     roi_messages=312,
-    past_messages=0,
+    backlog_messages=0,
     meta_messages=602,
     worst_window_bps=(712_000, 148_000, 800_000),
     sent={"small": 200, "uncertain": 112},
@@ -135,7 +135,7 @@ _SILENT = Feedback(
     clock_offset_ns=0,
     clock_error_ns=-1,
     stills=(),
-    past=(),
+    backlog=(),
 )
 FEEDBACK = replace(
     _SILENT,
@@ -157,19 +157,19 @@ FEEDBACK = replace(
             again=False,
         ),
     ),
-    past=(PastHave(session_id=U64, kind="base", number=450, have_bytes=12_000),),
+    backlog=(AcknowledgedRange(session_id=U64, kind="base", number=450, acknowledged_bytes=12_000),),
 )
-PAST = PastHeader(session_id=7, kind="still", number=31, offset=1400, total_bytes=5_000, send_ns=I63)
+BACKLOG = BacklogHeader(session_id=7, kind="still", number=31, offset=1400, total_bytes=5_000, send_ns=I63)
 REQUEST = ControlRequest(session_id=0, command="keyframe", arguments={})
 ANSWER = ControlAnswer(
     session_id=7,
     accepted=True,
     reason="",
-    still_ask=3,
+    still_request=3,
     frame_index=9_100,
     tracks=(TrackNow(track_id=57, class_id=3, confidence=0.613, box_source_px=(-3.125, 10.0, 90.875, 64.5)),),
 )
-EXAMPLES: tuple[Message, ...] = (BASE, ROI, STEP, INFO, STATUS, REQUEST, ANSWER, FEEDBACK, PAST)
+EXAMPLES: tuple[Message, ...] = (BASE, ROI, STEP, INFO, STATUS, REQUEST, ANSWER, FEEDBACK, BACKLOG)
 
 
 def feedback(**changes: Any) -> Feedback:

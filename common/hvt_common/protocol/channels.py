@@ -17,10 +17,10 @@ __all__ = [
     "DELIVERIES",
     "MSGPACK_ENCODING",
     "ROOT",
+    "Channel",
     "Delivery",
     "Direction",
     "EdgeKeys",
-    "Row",
     "check_edge_pattern",
     "matches",
     "parse_key",
@@ -36,13 +36,13 @@ _EDGE_ID = re.compile(r"[a-z0-9-]{1,32}")
 _EDGE_PATTERN = re.compile(r"[a-z0-9*-]{1,64}")
 
 
-class Row(StrEnum):
+class Channel(StrEnum):
     """The last part of a key."""
 
     BASE = "base"
     ROI = "roi"
     TRACKS = "tracks"
-    PAST = "past"
+    BACKLOG = "backlog"
     STATUS = "status"
     INFO = "info"
     CONTROL = "control"
@@ -55,7 +55,7 @@ class Direction(Enum):
 
     EDGE_TO_GROUND = "edge to ground"
     GROUND_TO_EDGE = "ground to edge"
-    GROUND_ASKS = "ground asks, edge answers"
+    GROUND_QUERIES = "ground asks, edge answers"
     PRESENCE = "liveliness token of the edge"
 
 
@@ -75,39 +75,39 @@ class Delivery:
     """Always False: sending without batching makes loss worse on a saturated link."""
 
 
-DELIVERIES: Mapping[Row, Delivery] = MappingProxyType(
+DELIVERIES: Mapping[Channel, Delivery] = MappingProxyType(
     {
-        Row.BASE: Delivery(
+        Channel.BASE: Delivery(
             Direction.EDGE_TO_GROUND,
             "one HEVC access unit, Annex B; attachment BaseHeader",
             "DATA_HIGH",
             "BLOCK",
             encoding="video/h265",
         ),
-        Row.ROI: Delivery(
+        Channel.ROI: Delivery(
             Direction.EDGE_TO_GROUND,
             "one coded still; attachment RoiHeader",
             "BACKGROUND",
             "BLOCK",
             encoding="image/jpeg",
         ),
-        Row.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "TrackStep", "DATA_LOW", "DROP"),
-        Row.PAST: Delivery(
+        Channel.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "TrackStep", "DATA_LOW", "DROP"),
+        Channel.BACKLOG: Delivery(
             Direction.EDGE_TO_GROUND,
-            "a piece of what was kept while the link was away; attachment PastHeader",
+            "a chunk of what was kept while the link was away; attachment BacklogHeader",
             "BACKGROUND",
             "BLOCK",
         ),
-        Row.STATUS: Delivery(Direction.EDGE_TO_GROUND, "Status", "INTERACTIVE_LOW", "DROP"),
-        Row.INFO: Delivery(Direction.GROUND_ASKS, "empty question, Info", "INTERACTIVE_HIGH", "BLOCK"),
-        Row.CONTROL: Delivery(
-            Direction.GROUND_ASKS, "ControlRequest, ControlAnswer", "INTERACTIVE_HIGH", "BLOCK"
+        Channel.STATUS: Delivery(Direction.EDGE_TO_GROUND, "Status", "INTERACTIVE_LOW", "DROP"),
+        Channel.INFO: Delivery(Direction.GROUND_QUERIES, "empty question, Info", "INTERACTIVE_HIGH", "BLOCK"),
+        Channel.CONTROL: Delivery(
+            Direction.GROUND_QUERIES, "ControlRequest, ControlAnswer", "INTERACTIVE_HIGH", "BLOCK"
         ),
-        Row.FEEDBACK: Delivery(Direction.GROUND_TO_EDGE, "Feedback", "INTERACTIVE_LOW", "DROP"),
-        Row.ALIVE: Delivery(Direction.PRESENCE, "nothing", "DATA", "BLOCK"),
+        Channel.FEEDBACK: Delivery(Direction.GROUND_TO_EDGE, "Feedback", "INTERACTIVE_LOW", "DROP"),
+        Channel.ALIVE: Delivery(Direction.PRESENCE, "nothing", "DATA", "BLOCK"),
     }
 )
-"""The one table. `Delivery.encoding` of `Row.ROI` is that of the default codec; another still codec says its own."""
+"""The one table. The encoding of `Channel.ROI` is that of the default codec; another still codec says its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class EdgeKeys:
                 f"edge id {self.edge!r} is not usable: 1 to 32 characters of a-z, 0-9 and '-' are accepted"
             )
 
-    def key(self, row: Row) -> str:
+    def key(self, row: Channel) -> str:
         """The full key, such as ``hvt/uav-1/base``."""
         return f"{ROOT}/{self.edge}/{row}"
 
@@ -136,7 +136,7 @@ def check_edge_pattern(pattern: str) -> str:
     return pattern
 
 
-def selector(row: Row, *, edges: str = "*") -> str:
+def selector(row: Channel, *, edges: str = "*") -> str:
     """The Zenoh key expression of one row for all edges that ``edges`` matches, such as ``hvt/uav-$*/base``.
 
     The pattern travels to the sender, so edges that nobody asked for cost no line bytes.
@@ -151,12 +151,12 @@ def matches(edge: str, *, edges: str) -> bool:
     return re.fullmatch(re.escape(edges).replace(r"\*", ".*"), edge) is not None
 
 
-def parse_key(key: str) -> tuple[str, Row] | None:
+def parse_key(key: str) -> tuple[str, Channel] | None:
     """The edge id and row of a received key; None for any key that is not ours."""
     parts = key.split("/")
     if len(parts) != 3 or parts[0] != ROOT or _EDGE_ID.fullmatch(parts[1]) is None:
         return None
     try:
-        return parts[1], Row(parts[2])
+        return parts[1], Channel(parts[2])
     except ValueError:
         return None

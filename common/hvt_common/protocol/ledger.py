@@ -14,23 +14,23 @@ from enum import Enum
 from typing import Literal
 
 __all__ = [
-    "Channel",
-    "Fate",
+    "Account",
     "Ledger",
     "LedgerSummary",
+    "StillOutcome",
     "WindowRates",
     "overhead_bytes",
 ]
 
-Fate = Literal["sent", "deferred", "dropped", "received"]
+StillOutcome = Literal["sent", "deferred", "dropped", "received"]
 
 
-class Channel(Enum):
+class Account(Enum):
     """What a message belongs to."""
 
     BASE = "base"
     ROI = "roi"
-    PAST = "past"
+    BACKLOG = "backlog"
     """What was kept while the link was away, and sent afterwards."""
     META = "meta"
     """Status, info, feedback and tracks."""
@@ -108,7 +108,7 @@ class LedgerSummary:
     duration_s: float
     base_bytes: int
     roi_bytes: int
-    past_bytes: int
+    backlog_bytes: int
     meta_bytes: int
     overhead_bytes: int
     messages: Mapping[str, int]
@@ -117,13 +117,13 @@ class LedgerSummary:
     roi_bps: int
     total_bps: int
     worst_window_bps: WindowRates
-    fates: Mapping[str, Mapping[str, int]]
+    outcomes: Mapping[str, Mapping[str, int]]
     """For each fate the number of stills by reason."""
 
     @property
     def line_bytes(self) -> int:
         """Everything."""
-        return self.base_bytes + self.roi_bytes + self.past_bytes + self.meta_bytes + self.overhead_bytes
+        return self.base_bytes + self.roi_bytes + self.backlog_bytes + self.meta_bytes + self.overhead_bytes
 
 
 class Ledger:
@@ -140,17 +140,17 @@ class Ledger:
         self._slack_ns = slack_ns
         self._pending: list[tuple[int, str, int]] = []
         self._windows = _Windows(window_ns)
-        self._line = dict.fromkeys(Channel, 0)
-        self._messages = dict.fromkeys(Channel, 0)
-        self._fates: dict[Fate, Counter[str]] = {
-            fate: Counter() for fate in ("sent", "deferred", "dropped", "received")
+        self._line = dict.fromkeys(Account, 0)
+        self._messages = dict.fromkeys(Account, 0)
+        self._outcomes: dict[StillOutcome, Counter[str]] = {
+            outcome: Counter() for outcome in ("sent", "deferred", "dropped", "received")
         }
         self.base_bytes = 0
         """Payload of ``base``."""
         self.roi_bytes = 0
         """Payload of ``roi``."""
-        self.past_bytes = 0
-        """Payload of ``past``."""
+        self.backlog_bytes = 0
+        """Payload of ``backlog``."""
         self.meta_bytes = 0
         """Attachments of all three, and payload and attachments of everything else."""
         self.overhead_bytes = 0
@@ -158,17 +158,17 @@ class Ledger:
         self.last_ns: int | None = None
 
     def count(
-        self, channel: Channel, *, payload_bytes: int, attachment_bytes: int, overhead_bytes: int, at_ns: int
+        self, channel: Account, *, payload_bytes: int, attachment_bytes: int, overhead_bytes: int, at_ns: int
     ) -> None:
         """Add one message; ``at_ns`` is the time that its windows go by."""
         self.overhead_bytes += overhead_bytes
         self.meta_bytes += attachment_bytes
-        if channel is Channel.BASE:
+        if channel is Account.BASE:
             self.base_bytes += payload_bytes
-        elif channel is Channel.ROI:
+        elif channel is Account.ROI:
             self.roi_bytes += payload_bytes
-        elif channel is Channel.PAST:
-            self.past_bytes += payload_bytes
+        elif channel is Account.BACKLOG:
+            self.backlog_bytes += payload_bytes
         else:
             self.meta_bytes += payload_bytes
         line = payload_bytes + attachment_bytes + overhead_bytes
@@ -176,25 +176,25 @@ class Ledger:
         self._messages[channel] += 1
         self._enter(at_ns, channel, line)
 
-    def record_fate(self, fate: Fate, reason: str) -> None:
+    def record_outcome(self, outcome: StillOutcome, reason: str) -> None:
         """Note what became of a still and why. Some come from the network: of many, the later are ``other``."""
-        fates = self._fates[fate]
-        fates[reason if reason in fates or len(fates) < _MOST_REASONS else "other"] += 1
+        outcomes = self._outcomes[outcome]
+        outcomes[reason if reason in outcomes or len(outcomes) < _MOST_REASONS else "other"] += 1
 
-    def fates(self, fate: Fate) -> dict[str, int]:
+    def outcomes(self, outcome: StillOutcome) -> dict[str, int]:
         """Number of stills with this fate, by reason."""
-        return dict(self._fates[fate])
+        return dict(self._outcomes[outcome])
 
-    def messages(self, channel: Channel) -> int:
+    def messages(self, channel: Account) -> int:
         """Messages counted so far."""
         return self._messages[channel]
 
     @property
     def line_bytes(self) -> int:
         """Everything counted so far."""
-        return self.base_bytes + self.roi_bytes + self.past_bytes + self.meta_bytes + self.overhead_bytes
+        return self.base_bytes + self.roi_bytes + self.backlog_bytes + self.meta_bytes + self.overhead_bytes
 
-    def window_bytes(self, channel: Channel | None, now_ns: int) -> int:
+    def window_bytes(self, channel: Account | None, now_ns: int) -> int:
         """Line bytes of the messages in the window that ends at ``now_ns``; of all channels for None.
 
         Exact for any ``now_ns`` not further back than the slack from the newest message.
@@ -226,18 +226,18 @@ class Ledger:
             duration_s=duration_s,
             base_bytes=self.base_bytes,
             roi_bytes=self.roi_bytes,
-            past_bytes=self.past_bytes,
+            backlog_bytes=self.backlog_bytes,
             meta_bytes=self.meta_bytes,
             overhead_bytes=self.overhead_bytes,
             messages={channel.value: number for channel, number in self._messages.items()},
-            base_bps=rate(self._line[Channel.BASE]),
-            roi_bps=rate(self._line[Channel.ROI]),
+            base_bps=rate(self._line[Account.BASE]),
+            roi_bps=rate(self._line[Account.ROI]),
             total_bps=rate(self.line_bytes),
             worst_window_bps=self.worst_window_bps,
-            fates={fate: dict(reasons) for fate, reasons in self._fates.items()},
+            outcomes={outcome: dict(reasons) for outcome, reasons in self._outcomes.items()},
         )
 
-    def _enter(self, at_ns: int, channel: Channel, line: int) -> None:
+    def _enter(self, at_ns: int, channel: Account, line: int) -> None:
         self.first_ns = at_ns if self.first_ns is None else min(self.first_ns, at_ns)
         self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
         if self._pending and at_ns < self._pending[-1][0] - self._slack_ns:
@@ -258,7 +258,7 @@ class Ledger:
         del self._pending[:ready]
 
 
-_SUMS = (*(channel.value for channel in Channel), "total")
+_SUMS = (*(channel.value for channel in Account), "total")
 
 
 @dataclass(slots=True)

@@ -7,7 +7,7 @@ import ctypes
 import os
 import sys
 
-__all__ = ["keep_to_few_heaps"]
+__all__ = ["limit_malloc_arenas"]
 
 # Numbers of glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
@@ -20,7 +20,7 @@ _LARGEST_BYTES = 32 << 20
 _KEPT_BYTES = 64 << 20
 
 
-def keep_to_few_heaps() -> None:
+def limit_malloc_arenas() -> None:
     """Have all threads allocate from two heaps, which keep what is freed for the next frame; only with glibc.
 
     By itself glibc gives each thread a heap of its own (up to eight for each processor), and its idea of how large is

@@ -7,12 +7,12 @@ import os
 import sys
 import threading
 
-__all__ = ["give_way"]
+__all__ = ["lower_priority"]
 
 _NICENESS = 10
 
 
-def give_way() -> None:
+def lower_priority() -> None:
     """Let other threads go before the calling one, and before those that it starts; on Linux only.
 
     Encoding and decoding are what the operator sees move; detection and stills may come a little later.

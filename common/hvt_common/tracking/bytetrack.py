@@ -20,7 +20,7 @@ import numpy.typing as npt
 from hvt_common.tracking import kalman
 from hvt_common.tracking.association import grown, overlaps, pair
 from hvt_common.tracking.camera_motion import CameraMotion
-from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, Seen, TrackTable
+from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, TrackerInput, TrackTable
 from hvt_common.values import Detections, Image, Tracks
 
 __all__ = ["ByteTracker", "TrackerSettings", "weak_confidence"]
@@ -148,7 +148,7 @@ class ByteTracker:
         ``image_bgr`` is that frame; it is needed only to follow the camera's motion.
         A `ValueError` means that ``frame_index`` does not rise or that the class ids are negative.
         """
-        seen = Seen.of(detections, low_confidence=self._settings.low_confidence)
+        seen = TrackerInput.of(detections, low_confidence=self._settings.low_confidence)
         self._advance(frame_index, image_bgr, hold_unconfirmed=True)
         self._forget_stale(frame_index)
         self._make_room_for(seen)
@@ -225,7 +225,7 @@ class ByteTracker:
         if stale.any():
             table.keep(~(stale & (table.lost_at != self._updated_index)))
 
-    def _make_room_for(self, seen: Seen) -> None:
+    def _make_room_for(self, seen: TrackerInput) -> None:
         if len(seen):
             if seen.class_ids.min() < 0:
                 raise ValueError(f"class_ids holds {seen.class_ids.min()}, must not be negative")
@@ -243,7 +243,7 @@ class ByteTracker:
         unsearched = frame_index - self._updated_index - 1
         return min(_MOST_GROWTH, self._settings.search_growth_per_s * unsearched / self._fps)
 
-    def _match(self, seen: Seen, *, growth: float) -> tuple[_Indices, _Indices]:
+    def _match(self, seen: TrackerInput, *, growth: float) -> tuple[_Indices, _Indices]:
         """The detection of each track (-1: none), and the confident detections left that may start tracks."""
         settings, table = self._settings, self._table
         # A detection at exactly the threshold is neither confident nor weak in the authors' program.
@@ -266,10 +266,10 @@ class ByteTracker:
         free &= seen.confidences >= settings.birth_confidence
         return match, free.nonzero()[0]
 
-    def _fused(self, iou: _Floats, seen: Seen) -> _Floats:
+    def _fused(self, iou: _Floats, seen: TrackerInput) -> _Floats:
         return iou * seen.confidences if self._settings.fuse_scores else iou
 
-    def _correct(self, seen: Seen, match: _Indices, frame_index: int) -> None:
+    def _correct(self, seen: TrackerInput, match: _Indices, frame_index: int) -> None:
         """Take each matched detection into its track."""
         table, settings = self._table, self._settings
         rows = (match >= 0).nonzero()[0]
@@ -301,7 +301,7 @@ class ByteTracker:
         table.states[newly_lost, kalman.VELOCITY, 3] = 0
         return np.asarray(~ended)
 
-    def _start(self, seen: Seen, frame_index: int, *, confirmed: bool) -> None:
+    def _start(self, seen: TrackerInput, frame_index: int, *, confirmed: bool) -> None:
         if not len(seen):
             return
         classes = self._table.votes.shape[1]

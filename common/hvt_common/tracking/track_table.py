@@ -12,7 +12,7 @@ import numpy.typing as npt
 from hvt_common.tracking import kalman
 from hvt_common.values import Detections
 
-__all__ = ["LOST", "TRACKED", "UNCONFIRMED", "Seen", "TrackTable"]
+__all__ = ["LOST", "TRACKED", "UNCONFIRMED", "TrackTable", "TrackerInput"]
 
 _Floats = npt.NDArray[np.float64]
 _Indices = npt.NDArray[np.int64]
@@ -25,7 +25,7 @@ UNCONFIRMED, TRACKED, LOST = range(3)
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class TrackerInput:
     """The usable detections of one frame, best first."""
 
     boxes: _Floats
@@ -38,7 +38,7 @@ class Seen:
         return len(self.confidences)
 
     @classmethod
-    def of(cls, detections: Detections, *, low_confidence: float) -> Seen:
+    def of(cls, detections: Detections, *, low_confidence: float) -> TrackerInput:
         """Leave out what is weak, not finite or without area; order what remains.
 
         New ids are given in this order, so it must not depend on the order of the input: equal confidences are
@@ -56,9 +56,11 @@ class Seen:
         boxes = boxes[order]
         return cls(boxes, kalman.measure(boxes), confidences[order], class_ids[order])
 
-    def take(self, index: _Indices) -> Seen:
+    def take(self, index: _Indices) -> TrackerInput:
         """Some of them, in the order of ``index``."""
-        return Seen(self.boxes[index], self.measured[index], self.confidences[index], self.class_ids[index])
+        return TrackerInput(
+            self.boxes[index], self.measured[index], self.confidences[index], self.class_ids[index]
+        )
 
 
 @dataclass(slots=True)
@@ -85,10 +87,12 @@ class TrackTable:
     @classmethod
     def empty(cls) -> TrackTable:
         """No tracks."""
-        return cls.new(Seen.of(Detections.none(), low_confidence=0), first_id=1, frame_index=0, classes=0)
+        return cls.new(
+            TrackerInput.of(Detections.none(), low_confidence=0), first_id=1, frame_index=0, classes=0
+        )
 
     @classmethod
-    def new(cls, seen: Seen, *, first_id: int, frame_index: int, classes: int) -> TrackTable:
+    def new(cls, seen: TrackerInput, *, first_id: int, frame_index: int, classes: int) -> TrackTable:
         """One unconfirmed track a detection, with votes on ``classes`` classes."""
         count = len(seen)
         votes = np.zeros((count, classes), np.float32)

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 import zenoh
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, EdgeKeys, Row
+from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, EdgeKeys
 from hvt_common.transport.doctor.certificate import check_own_keys
 from hvt_common.transport.doctor.diagnose import visit
 from hvt_common.transport.inbox import Inbox, Received, Sink
@@ -59,7 +59,7 @@ def open_session(settings: LinkSettings) -> Iterator[zenoh.Session]:
         _close(session)
 
 
-def declare_publisher(session: zenoh.Session, row: Row, *, keys: EdgeKeys) -> zenoh.Publisher:
+def declare_publisher(session: zenoh.Session, row: Channel, *, keys: EdgeKeys) -> zenoh.Publisher:
     """A publisher of one row, delivered as the key table says. ``put`` may block on a ``BLOCK`` row: own a thread."""
     delivery = DELIVERIES[row]
     return session.declare_publisher(
@@ -97,7 +97,7 @@ def subscribe(
 
 def ask(
     session: zenoh.Session,
-    row: Row,
+    row: Channel,
     *,
     keys: EdgeKeys,
     question: bytes,
@@ -125,7 +125,7 @@ def ask(
 
 
 def serve(
-    session: zenoh.Session, row: Row, *, keys: EdgeKeys, answer: Callable[[bytes], bytes | None]
+    session: zenoh.Session, row: Channel, *, keys: EdgeKeys, answer: Callable[[bytes], bytes | None]
 ) -> zenoh.Queryable[None]:
     """Answer a queryable row: ``answer(question)`` runs in Zenoh's callback and must be quick; None says nothing."""
     key = keys.key(row)

@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 
-from hvt_common.protocol.messages import PastHave, PastKind
+from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.entry import Entry, Key
 
-__all__ = ["Backfill", "Piece"]
+__all__ = ["Backfill", "Chunk"]
 
 _log = logging.getLogger(__name__)
 
@@ -31,17 +31,17 @@ _MOST_OBJECTS = 12
 """On their way at a time; one report of the ground names 16."""
 _MOST_AHEAD_BYTES = 256 * 1024
 """Of one object, beyond what the ground has said it has."""
-_LEAST_PIECE_BYTES = 600
+_LEAST_CHUNK_BYTES = 600
 """A smaller one is mostly headers, unless it is the last."""
 _OTHER_RECEIVER_NS = 5 * _SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class Chunk:
     """Bytes of one object."""
 
     session_id: int
-    kind: PastKind
+    kind: BacklogKind
     number: int
     offset: int
     total_bytes: int
@@ -55,7 +55,7 @@ class _Transfer:
     since_ns: int
     """Of the last piece sent or acknowledged."""
     sent_bytes: int = 0
-    have_bytes: int = 0
+    acknowledged_bytes: int = 0
     tries: int = 0
     answers: int = 0
     """In which the ground had got no further: it is busy."""
@@ -96,7 +96,9 @@ class Backfill:
 
     # What comes back
 
-    def hear(self, haves: Sequence[PastHave], *, receiver_id: int, now_ns: int) -> None:
+    def hear(
+        self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int, now_ns: int
+    ) -> None:
         """Take in what a ground says it has. One ground counts, until it says nothing of it for a while."""
         if receiver_id != self._receiver_id:
             if self._receiver_id is not None and now_ns - self._heard_ns < _OTHER_RECEIVER_NS:
@@ -106,22 +108,30 @@ class Backfill:
             self._aside.clear()
             self._acknowledged.clear()
         self._heard_ns = now_ns
-        for have in haves:
-            key = (have.session_id, PastKind(have.kind), have.number)
+        for acknowledged_range in acknowledged_ranges:
+            key = (
+                acknowledged_range.session_id,
+                BacklogKind(acknowledged_range.kind),
+                acknowledged_range.number,
+            )
             transfer = self._line.get(key)
             if transfer is not None:
-                self._advance(transfer, have.have_bytes, now_ns)
+                self._advance(transfer, acknowledged_range.acknowledged_bytes, now_ns)
             elif key in self._aside:
-                self._late(key, have.have_bytes)
-            elif key[1:] == (PastKind.INFO, 0) and not have.have_bytes and self._folder.find(key) is not None:
-                self._informed.discard(have.session_id)
-                self._asked.add(have.session_id)
+                self._late(key, acknowledged_range.acknowledged_bytes)
+            elif (
+                key[1:] == (BacklogKind.INFO, 0)
+                and not acknowledged_range.acknowledged_bytes
+                and self._folder.find(key) is not None
+            ):
+                self._informed.discard(acknowledged_range.session_id)
+                self._asked.add(acknowledged_range.session_id)
 
-    def _late(self, key: Key, have_bytes: int) -> None:
+    def _late(self, key: Key, acknowledged_bytes: int) -> None:
         """The ground had it after all when it was put aside."""
         entry = self._folder.find(key)
         data = None if entry is None else self._folder.read(entry)
-        if entry is not None and data is not None and have_bytes == len(data):
+        if entry is not None and data is not None and acknowledged_bytes == len(data):
             self._aside.discard(key)
             self._folder.remove(entry)
             self._on_done(entry)
@@ -135,33 +145,37 @@ class Backfill:
     def _forget(self) -> None:
         """Keep nothing of objects that are not here any more."""
         self._aside = {key for key in self._aside if self._folder.find(key) is not None}
-        here = {key: have for key, have in self._acknowledged.items() if self._folder.find(key) is not None}
+        here = {
+            key: acknowledged_range
+            for key, acknowledged_range in self._acknowledged.items()
+            if self._folder.find(key) is not None
+        }
         self._acknowledged = here
 
-    def _advance(self, transfer: _Transfer, have_bytes: int, now_ns: int) -> None:
-        if have_bytes > transfer.total_bytes:
+    def _advance(self, transfer: _Transfer, acknowledged_bytes: int, now_ns: int) -> None:
+        if acknowledged_bytes > transfer.total_bytes:
             return
         key = transfer.entry.key
         # By object, not by transfer: after an outage the ground says again what it has said before.
-        self.acknowledged_bytes += max(0, have_bytes - self._acknowledged.get(key, 0))
-        self._acknowledged[key] = have_bytes
-        if have_bytes == transfer.total_bytes:
+        self.acknowledged_bytes += max(0, acknowledged_bytes - self._acknowledged.get(key, 0))
+        self._acknowledged[key] = acknowledged_bytes
+        if acknowledged_bytes == transfer.total_bytes:
             self._done(transfer)
             return
-        if have_bytes < transfer.have_bytes:  # it was started again, or lost some
-            transfer.sent_bytes = have_bytes
-        elif have_bytes > transfer.have_bytes:
+        if acknowledged_bytes < transfer.acknowledged_bytes:  # it was started again, or lost some
+            transfer.sent_bytes = acknowledged_bytes
+        elif acknowledged_bytes > transfer.acknowledged_bytes:
             transfer.tries, transfer.answers, transfer.since_ns = 0, 0, now_ns
         elif transfer.answers < _MOST_ANSWERS:  # it is busy: only silence is a try that failed
             transfer.tries, transfer.answers = 0, transfer.answers + 1
-        transfer.have_bytes = have_bytes
-        transfer.sent_bytes = max(transfer.sent_bytes, have_bytes)
+        transfer.acknowledged_bytes = acknowledged_bytes
+        transfer.sent_bytes = max(transfer.sent_bytes, acknowledged_bytes)
 
     def _done(self, transfer: _Transfer) -> None:
         entry = transfer.entry
         self._leave(entry.key)
         self._acknowledged.pop(entry.key, None)
-        if entry.kind is PastKind.INFO:
+        if entry.kind is BacklogKind.INFO:
             self._informed.add(entry.session_id)
             return
         self._folder.remove(entry)
@@ -174,38 +188,38 @@ class Backfill:
 
     # What goes out
 
-    def next_piece(self, most_bytes: int, *, now_ns: int, round_trip_ns: int) -> Piece | None:
+    def next_chunk(self, most_bytes: int, *, now_ns: int, round_trip_ns: int) -> Chunk | None:
         """The next piece, of at most so many bytes; None where there is none, or it would be too small."""
         self._begin_again(now_ns - _PATIENCE_NS - round_trip_ns, now_ns)
         while (transfer := self._current(now_ns)) is not None:
             data = self._bytes_of(transfer)
             if data is None:
                 continue
-            piece = data[transfer.sent_bytes : transfer.sent_bytes + max(0, most_bytes)]
-            ends = transfer.sent_bytes + len(piece) == len(data)
-            if not piece or (len(piece) < _LEAST_PIECE_BYTES and not ends):
+            chunk = data[transfer.sent_bytes : transfer.sent_bytes + max(0, most_bytes)]
+            ends = transfer.sent_bytes + len(chunk) == len(data)
+            if not chunk or (len(chunk) < _LEAST_CHUNK_BYTES and not ends):
                 return None
             key, offset = transfer.entry.key, transfer.sent_bytes
-            transfer.sent_bytes += len(piece)
+            transfer.sent_bytes += len(chunk)
             transfer.since_ns = now_ns
-            return Piece(*key, offset=offset, total_bytes=len(data), data=piece)
+            return Chunk(*key, offset=offset, total_bytes=len(data), data=chunk)
         return None
 
-    def take_back(self, piece: Piece) -> None:
+    def take_back(self, chunk: Chunk) -> None:
         """This piece has not been sent after all."""
-        transfer = self._line.get((piece.session_id, piece.kind, piece.number))
+        transfer = self._line.get((chunk.session_id, chunk.kind, chunk.number))
         if transfer is not None:
-            transfer.sent_bytes = min(transfer.sent_bytes, piece.offset)
+            transfer.sent_bytes = min(transfer.sent_bytes, chunk.offset)
 
     def _begin_again(self, before_ns: int, now_ns: int) -> None:
         """Where the ground has not got on for too long."""
         for key, transfer in list(self._line.items()):
             if self._folder.find(key) is None:  # evicted meanwhile
                 self._leave(key)
-            elif transfer.since_ns < before_ns and transfer.sent_bytes > transfer.have_bytes:
+            elif transfer.since_ns < before_ns and transfer.sent_bytes > transfer.acknowledged_bytes:
                 transfer.tries += 1
-                transfer.sent_bytes, transfer.since_ns = transfer.have_bytes, now_ns
-                if transfer.tries >= (_TRIES_BEGUN if transfer.have_bytes else _TRIES):
+                transfer.sent_bytes, transfer.since_ns = transfer.acknowledged_bytes, now_ns
+                if transfer.tries >= (_TRIES_BEGUN if transfer.acknowledged_bytes else _TRIES):
                     self._give_up(transfer)
 
     def _give_up(self, transfer: _Transfer) -> None:
@@ -219,7 +233,7 @@ class Backfill:
                 transfer.tries,
                 self.given_up,
             )
-        if transfer.entry.kind is PastKind.INFO:
+        if transfer.entry.kind is BacklogKind.INFO:
             self._asked.discard(transfer.entry.session_id)
             self._informed.add(transfer.entry.session_id)  # what follows shows whether it was needed
         else:  # only a ground that has it, age or want of room may cost an object its place
@@ -230,7 +244,7 @@ class Backfill:
         """The object of which pieces are cut now: one that is not all on its way, or the next one."""
         for transfer in self._line.values():
             if transfer.sent_bytes < transfer.total_bytes:
-                ahead = transfer.sent_bytes - transfer.have_bytes
+                ahead = transfer.sent_bytes - transfer.acknowledged_bytes
                 return transfer if ahead < _MOST_AHEAD_BYTES else None
         if len(self._line) >= _MOST_OBJECTS:
             return None

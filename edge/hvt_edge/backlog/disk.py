@@ -30,7 +30,7 @@ from typing import BinaryIO, Self
 import av.error
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.messages import PastKind, WireError
+from hvt_common.protocol.messages import BacklogKind, WireError
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.entry import (
     Entry,
@@ -54,7 +54,7 @@ __all__ = ["SEGMENT_NS", "Folder", "check_folder", "default_folder"]
 _log = logging.getLogger(__name__)
 
 _VIDEO_SHARE = 0.75
-_OURS = (".past", ".mkv", ".index", ".part")
+_OURS = (".still", ".mkv", ".index", ".part")
 _SESSION = re.compile(r"[0-9a-f]{16}")
 
 
@@ -116,7 +116,7 @@ class Folder:
         self._segments: list[tuple[int, int, int]] = []
         """(capture time, session, number), oldest first."""
         self._entries: dict[Key, Entry] = {}
-        self._disk_bytes = dict.fromkeys(PastKind, 0)
+        self._disk_bytes = dict.fromkeys(BacklogKind, 0)
         self._objects: Counter[int] = Counter()
         """Stills and segments by session."""
         self._span_ns = 0
@@ -176,8 +176,8 @@ class Folder:
     # Keeping
 
     def add_still(self, number: int, data: bytes, *, utility: float, capture_ns: int) -> None:
-        """Keep a still; ``data`` is `pack_past_still`'s. Raises OSError where the disk takes it not."""
-        if (self._session_id, PastKind.STILL, number) in self._entries:
+        """Keep a still; ``data`` is `pack_backlog_still`'s. Raises OSError where the disk takes it not."""
+        if (self._session_id, BacklogKind.STILL, number) in self._entries:
             return
         folder = self._session_folder()
         path = folder / still_name(number, capture_ns, utility)
@@ -226,16 +226,16 @@ class Folder:
     def best_stills(self) -> Iterator[Entry]:
         """Most useful first."""
         for _, session_id, number in reversed(self._stills):
-            yield self._entries[session_id, PastKind.STILL, number]
+            yield self._entries[session_id, BacklogKind.STILL, number]
 
     def newest_segments(self) -> Iterator[Entry]:
         """Newest first."""
         for _, session_id, number in reversed(self._segments):
-            yield self._entries[session_id, PastKind.BASE, number]
+            yield self._entries[session_id, BacklogKind.BASE, number]
 
     def info_of(self, session_id: int) -> Entry | None:
         """The facts of a session; None where they are not kept."""
-        return self._entries.get((session_id, PastKind.INFO, 0))
+        return self._entries.get((session_id, BacklogKind.INFO, 0))
 
     def find(self, key: Key) -> Entry | None:
         """The entry of this name, if it is still here."""
@@ -263,10 +263,10 @@ class Folder:
             return
         self._disk_bytes[entry.kind] -= entry.disk_bytes
         self._span_ns -= entry.span_ns
-        self._objects[entry.session_id] -= entry.kind is not PastKind.INFO
-        if entry.kind is PastKind.STILL:
+        self._objects[entry.session_id] -= entry.kind is not BacklogKind.INFO
+        if entry.kind is BacklogKind.STILL:
             self._stills.remove((entry.worth, entry.session_id, entry.number))
-        elif entry.kind is PastKind.BASE:
+        elif entry.kind is BacklogKind.BASE:
             self._segments.remove((entry.capture_ns, entry.session_id, entry.number))
         unlink(entry.path)
         self._tidy(entry.session_id)
@@ -290,7 +290,7 @@ class Folder:
 
     def _make_room(self, needed_bytes: int) -> None:
         while self.disk_bytes + needed_bytes > self._max_bytes and (least := self._least()) is not None:
-            if least.kind is PastKind.STILL:
+            if least.kind is BacklogKind.STILL:
                 self.evicted_stills += 1
             else:
                 self.evicted_segments += 1
@@ -302,23 +302,23 @@ class Folder:
 
     def _least(self) -> Entry | None:
         opened = 0 if self._open is None else self._open.disk_bytes
-        video_bytes = self._disk_bytes[PastKind.BASE] + opened
+        video_bytes = self._disk_bytes[BacklogKind.BASE] + opened
         if self._segments and (not self._stills or video_bytes > _VIDEO_SHARE * self._max_bytes):
             _, session_id, number = self._segments[0]
-            return self._entries[session_id, PastKind.BASE, number]
+            return self._entries[session_id, BacklogKind.BASE, number]
         if not self._stills:
             return None
         _, session_id, number = self._stills[0]
-        return self._entries[session_id, PastKind.STILL, number]
+        return self._entries[session_id, BacklogKind.STILL, number]
 
     def _enter(self, entry: Entry) -> None:
         self._entries[entry.key] = entry
         self._disk_bytes[entry.kind] += entry.disk_bytes
         self._span_ns += entry.span_ns
-        self._objects[entry.session_id] += entry.kind is not PastKind.INFO
-        if entry.kind is PastKind.STILL:
+        self._objects[entry.session_id] += entry.kind is not BacklogKind.INFO
+        if entry.kind is BacklogKind.STILL:
             insort(self._stills, (entry.worth, entry.session_id, entry.number))
-        elif entry.kind is PastKind.BASE:
+        elif entry.kind is BacklogKind.BASE:
             insort(self._segments, (entry.capture_ns, entry.session_id, entry.number))
 
     # Folders
@@ -331,7 +331,7 @@ class Folder:
                 self.enter()
             if self._lock is None:
                 self._lock_up()
-        if (self._session_id, PastKind.INFO, 0) not in self._entries:
+        if (self._session_id, BacklogKind.INFO, 0) not in self._entries:
             folder.mkdir(mode=0o700, exist_ok=True)
             write_whole(folder / "info", self._info())
             self._enter(info_entry(folder / "info", self._session_id))
@@ -359,7 +359,7 @@ class Folder:
                 continue
             for path in sorted(folder.iterdir()):
                 entry = found(path, int(folder.name, 16))
-                if entry is not None and (entry.kind is PastKind.INFO or entry.capture_ns >= oldest_ns):
+                if entry is not None and (entry.kind is BacklogKind.INFO or entry.capture_ns >= oldest_ns):
                     self._enter(entry)
                     continue
                 too_old += entry is not None
@@ -381,9 +381,9 @@ class Folder:
         if session_id == self._session_id or self._objects[session_id] > 0:
             return
         del self._objects[session_id]
-        info = self._entries.pop((session_id, PastKind.INFO, 0), None)
+        info = self._entries.pop((session_id, BacklogKind.INFO, 0), None)
         if info is not None:
-            self._disk_bytes[PastKind.INFO] -= info.disk_bytes
+            self._disk_bytes[BacklogKind.INFO] -= info.disk_bytes
         folder = self.path / f"{session_id:016x}"
         unlink(folder / "info")
         with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
 """One object of the store, and its file: what the name says, how it is written whole, read and checked.
 
 Everything that is to be known of an object without reading it stands in its file's name, so that another start of
-the edge finds it: ``still-<number>-<capture ns>-<utility>.past`` and ``base-<first frame>-<capture ns>.mkv``, with
+the edge finds it: ``still-<number>-<capture ns>-<utility>.still`` and ``base-<first frame>-<capture ns>.mkv``, with
 ``.index`` beside it.
 """
 
@@ -14,18 +14,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hvt_common.protocol.messages import (
-    MAX_PAST_BYTES,
+    MAX_BACKLOG_BYTES,
+    BacklogKind,
     Info,
-    PastKind,
     RoiHeader,
-    pack_past_units,
-    parse_past_still,
+    pack_backlog_units,
+    parse_backlog_still,
 )
 from hvt_edge.backlog.segment import DamagedError, index_of, last_ns, read_segment
 
 __all__ = [
     "BLOCK_BYTES",
-    "FIRST_KEPT",
+    "FIRST_STORED",
     "Entry",
     "Key",
     "base_entry",
@@ -40,17 +40,17 @@ __all__ = [
     "write_whole",
 ]
 
-FIRST_KEPT = 2**31
+FIRST_STORED = 2**31
 """Stills that are kept for later have numbers of their own: those that are sent have no holes then."""
 BLOCK_BYTES = 4096
 """Files take whole blocks, as on most disks."""
 _SECOND_NS = 1_000_000_000
 _HALF_LIFE_NS = 600 * _SECOND_NS
 _LEAST_STRENGTH = -60.0
-_STILL = re.compile(r"still-(\d{1,10})-(\d{1,19})-(\S{1,32})\.past")
+_STILL = re.compile(r"still-(\d{1,10})-(\d{1,19})-(\S{1,32})\.still")
 _BASE = re.compile(r"base-(\d{1,10})-(\d{1,19})\.mkv")
 
-Key = tuple[int, PastKind, int]
+Key = tuple[int, BacklogKind, int]
 """Session, kind and number: what an object is called on the link."""
 
 
@@ -59,7 +59,7 @@ class Entry:
     """One object that is kept."""
 
     session_id: int
-    kind: PastKind
+    kind: BacklogKind
     number: int
     capture_ns: int
     path: Path
@@ -78,7 +78,7 @@ class Entry:
 
 def still_name(number: int, capture_ns: int, utility: float) -> str:
     """Of the file of a still."""
-    return f"still-{number}-{capture_ns}-{utility:.6g}.past"
+    return f"still-{number}-{capture_ns}-{utility:.6g}.still"
 
 
 def base_name(first_frame: int, capture_ns: int) -> str:
@@ -88,16 +88,16 @@ def base_name(first_frame: int, capture_ns: int) -> str:
 
 def object_of(entry: Entry) -> bytes:
     """Its bytes as they cross the link. Raises OSError, WireError, DamagedError or ValueError where they cannot."""
-    if entry.kind is PastKind.BASE:
-        data = pack_past_units(read_segment(entry.path))
-        if len(data) > MAX_PAST_BYTES:
+    if entry.kind is BacklogKind.BASE:
+        data = pack_backlog_units(read_segment(entry.path))
+        if len(data) > MAX_BACKLOG_BYTES:
             raise DamagedError(f"{len(data)} bytes are more than can be sent")
         return data
-    if entry.path.stat().st_size > MAX_PAST_BYTES:
+    if entry.path.stat().st_size > MAX_BACKLOG_BYTES:
         raise DamagedError("it is larger than can be sent")
     data = entry.path.read_bytes()
-    if entry.kind is PastKind.STILL:
-        still = parse_past_still(data)
+    if entry.kind is BacklogKind.STILL:
+        still = parse_backlog_still(data)
         RoiHeader.parse(still.attachment, still.payload)
     else:
         Info.parse(data)
@@ -120,7 +120,7 @@ def found(path: Path, session_id: int) -> Entry | None:
 
 def info_entry(path: Path, session_id: int) -> Entry:
     """The facts of a session."""
-    return Entry(session_id, PastKind.INFO, 0, 0, path, blocks(path.stat().st_size))
+    return Entry(session_id, BacklogKind.INFO, 0, 0, path, blocks(path.stat().st_size))
 
 
 def still_entry(path: Path, session_id: int, number: int, capture_ns: int, utility: float) -> Entry:
@@ -133,14 +133,14 @@ def still_entry(path: Path, session_id: int, number: int, capture_ns: int, utili
         strength = _LEAST_STRENGTH - math.log2(1 + min(-utility, 1e12))
     worth = strength + capture_ns / _HALF_LIFE_NS
     size = blocks(path.stat().st_size)
-    return Entry(session_id, PastKind.STILL, number, capture_ns, path, size, worth=worth)
+    return Entry(session_id, BacklogKind.STILL, number, capture_ns, path, size, worth=worth)
 
 
 def base_entry(path: Path, session_id: int, first_frame: int, capture_ns: int) -> Entry:
     """A segment, by its first frame."""
     size = blocks(path.stat().st_size) + blocks(index_of(path).stat().st_size)
     return Entry(
-        session_id, PastKind.BASE, first_frame, capture_ns, path, size, max(0, last_ns(path) - capture_ns)
+        session_id, BacklogKind.BASE, first_frame, capture_ns, path, size, max(0, last_ns(path) - capture_ns)
     )
 
 

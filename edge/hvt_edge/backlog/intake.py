@@ -11,18 +11,18 @@ from collections import OrderedDict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hvt_common.protocol.messages import PastHave, PastKind, PastStill
+from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, BacklogStill
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.entry import Key
 
-__all__ = ["EndSegment", "Intake", "KeptStill", "KeptUnit", "News"]
+__all__ = ["EndSegment", "Intake", "IntakeStill", "IntakeUnit", "News"]
 
-_MOST_HAVES = 64
+_MOST_ACKNOWLEDGED_RANGES = 64
 """Of all grounds together, the newest of each object; one report names 16."""
 
 
 @dataclass(frozen=True, slots=True)
-class KeptUnit:
+class IntakeUnit:
     """An access unit for the disk."""
 
     unit: AccessUnit
@@ -31,13 +31,13 @@ class KeptUnit:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptStill:
+class IntakeStill:
     """A still for the disk."""
 
     number: int
     capture_ns: int
     utility: float
-    still: PastStill
+    still: BacklogStill
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class News:
     """The link went: what was on its way is not."""
     video_first: bool
     """Somebody asked for the video."""
-    haves: tuple[tuple[int, PastHave], ...]
+    acknowledged_ranges: tuple[tuple[int, AcknowledgedRange], ...]
     """What grounds say they have, with their receiver ids."""
 
 
@@ -63,10 +63,10 @@ class Intake:
     def __init__(self, most: int) -> None:
         self._most = most
         self._changed = threading.Condition()
-        self._items: deque[KeptUnit | KeptStill | EndSegment] = deque()
+        self._items: deque[IntakeUnit | IntakeStill | EndSegment] = deque()
         self._waiting = 0
         self._interrupted = self._video_first = self._woken = self._closed = False
-        self._haves: OrderedDict[tuple[int, Key], PastHave] = OrderedDict()
+        self._acknowledged_ranges: OrderedDict[tuple[int, Key], AcknowledgedRange] = OrderedDict()
 
     def __len__(self) -> int:
         """Frames and stills that wait."""
@@ -80,7 +80,7 @@ class Intake:
 
     # From any thread
 
-    def offer(self, item: KeptUnit | KeptStill) -> bool:
+    def offer(self, item: IntakeUnit | IntakeStill) -> bool:
         """Hand over something to be kept; False where there is no room for it."""
         with self._changed:
             if self._closed or self._waiting >= self._most:
@@ -109,15 +109,22 @@ class Intake:
             self._video_first = True
             self._wake()
 
-    def hear(self, haves: Sequence[PastHave], *, receiver_id: int) -> None:
+    def hear(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
         """A ground says what it has; the newest counts, and one that is lost comes again."""
         with self._changed:
-            for have in haves:
-                key = (receiver_id, (have.session_id, PastKind(have.kind), have.number))
-                self._haves.pop(key, None)
-                self._haves[key] = have
-            while len(self._haves) > _MOST_HAVES:
-                self._haves.popitem(last=False)
+            for acknowledged_range in acknowledged_ranges:
+                key = (
+                    receiver_id,
+                    (
+                        acknowledged_range.session_id,
+                        BacklogKind(acknowledged_range.kind),
+                        acknowledged_range.number,
+                    ),
+                )
+                self._acknowledged_ranges.pop(key, None)
+                self._acknowledged_ranges[key] = acknowledged_range
+            while len(self._acknowledged_ranges) > _MOST_ACKNOWLEDGED_RANGES:
+                self._acknowledged_ranges.popitem(last=False)
             self._wake()
 
     def wake(self) -> None:
@@ -137,17 +144,20 @@ class Intake:
 
     # In the thread that takes
 
-    def take(self, timeout_s: float) -> tuple[News, KeptUnit | KeptStill | EndSegment | None]:
+    def take(self, timeout_s: float) -> tuple[News, IntakeUnit | IntakeStill | EndSegment | None]:
         """What has happened, and the next item; None where there is none within that time, or something happened."""
         with self._changed:
             self._changed.wait_for(lambda: self._items or self._woken, timeout=timeout_s)
             news = News(
                 self._interrupted,
                 self._video_first,
-                tuple((receiver_id, have) for (receiver_id, _), have in self._haves.items()),
+                tuple(
+                    (receiver_id, acknowledged_range)
+                    for (receiver_id, _), acknowledged_range in self._acknowledged_ranges.items()
+                ),
             )
             self._interrupted = self._video_first = self._woken = False
-            self._haves.clear()
+            self._acknowledged_ranges.clear()
             item = self._items.popleft() if self._items else None
             self._waiting -= item is not None and not isinstance(item, EndSegment)
             return news, item

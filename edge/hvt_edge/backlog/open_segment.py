@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hvt_common.protocol.messages import MAX_PAST_BYTES
+from hvt_common.protocol.messages import MAX_BACKLOG_BYTES
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.entry import BLOCK_BYTES, blocks
 from hvt_edge.backlog.segment import SegmentWriter
@@ -13,7 +13,7 @@ __all__ = ["SEGMENT_NS", "OpenSegment"]
 
 SEGMENT_NS = 10_000_000_000
 """A keyframe is wanted when a segment is so long: eviction and sending go by segments."""
-_MOST_SEGMENT_BYTES = MAX_PAST_BYTES - 512 * 1024
+_MOST_SEGMENT_BYTES = MAX_BACKLOG_BYTES - 512 * 1024
 _MOST_SEGMENT_UNITS = 2400
 
 

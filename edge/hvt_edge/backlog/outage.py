@@ -38,7 +38,7 @@ class Outage:
         reported_ns = self._reported_ns
         return reported_ns is not None and now_ns - reported_ns <= SILENCE_NS
 
-    def away(self, now_ns: int, *, linked: bool) -> bool:
+    def offline(self, now_ns: int, *, linked: bool) -> bool:
         """Whether the link is away; asked before each frame. ``linked``: somebody listens, by what Zenoh knows.
 
         Before anybody ever listened, only a live source is kept: a clip plays again.

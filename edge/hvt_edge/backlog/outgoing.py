@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from hvt_common.runtime.priority import give_way
-from hvt_edge.backlog.backfill import Piece
+from hvt_common.runtime.priority import lower_priority
+from hvt_edge.backlog.backfill import Chunk
 
 __all__ = ["Outgoing"]
 
@@ -17,30 +17,30 @@ class Outgoing:
     ``send(piece)`` returns the line bytes, 0 where it was not sent; it may block.
     """
 
-    def __init__(self, send: Callable[[Piece], int], *, on_done: Callable[[], None]) -> None:
+    def __init__(self, send: Callable[[Chunk], int], *, on_done: Callable[[], None]) -> None:
         self._send = send
         self._on_done = on_done
         self._changed = threading.Condition()
-        self._piece: Piece | None = None
-        self._done: tuple[Piece, int] | None = None
+        self._chunk: Chunk | None = None
+        self._done: tuple[Chunk, int] | None = None
         self._closed = False
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="hvt-past", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="hvt-backlog", daemon=True)
         self._thread.start()
 
     @property
     def busy(self) -> bool:
         """Whether a piece is being sent, or was and nobody has asked what became of it."""
-        return self._piece is not None or self._done is not None
+        return self._chunk is not None or self._done is not None
 
-    def put(self, piece: Piece) -> None:
+    def put(self, chunk: Chunk) -> None:
         """Send this; only where it is not `busy`."""
         assert not self.busy, "one at a time"
         with self._changed:
-            self._piece = piece
+            self._chunk = chunk
             self._changed.notify()
 
-    def take(self) -> tuple[Piece, int] | None:
+    def take(self) -> tuple[Chunk, int] | None:
         """Return the piece that was sent last and its line bytes, once; None while there is none.
 
         Raises whatever ``send`` has raised.
@@ -59,20 +59,20 @@ class Outgoing:
         self._thread.join(timeout=timeout_s)
 
     def _run(self) -> None:
-        give_way()
-        while (piece := self._next()) is not None:
+        lower_priority()
+        while (chunk := self._next()) is not None:
             try:
-                line_bytes = self._send(piece)
+                line_bytes = self._send(chunk)
             except BaseException as error:  # noqa: BLE001 - handed to the disk thread, which hands it on
                 with self._changed:
                     self._error = error
                 self._on_done()
                 return
             with self._changed:
-                self._done, self._piece = (piece, line_bytes), None
+                self._done, self._chunk = (chunk, line_bytes), None
             self._on_done()
 
-    def _next(self) -> Piece | None:
+    def _next(self) -> Chunk | None:
         with self._changed:
-            self._changed.wait_for(lambda: self._piece is not None or self._closed)
-            return None if self._closed else self._piece
+            self._changed.wait_for(lambda: self._chunk is not None or self._closed)
+            return None if self._closed else self._chunk

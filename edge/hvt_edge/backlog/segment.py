@@ -18,7 +18,7 @@ from typing import BinaryIO
 import av
 import av.error
 
-from hvt_common.protocol.messages import PastUnit
+from hvt_common.protocol.messages import BacklogUnit
 from hvt_common.values import AccessUnit
 
 __all__ = ["DamagedError", "SegmentWriter", "index_of", "last_ns", "read_segment"]
@@ -86,13 +86,13 @@ class SegmentWriter:
             self._index.close()
 
 
-def read_segment(video: Path) -> tuple[PastUnit, ...]:
+def read_segment(video: Path) -> tuple[BacklogUnit, ...]:
     """The frames of a segment, bytes as x265 made them, up to the first that is missing or damaged.
 
     Raises:
         DamagedError: not even one is whole.
     """
-    units: list[PastUnit] = []
+    units: list[BacklogUnit] = []
     try:
         records = index_of(video).read_bytes()
         for (frame_index, capture_ns, crc, size, keyframe), nals in zip(
@@ -104,7 +104,7 @@ def read_segment(video: Path) -> tuple[PastUnit, ...]:
             late = units and not (frame_index > units[-1].frame_index and capture_ns > units[-1].capture_ns)
             if len(whole) != size or zlib.crc32(whole) != crc or late:
                 break
-            units.append(PastUnit(frame_index, capture_ns, bool(keyframe), _as_coded(nals)))
+            units.append(BacklogUnit(frame_index, capture_ns, bool(keyframe), _as_coded(nals)))
     except (av.error.FFmpegError, OSError, IndexError) as error:
         if not units:
             raise DamagedError(f"{video.name} cannot be read ({error})") from None

@@ -13,17 +13,17 @@ from enum import Enum
 from types import TracebackType
 from typing import Protocol, Self
 
-from hvt_common.protocol.channels import Row
-from hvt_common.protocol.messages import Feedback, PastKind, PastStill
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.messages import BacklogKind, BacklogStill, Feedback
 from hvt_common.values import AccessUnit, Still
-from hvt_edge.backlog.backfill import Piece
+from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import SEGMENT_NS, Folder
-from hvt_edge.backlog.entry import FIRST_KEPT, Entry
+from hvt_edge.backlog.entry import FIRST_STORED, Entry
 from hvt_edge.backlog.outage import SILENCE_NS, Outage
-from hvt_edge.backlog.worker import KeptStill, KeptUnit, StoreNumbers, StoreWorker
+from hvt_edge.backlog.worker import IntakeStill, IntakeUnit, StoreNumbers, StoreWorker
 from hvt_edge.operating.keyframes import KeyframePlan
 
-__all__ = ["Keep", "Link", "Sending", "State", "Stills", "Unsent"]
+__all__ = ["BacklogLink", "BacklogStage", "Link", "State", "Stills", "Unsent"]
 
 _SECOND_NS = 1_000_000_000
 _STEADY_NS = 2 * _SECOND_NS
@@ -42,14 +42,14 @@ class State(Enum):
     """Where frames and stills go."""
 
     LIVE = "to the link"
-    AWAY = "into the store: the link is away"
+    OFFLINE = "into the store: the link is away"
     RETURNING = "stills to the link; frames into the store, until the keyframe to go on with is made"
 
 
 class Link(Protocol):
     """The link, as far as it matters here."""
 
-    def listens(self, row: Row) -> bool:
+    def listens(self, row: Channel) -> bool:
         """Whether somebody subscribes to this row."""
         ...
 
@@ -79,8 +79,8 @@ class Stills(Protocol):
         ...
 
 
-class Sending(Protocol):
-    """How things leave (`hvt_edge.link.transmitter.Sender`)."""
+class BacklogLink(Protocol):
+    """How things leave (`hvt_edge.link.transmitter.Transmitter`)."""
 
     @property
     def total_bps(self) -> int:
@@ -97,27 +97,27 @@ class Sending(Protocol):
         """What was sent and is not acknowledged."""
         ...
 
-    def past_room_bytes(self, now_ns: int, *, reserve: float) -> int:
+    def backlog_allowance_bytes(self, now_ns: int, *, reserve: float) -> int:
         """Payload that a piece may have now."""
         ...
 
-    def past(self, piece: Piece, *, now_ns: int) -> int:
+    def backlog(self, chunk: Chunk, *, now_ns: int) -> int:
         """Send it; return its line bytes, 0 where its room is gone."""
         ...
 
-    def kept_base(self, unit: AccessUnit, *, now_ns: int) -> None:
+    def store_base(self, unit: AccessUnit, *, now_ns: int) -> None:
         """A frame is kept and not sent."""
         ...
 
-    def kept_still(self, still: Still, *, now_ns: int, counted: bool = True) -> PastStill:
+    def store_still(self, still: Still, *, now_ns: int, counted: bool = True) -> BacklogStill:
         """The still as it is kept."""
         ...
 
 
-class Keep:
+class BacklogStage:
     """One for each run in real time. `follow`, `base` and `sent` in the frame loop, `still` in the stills' thread.
 
-    ``on_fate`` is told of each kept still that arrived. `attend` before the first frame.
+    ``on_outcome`` is told of each kept still that arrived. `attend` before the first frame.
     """
 
     def __init__(
@@ -127,17 +127,17 @@ class Keep:
         session_id: int,
         live: bool,
         link: Link,
-        sender: Sending,
+        sender: BacklogLink,
         keyframes: KeyframePlan,
         clock: Callable[[], int],
-        on_fate: Callable[[str, str], None],
+        on_outcome: Callable[[str, str], None],
     ) -> None:
         self._outage = Outage(live=live)
         self._link = link
         self._sender = sender
         self._keyframes = keyframes
         self._clock = clock
-        self._on_fate = on_fate
+        self._on_outcome = on_outcome
         self._session_id = session_id
         self._stills: Stills | None = None
         self.state = State.LIVE
@@ -162,9 +162,9 @@ class Keep:
     # The frame loop
 
     @property
-    def away(self) -> bool:
+    def offline(self) -> bool:
         """Whether the link is away."""
-        return self.state is State.AWAY
+        return self.state is State.OFFLINE
 
     def follow(self, now_ns: int, *, linked: bool) -> bool:
         """Before each frame: notice that the link went or came; return whether it is away.
@@ -173,18 +173,18 @@ class Keep:
         """
         self._worker.check()
         self._linked = linked
-        away = self._outage.away(now_ns, linked=linked) and not self._worker.failed
-        if away and not self.away:
+        offline = self._outage.offline(now_ns, linked=linked) and not self._worker.failed
+        if offline and not self.offline:
             self._leave()
-        elif self.away and not away:
+        elif self.offline and not offline:
             self.state = State.RETURNING
             self._back_ns = now_ns
             self._keyframes.renew(now_ns)
-        return away
+        return offline
 
     def keeps(self, *, keyframe: bool) -> bool:
         """Whether the next frame is kept; ``keyframe``: it could be the one to go on with on the link."""
-        return self.away or (self.state is State.RETURNING and not keyframe)
+        return self.offline or (self.state is State.RETURNING and not keyframe)
 
     def wants_keyframe(self, now_ns: int, *, due: bool = False) -> bool:
         """Whether the next frame that is kept should begin a segment; ``due``: the plan has one for now.
@@ -192,22 +192,22 @@ class Keep:
         The one to go on with on the link stays due until it can be sent.
         """
         long = self._segment_ns is None or now_ns - self._segment_ns >= SEGMENT_NS
-        return long or (due and self.away)
+        return long or (due and self.offline)
 
     def base(self, unit: AccessUnit, *, now_ns: int, sent: bool = False) -> None:
         """Keep a frame; ``sent``: it goes out too."""
         if not sent:
             self.frames += 1
-            self._sender.kept_base(unit, now_ns=now_ns)
+            self._sender.store_base(unit, now_ns=now_ns)
         if unit.keyframe:
             self._keyframe = unit.data
             self._segment_ns = now_ns
-        if not self._worker.offer(KeptUnit(unit, self._keyframe)):
+        if not self._worker.offer(IntakeUnit(unit, self._keyframe)):
             self._segment_ns = None  # what follows can be shown from a keyframe on only
 
     def probes(self, now_ns: int) -> bool:
         """Whether this frame is sent too, to show whether the link is back; without the others none can show it."""
-        if not (self.away and self._linked) or now_ns - self._probed_ns < _PROBE_NS:
+        if not (self.offline and self._linked) or now_ns - self._probed_ns < _PROBE_NS:
             return False
         self._probed_ns = now_ns
         return True
@@ -229,7 +229,7 @@ class Keep:
         self._worker.interrupt()
         self._swallow()
         self._segment_ns = None
-        self.state = State.AWAY
+        self.state = State.OFFLINE
 
     def _swallow(self) -> None:
         """What no report has named is taken for lost, and is to be kept."""
@@ -239,7 +239,7 @@ class Keep:
         self._lost.extend(stills)
         if self.state is State.LIVE:  # else these were to show whether the link is back, and are kept already
             for unit in units:
-                self._worker.offer(KeptUnit(unit, self._keyframe))
+                self._worker.offer(IntakeUnit(unit, self._keyframe))
 
     # The end of the run
 
@@ -260,7 +260,7 @@ class Keep:
                 self.resume()
             if now_ns - began_ns > SILENCE_NS:
                 self._end_unacked()
-            self.keep_lost(now_ns)
+            self.store_lost(now_ns)
             if not said and not self.numbers.empty:
                 note("sending what was kept while the link was away; Ctrl-C leaves it for the next start")
                 said = True
@@ -295,7 +295,7 @@ class Keep:
         while len(self._utilities) > _MOST_UTILITIES:
             self._utilities.popitem(last=False)
 
-    def keep_lost(self, now_ns: int) -> None:
+    def store_lost(self, now_ns: int) -> None:
         """Keep the stills that an outage has swallowed; after that thread's end, in whichever ends the run."""
         while self._lost:
             still = self._lost.popleft()
@@ -306,16 +306,16 @@ class Keep:
 
     def still(self, still: Still, *, utility: float, now_ns: int, counted: bool = True) -> None:
         """Keep a still; ``counted``: it takes from the budget what sending it would have taken."""
-        kept = self._sender.kept_still(still, now_ns=now_ns, counted=counted)
-        self._worker.offer(KeptStill(still.sequence, still.capture_ns, utility, kept))
+        kept = self._sender.store_still(still, now_ns=now_ns, counted=counted)
+        self._worker.offer(IntakeStill(still.sequence, still.capture_ns, utility, kept))
 
     # What comes back
 
     def hear(self, feedback: Feedback, *, now_ns: int) -> None:
         """A ground has reported on this session (any thread)."""
         self._outage.reported(now_ns)
-        if feedback.past:
-            self._worker.hear(feedback.past, receiver_id=feedback.receiver_id)
+        if feedback.backlog:
+            self._worker.hear(feedback.backlog, receiver_id=feedback.receiver_id)
 
     def send_video(self) -> bool:
         """Somebody wants the video before the stills; False where nothing is kept."""
@@ -340,7 +340,7 @@ class Keep:
         """Keep what no ground has acknowledged, and leave the store in order; after the last word to the ground."""
         try:
             self._end_unacked()
-            self.keep_lost(self._clock())
+            self.store_lost(self._clock())
         finally:
             self._worker.close()
 
@@ -355,11 +355,11 @@ class Keep:
     def _note_sent(self, entry: Entry) -> None:
         # One of a lower number was swallowed by an outage and counted when it was sent; a former run has its own
         # account.
-        own = entry.session_id == self._session_id and entry.number >= FIRST_KEPT
-        if own and entry.kind is PastKind.STILL:
-            self._on_fate("sent", "stored")
+        own = entry.session_id == self._session_id and entry.number >= FIRST_STORED
+        if own and entry.kind is BacklogKind.STILL:
+            self._on_outcome("sent", "stored")
 
-    # How pieces leave (`hvt_edge.backlog.worker.Sends`)
+    # How pieces leave (`hvt_edge.backlog.worker.ChunkSender`)
 
     def may_send(self, now_ns: int) -> bool:
         """Whether the link is there and steady, a ground reports, and no keyframe is to come."""
@@ -368,21 +368,21 @@ class Keep:
         if not self._outage.hears(now_ns):
             return False  # of who only listens nobody would know what has arrived
         # While a keyframe is to come nothing else takes its room; after the last frame none comes.
-        return self._link.listens(Row.PAST) and (self._finishing or not self._keyframes.due(now_ns))
+        return self._link.listens(Channel.BACKLOG) and (self._finishing or not self._keyframes.due(now_ns))
 
     def room_bytes(self, now_ns: int, *, live_waits: bool) -> int:
         """Payload that a piece may have now."""
         if live_waits:
-            return min(_TRICKLE_BYTES, self._sender.past_room_bytes(now_ns, reserve=0.0))
-        return self._sender.past_room_bytes(now_ns, reserve=0.0 if self._finishing else _RESERVE)
+            return min(_TRICKLE_BYTES, self._sender.backlog_allowance_bytes(now_ns, reserve=0.0))
+        return self._sender.backlog_allowance_bytes(now_ns, reserve=0.0 if self._finishing else _RESERVE)
 
     def live_waits(self) -> bool:
         """Whether a live still waits for room; after the last frame none goes any more."""
         return not self._finishing and self._stills is not None and self._stills.live_waits
 
-    def send(self, piece: Piece, *, now_ns: int) -> int:
+    def send(self, chunk: Chunk, *, now_ns: int) -> int:
         """Send it."""
-        return self._sender.past(piece, now_ns=now_ns)
+        return self._sender.backlog(chunk, now_ns=now_ns)
 
     @property
     def round_trip_ns(self) -> int:

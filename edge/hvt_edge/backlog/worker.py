@@ -13,15 +13,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from hvt_common.protocol.messages import PastHave, PastKind, pack_past_still
-from hvt_common.runtime.priority import give_way
-from hvt_edge.backlog.backfill import Backfill, Piece
+from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, pack_backlog_still
+from hvt_common.runtime.priority import lower_priority
+from hvt_edge.backlog.backfill import Backfill, Chunk
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.entry import Entry
-from hvt_edge.backlog.intake import EndSegment, Intake, KeptStill, KeptUnit, News
+from hvt_edge.backlog.intake import EndSegment, Intake, IntakeStill, IntakeUnit, News
 from hvt_edge.backlog.outgoing import Outgoing
 
-__all__ = ["KeptStill", "KeptUnit", "Sends", "StoreNumbers", "StoreWorker"]
+__all__ = ["ChunkSender", "IntakeStill", "IntakeUnit", "StoreNumbers", "StoreWorker"]
 
 _log = logging.getLogger(__name__)
 
@@ -29,14 +29,14 @@ _QUEUE = 512
 _TICK_S = 0.02
 _IDLE_S = 0.25
 _CLOSE_S = 5.0
-_LAST_PIECE_S = 1.0
+_LAST_CHUNK_S = 1.0
 """What is being sent when no more is to be sent has so long to go."""
 _TRICKLE_SHARE = 1 / 40
 """Of the total, where live stills always wait: they must not keep what was admitted before from ever arriving."""
 _SECOND_NS = 1_000_000_000
 
 
-class Sends(Protocol):
+class ChunkSender(Protocol):
     """How pieces leave the edge."""
 
     def may_send(self, now_ns: int) -> bool:
@@ -51,7 +51,7 @@ class Sends(Protocol):
         """Payload that a piece may have now."""
         ...
 
-    def send(self, piece: Piece, *, now_ns: int) -> int:
+    def send(self, chunk: Chunk, *, now_ns: int) -> int:
         """Send it; return its line bytes, 0 where its room is gone. May block while the link is full."""
         ...
 
@@ -99,7 +99,7 @@ class StoreWorker:
     def __init__(
         self,
         open_folder: Callable[[], Folder],
-        sends: Sends,
+        sends: ChunkSender,
         *,
         session_id: int,
         clock: Callable[[], int],
@@ -113,7 +113,7 @@ class StoreWorker:
         self._on_sent = on_sent
         self._close_s = close_s
         self._intake = Intake(_QUEUE)
-        self._outgoing = Outgoing(lambda piece: sends.send(piece, now_ns=clock()), on_done=self._intake.wake)
+        self._outgoing = Outgoing(lambda chunk: sends.send(chunk, now_ns=clock()), on_done=self._intake.wake)
         self._folder: Folder | None = None
         self._backfill: Backfill | None = None
         self._sent_stills = 0
@@ -134,7 +134,7 @@ class StoreWorker:
             error, self._error = self._error, None
             raise error
 
-    def offer(self, item: KeptUnit | KeptStill) -> bool:
+    def offer(self, item: IntakeUnit | IntakeStill) -> bool:
         """Hand over something to be kept; False where it is not, because the disk is too slow or refuses."""
         self.check()
         if self.failed:
@@ -146,9 +146,9 @@ class StoreWorker:
             return False
         return True
 
-    def hear(self, haves: Sequence[PastHave], *, receiver_id: int) -> None:
+    def hear(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
         """A ground says what it has. One that is not heard comes again."""
-        self._intake.hear(haves, receiver_id=receiver_id)
+        self._intake.hear(acknowledged_ranges, receiver_id=receiver_id)
 
     def end_segment(self) -> None:
         """The link is back: what was kept may be sent."""
@@ -189,7 +189,7 @@ class StoreWorker:
 
     def send_no_more(self) -> None:
         """Let nothing go out from now on, so that an account can be closed; what comes is kept all the same."""
-        self._outgoing.close(_LAST_PIECE_S)
+        self._outgoing.close(_LAST_CHUNK_S)
 
     def close(self) -> None:
         """Write what waits, end the files, join the thread. A disk that hangs costs what waits, and a warning."""
@@ -208,7 +208,7 @@ class StoreWorker:
     # In the thread
 
     def _run(self) -> None:
-        give_way()
+        lower_priority()
         try:
             self._open()
             try:
@@ -238,10 +238,10 @@ class StoreWorker:
             if isinstance(item, EndSegment):
                 folder.end_segment()
             elif item is not None:
-                self._keep(folder, item)
+                self._backlog(folder, item)
             else:
                 self._enter(folder)
-                self._send_piece(backfill)
+                self._send_chunk(backfill)
 
     def _patience_s(self) -> float:
         busy = self._folder is not None and (self._folder.stills or self._folder.segments)
@@ -252,18 +252,21 @@ class StoreWorker:
             backfill.interrupt()
         if news.video_first:
             backfill.video_first = True
-        for receiver_id, have in news.haves:
-            backfill.hear([have], receiver_id=receiver_id, now_ns=self._clock())
+        for receiver_id, acknowledged_range in news.acknowledged_ranges:
+            backfill.hear([acknowledged_range], receiver_id=receiver_id, now_ns=self._clock())
 
-    def _keep(self, folder: Folder, item: KeptUnit | KeptStill) -> None:
+    def _backlog(self, folder: Folder, item: IntakeUnit | IntakeStill) -> None:
         if self.failed:
             return
         try:
-            if isinstance(item, KeptUnit):
+            if isinstance(item, IntakeUnit):
                 folder.add_unit(item.unit, parameter_sets=item.parameter_sets)
             else:
                 folder.add_still(
-                    item.number, pack_past_still(item.still), utility=item.utility, capture_ns=item.capture_ns
+                    item.number,
+                    pack_backlog_still(item.still),
+                    utility=item.utility,
+                    capture_ns=item.capture_ns,
                 )
         except OSError as error:
             self._fail(error)
@@ -287,7 +290,7 @@ class StoreWorker:
             error.strerror or error,
         )
 
-    def _send_piece(self, backfill: Backfill) -> None:
+    def _send_chunk(self, backfill: Backfill) -> None:
         done = self._outgoing.take()
         if done is not None and not done[1]:
             backfill.take_back(done[0])  # and wait a moment: others send
@@ -302,12 +305,12 @@ class StoreWorker:
         if live_waits and now_ns < self._trickle_ns:
             return
         room_bytes = self._sends.room_bytes(now_ns, live_waits=live_waits)
-        piece = backfill.next_piece(room_bytes, now_ns=now_ns, round_trip_ns=self._sends.round_trip_ns)
-        if piece is not None:
-            self._outgoing.put(piece)
+        chunk = backfill.next_chunk(room_bytes, now_ns=now_ns, round_trip_ns=self._sends.round_trip_ns)
+        if chunk is not None:
+            self._outgoing.put(chunk)
 
     def _note_done(self, entry: Entry) -> None:
-        if entry.kind is PastKind.STILL:
+        if entry.kind is BacklogKind.STILL:
             self._sent_stills += 1
         self._sent_ns += entry.span_ns
         self._on_sent(entry)

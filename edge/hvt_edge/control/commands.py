@@ -16,7 +16,7 @@ from typing import Any
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, TrackNow, fitted_text
 from hvt_common.units import bitrate_text
-from hvt_edge.backlog.stage import Keep
+from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import LEAST_FPS, REGIMES, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframePlan
 from hvt_edge.stills.on_demand import OnDemand
@@ -24,7 +24,7 @@ from hvt_edge.stills.on_demand_crop import Ask, RefusedError
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser
 from hvt_edge.video.least_rate import least_base_bps
-from hvt_edge.video.reconfigure import Renewal
+from hvt_edge.video.reconfigure import EncoderReconfiguration
 
 __all__ = ["Commands", "Served"]
 
@@ -48,17 +48,17 @@ class Served:
     """The parts of a running edge that commands reach."""
 
     on_demand: OnDemand
-    renewal: Renewal
+    reconfiguration: EncoderReconfiguration
     chooser: Chooser
     base_size: tuple[int, int]
-    keep: Keep | None = None
+    backlog: BacklogStage | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Said:
     """What an accepted command answers beside yes."""
 
-    still_ask: int = -1
+    still_request: int = -1
     frame_index: int = -1
     tracks: tuple[TrackNow, ...] = ()
 
@@ -98,11 +98,11 @@ class Commands:
         self._commands: dict[str, Callable[[Arguments], _Said]] = {
             Command.KEYFRAME: self._keyframe,
             Command.STILL: self._still,
-            Command.STILL_FATE: self._still_fate,
+            Command.STILL_OUTCOME: self._still_outcome,
             Command.TRACKS: self._tracks,
             Command.SET_BUDGET: self._set_budget,
             Command.SET_METHOD: self._set_method,
-            Command.SEND_PAST: self._send_past,
+            Command.SEND_BACKLOG: self._send_backlog,
         }
 
     @property
@@ -128,7 +128,7 @@ class Commands:
             session_id=self._session_id,
             accepted=not reason,
             reason=reason,
-            still_ask=said.still_ask,
+            still_request=said.still_request,
             frame_index=said.frame_index,
             tracks=said.tracks,
         )
@@ -159,13 +159,13 @@ class Commands:
 
     def _still(self, arguments: Arguments) -> _Said:
         number, frame_index = self._parts().on_demand.ask(_ask(arguments))
-        return _Said(still_ask=number, frame_index=frame_index)
+        return _Said(still_request=number, frame_index=frame_index)
 
-    def _still_fate(self, arguments: Arguments) -> _Said:
-        reader = _Reader("still-fate", arguments)
+    def _still_outcome(self, arguments: Arguments) -> _Said:
+        reader = _Reader("still-outcome", arguments)
         number = reader.needed("ask", 0, _U32)
         reader.end()
-        self._parts().on_demand.fate(number)
+        self._parts().on_demand.outcome(number)
         return _Said()
 
     def _tracks(self, arguments: Arguments) -> _Said:
@@ -198,12 +198,12 @@ class Commands:
         chooser.set_method(policy)
         return _Said()
 
-    def _send_past(self, arguments: Arguments) -> _Said:
-        _Reader("send-past", arguments).end()
-        keep = self._parts().keep
-        if keep is None:
+    def _send_backlog(self, arguments: Arguments) -> _Said:
+        _Reader("send-backlog", arguments).end()
+        backlog = self._parts().backlog
+        if backlog is None:
             raise RefusedError("this edge keeps nothing while its link is away (--store 0)")
-        if not keep.send_video():
+        if not backlog.send_video():
             raise RefusedError("nothing is kept that was not sent")
         return _Said()
 
@@ -217,7 +217,7 @@ class Commands:
                 raise RefusedError("the rates were changed a moment ago: wait two seconds")
             _check_base(config, served.base_size)
             self._changed_ns = now_ns
-            served.renewal.change(config)
+            served.reconfiguration.change(config)
             self._keyframes.renew(self._window_ns())
         self._config = config
         self.highest_budget_bps = max(self.highest_budget_bps, config.budget_bps)
@@ -237,7 +237,7 @@ class Commands:
 
 def _check_base(config: EdgeConfig, size: tuple[int, int]) -> None:
     """As `hvt_edge.config.check_rate`, in words for whoever asks from afar."""
-    fps = LEAST_FPS if config.auto_fps else config.tick_fps
+    fps = LEAST_FPS if config.auto_fps else config.nominal_fps
     least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
     if config.base_bps < least_bps:
         raise RefusedError(

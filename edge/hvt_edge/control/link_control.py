@@ -8,21 +8,21 @@ from collections.abc import Callable, Sequence
 
 from hvt_common.protocol.messages import Feedback
 from hvt_common.values import Still
-from hvt_edge.backlog.stage import Keep, Stills
+from hvt_edge.backlog.stage import BacklogStage, Stills
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.link.unacknowledged import Unacknowledged
 from hvt_edge.operating.keyframes import KeyframePlan
-from hvt_edge.video.reconfigure import Renewal
+from hvt_edge.video.reconfigure import EncoderReconfiguration
 
-__all__ = ["LinkFollower", "wait_for_ground"]
+__all__ = ["LinkControl", "wait_for_ground"]
 
 _MOST_WAIT_NS = 100_000_000
 """A frame that would wait longer for the budget's window is dropped before it is encoded."""
 
 
-class LinkFollower:
+class LinkControl:
     """One for each run: `hear` in the link's thread, `overdue_stills` in the stills', all else in the frame loop.
 
     ``pacer`` is None without ``--adapt``, ``unacked`` in lockstep: when reports come must not decide there on what is
@@ -34,40 +34,45 @@ class LinkFollower:
     ) -> None:
         self.pacer = pacer
         self.unacked = unacked
-        self.keep: Keep | None = None
+        self.backlog: BacklogStage | None = None
         """Who keeps what the link cannot carry away; None where nobody does."""
         self._keyframes = keyframes
         self._linked: Callable[[], bool] = lambda: False
-        self._sender: Sender | None = None
-        self._renewal: Renewal | None = None
+        self._sender: Transmitter | None = None
+        self._reconfiguration: EncoderReconfiguration | None = None
 
     def attach(
         self,
         *,
         linked: Callable[[], bool],
-        sender: Sender,
-        renewal: Renewal,
+        sender: Transmitter,
+        reconfiguration: EncoderReconfiguration,
         stills: Stills,
-        keep: Keep | None,
+        backlog: BacklogStage | None,
     ) -> None:
         """What it decides for. ``linked()`` tells whether a ground listens."""
-        self._linked, self._sender, self._renewal, self.keep = linked, sender, renewal, keep
-        if keep is not None:
-            keep.attend(stills)
+        self._linked, self._sender, self._reconfiguration, self.backlog = (
+            linked,
+            sender,
+            reconfiguration,
+            backlog,
+        )
+        if backlog is not None:
+            backlog.attend(stills)
 
     def before_frame(self, now_ns: int) -> None:
         """What the link carries decides on budget, base rate, keyframe, and on whether anything is sent at all."""
         linked = self._linked()
-        away = self.keep is not None and self.keep.follow(now_ns, linked=linked)
+        offline = self.backlog is not None and self.backlog.follow(now_ns, linked=linked)
         if self.pacer is None:
             return
         back = self.pacer.link(linked, now_ns=now_ns)
-        assert self._renewal is not None, "attached before the first frame"
-        if away:  # what is kept keeps the quality that the link had
-            self._renewal.hold(now_ns)
-        if away or not linked:  # nothing is carried anywhere
+        assert self._reconfiguration is not None, "attached before the first frame"
+        if offline:  # what is kept keeps the quality that the link had
+            self._reconfiguration.hold(now_ns)
+        if offline or not linked:  # nothing is carried anywhere
             return
-        if self._renewal.follow(now_ns) or back:
+        if self._reconfiguration.follow(now_ns) or back:
             self._keyframes.renew(now_ns)
 
     def admits(self, now_ns: int) -> bool:
@@ -79,12 +84,12 @@ class LinkFollower:
 
     def text(self) -> str:
         """What is kept, for the status line; empty where nothing is."""
-        return "" if self.keep is None else self.keep.text()
+        return "" if self.backlog is None else self.backlog.text()
 
     def finish(self, *, stop: threading.Event, note: Callable[[str], None]) -> None:
         """After the last frame of a recorded source: send what was kept."""
-        if self.keep is not None:
-            self.keep.finish(follow=self._after_last, stop=stop, note=note)
+        if self.backlog is not None:
+            self.backlog.finish(follow=self._after_last, stop=stop, note=note)
 
     def _after_last(self, now_ns: int) -> None:
         self.before_frame(now_ns)
@@ -97,8 +102,8 @@ class LinkFollower:
             self.pacer.hear(feedback, now_ns=now_ns)
         if self.unacked is not None:
             self.unacked.hear(feedback, now_ns=now_ns)
-        if self.keep is not None:
-            self.keep.hear(feedback, now_ns=now_ns)
+        if self.backlog is not None:
+            self.backlog.hear(feedback, now_ns=now_ns)
 
     def overdue_stills(self, now_ns: int) -> Sequence[tuple[Still, float]]:
         """Stills that seem to be lost, with their utility, most useful first."""

@@ -5,7 +5,8 @@ No rolling window ever exceeds the total.
 Two limits hold for stills at once, both in line bytes (payload, attachment and transport overhead):
 
 * **the share**: stills earn what is neither the base's nor metadata's, ``B_tot - B_v - metadata``, all the time and
-  may save up what they do not spend, but no more than ``carry_s`` seconds of it (a token bucket). With ``lend`` they
+  may save up what they do not spend, but no more than ``carry_s`` seconds of it (a token bucket). With
+  ``borrow_unused`` they
   may also take what the base left of ``B_v`` in the last window: base and what was lent stay within ``B_v`` there;
 * **the window**: in every rolling window of ``window_ns``, past or still to come, base and stills together stay
   within ``B_tot``. A still sent now sits in every window that ends up to one window from now, so the
@@ -57,7 +58,7 @@ class BudgetSettings:
     carry_s: float = 2.0
     metadata_bps: int = 0
     """Kept free of stills for messages beside base and stills, such as ``tracks``."""
-    lend: bool = False
+    borrow_unused: bool = False
     """Whether stills may also take what the base leaves of B_v."""
 
     @property
@@ -138,8 +139,8 @@ class RollingBudget:
     def most_still_bytes(self) -> int:
         """The most line bytes that `still_room` ever gives, while the base keeps to its share."""
         window_s = self._settings.window_ns / _SECOND_NS
-        lent = self._settings.base_bps * window_s / 8 if self._settings.lend else 0.0
-        return int(min(self._cap + lent, self._settings.still_bps * window_s / 8))
+        borrowed = self._settings.base_bps * window_s / 8 if self._settings.borrow_unused else 0.0
+        return int(min(self._cap + borrowed, self._settings.still_bps * window_s / 8))
 
     def record_base(
         self, line_bytes: int, *, now_ns: int, keyframe: bool = False, kept: bool = False
@@ -164,18 +165,18 @@ class RollingBudget:
         self._record(line_bytes, now_ns)
         self._last_ns = max(self._last_ns, now_ns)
 
-    def record_past(self, line_bytes: int, *, now_ns: int) -> None:
-        """Count a piece of what was kept, that `past_room` admitted at this very time."""
+    def record_backlog(self, line_bytes: int, *, now_ns: int) -> None:
+        """Count a piece of what was kept, that `backlog_allowance` admitted at this very time."""
         self._record(line_bytes, now_ns)
 
     def record_still(self, line_bytes: int, *, now_ns: int) -> None:
         """Count one still; it was admitted by `still_room` at this very time."""
         self._refill(now_ns)
         # What the base left goes first: it is gone a window later, what was saved up is not.
-        lent = min(float(line_bytes), self._lendable(now_ns))
-        if lent > 0:
-            self._lent.append((now_ns, lent))
-        self._tokens -= line_bytes - lent
+        borrowed = min(float(line_bytes), self._borrowable(now_ns))
+        if borrowed > 0:
+            self._lent.append((now_ns, borrowed))
+        self._tokens -= line_bytes - borrowed
         self._record(line_bytes, now_ns)
 
     def has_room(self, line_bytes: int, *, now_ns: int) -> bool:
@@ -217,9 +218,9 @@ class RollingBudget:
     def still_room(self, now_ns: int) -> int:
         """Return how many line bytes a still may take now; 0 where it has to wait."""
         self._refill(now_ns)
-        return max(0, int(min(self._tokens + self._lendable(now_ns), self._window_room(now_ns))))
+        return max(0, int(min(self._tokens + self._borrowable(now_ns), self._window_room(now_ns))))
 
-    def past_room(self, now_ns: int, *, reserve: float) -> int:
+    def backlog_allowance(self, now_ns: int, *, reserve: float) -> int:
         """Return how many line bytes of what was kept may go now: what neither base nor stills will want.
 
         It takes no share of anybody's. ``reserve`` is left free of a window, as a share of what stills have of one.
@@ -260,21 +261,21 @@ class RollingBudget:
         until_ns, old_peak = self._old_peak
         return max(old_peak, self._base_peak) if at_ns < until_ns else self._base_peak
 
-    def _lendable(self, now_ns: int) -> float:
+    def _borrowable(self, now_ns: int) -> float:
         """What of B_v neither the base nor a still has taken in the window that ends now."""
         settings = self._settings
-        if not settings.lend or self._last_base_ns is None:
+        if not settings.borrow_unused or self._last_base_ns is None:
             return 0.0
         oldest_ns = now_ns - settings.window_ns
         while self._lent and self._lent[0][0] <= oldest_ns - settings.window_ns:
             self._lent.popleft()  # kept for one window more, for a thread whose clock is behind
-        lent = sum(size for at_ns, size in self._lent if at_ns > oldest_ns)
+        borrowed = sum(size for at_ns, size in self._lent if at_ns > oldest_ns)
         # Up to the last frame, unless the next is overdue, and half a frame short of the window: between two frames,
         # or where they jitter, one that is yet to come would count as left over.
         last_ns = max(self._last_base_ns, now_ns - self._step_ns)
         first_ns = last_ns - settings.window_ns + self._step_ns // 2
         taken = sum(size for at_ns, size in self._base_events if at_ns > first_ns)
-        return max(0.0, settings.base_bps * settings.window_ns / 8 / _SECOND_NS - taken - lent)
+        return max(0.0, settings.base_bps * settings.window_ns / 8 / _SECOND_NS - taken - borrowed)
 
     def _window_room(self, now_ns: int) -> float:
         """The least room over every window that would contain a message sent now.
@@ -292,9 +293,9 @@ class RollingBudget:
         spans_ns = np.maximum(self._settings.window_ns - ahead_ns, 0)
         times_ns = np.array([at_ns for at_ns, _ in self._events], np.int64)
         upto = np.cumsum([0, *(size for _, size in self._events)])
-        past = upto[-1] - upto[np.searchsorted(times_ns, now_ns - spans_ns, side="right")]
+        spent = upto[-1] - upto[np.searchsorted(times_ns, now_ns - spans_ns, side="right")]
         beside = self._settings.metadata_bps / 8 / _SECOND_NS * ahead_ns
-        return float((self._total - past - self._burst - beside).min())
+        return float((self._total - spent - self._burst - beside).min())
 
     def _recent_bursts(self) -> npt.NDArray[np.float64]:
         """Bytes that ``k`` base frames in a row may take, for each ``k`` of the forecast."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.messages import Feedback
 from hvt_edge.link.rate_control import LeastDelay, Progress, RateController
-from hvt_edge.link.receivers import Followed
+from hvt_edge.link.receivers import PrimaryReceiver
 
 __all__ = ["Flight", "Pacer"]
 
@@ -44,7 +44,7 @@ class Sent:
 
     sequence: int
     sent_ns: int
-    own_ns: int
+    serialization_ns: int
     """From sending until it has left, on a link of the present rate."""
     line_bytes: int
     up_to_bytes: int
@@ -81,8 +81,10 @@ class Flight:
         self._add(line_bytes, now_ns=now_ns, rate_bps=rate_bps)
         self._messages += 1
         self._last = (sequence, self._last[1])
-        own_ns = self.backlog_ns(now_ns=now_ns, rate_bps=rate_bps)
-        self._base.append(Sent(sequence, now_ns, own_ns, line_bytes, self._total_bytes, self._messages))
+        serialization_ns = self.backlog_ns(now_ns=now_ns, rate_bps=rate_bps)
+        self._base.append(
+            Sent(sequence, now_ns, serialization_ns, line_bytes, self._total_bytes, self._messages)
+        )
 
     def sent_still(self, sequence: int, line_bytes: int, *, now_ns: int, rate_bps: int) -> None:
         """A still goes out."""
@@ -148,7 +150,7 @@ class Pacer:
         self._controller = controller
         self._flight = Flight()
         self._lock = threading.Lock()
-        self._followed = Followed()
+        self._primary = PrimaryReceiver()
         self._held_ns = _FIRST_HELD_NS
         self._round_trip = LeastDelay(15 * _SECOND_NS)
         self._round_trip_ns = _SECOND_NS // 2
@@ -227,7 +229,7 @@ class Pacer:
                     now_ns=now_ns,
                     sent_ns=sent.sent_ns,
                     arrived_ns=feedback.send_ns - 1000 * feedback.base_held_us,
-                    own_ns=sent.own_ns,
+                    serialization_ns=sent.serialization_ns,
                     arrived_bytes=sent.up_to_bytes,
                     messages=sent.messages,
                     lost=feedback.lost,
@@ -244,7 +246,7 @@ class Pacer:
                 self._started_ns = None
             if before and not there:
                 self._flight.clear()
-                if self._followed.receiver_id is not None:
+                if self._primary.receiver_id is not None:
                     self._controller.on_silence(now_ns)
                 self._leave()
             return before is False and there and self.backoffs > 0
@@ -254,16 +256,16 @@ class Pacer:
     def admits_base(self, now_ns: int) -> bool:
         """Whether a frame may be encoded and sent now."""
         with self._lock:
-            if self._followed.receiver_id is None:
+            if self._primary.receiver_id is None:
                 return self._may_start(now_ns)
-            if now_ns - self._followed.heard_ns > _FORGET_NS and self._linked:
+            if now_ns - self._primary.heard_ns > _FORGET_NS and self._linked:
                 self._leave()
                 self._controller.forget_silence()
                 return True
-            if now_ns - self._followed.heard_ns > _SILENCE_NS:
+            if now_ns - self._primary.heard_ns > _SILENCE_NS:
                 self._controller.on_silence(now_ns)
                 return now_ns - self._last_sent_ns >= _PROBE_NS
-            if min(self._overdue_ns(now_ns), now_ns - self._followed.progress_ns) > _GIVEN_UP_NS:
+            if min(self._overdue_ns(now_ns), now_ns - self._primary.progress_ns) > _GIVEN_UP_NS:
                 self._controller.on_silence(now_ns)
                 self._flight.clear()
             return self._is_open(now_ns, _MOST_BACKLOG_NS)
@@ -271,11 +273,9 @@ class Pacer:
     def admits_still(self, now_ns: int) -> bool:
         """Whether a still may go now."""
         with self._lock:
-            if self._followed.receiver_id is None:
+            if self._primary.receiver_id is None:
                 return self._may_start(now_ns)
-            return now_ns - self._followed.heard_ns <= _SILENCE_NS and self._is_open(
-                now_ns, _STILL_BACKLOG_NS
-            )
+            return now_ns - self._primary.heard_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
 
     def _may_start(self, now_ns: int) -> bool:
         if not self._linked or self._started_ns is None:
@@ -289,17 +289,19 @@ class Pacer:
 
     def _overdue_ns(self, now_ns: int) -> int:
         oldest = self._flight.oldest
-        return 0 if oldest is None else now_ns - oldest.sent_ns - oldest.own_ns - self._round_trip_ns
+        return (
+            0 if oldest is None else now_ns - oldest.sent_ns - oldest.serialization_ns - self._round_trip_ns
+        )
 
     def _follow(self, feedback: Feedback, now_ns: int) -> bool:
         """Whether this report is the newest of the receiver that counts."""
-        kind = self._followed.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns)
+        kind = self._primary.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns)
         if kind == "first":
             self._forget_path()
         return kind is not None
 
     def _leave(self) -> None:
-        self._followed.forget()
+        self._primary.forget()
         self._forget_path()
 
     def _forget_path(self) -> None:
@@ -312,5 +314,5 @@ class Pacer:
         # Quickly up, slowly down: what is expected is the longest of the usual.
         held_ns = min(max(held_ns, _LEAST_HELD_NS), _MOST_HELD_NS)
         self._held_ns = max((9 * self._held_ns + held_ns) // 10, min(held_ns, 2 * self._held_ns))
-        self._followed.note_progress(now_ns)
+        self._primary.note_progress(now_ns)
         self._round_trip_ns = self._round_trip.add(max(0, now_ns - sent.sent_ns), now_ns=now_ns)

@@ -9,7 +9,7 @@ from typing import Self
 
 import zenoh
 
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, Feedback, WireError
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.session import declare_publisher, serve
@@ -18,10 +18,10 @@ __all__ = ["EdgeLink"]
 
 _log = logging.getLogger(__name__)
 
-_PUBLISHED = (Row.BASE, Row.ROI, Row.TRACKS, Row.PAST, Row.STATUS)
+_PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.BACKLOG, Channel.STATUS)
 _MOST_PER_S = 1000
 """Questions, or reports: a ground sends some ten a second."""
-_NEEDED = (Row.BASE, Row.ROI, Row.STATUS)
+_NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
 """Rows that a ground subscribes to in any case; one that only shows the video may leave out tracks and past."""
 
 
@@ -51,22 +51,24 @@ class EdgeLink:
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
         self._publishers = {row: declare_publisher(session, row, keys=keys) for row in _PUBLISHED}
-        serve(session, Row.INFO, keys=keys, answer=self._info)
-        serve(session, Row.CONTROL, keys=keys, answer=self._control)
-        self._feedback = session.declare_subscriber(keys.key(Row.FEEDBACK), self._on_feedback)
+        serve(session, Channel.INFO, keys=keys, answer=self._info)
+        serve(session, Channel.CONTROL, keys=keys, answer=self._control)
+        self._feedback = session.declare_subscriber(keys.key(Channel.FEEDBACK), self._on_feedback)
         # Last: who sees the token may ask at once.
-        self._token = session.liveliness().declare_token(keys.key(Row.ALIVE))
+        self._token = session.liveliness().declare_token(keys.key(Channel.ALIVE))
 
     def heard(self) -> bool:
         """Whether a ground subscribes to base, stills and status."""
         return all(self.listens(row) for row in _NEEDED)
 
-    def listens(self, row: Row) -> bool:
+    def listens(self, row: Channel) -> bool:
         """Whether somebody subscribes to this row."""
         # Zenoh's own stub calls the status a bool.
         return bool(self._publishers[row].matching_status.matching)  # type: ignore[attr-defined]
 
-    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+    def put(
+        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
         """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
         try:
             self._publishers[row].put(payload, attachment=attachment, encoding=encoding or None)
@@ -89,7 +91,7 @@ class EdgeLink:
         return self._answer_info(self._clock())
 
     def _control(self, question: bytes) -> bytes | None:
-        self._watch(Row.CONTROL)
+        self._watch(Channel.CONTROL)
         try:
             request = ControlRequest.parse(question)
         except WireError as error:
@@ -98,7 +100,7 @@ class EdgeLink:
         return self._answer_control(request).pack()
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
-        self._watch(Row.FEEDBACK)
+        self._watch(Channel.FEEDBACK)
         try:
             feedback = Feedback.parse(sample.payload.to_bytes())
         except WireError as error:
@@ -106,7 +108,7 @@ class EdgeLink:
             return
         self._hear(feedback)
 
-    def _watch(self, row: Row) -> None:
+    def _watch(self, row: Channel) -> None:
         if self._flood.note(row, now_ns=self._clock()) is not None:
             _log.warning(
                 "more than %d messages a second on %s, far more than any ground sends: somebody floods this edge "

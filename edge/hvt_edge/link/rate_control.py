@@ -2,7 +2,8 @@
 
 The signal is queueing delay (RFC 8298, section 4.1.2; RFC 6817): one-way delay above the least seen lately, so the
 two clocks need not agree. From it is taken what the edge's own messages would have waited on a link of exactly the
-present rate (`Progress.own_ns`): a keyframe or a burst is no congestion, and what is left, the **excess**, grows
+present rate (`Progress.serialization_ns`): a keyframe or a burst is no congestion, and what is left, the
+**excess**, grows
 exactly where the link is slower than the rate. It counts as overuse where it stays high and does not fall over
 several reports (as in CoDel, a burst empties, a standing queue does not). Then the rate becomes a share of what
 arrived meanwhile, which is what the link carries. Messages sent before that say nothing about the new rate and are
@@ -18,7 +19,14 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 
-__all__ = ["LeastDelay", "Progress", "RateController", "RateSettings", "Reopening", "ReopeningSettings"]
+__all__ = [
+    "LeastDelay",
+    "Progress",
+    "RateController",
+    "RateSettings",
+    "ReconfigurationSettings",
+    "ReconfigurationTrigger",
+]
 
 _MS = 1_000_000
 _SECOND_NS = 1_000_000_000
@@ -66,7 +74,7 @@ class Progress:
     """When the message was sent, the edge's clock."""
     arrived_ns: int
     """The ground's clock."""
-    own_ns: int
+    serialization_ns: int
     """What it would have taken on a link of the rate of that time, behind the edge's own messages."""
     arrived_bytes: int
     """Line bytes sent up to and with it: they have all arrived, or are lost."""
@@ -210,7 +218,7 @@ class RateController:
         if self._base_ns is not None and abs(delay_ns - self._base_ns) > _ABSURD_NS:
             self.forget_path()
         self._base_ns = self._least.add(delay_ns, now_ns=progress.now_ns)
-        return delay_ns - self._base_ns - progress.own_ns
+        return delay_ns - self._base_ns - progress.serialization_ns
 
     def _limit_ns(self) -> int:
         return max(self._settings.excess_ns, round(2 * _MTU_BITS * _SECOND_NS / self._rate))
@@ -301,7 +309,7 @@ def _arrival_bps(first: Progress, last: Progress) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class ReopeningSettings:
+class ReconfigurationSettings:
     """By how much the base's rate must be off, and for how long, before x265 is opened anew."""
 
     much_less: float = 0.8
@@ -314,13 +322,13 @@ class ReopeningSettings:
     """So long it must be off by `some`."""
 
 
-class Reopening:
+class ReconfigurationTrigger:
     """Whether it is worth a keyframe and some 35 ms to open x265 at another rate. Time is an argument.
 
     Until then a base stream that is too fast takes from the stills, and then drops frames.
     """
 
-    def __init__(self, settings: ReopeningSettings = ReopeningSettings()) -> None:
+    def __init__(self, settings: ReconfigurationSettings = ReconfigurationSettings()) -> None:
         self._settings = settings
         self._done_ns: int | None = None
         self._off_ns: int | None = None

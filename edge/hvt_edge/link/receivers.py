@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-__all__ = ["Followed"]
+__all__ = ["PrimaryReceiver"]
 
 _OTHER_RECEIVER_NS = 1_000_000_000
 
 
-class Followed:
+class PrimaryReceiver:
     """Not thread-safe; time is an argument."""
 
     def __init__(self) -> None:

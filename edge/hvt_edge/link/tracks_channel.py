@@ -10,7 +10,7 @@ import numpy as np
 
 from hvt_common.protocol.messages import TrackStepEncoder
 from hvt_common.values import Tracks
-from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.analyzer import AnalyzedFrame
 
 __all__ = ["TrackReportSettings", "TrackReporter", "TrackSender"]
 
@@ -34,7 +34,7 @@ class TrackReportSettings:
 
 
 class TrackSender(Protocol):
-    """Where steps go: `hvt_edge.link.transmitter.Sender`."""
+    """Where steps go: `hvt_edge.link.transmitter.Transmitter`."""
 
     def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
         """Send ``make(at_ns)``, made for the moment at which the budget has room; by that a few bytes may differ."""
@@ -56,7 +56,7 @@ class TrackReporter:
         """Sent so far."""
         self.boxes = 0
 
-    def report(self, seen: Seen, *, now_ns: int) -> bool:
+    def report(self, seen: AnalyzedFrame, *, now_ns: int) -> bool:
         """Send this step's tracks if it is a decision step and one is due; tell whether it was sent.
 
         A step without tracks is sent too: that nothing is there is news. ``now_ns`` is the time windows go by.

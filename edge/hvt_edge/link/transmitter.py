@@ -11,20 +11,20 @@ import threading
 from collections.abc import Callable
 from typing import Protocol
 
-from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row
-from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
+from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import (
     AlsoShown,
+    BacklogHeader,
+    BacklogStill,
     BaseHeader,
     Flags,
-    PastHeader,
-    PastStill,
     RoiHeader,
     Status,
     fitted_text,
 )
 from hvt_common.values import AccessUnit, Still
-from hvt_edge.backlog.backfill import Piece
+from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.unacknowledged import Unacknowledged
@@ -35,7 +35,7 @@ __all__ = [
     "STATUS_BYTES",
     "STILL_ATTACHMENT_BYTES",
     "Outlet",
-    "Sender",
+    "Transmitter",
     "base_overhead_bps",
 ]
 
@@ -43,13 +43,13 @@ BASE_ATTACHMENT_BYTES = 48
 """What a `BaseHeader` takes at most."""
 STILL_ATTACHMENT_BYTES = 100
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
-`Sender.still_room_bytes` of one that is counts its own header."""
+`Transmitter.still_room_bytes` of one that is counts its own header."""
 STATUS_BYTES = 320
 """What a `Status` takes."""
-PAST_ATTACHMENT_BYTES = 48
-"""What a `PastHeader` takes at most."""
-_LEAST_PIECE_BYTES, _MOST_PIECE_BYTES = 1_000, 12_000
-_PIECE_S = 0.05
+BACKLOG_ATTACHMENT_BYTES = 48
+"""What a `BacklogHeader` takes at most."""
+_LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
+_CHUNK_S = 0.05
 """So long the link is busy with a piece at most, so that a frame or a live still need not wait for it."""
 _SECOND_NS = 1_000_000_000
 _GROWTH_BYTES = 16
@@ -64,7 +64,9 @@ _OWN_TYPES = "application/vnd.hvt."
 class Outlet(Protocol):
     """Where bytes go: the link, or in the study nowhere."""
 
-    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+    def put(
+        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
         """Hand over one message; may block while the link is full."""
         ...
 
@@ -72,12 +74,12 @@ class Outlet(Protocol):
 def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
     """What headers, framing and ``status`` take of ``base_bps``: the encoder gets the rest."""
     payload = round(base_bps / 8 / fps)
-    key = EdgeKeys(edge_id).key(Row.BASE)
-    encoding = DELIVERIES[Row.BASE].encoding
+    key = EdgeKeys(edge_id).key(Channel.BASE)
+    encoding = DELIVERIES[Channel.BASE].encoding
     per_frame = BASE_ATTACHMENT_BYTES + overhead_bytes(
         payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding
     )
-    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Row.STATUS))
+    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Channel.STATUS))
     return 8 * (per_frame * fps + per_second)
 
 
@@ -89,7 +91,7 @@ def _encoding(still: Still) -> str:
     return PLAIN_ENCODING if still.media_type.startswith(_OWN_TYPES) else still.media_type
 
 
-class Sender:
+class Transmitter:
     """Sends access units, stills, tracks and status, and accounts for each.
 
     ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` is told of all
@@ -128,7 +130,7 @@ class Sender:
 
         ``after_hole``: frames that it builds on were not sent. A number is left out, so that nobody shows it.
         """
-        line_bytes = self._line_bytes(Row.BASE, unit.data, BASE_ATTACHMENT_BYTES)
+        line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
             at_ns = self._budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
             self.base_sequence += 2 if after_hole else 1
@@ -141,14 +143,16 @@ class Sender:
                 flags=self._flags | ((Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0),
             )
             attachment = header.pack(unit.data)
-            line_bytes = self._count(Row.BASE, Channel.BASE, unit.data, attachment, at_ns=at_ns)
+            line_bytes = self._count(Channel.BASE, Account.BASE, unit.data, attachment, at_ns=at_ns)
             self._budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
             if self._pacer is not None:
                 self._pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
             if self._unacked is not None:
                 self._unacked.sent_base(self.base_sequence, unit, now_ns=at_ns)
         self._wait_until(at_ns)
-        self._outlet.put(Row.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Row.BASE].encoding)
+        self._outlet.put(
+            Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
+        )
         return line_bytes
 
     def still_room_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
@@ -163,14 +167,14 @@ class Sender:
         if paced and self._pacer is not None and not self._pacer.admits_still(now_ns):
             return 0
         if still is None:
-            return self._payload_bytes(room, STILL_ATTACHMENT_BYTES, DELIVERIES[Row.ROI].encoding)
+            return self._payload_bytes(room, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
         attachment_bytes = len(self._still_header(still, send_ns=now_ns).pack())
         return self._payload_bytes(room, attachment_bytes, _encoding(still))
 
     def most_still_bytes(self) -> int:
         """About the payload of the largest still that the budget ever admits."""
         return self._payload_bytes(
-            self._budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Row.ROI].encoding
+            self._budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding
         )
 
     def still(self, still: Still, *, now_ns: int, utility: float = 0.0) -> None:
@@ -185,7 +189,7 @@ class Sender:
             at_ns = self._still_at_ns(still, encoding, now_ns)
             attachment = self._still_header(still, send_ns=at_ns).pack(still.data)
             line_bytes = self._count(
-                Row.ROI, Channel.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
+                Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
             )
             self._budget.record_still(line_bytes, now_ns=at_ns)
             if self._pacer is not None and again:  # its number stands for the first copy, or for later stills
@@ -195,23 +199,23 @@ class Sender:
             if self._unacked is not None:
                 self._unacked.sent_still(still, utility=utility, now_ns=at_ns)
         self._wait_until(at_ns)
-        self._outlet.put(Row.ROI, still.data, attachment=attachment, encoding=encoding)
+        self._outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=encoding)
 
-    def kept_base(self, unit: AccessUnit, *, now_ns: int) -> None:
+    def store_base(self, unit: AccessUnit, *, now_ns: int) -> None:
         """An access unit is kept for later: it has used up its share, and left nothing of it to a still."""
-        line_bytes = self._line_bytes(Row.BASE, unit.data, BASE_ATTACHMENT_BYTES)
+        line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
             self._budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, kept=True)
 
-    def kept_still(self, still: Still, *, now_ns: int, counted: bool = True) -> PastStill:
+    def store_still(self, still: Still, *, now_ns: int, counted: bool = True) -> BacklogStill:
         """The still as it would have gone out, for the store; ``counted``: its share of the budget is taken."""
         header = self._still_header(still, send_ns=now_ns, stored=True)
         attachment, encoding = header.pack(still.data), _encoding(still)
         if counted:
-            line_bytes = self._line_bytes(Row.ROI, still.data, len(attachment), encoding=encoding)
+            line_bytes = self._line_bytes(Channel.ROI, still.data, len(attachment), encoding=encoding)
             with self._lock:
                 self._budget.record_still(line_bytes, now_ns=now_ns)
-        return PastStill(attachment, encoding, still.data)
+        return BacklogStill(attachment, encoding, still.data)
 
     @property
     def unacked(self) -> Unacknowledged | None:
@@ -228,53 +232,58 @@ class Sender:
         """The budget as it is now."""
         return self._budget.total_bps
 
-    def past_room_bytes(self, now_ns: int, *, reserve: float) -> int:
-        """Payload that a piece of what was kept may have now; ``reserve``: see `RollingBudget.past_room`."""
+    def backlog_allowance_bytes(self, now_ns: int, *, reserve: float) -> int:
+        """Payload that a piece of what was kept may have now; ``reserve``: see `RollingBudget.backlog_allowance`."""
         with self._lock:
-            room = self._budget.past_room(now_ns, reserve=reserve)
+            room = self._budget.backlog_allowance(now_ns, reserve=reserve)
         if self._pacer is not None and not self._pacer.admits_still(now_ns):
             return 0
-        around = PAST_ATTACHMENT_BYTES + overhead_bytes(
-            room, PAST_ATTACHMENT_BYTES, key=self._keys.key(Row.PAST), encoding=DELIVERIES[Row.PAST].encoding
+        around = BACKLOG_ATTACHMENT_BYTES + overhead_bytes(
+            room,
+            BACKLOG_ATTACHMENT_BYTES,
+            key=self._keys.key(Channel.BACKLOG),
+            encoding=DELIVERIES[Channel.BACKLOG].encoding,
         )
-        most = min(_MOST_PIECE_BYTES, max(_LEAST_PIECE_BYTES, round(_PIECE_S * self.total_bps / 8)))
+        most = min(_MOST_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, round(_CHUNK_S * self.total_bps / 8)))
         return min(most, max(0, room - around))
 
-    def past(self, piece: Piece, *, now_ns: int) -> int:
-        """Send a piece that `past_room_bytes` admitted at this very time; return its line bytes.
+    def backlog(self, chunk: Chunk, *, now_ns: int) -> int:
+        """Send a piece that `backlog_allowance_bytes` admitted at this very time; return its line bytes.
 
         0: another thread has taken the room since, and it was not sent.
         """
-        header = PastHeader(
-            session_id=piece.session_id,
-            kind=piece.kind,
-            number=piece.number,
-            offset=piece.offset,
-            total_bytes=piece.total_bytes,
+        header = BacklogHeader(
+            session_id=chunk.session_id,
+            kind=chunk.kind,
+            number=chunk.number,
+            offset=chunk.offset,
+            total_bytes=chunk.total_bytes,
             send_ns=now_ns,
         )
-        attachment = header.pack(piece.data)
+        attachment = header.pack(chunk.data)
         with self._lock:
-            wanted_bytes = self._line_bytes(Row.PAST, piece.data, len(attachment))
-            if wanted_bytes > self._budget.past_room(now_ns, reserve=0.0):
+            wanted_bytes = self._line_bytes(Channel.BACKLOG, chunk.data, len(attachment))
+            if wanted_bytes > self._budget.backlog_allowance(now_ns, reserve=0.0):
                 return 0
-            line_bytes = self._count(Row.PAST, Channel.PAST, piece.data, attachment, at_ns=now_ns)
-            self._budget.record_past(line_bytes, now_ns=now_ns)
+            line_bytes = self._count(Channel.BACKLOG, Account.BACKLOG, chunk.data, attachment, at_ns=now_ns)
+            self._budget.record_backlog(line_bytes, now_ns=now_ns)
             if self._pacer is not None:
                 self._pacer.sent_other(line_bytes, now_ns=now_ns)
-        self._outlet.put(Row.PAST, piece.data, attachment=attachment, encoding=DELIVERIES[Row.PAST].encoding)
+        self._outlet.put(
+            Channel.BACKLOG, chunk.data, attachment=attachment, encoding=DELIVERIES[Channel.BACKLOG].encoding
+        )
         return line_bytes
 
     def tracks(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
         """Send the edge's own tracks of one decision step, made for the moment at which they may go."""
-        self._metadata(Row.TRACKS, make, now_ns=now_ns)
+        self._metadata(Channel.TRACKS, make, now_ns=now_ns)
 
     def status(self, make: Callable[[int], Status], *, now_ns: int) -> None:
         """Send the once-a-second report, made for the moment at which it may go.
 
         ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment.
         """
-        self._metadata(Row.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns)
+        self._metadata(Channel.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns)
 
     def set_base(self, base_bps: int, fps: float, *, now_ns: int) -> None:
         """The base stream's share of the budget and its rate of frames, from the keyframe that comes next."""
@@ -302,19 +311,19 @@ class Sender:
         with self._lock:
             return self._budget.keyframe_fits(line_bytes, now_ns=now_ns)
 
-    def fate(self, fate: str, reason: str) -> None:
+    def outcome(self, outcome: str, reason: str) -> None:
         """Note what became of a candidate: ``sent``, ``deferred`` or ``dropped``, and why."""
-        assert fate in ("sent", "deferred", "dropped")
+        assert outcome in ("sent", "deferred", "dropped")
         with self._lock:
-            self._ledger.record_fate(fate, reason)  # type: ignore[arg-type]
+            self._ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
 
-    def _metadata(self, row: Row, make: Callable[[int], bytes], *, now_ns: int) -> None:
+    def _metadata(self, row: Channel, make: Callable[[int], bytes], *, now_ns: int) -> None:
         """Send what belongs to neither stream as soon as the budget's window has room for it."""
         with self._lock:
             size_bytes = _GROWTH_BYTES + self._line_bytes(row, make(now_ns), 0)
             at_ns = self._budget.earliest_ns(size_bytes, now_ns=now_ns)
             payload = make(at_ns)
-            line_bytes = self._count(row, Channel.META, payload, b"", at_ns=at_ns)
+            line_bytes = self._count(row, Account.META, payload, b"", at_ns=at_ns)
             self._budget.record_metadata(line_bytes, now_ns=at_ns)
             if self._pacer is not None:
                 self._pacer.sent_other(line_bytes, now_ns=at_ns)
@@ -344,7 +353,7 @@ class Sender:
     def _still_at_ns(self, still: Still, encoding: str, now_ns: int) -> int:
         """When it may go: now, unless its room is gone."""
         attachment_bytes = len(self._still_header(still, send_ns=now_ns).pack())
-        line_bytes = self._line_bytes(Row.ROI, still.data, attachment_bytes, encoding=encoding)
+        line_bytes = self._line_bytes(Channel.ROI, still.data, attachment_bytes, encoding=encoding)
         if self._budget.has_room(line_bytes, now_ns=now_ns):
             return now_ns
         return self._budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
@@ -352,12 +361,19 @@ class Sender:
     def _payload_bytes(self, room_bytes: int, attachment_bytes: int, media_type: str) -> int:
         """What of so many line bytes is left for a still's payload."""
         around = attachment_bytes + overhead_bytes(
-            room_bytes, attachment_bytes, key=self._keys.key(Row.ROI), encoding=media_type
+            room_bytes, attachment_bytes, key=self._keys.key(Channel.ROI), encoding=media_type
         )
         return max(0, room_bytes - around)
 
     def _count(
-        self, row: Row, channel: Channel, payload: bytes, attachment: bytes, *, at_ns: int, encoding: str = ""
+        self,
+        row: Channel,
+        channel: Account,
+        payload: bytes,
+        attachment: bytes,
+        *,
+        at_ns: int,
+        encoding: str = "",
     ) -> int:
         line_bytes = self._line_bytes(row, payload, len(attachment), encoding=encoding)
         self._ledger.count(
@@ -369,7 +385,7 @@ class Sender:
         )
         return line_bytes
 
-    def _line_bytes(self, row: Row, payload: bytes, attachment_bytes: int, *, encoding: str = "") -> int:
+    def _line_bytes(self, row: Channel, payload: bytes, attachment_bytes: int, *, encoding: str = "") -> int:
         """Payload, attachment and what the transport adds."""
         overhead = overhead_bytes(
             len(payload),

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.messages import Feedback
 from hvt_common.values import AccessUnit, Still
-from hvt_edge.link.receivers import Followed
+from hvt_edge.link.receivers import PrimaryReceiver
 
 __all__ = ["UnackedSettings", "Unacknowledged"]
 
@@ -60,7 +60,7 @@ class Unacknowledged:
         """By sequence, in the order of first sending."""
         self._still_bytes = 0
         self._last_base = self._last_still = -1
-        self._followed = Followed()
+        self._primary = PrimaryReceiver()
 
     def __len__(self) -> int:
         """Access units and stills together."""
@@ -107,7 +107,7 @@ class Unacknowledged:
             # Numbers that were never sent mean nothing, and who names them is not followed.
             if feedback.base_sequence > self._last_base or feedback.still_sequence > self._last_still:
                 return
-            if self._followed.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns) is None:
+            if self._primary.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns) is None:
                 return
             before = len(self)
             while self._base and self._base[0][0] <= feedback.base_sequence:
@@ -117,7 +117,7 @@ class Unacknowledged:
                 if sequence not in missing:
                     self._forget_still(sequence)
             if len(self) < before:
-                self._followed.note_progress(now_ns)
+                self._primary.note_progress(now_ns)
 
     def overdue_stills(self, now_ns: int, *, round_trip_ns: int) -> list[tuple[Still, float]]:
         """Return those to be sent again, with their utility, most useful first.
@@ -132,7 +132,7 @@ class Unacknowledged:
                 one
                 for one in self._stills.values()
                 if not one.again
-                and self._followed.heard_ns - one.sent_ns >= wait_ns
+                and self._primary.heard_ns - one.sent_ns >= wait_ns
                 and now_ns - one.sent_ns <= settings.max_age_ns
             ]
         return [(one.still, one.utility) for one in sorted(overdue, key=lambda one: -one.utility)]

@@ -19,7 +19,7 @@ from hvt_common.values import Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.operating.keyframes import KeyframePlan
-from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.video.stage import BaseStage
 
@@ -61,7 +61,7 @@ class LockstepPace:
         self._stop = stop
         self._follows = heard()
         self._eyes = ThreadPoolExecutor(1, thread_name_prefix="hvt-sight")
-        self._seeing: tuple[Frame, int, bool, Future[Seen]] | None = None
+        self._seeing: tuple[Frame, int, bool, Future[AnalyzedFrame]] | None = None
         self._in_flight: deque[tuple[int, int, set[int]]] = deque()
         """(tick, newest coded tick by then, stills sent with it): what the ground is to answer."""
         self._coded_index = -1

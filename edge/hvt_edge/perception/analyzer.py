@@ -12,11 +12,11 @@ from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
 
-__all__ = ["Seen", "Sight", "SightSettings"]
+__all__ = ["AnalyzedFrame", "Analyzer", "AnalyzerSettings"]
 
 
 @dataclass(frozen=True, slots=True)
-class SightSettings:
+class AnalyzerSettings:
     """``candidates`` says on which pixels the detector runs and the tracker follows the camera.
 
     Of the source means before it is coded, at the finer of its two sizes: a source that the base enlarges is
@@ -24,12 +24,12 @@ class SightSettings:
     """
 
     detect_every: int = 5
-    """Ticks from one detection to the next; see `Sight.see` for streams that code fewer ticks than that."""
+    """Ticks from one detection to the next; see `Analyzer.see` for streams that code fewer ticks than that."""
     candidates: Literal["decoded", "source"] = "decoded"
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class AnalyzedFrame:
     """One tick with all that is known of it."""
 
     frame: Frame
@@ -49,7 +49,7 @@ class _Decoder(Protocol):
     def decode(self, data: bytes) -> Image | None: ...
 
 
-class Sight:
+class Analyzer:
     """Decodes the edge's own access units, detects on every n-th tick and tracks on each."""
 
     def __init__(
@@ -58,7 +58,7 @@ class Sight:
         tracker: ByteTracker,
         *,
         view: View,
-        settings: SightSettings = SightSettings(),
+        settings: AnalyzerSettings = AnalyzerSettings(),
         decoder: _Decoder | None = None,
     ) -> None:
         self._detector = detector
@@ -70,7 +70,7 @@ class Sight:
         self._coded_index: int | None = None
         self._coded_gap = 1
 
-    def see(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool = False) -> Seen:
+    def see(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool = False) -> AnalyzedFrame:
         """Take in the next tick; ``unit`` is None where it is not coded.
 
         Detection is due ``detect_every`` ticks after the last one. With candidates of the decoded stream that can
@@ -83,11 +83,11 @@ class Sight:
         pixels = frame.base_bgr if self._settings.candidates == "source" else base_bgr
         if hurry or not self._due(frame.index, coded=unit is not None):
             tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
-            return Seen(frame, base_bgr, tracks, detected=False)
+            return AnalyzedFrame(frame, base_bgr, tracks, detected=False)
         self._detected_index = frame.index
         detections = self._detect(frame, base_bgr)
         tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
-        return Seen(frame, base_bgr, tracks, detected=True)
+        return AnalyzedFrame(frame, base_bgr, tracks, detected=True)
 
     def _decode(self, index: int, unit: AccessUnit) -> Image:
         base_bgr = self._decoder.decode(unit.data)

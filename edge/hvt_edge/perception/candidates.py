@@ -17,7 +17,7 @@ from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
 from hvt_edge.perception.base_loss import BaseLoss, measure_loss
 from hvt_edge.perception.crop import PADDING, crop_box
 
-__all__ = ["Belief", "Candidate", "TrackMemory", "sharpness"]
+__all__ = ["Candidate", "ClassPosterior", "TrackMemory", "sharpness"]
 
 Box = tuple[float, float, float, float]
 
@@ -28,7 +28,7 @@ _SHARPNESS_SIDE_PX = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class ClassPosterior:
     """What the ground's classifier said of a track, as it came back by ``feedback``."""
 
     class_name: str
@@ -75,7 +75,7 @@ class Candidate:
     last_sent_at_border: bool = False
     last_refused_ns: int | None = None
     """When the still stage last gave no still (`TrackMemory.record_refused`)."""
-    posterior: Belief | None = None
+    posterior: ClassPosterior | None = None
     sharpness: Callable[[], float] | None = field(default=None, compare=False, repr=False)
     """Measures the source crop when called; None where no picture was at hand."""
     loss: Callable[[], BaseLoss] | None = field(default=None, compare=False, repr=False)
@@ -115,7 +115,7 @@ class _History:
     sent_sharpness: float | None = None
     sent_at_border: bool = False
     refused_ns: int | None = None
-    belief: Belief | None = None
+    class_posterior: ClassPosterior | None = None
 
 
 class TrackMemory:
@@ -189,7 +189,7 @@ class TrackMemory:
         """Note what the ground's classifier made of the track; unknown tracks are ignored."""
         history = self._histories.get(track_id)
         if history is not None:
-            history.belief = Belief(class_name, confidence, entropy_nats)
+            history.class_posterior = ClassPosterior(class_name, confidence, entropy_nats)
 
     def candidates(
         self,
@@ -279,7 +279,7 @@ class TrackMemory:
             last_sent_sharpness=history.sent_sharpness,
             last_sent_at_border=history.sent_at_border,
             last_refused_ns=history.refused_ns,
-            posterior=history.belief,
+            posterior=history.class_posterior,
             sharpness=None if source_bgr is None else _sharpness_of(source_bgr, crop),
             loss=None
             if source_bgr is None or base_bgr is None

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from hvt_common.values import Frame, Image, Tracks
 
-__all__ = ["FrameRing", "KeptFrame", "RingSettings"]
+__all__ = ["FrameRing", "RingFrame", "RingSettings"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class RingSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptFrame:
+class RingFrame:
     """A source frame and what was tracked in it."""
 
     frame_index: int
@@ -42,7 +42,7 @@ class FrameRing:
 
     def __init__(self, settings: RingSettings = RingSettings()) -> None:
         self._settings = settings
-        self._frames: list[KeptFrame] = []
+        self._frames: list[RingFrame] = []
         """Oldest first; all but the newest lie on the grid that `_spacing_ns` makes."""
         self._size_bytes = 0
         self._lock = threading.Lock()
@@ -56,7 +56,7 @@ class FrameRing:
         return self._size_bytes
 
     @property
-    def newest(self) -> KeptFrame | None:
+    def newest(self) -> RingFrame | None:
         """The frame added last; None before the first, or where none is kept."""
         with self._lock:
             return self._frames[-1] if self._frames else None
@@ -72,18 +72,18 @@ class FrameRing:
             # The newest was kept for being the newest; unless it lies on the grid, it makes way for this one.
             if len(self._frames) > 1 and self._gap_ns(-1) < spacing_ns:
                 self._size_bytes -= self._frames.pop().source_bgr.nbytes
-            self._frames.append(KeptFrame(frame.index, frame.capture_ns, frame.source_bgr, tracks))
+            self._frames.append(RingFrame(frame.index, frame.capture_ns, frame.source_bgr, tracks))
             self._size_bytes += size_bytes
             self._let_go(frame.capture_ns - self._settings.max_age_ns)
 
-    def near_time(self, capture_ns: int) -> KeptFrame | None:
+    def near_time(self, capture_ns: int) -> RingFrame | None:
         """The frame kept that was taken nearest to this time; None where that is further back than the ring goes."""
         with self._lock:
             if not self._frames or capture_ns < self._reach_ns():
                 return None
             return min(self._frames, key=lambda one: abs(one.capture_ns - capture_ns))
 
-    def near_index(self, frame_index: int) -> KeptFrame | None:
+    def near_index(self, frame_index: int) -> RingFrame | None:
         """The frame kept whose index is nearest; None where that is further back than the ring goes, or to come."""
         with self._lock:
             if not self._frames or frame_index > self._frames[-1].frame_index:

@@ -13,7 +13,7 @@ import numpy as np
 from hvt_common.values import Image, Still
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db
 
-__all__ = ["Cut", "Rival", "crop_of", "inner_box"]
+__all__ = ["Alternative", "CropJob", "crop_of", "inner_box"]
 
 Box = tuple[float, float, float, float]
 Crop = tuple[int, int, int, int]
@@ -26,7 +26,7 @@ _FAR_OFF_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Rival:
+class Alternative:
     """How far the base is from the source at a crop, and so how far a still may be."""
 
     places: tuple[Place, ...]
@@ -39,7 +39,9 @@ class Rival:
     """Its squared luma error over the variance of the crop's luma: 1 is no better than one flat grey."""
 
     @classmethod
-    def of(cls, base_crop: Image, *, crop: Image, places: tuple[Place, ...], min_gain_db: float) -> Rival:
+    def of(
+        cls, base_crop: Image, *, crop: Image, places: tuple[Place, ...], min_gain_db: float
+    ) -> Alternative:
         """``min_gain_db`` is by how much a still must be closer than the base."""
         share = 10 ** (-min_gain_db / 10)
         limits = tuple(share * error for error in _errors(base_crop, crop, places))
@@ -59,16 +61,16 @@ class Rival:
 
 
 @dataclass(frozen=True, slots=True)
-class Cut:
+class CropJob:
     """One crop, ready to be coded."""
 
-    draft: Still
+    header: Still
     """The still as it will be, but for sequence, quality and data."""
     crop_bgr: Image
     """Of the source, at the size at which it is coded."""
     base_crop_bgr: Image | None
     """What the decoded base frame of the same tick shows of it, at that size; None where there is none."""
-    rival: Rival | None
+    alternative: Alternative | None
     """None where the base was not at hand."""
 
     @property
@@ -79,12 +81,14 @@ class Cut:
     @property
     def base_far_off(self) -> bool:
         """Whether the base shows something else here, so that a codec may do better without it."""
-        return self.rival is not None and self.rival.error_share > _FAR_OFF_SHARE
+        return self.alternative is not None and self.alternative.error_share > _FAR_OFF_SHARE
 
-    def recoded(self, codec: StillCodec, *, reason: str) -> Cut:
+    def recoded(self, codec: StillCodec, *, reason: str) -> CropJob:
         """The same crop for another codec, without the base; the still must be closer than the base all the same."""
-        draft = replace(self.draft, reason=reason, codec=codec.name, media_type=codec.media_type)
-        return Cut(draft=draft, crop_bgr=self.crop_bgr, base_crop_bgr=None, rival=self.rival)
+        header = replace(self.header, reason=reason, codec=codec.name, media_type=codec.media_type)
+        return CropJob(
+            header=header, crop_bgr=self.crop_bgr, base_crop_bgr=None, alternative=self.alternative
+        )
 
 
 def crop_of(source_bgr: Image, crop_px: Crop, size: tuple[int, int]) -> Image:

@@ -13,7 +13,7 @@ from hvt_common.video.still_codecs import (
     best_fitting,
     smallest_reaching,
 )
-from hvt_edge.stills.crop_job import Cut
+from hvt_edge.stills.crop_job import CropJob
 
 __all__ = ["Fitted", "Fitter", "NoStill"]
 
@@ -51,7 +51,7 @@ class Fitter:
     floor_pct: int
     ceiling_pct: int
 
-    def best(self, cut: Cut, *, limit_bytes: int) -> Fitted | NoStill:
+    def best(self, cut: CropJob, *, limit_bytes: int) -> Fitted | NoStill:
         """The asked fidelity or quality, or the best below it that fits; then upwards until the base is beaten."""
         asked = self._asked(cut)
         if len(asked.data) > limit_bytes:
@@ -67,19 +67,19 @@ class Fitter:
                 return NoStill("too_large")
         return asked
 
-    def smallest(self, cut: Cut, *, psnr_db: float, limit_bytes: int) -> Fitted | None:
+    def smallest(self, cut: CropJob, *, psnr_db: float, limit_bytes: int) -> Fitted | None:
         """The fewest bytes, fewer than ``limit_bytes``, that come this near to the source and beat the base."""
         fitted = self._reaching(cut, psnr_db)
         if fitted is None or len(fitted.data) >= limit_bytes or not _beats_base(fitted, cut):
             return None
         return fitted
 
-    def _asked(self, cut: Cut) -> Fitted:
+    def _asked(self, cut: CropJob) -> Fitted:
         if not self.fidelity_db:
             return self._at(cut, self.quality_pct)
         return self._reaching(cut, self.fidelity_db) or self._at(cut, _MOST_PCT)
 
-    def _reaching(self, cut: Cut, psnr_db: float) -> Fitted | None:
+    def _reaching(self, cut: CropJob, psnr_db: float) -> Fitted | None:
         """The lowest quality that comes this near; None where none does."""
         found = smallest_reaching(
             self.codec,
@@ -94,7 +94,7 @@ class Fitter:
         coded, quality_pct, shown_bgr, _ = found
         return Fitted(coded.data, coded.parameters, quality_pct, shown_bgr)
 
-    def _best_fitting(self, cut: Cut, limit_bytes: int, *, below_pct: int) -> Fitted | None:
+    def _best_fitting(self, cut: CropJob, limit_bytes: int, *, below_pct: int) -> Fitted | None:
         """The best quality from the floor to below the asked one that fits."""
         found = best_fitting(
             self.codec,
@@ -106,20 +106,20 @@ class Fitter:
         )
         return None if found is None else self._decoded(cut, *found)
 
-    def _at(self, cut: Cut, quality_pct: int) -> Fitted:
+    def _at(self, cut: CropJob, quality_pct: int) -> Fitted:
         coded = self.codec.encode(cut.crop_bgr, quality_pct=quality_pct, base_bgr=self._base(cut))
         return self._decoded(cut, coded, quality_pct)
 
-    def _decoded(self, cut: Cut, coded: CodedCrop, quality_pct: int) -> Fitted:
+    def _decoded(self, cut: CropJob, coded: CodedCrop, quality_pct: int) -> Fitted:
         height, width = cut.crop_bgr.shape[:2]
         shown = self.codec.decode(
             coded.data, size=(width, height), parameters=coded.parameters, base_bgr=self._base(cut)
         )
         return Fitted(coded.data, coded.parameters, quality_pct, shown)
 
-    def _base(self, cut: Cut) -> Image | None:
+    def _base(self, cut: CropJob) -> Image | None:
         return cut.base_crop_bgr if self.codec.needs_base else None
 
 
-def _beats_base(fitted: Fitted, cut: Cut) -> bool:
-    return cut.rival is None or cut.rival.loses_to(fitted.shown_bgr, crop=cut.crop_bgr)
+def _beats_base(fitted: Fitted, cut: CropJob) -> bool:
+    return cut.alternative is None or cut.alternative.loses_to(fitted.shown_bgr, crop=cut.crop_bgr)

@@ -19,7 +19,7 @@ from hvt_common.values import Frame, Image, Still, View
 from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
 from hvt_common.video.still_codecs import JpegCodec, StillCodec, psnr_y_db
 from hvt_edge.perception.crop import PADDING
-from hvt_edge.stills.crop_job import Cut, Rival, crop_of, inner_box
+from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box
 from hvt_edge.stills.fidelity import Fitted, Fitter, NoStill
 from hvt_edge.stills.merging import union_crop
 from hvt_edge.stills.policy.base import Request
@@ -70,7 +70,7 @@ class StillMaker:
 
     def cut(
         self, frame: Frame, request: Request, *, view: View, base_bgr: Image | None = None
-    ) -> Cut | NoStill:
+    ) -> CropJob | NoStill:
         """Take the request's crop out of ``frame``, which is the frame the request was made at.
 
         ``base_bgr`` is the decoded base frame of the same index; without it the second promise is not checked.
@@ -82,16 +82,16 @@ class StillMaker:
         if base_bgr is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
             return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
         crop = crop_of(frame.source_bgr, crop_px, size)
-        seen = rival = None
+        seen = alternative = None
         if base_bgr is not None:
             seen = base_crop(base_bgr, view=view, crop_source_px=crop_px, size=size)
             boxes = (one.box_source_px for one in (lead, *request.also))
             places = tuple(inner_box(box, crop_px, size) for box in boxes)
-            rival = Rival.of(seen, crop=crop, places=places, min_gain_db=self.min_gain_db)
-            if 0 < self.fidelity_db <= rival.psnr_y_db:
+            alternative = Alternative.of(seen, crop=crop, places=places, min_gain_db=self.min_gain_db)
+            if 0 < self.fidelity_db <= alternative.psnr_y_db:
                 return NoStill("base_good")
         codec = self.without_base if seen is None else self.codec
-        draft = Still(
+        header = Still(
             sequence=0,
             frame_index=frame.index,
             capture_ns=frame.capture_ns,
@@ -110,19 +110,19 @@ class StillMaker:
             else {"w": size[0], "h": size[1]},
             also=tuple((one.track_id, one.box_source_px) for one in request.also),
         )
-        return Cut(draft=draft, crop_bgr=crop, base_crop_bgr=seen, rival=rival)
+        return CropJob(header=header, crop_bgr=crop, base_crop_bgr=seen, alternative=alternative)
 
-    def code(self, cut: Cut, *, sequence: int, room: Room) -> Still | NoStill:
+    def code(self, cut: CropJob, *, sequence: int, room: Room) -> Still | NoStill:
         """Code a crop so that ``room``, asked of the very still that comes out, holds its data."""
-        draft = replace(cut.draft, sequence=sequence)
+        header = replace(cut.header, sequence=sequence)
         if cut.base_crop_bgr is None or not self.codec.needs_base:
-            made = self._fitted(self.without_base, cut, draft, room)
+            made = self._fitted(self.without_base, cut, header, room)
             return made if isinstance(made, NoStill) else made[0]
-        built = self._fitted(self.codec, cut, draft, room)
+        built = self._fitted(self.codec, cut, header, room)
         if isinstance(built, NoStill):
-            made = self._fitted(self.without_base, cut, draft, room) if cut.base_far_off else built
+            made = self._fitted(self.without_base, cut, header, room) if cut.base_far_off else built
             return made if isinstance(made, NoStill) else made[0]
-        return (self._cheaper(*built, cut, draft) if cut.base_far_off else None) or built[0]
+        return (self._cheaper(*built, cut, header) if cut.base_far_off else None) or built[0]
 
     def make(
         self,
@@ -141,29 +141,29 @@ class StillMaker:
         return self.code(cut, sequence=sequence, room=lambda _: limit_bytes)
 
     def _fitted(
-        self, codec: StillCodec, cut: Cut, draft: Still, room: Room
+        self, codec: StillCodec, cut: CropJob, header: Still, room: Room
     ) -> tuple[Still, Fitted] | NoStill:
         """As asked, with this codec, or the best below that for which there is room."""
         fitter = self._fitter(codec)
-        draft = _of_codec(draft, codec)
-        limit_bytes = room(draft)
+        header = _of_codec(header, codec)
+        limit_bytes = room(header)
         for _ in range(_TRIES):
             fitted = fitter.best(cut, limit_bytes=limit_bytes)
             if isinstance(fitted, NoStill):
                 return fitted
-            still = _filled(draft, fitted)
+            still = _filled(header, fitted)
             excess_bytes = len(still.data) - room(still)  # the codec's parameters have taken their part
             if excess_bytes <= 0:
                 return still, fitted
             limit_bytes = min(limit_bytes, len(still.data)) - excess_bytes
         return NoStill("too_large")
 
-    def _cheaper(self, built: Still, fitted: Fitted, cut: Cut, draft: Still) -> Still | None:
+    def _cheaper(self, built: Still, fitted: Fitted, cut: CropJob, header: Still) -> Still | None:
         """The fallback's still, where it shows no less than the one built on the base, in fewer bytes."""
         codec = self.without_base
         psnr_db = psnr_y_db(fitted.shown_bgr, cut.crop_bgr)
         smaller = self._fitter(codec).smallest(cut, psnr_db=psnr_db, limit_bytes=len(built.data))
-        return None if smaller is None else _filled(_of_codec(draft, codec), smaller)
+        return None if smaller is None else _filled(_of_codec(header, codec), smaller)
 
     def _fitter(self, codec: StillCodec) -> Fitter:
         return Fitter(
@@ -175,14 +175,14 @@ class StillMaker:
         )
 
 
-def _filled(draft: Still, fitted: Fitted) -> Still:
+def _filled(header: Still, fitted: Fitted) -> Still:
     return replace(
-        draft,
+        header,
         quality_pct=fitted.quality_pct,
         data=fitted.data,
-        parameters={**draft.parameters, **fitted.parameters},
+        parameters={**header.parameters, **fitted.parameters},
     )
 
 
-def _of_codec(draft: Still, codec: StillCodec) -> Still:
-    return replace(draft, codec=codec.name, media_type=codec.media_type)
+def _of_codec(header: Still, codec: StillCodec) -> Still:
+    return replace(header, codec=codec.name, media_type=codec.media_type)

@@ -18,15 +18,15 @@ import numpy as np
 
 from hvt_common.protocol.messages import MAX_TRACKS_NOW, TrackNow
 from hvt_common.values import Still, View
-from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.frame_ring import FrameRing
-from hvt_edge.stills.crop_job import Cut
+from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import NoStill, Room, StillMaker
-from hvt_edge.stills.on_demand_crop import Ask, RefusedError, box_of, cut_for, frame_for, shrunk
+from hvt_edge.stills.on_demand_crop import Ask, RefusedError, box_of, crop_job_for, frame_for, shrunk
 
-__all__ = ["ASK_PARAMETER", "OnDemand", "OnDemandSettings"]
+__all__ = ["REQUEST_PARAMETER", "OnDemand", "OnDemandSettings"]
 
-ASK_PARAMETER = "ask"
+REQUEST_PARAMETER = "ask"
 """The parameter that carries its number."""
 
 _FULL_SHARE = 0.9
@@ -37,7 +37,7 @@ _SHRINKS = (1.0, 0.7, 0.5, 0.35, 0.25)
 _FLOOR_PCT = 20
 """Below it a smaller picture of better quality shows more."""
 _NO_LIMIT_BYTES = 2**31
-_FATES = 64
+_OUTCOMES = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +52,9 @@ class OnDemandSettings:
 
 
 @dataclass(slots=True)
-class _Waiting:
+class _PendingRequest:
     number: int
-    cut: Cut
+    cut: CropJob
     maker: StillMaker
     since_ns: int | None = None
     """When the still thread first saw it."""
@@ -66,7 +66,7 @@ class _Waiting:
 
 
 class OnDemand:
-    """The edge's end of ``control: still``. `ask`, `fate` and `tracks` may be called from any thread.
+    """The edge's end of ``control: still``. `ask`, `outcome` and `tracks` may be called from any thread.
 
     Args:
         ring: where frames come from; filled by `see`.
@@ -94,8 +94,8 @@ class OnDemand:
         self._most_bytes = most_bytes
         self._settings = settings
         self._lock = threading.Lock()
-        self._line: deque[_Waiting] = deque()
-        self._fates: OrderedDict[int, str] = OrderedDict()
+        self._line: deque[_PendingRequest] = deque()
+        self._outcomes: OrderedDict[int, str] = OrderedDict()
         """Number → why it was given up, or nothing where it waits or was sent; of the last ones."""
         self._next_number = 0
         self._ended = False
@@ -105,7 +105,7 @@ class OnDemand:
         """How many wait for room."""
         return len(self._line)
 
-    def see(self, seen: Seen) -> None:
+    def see(self, seen: AnalyzedFrame) -> None:
         """Keep a frame with its tracks."""
         self._ring.add(seen.frame, seen.tracks)
 
@@ -127,29 +127,29 @@ class OnDemand:
         if self._most_bytes() < _LEAST_BYTES:
             raise RefusedError("the budget leaves nothing for stills: raise it, or lower --video-share")
         kept = frame_for(ask, self._ring)
-        cut = cut_for(ask, kept, maker=self._maker, view=self._view, class_names=self._class_names)
+        cut = crop_job_for(ask, kept, maker=self._maker, view=self._view, class_names=self._class_names)
         quality_pct = self._maker.quality_pct if ask.quality_pct is None else ask.quality_pct
         maker = replace(self._maker, quality_pct=quality_pct, floor_pct=min(_FLOOR_PCT, quality_pct))
         with self._lock:
             number = self._next_number
             self._next_number += 1
-            parameters = {**cut.draft.parameters, ASK_PARAMETER: number}
-            draft = replace(cut.draft, quality_pct=quality_pct, parameters=parameters)
-            self._line.append(_Waiting(number, replace(cut, draft=draft), maker))
+            parameters = {**cut.header.parameters, REQUEST_PARAMETER: number}
+            header = replace(cut.header, quality_pct=quality_pct, parameters=parameters)
+            self._line.append(_PendingRequest(number, replace(cut, header=header), maker))
             self._note(number, "")
         return number, kept.frame_index
 
-    def fate(self, number: int) -> None:
+    def outcome(self, number: int) -> None:
         """Return where that still waits or was sent.
 
         Raises:
             RefusedError: it was given up, or is not known (any more).
         """
         with self._lock:
-            if number not in self._fates:
+            if number not in self._outcomes:
                 raise RefusedError(f"nothing is known of a still of the number {number}")
-            if self._fates[number]:
-                raise RefusedError(self._fates[number])
+            if self._outcomes[number]:
+                raise RefusedError(self._outcomes[number])
 
     def tracks(self) -> tuple[int, tuple[TrackNow, ...]]:
         """The newest frame's index, and its tracks by id; of too many, those of most confidence."""
@@ -191,7 +191,7 @@ class OnDemand:
             while self._line:
                 self._note(self._line.popleft().number, "the session ended before there was room for it")
 
-    def _first(self, now_ns: int) -> _Waiting | None:
+    def _first(self, now_ns: int) -> _PendingRequest | None:
         with self._lock:
             waiting = self._line[0] if self._line else None
         if waiting is not None and waiting.first_ns is None:
@@ -208,7 +208,7 @@ class OnDemand:
                     self._line.remove(waiting)
                     self._note(waiting.number, f"in {limit_ns / 1e9:g} s the budget had no room for it")
 
-    def _coded(self, waiting: _Waiting, *, now_ns: int, room: Room, sequence: int) -> Still | None:
+    def _coded(self, waiting: _PendingRequest, *, now_ns: int, room: Room, sequence: int) -> Still | None:
         """As asked for; or, when waiting longer is of no use, what there is room for."""
         if waiting.whole is None:
             made = waiting.maker.code(waiting.cut, sequence=sequence, room=lambda _: _NO_LIMIT_BYTES)
@@ -228,13 +228,13 @@ class OnDemand:
         waiting.tried_ns = now_ns
         return _fitted(waiting, sequence=sequence, room=room)
 
-    def _note(self, number: int, fate: str) -> None:
-        self._fates[number] = fate
-        while len(self._fates) > _FATES:
-            self._fates.popitem(last=False)
+    def _note(self, number: int, outcome: str) -> None:
+        self._outcomes[number] = outcome
+        while len(self._outcomes) > _OUTCOMES:
+            self._outcomes.popitem(last=False)
 
 
-def _fitted(waiting: _Waiting, *, sequence: int, room: Room) -> Still | None:
+def _fitted(waiting: _PendingRequest, *, sequence: int, room: Room) -> Still | None:
     """The largest picture of which some quality fits; None where nothing does."""
     for shrink in _SHRINKS:
         made = waiting.maker.code(shrunk(waiting.cut, shrink), sequence=sequence, room=room)

@@ -10,11 +10,11 @@ import numpy as np
 from hvt_common.values import Boxes, Still, View
 from hvt_common.video.base_crop import coded_size
 from hvt_edge.perception.crop import MIN_SIDE_PX, crop_box
-from hvt_edge.perception.frame_ring import FrameRing, KeptFrame
-from hvt_edge.stills.crop_job import Cut, crop_of
+from hvt_edge.perception.frame_ring import FrameRing, RingFrame
+from hvt_edge.stills.crop_job import CropJob, crop_of
 from hvt_edge.stills.maker import StillMaker
 
-__all__ = ["ASKED", "Ask", "RefusedError", "box_of", "cut_for", "frame_for", "shrunk"]
+__all__ = ["ASKED", "Ask", "RefusedError", "box_of", "crop_job_for", "frame_for", "shrunk"]
 
 ASKED = "asked"
 """The reason that such a still carries on the wire and in the ledger."""
@@ -42,7 +42,7 @@ class Ask:
     """At most so good; None for the quality of all stills."""
 
 
-def frame_for(ask: Ask, ring: FrameRing) -> KeptFrame:
+def frame_for(ask: Ask, ring: FrameRing) -> RingFrame:
     """The frame that is asked for, or the nearest that is kept; raises `RefusedError` where it is gone or to come."""
     newest = ring.newest
     if newest is None:
@@ -60,7 +60,9 @@ def frame_for(ask: Ask, ring: FrameRing) -> KeptFrame:
     return kept
 
 
-def cut_for(ask: Ask, kept: KeptFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]) -> Cut:
+def crop_job_for(
+    ask: Ask, kept: RingFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]
+) -> CropJob:
     """Take what is asked for out of that frame; raises `RefusedError` where it is not in it."""
     height, width = kept.source_bgr.shape[:2]
     box: Box
@@ -79,7 +81,7 @@ def cut_for(ask: Ask, kept: KeptFrame, *, maker: StillMaker, view: View, class_n
         box, name, confidence = (*map(float, crop),), "", 0.0  # type: ignore[assignment]
     size = coded_size(crop, max_side_px=maker.max_side_px)
     codec = maker.codec
-    draft = Still(
+    header = Still(
         sequence=0,
         frame_index=kept.frame_index,
         capture_ns=kept.capture_ns,
@@ -96,10 +98,10 @@ def cut_for(ask: Ask, kept: KeptFrame, *, maker: StillMaker, view: View, class_n
         parameters=_size_parameters(crop, size),
     )
     pixels = crop_of(kept.source_bgr, crop, size)
-    return Cut(draft=draft, crop_bgr=pixels, base_crop_bgr=None, rival=None)
+    return CropJob(header=header, crop_bgr=pixels, base_crop_bgr=None, alternative=None)
 
 
-def _row(kept: KeptFrame, track_id: int) -> int:
+def _row(kept: RingFrame, track_id: int) -> int:
     rows = np.flatnonzero(kept.tracks.ids == track_id)
     if len(rows):
         return int(rows[0])
@@ -111,15 +113,15 @@ def _row(kept: KeptFrame, track_id: int) -> int:
     )
 
 
-def shrunk(cut: Cut, shrink: float) -> Cut:
+def shrunk(cut: CropJob, shrink: float) -> CropJob:
     """The same crop, coded with its sides so much shorter."""
     height, width = cut.crop_bgr.shape[:2]
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     if size == (width, height):
         return cut
     pixels = np.asarray(cv2.resize(cut.crop_bgr, size, interpolation=cv2.INTER_AREA), np.uint8)
-    parameters = {**cut.draft.parameters, **_size_parameters(cut.draft.crop_source_px, size)}
-    return replace(cut, draft=replace(cut.draft, parameters=parameters), crop_bgr=pixels)
+    parameters = {**cut.header.parameters, **_size_parameters(cut.header.crop_source_px, size)}
+    return replace(cut, header=replace(cut.header, parameters=parameters), crop_bgr=pixels)
 
 
 def _size_parameters(crop: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:

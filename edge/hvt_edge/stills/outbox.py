@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from hvt_edge.stills.crop_job import Cut
+from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.policy.base import Request
 
-__all__ = ["QueueSettings", "StillQueue", "Waiting"]
+__all__ = ["PendingStill", "QueueSettings", "StillQueue"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,11 +20,11 @@ class QueueSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Waiting:
+class PendingStill:
     """A wish for a still, with the crop that it is to show."""
 
     request: Request
-    cut: Cut
+    cut: CropJob
     since_ns: int
     again: bool = False
     """It was sent before, and the ground could make nothing of it."""
@@ -45,13 +45,13 @@ class StillQueue:
 
     def __init__(self, settings: QueueSettings = QueueSettings()) -> None:
         self._settings = settings
-        self._waiting: dict[int, Waiting] = {}
+        self._waiting: dict[int, PendingStill] = {}
         """By the track that leads."""
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def __iter__(self) -> Iterator[Waiting]:
+    def __iter__(self) -> Iterator[PendingStill]:
         return iter(tuple(self._waiting.values()))
 
     def __contains__(self, track_id: int) -> bool:
@@ -65,13 +65,13 @@ class StillQueue:
         least = min(_usefulness(waiting.request, waiting.since_ns) for waiting in self._waiting.values())
         return _usefulness(request, now_ns) > least
 
-    def offer(self, waiting: Waiting) -> list[tuple[Waiting, str]]:
+    def offer(self, waiting: PendingStill) -> list[tuple[PendingStill, str]]:
         """Take in one wish; return those that had to leave for it, with the reason.
 
         An older wish leaves where the new one shows the track that leads it; a track that rides with another's wish
         only gets off that one.
         """
-        left: list[tuple[Waiting, str]] = []
+        left: list[tuple[PendingStill, str]] = []
         for older in self:
             if older.track_id in waiting.track_ids:
                 left.append((self._waiting.pop(older.track_id), "replaced"))
@@ -83,36 +83,36 @@ class StillQueue:
             left.append((self._waiting.pop(least.track_id), "queue_full"))
         return left
 
-    def expire(self, now_ns: int) -> list[tuple[Waiting, str]]:
+    def expire(self, now_ns: int) -> list[tuple[PendingStill, str]]:
         """Remove and return what has waited too long."""
         limit_ns = now_ns - self._settings.max_age_ns
         old = [waiting for waiting in self._waiting.values() if waiting.since_ns < limit_ns]
         return [(self._waiting.pop(waiting.track_id), "stale") for waiting in old]
 
-    def best(self) -> Waiting | None:
+    def best(self) -> PendingStill | None:
         """Return the most useful wish, without removing it."""
         return max(self._waiting.values(), key=_order, default=None)
 
-    def remove(self, waiting: Waiting) -> None:
+    def remove(self, waiting: PendingStill) -> None:
         """Take a wish out: it was sent or given up."""
         self._waiting.pop(waiting.track_id, None)
 
-    def clear(self) -> list[Waiting]:
+    def clear(self) -> list[PendingStill]:
         """Empty the queue and return what was in it."""
         left = list(self._waiting.values())
         self._waiting.clear()
         return left
 
 
-def _without(waiting: Waiting, track_ids: set[int]) -> Waiting:
+def _without(waiting: PendingStill, track_ids: set[int]) -> PendingStill:
     """The same wish, in which these tracks are named no more; its crop stays as it was cut."""
     also = tuple(one for one in waiting.request.also if one.track_id not in track_ids)
-    named = tuple(shown for shown in waiting.cut.draft.also if shown[0] not in track_ids)
-    cut = replace(waiting.cut, draft=replace(waiting.cut.draft, also=named))
+    named = tuple(shown for shown in waiting.cut.header.also if shown[0] not in track_ids)
+    cut = replace(waiting.cut, header=replace(waiting.cut.header, also=named))
     return replace(waiting, request=replace(waiting.request, also=also), cut=cut)
 
 
-def _order(waiting: Waiting) -> tuple[float, int, int]:
+def _order(waiting: PendingStill) -> tuple[float, int, int]:
     return _usefulness(waiting.request, waiting.since_ns)
 
 

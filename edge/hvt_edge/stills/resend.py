@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from hvt_edge.stills.outbox import Waiting
+from hvt_edge.stills.outbox import PendingStill
 
 __all__ = ["ResendRing", "ResendSettings"]
 
@@ -26,7 +26,7 @@ class ResendSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    waiting: Waiting
+    waiting: PendingStill
     sent_ns: int
     size_bytes: int
 
@@ -48,7 +48,7 @@ class ResendRing:
         """Memory of the crops."""
         return self._size_bytes
 
-    def keep(self, sequence: int, waiting: Waiting, *, now_ns: int) -> None:
+    def backlog(self, sequence: int, waiting: PendingStill, *, now_ns: int) -> None:
         """Remember a still that was sent; ``waiting.cut`` should hold no base any more."""
         size_bytes = waiting.cut.size_bytes
         self._kept[sequence] = _Kept(waiting, now_ns, size_bytes)
@@ -62,7 +62,7 @@ class ResendRing:
         if sequence in self._kept:
             self._asked.add(sequence)
 
-    def take(self, now_ns: int) -> list[tuple[int, Waiting]]:
+    def take(self, now_ns: int) -> list[tuple[int, PendingStill]]:
         """Return those asked for, in the order in which they were sent, and keep them no longer.
 
         What was sent too long ago is forgotten.
@@ -73,7 +73,7 @@ class ResendRing:
             self._drop(sequence)
         return [(sequence, self._drop(sequence)) for sequence in sorted(self._asked)]
 
-    def _drop(self, sequence: int) -> Waiting:
+    def _drop(self, sequence: int) -> PendingStill:
         kept = self._kept.pop(sequence)
         self._size_bytes -= kept.size_bytes
         self._asked.discard(sequence)

@@ -12,14 +12,14 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from hvt_common.values import Still, View
-from hvt_edge.backlog.entry import FIRST_KEPT
-from hvt_edge.perception.analyzer import Seen
+from hvt_edge.backlog.entry import FIRST_STORED
+from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.stills.gate import Gate
 from hvt_edge.stills.maker import NoStill, Room, StillMaker
 from hvt_edge.stills.measured import without_frame
 from hvt_edge.stills.merging import expected_bytes, group
-from hvt_edge.stills.outbox import QueueSettings, StillQueue, Waiting
+from hvt_edge.stills.outbox import PendingStill, QueueSettings, StillQueue
 from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Method, Request, Step
 from hvt_edge.stills.policy.cost import CostModel
 from hvt_edge.stills.resend import ResendRing, ResendSettings
@@ -61,7 +61,7 @@ class Asked(Protocol):
         """How many wait for room."""
         ...
 
-    def see(self, seen: Seen) -> None:
+    def see(self, seen: AnalyzedFrame) -> None:
         """Take in a frame."""
         ...
 
@@ -77,7 +77,7 @@ class Asked(Protocol):
 class Chooser:
     """Decides at each step who is wanted, and hands out stills as the budget has room for them.
 
-    ``on_fate(fate, reason)`` is called with ``sent``, ``deferred`` or ``dropped`` for every candidate that a step
+    ``on_outcome(fate, reason)`` is called with ``sent``, ``deferred`` or ``dropped`` for every candidate that a step
     did not simply pass over; ``observe(candidates, step)`` with all tracks of each step, those that rest included.
     ``asked`` are the stills that grounds ask for: they go before all others. ``overdue(now_ns)`` returns stills that
     were sent and seem to be lost, each with its utility, most useful first.
@@ -96,7 +96,7 @@ class Chooser:
         view: View,
         class_names: tuple[str, ...],
         settings: ChooserSettings,
-        on_fate: Callable[[str, str], None],
+        on_outcome: Callable[[str, str], None],
         observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
         asked: Asked | None = None,
         overdue: Callable[[int], Sequence[tuple[Still, float]]] = lambda _now_ns: (),
@@ -112,7 +112,7 @@ class Chooser:
         self._view = view
         self._class_names = class_names
         self._settings = settings
-        self._on_fate = on_fate
+        self._on_outcome = on_outcome
         self._observe = observe
         self._most_bytes = settings.most_bytes
         self._costs: dict[str, CostModel] = {}
@@ -121,7 +121,7 @@ class Chooser:
         self._put_off = False
         self._held_up: dict[int, int] = {}
         """Track id → since when it has been the most useful and without room (ns)."""
-        self._sequences = {False: 0, True: FIRST_KEPT}
+        self._sequences = {False: 0, True: FIRST_STORED}
         """Of the next still: for the link, and to be kept."""
         self._keeps = False
 
@@ -135,7 +135,7 @@ class Chooser:
         """Whether any still waits for room, one that was asked for included."""
         return bool(self._queue) or (self._asked is not None and self._asked.waiting > 0)
 
-    def consider(self, seen: Seen, *, now_ns: int, room_bytes: int) -> None:
+    def consider(self, seen: AnalyzedFrame, *, now_ns: int, room_bytes: int) -> None:
         """Take in one frame's tracks; at a decision step let the method say which it wants.
 
         Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
@@ -173,16 +173,16 @@ class Chooser:
         self._keeps = keeps
         self._wish_again(now_ns)
         for _, reason in self._queue.expire(now_ns):
-            self._on_fate("dropped", reason)
+            self._on_outcome("dropped", reason)
         yield from self._asked_for(now_ns=now_ns, room=room)
         if self._asked is not None and self._asked.waiting:
             return  # it waits for its room; none of the others takes that away
         while (waiting := self._queue.best()) is not None:
             yield from self._lost(over=waiting.request.score, now_ns=now_ns, room=room)
             if keeps:
-                recoded = waiting.cut.recoded(self._maker.without_base, reason=waiting.cut.draft.reason)
+                recoded = waiting.cut.recoded(self._maker.without_base, reason=waiting.cut.header.reason)
                 waiting = replace(waiting, cut=recoded)
-            if not self._may_go(waiting, room(self._draft(waiting)), now_ns=now_ns):
+            if not self._may_go(waiting, room(self._header(waiting)), now_ns=now_ns):
                 break  # the most useful waits for its room; a lesser one does not slip in before it
             still = self._make(waiting, room, now_ns=now_ns)
             if still is not None:
@@ -199,7 +199,7 @@ class Chooser:
         self._wish_again(now_ns)
         self._sent.ask(still.sequence)
         for _, waiting in self._sent.take(now_ns):
-            cut = replace(waiting.cut, draft=replace(waiting.cut.draft, reason=still.reason))
+            cut = replace(waiting.cut, header=replace(waiting.cut.header, reason=still.reason))
             made = self._maker.code(cut, sequence=still.sequence, room=lambda _: self._most_bytes)
             if not isinstance(made, NoStill):
                 return made
@@ -228,13 +228,13 @@ class Chooser:
     def close(self) -> None:
         """What still waits will not be sent any more."""
         for _ in self._queue.clear():
-            self._on_fate("dropped", "ended")
+            self._on_outcome("dropped", "ended")
         if self._asked is not None:
             self._asked.close()
 
     # Wishes
 
-    def _candidates(self, seen: Seen, *, now_ns: int) -> list[Candidate]:
+    def _candidates(self, seen: AnalyzedFrame, *, now_ns: int) -> list[Candidate]:
         """All tracks of this step."""
         return self._memory.candidates(
             seen.tracks,
@@ -249,7 +249,7 @@ class Chooser:
         """Those that may be asked for."""
         kept, held = self._suppression.apply(candidates, now_ns=now_ns)
         for _, reason in held:
-            self._on_fate("deferred", reason)
+            self._on_outcome("deferred", reason)
         # The gate comes last because it looks at pixels, and before the method, so that the queue's places go to
         # those that gain from a still.
         return [one for one in kept if not self._gated(one, now_ns=now_ns)]
@@ -274,31 +274,31 @@ class Chooser:
         )
         return [request for request, _ in joined]
 
-    def _wish(self, request: Request, seen: Seen, *, now_ns: int) -> None:
+    def _wish(self, request: Request, seen: AnalyzedFrame, *, now_ns: int) -> None:
         if not self._queue.admits(request, now_ns=now_ns):
-            self._on_fate("dropped", "queue_full")
+            self._on_outcome("dropped", "queue_full")
             return
         cut = self._maker.cut(seen.frame, request, view=self._view, base_bgr=seen.base_bgr)
         if isinstance(cut, NoStill):
             for one in (request.candidate, *request.also):
                 self._memory.record_refused(one.track_id, now_ns=now_ns)
-            self._on_fate("dropped", cut.reason)
+            self._on_outcome("dropped", cut.reason)
             return
-        self._offer(Waiting(without_frame(request), cut, now_ns))
+        self._offer(PendingStill(without_frame(request), cut, now_ns))
 
     def _wish_again(self, now_ns: int) -> None:
         """Let those that the ground asked for once more wait for room, unless something newer of the track does."""
         for sequence, waiting in self._sent.take(now_ns):
             if waiting.track_id not in self._queue and self._queue.admits(waiting.request, now_ns=now_ns):
-                draft = waiting.cut.draft
+                header = waiting.cut.header
                 cut = replace(
-                    waiting.cut, draft=replace(draft, parameters={**draft.parameters, _AGAIN: sequence})
+                    waiting.cut, header=replace(header, parameters={**header.parameters, _AGAIN: sequence})
                 )
                 self._offer(replace(waiting, cut=cut, since_ns=now_ns))
 
-    def _offer(self, waiting: Waiting) -> None:
+    def _offer(self, waiting: PendingStill) -> None:
         for _left, reason in self._queue.offer(waiting):
-            self._on_fate("deferred" if reason == "replaced" else "dropped", reason)
+            self._on_outcome("deferred" if reason == "replaced" else "dropped", reason)
 
     # Stills
 
@@ -317,7 +317,7 @@ class Chooser:
                 return
             # Something newer of its track says more.
             if still.track_id not in self._queue and len(still.data) <= room(still):
-                self._on_fate("sent", _AGAIN)
+                self._on_outcome("sent", _AGAIN)
                 self.utility = utility
                 yield still
 
@@ -328,16 +328,16 @@ class Chooser:
     def _made(self, still: Still) -> None:
         """It goes out, or into the store."""
         self._sequences[self._keeps] += 1
-        self._on_fate(*(("deferred", "stored") if self._keeps else ("sent", still.reason)))
+        self._on_outcome(*(("deferred", "stored") if self._keeps else ("sent", still.reason)))
 
-    def _draft(self, waiting: Waiting) -> Still:
-        return replace(waiting.cut.draft, sequence=self._sequence)
+    def _header(self, waiting: PendingStill) -> Still:
+        return replace(waiting.cut.header, sequence=self._sequence)
 
-    def _may_go(self, waiting: Waiting, limit_bytes: int, *, now_ns: int) -> bool:
+    def _may_go(self, waiting: PendingStill, limit_bytes: int, *, now_ns: int) -> bool:
         """Whether there is as much room as it will need, or it has waited for that long enough."""
         expected = expected_bytes(
             waiting.request,
-            cost=self._cost_of(waiting.cut.draft.codec).estimate(),
+            cost=self._cost_of(waiting.cut.header.codec).estimate(),
             padding=self._maker.padding,
             source_size=self._view.source_size,
         )
@@ -347,7 +347,7 @@ class Chooser:
         since_ns = self._held_up.setdefault(waiting.track_id, now_ns)
         return now_ns - since_ns >= _PATIENCE_SHARE * self._settings.queue.max_age_ns
 
-    def _make(self, waiting: Waiting, room: Room, *, now_ns: int) -> Still | None:
+    def _make(self, waiting: PendingStill, room: Room, *, now_ns: int) -> Still | None:
         self._queue.remove(waiting)
         self._held_up.pop(waiting.track_id, None)
         made = self._maker.code(waiting.cut, sequence=self._sequence, room=room)
@@ -358,7 +358,7 @@ class Chooser:
         self._record(waiting, made, now_ns=now_ns)
         return made
 
-    def _record(self, waiting: Waiting, still: Still, *, now_ns: int) -> None:
+    def _record(self, waiting: PendingStill, still: Still, *, now_ns: int) -> None:
         height, width = waiting.cut.crop_bgr.shape[:2]
         self._cost_of(still.codec).observe(area_px=width * height, size_bytes=len(still.data))
         if waiting.again:
@@ -374,11 +374,11 @@ class Chooser:
             )
         if still.codec != self._maker.without_base.name:  # it builds on the base, and a ground may lack that
             cut = waiting.cut.recoded(self._maker.without_base, reason=_AGAIN)
-            self._sent.keep(still.sequence, replace(waiting, cut=cut, again=True), now_ns=now_ns)
+            self._sent.backlog(still.sequence, replace(waiting, cut=cut, again=True), now_ns=now_ns)
 
     def _refuse(self, candidate: Candidate, reason: str, *, now_ns: int) -> None:
         self._memory.record_refused(candidate.track_id, now_ns=now_ns)
-        self._on_fate("dropped", reason)
+        self._on_outcome("dropped", reason)
 
     def _cost_of(self, codec: str) -> CostModel:
         """Learnt for each codec apart: a residual takes a fraction of what an intra still takes."""

@@ -12,12 +12,12 @@ from typing import Protocol, Self
 
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.distinct import DistinctIds
-from hvt_common.runtime.priority import give_way
+from hvt_common.runtime.priority import lower_priority
 from hvt_common.values import AccessUnit, Frame, Still, Tracks
-from hvt_edge.backlog.stage import Keep
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.backlog.stage import BacklogStage
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan
-from hvt_edge.perception.analyzer import Seen, Sight
+from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.stills.scheduler import Chooser
 
 __all__ = ["MAX_QUEUE_BYTES", "Reporter", "StillStage", "StillWorker"]
@@ -34,7 +34,7 @@ _AGAIN_S = 0.025
 class Reporter(Protocol):
     """Tells the ground which tracks the edge has."""
 
-    def report(self, seen: Seen, *, now_ns: int) -> object:
+    def report(self, seen: AnalyzedFrame, *, now_ns: int) -> object:
         """Send the tracks of one decision step, if it wants to."""
         ...
 
@@ -43,28 +43,28 @@ class StillStage:
     """Takes each frame with its access unit, if it has one, after the unit was sent.
 
     With a ``reporter`` the edge's own tracks go out at each decision step, before the stills of it. While the link is
-    away ``keep`` takes the stills, as many as would have been sent.
+    away ``backlog`` takes the stills, as many as would have been sent.
     """
 
     def __init__(
         self,
-        sight: Sight,
+        analyzer: Analyzer,
         chooser: Chooser,
         *,
-        sender: Sender,
+        sender: Transmitter,
         keyframes: KeyframePlan,
         reporter: Reporter | None = None,
-        keep: Keep | None = None,
+        backlog: BacklogStage | None = None,
     ) -> None:
-        self._sight = sight
+        self._analyzer = analyzer
         self._chooser = chooser
         self._sender = sender
         self._keyframes = keyframes
         self._reporter = reporter
-        self._keep = keep
+        self._backlog = backlog
         self._latest_tracks: Tracks | None = None
         self._track_ids = DistinctIds()
-        self._sight_ns = 0
+        self._perception_ns = 0
         self._steps = 0
 
     @property
@@ -91,20 +91,20 @@ class StillStage:
         return self._chooser.live_waits
 
     @property
-    def sight_ms(self) -> float:
+    def perception_ms(self) -> float:
         """Mean time to decode, detect and track, over all frames."""
-        return self._sight_ns / max(1, self._steps) / 1e6
+        return self._perception_ns / max(1, self._steps) / 1e6
 
-    def see(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool = False) -> Seen:
+    def see(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool = False) -> AnalyzedFrame:
         """Decode, detect and track one frame; ``unit`` is None for one that is not part of the base stream."""
         began_ns = time.perf_counter_ns()
-        seen = self._sight.see(frame, unit, hurry=hurry)
-        self._sight_ns += time.perf_counter_ns() - began_ns
+        seen = self._analyzer.see(frame, unit, hurry=hurry)
+        self._perception_ns += time.perf_counter_ns() - began_ns
         self._steps += 1
         self._track_ids.add(seen.tracks.ids.tolist())
         return seen
 
-    def send(self, seen: Seen, *, now_ns: int, held: bool | None = None) -> set[int]:
+    def send(self, seen: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills that fit now; return their sequence numbers.
 
         ``now_ns`` is the time that windows go by. With ``held`` none is sent, because a keyframe is to come; None
@@ -121,10 +121,10 @@ class StillStage:
     def send_waiting(self, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Send those that wait and fit now, without another frame; the rest as of `send`."""
         sent: set[int] = set()
-        if self._keep is not None:
-            self._keep.keep_lost(now_ns)
-            if self._keep.away:
-                self._keep_stills(self._keep, now_ns)
+        if self._backlog is not None:
+            self._backlog.store_lost(now_ns)
+            if self._backlog.offline:
+                self._keep_stills(self._backlog, now_ns)
                 return sent
         if self._keyframes.due(now_ns) if held is None else held:
             return sent
@@ -132,19 +132,19 @@ class StillStage:
             now_ns=now_ns, room=lambda one: self._sender.still_room_bytes(now_ns, still=one)
         ):
             self._sender.still(still, now_ns=now_ns, utility=self._chooser.utility)
-            if self._keep is not None:
-                self._keep.note_utility(still, self._chooser.utility)
+            if self._backlog is not None:
+                self._backlog.note_utility(still, self._chooser.utility)
             sent.add(still.sequence)
         return sent
 
-    def _keep_stills(self, keep: Keep, now_ns: int) -> None:
+    def _keep_stills(self, backlog: BacklogStage, now_ns: int) -> None:
         """Those that would have gone out now."""
         for still in self._chooser.stills(
             now_ns=now_ns,
             room=lambda one: self._sender.still_room_bytes(now_ns, still=one, paced=False),
             keeps=True,
         ):
-            keep.still(still, utility=self._chooser.utility, now_ns=now_ns)
+            backlog.still(still, utility=self._chooser.utility, now_ns=now_ns)
 
     def hear(self, results: Sequence[StillResult]) -> None:
         """What a ground made of stills counts for the next decision; one without a name is no opinion.
@@ -233,7 +233,7 @@ class StillWorker:
         self.close()
 
     def _run(self) -> None:
-        give_way()
+        lower_priority()
         try:
             while (item := self._next()) is not None and not self._given_up.is_set():
                 behind = self._frames.qsize() >= _BEHIND_FRAMES

@@ -1,7 +1,7 @@
 """Which ticks of the source are coded: each n-th, and with ``--fps auto`` an n that follows from what was measured.
 
 Fewer frames get more bits each. How many are best depends on how hard the scene is to code, which shows in the
-quantiser that x265 needs at the given rate: `MeasuredCadence` keeps it in a band (see base_model). The rate changes
+quantiser that x265 needs at the given rate: `MeasuredFrameSkip` keeps it in a band (see base_model). The rate changes
 at keyframes only, because the encoder is opened anew for it, and not more often than once in ``rest_ticks``.
 """
 
@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import math
 
-from hvt_edge.video.rate_model import better_every_n
+from hvt_edge.video.rate_model import better_decimation
 
-__all__ = ["Cadence", "MeasuredCadence"]
+__all__ = ["FrameSkip", "MeasuredFrameSkip"]
 
 
-class Cadence:
-    """Each ``every_n``-th tick. Where one was missed, the next tick is coded in its place."""
+class FrameSkip:
+    """Each ``decimation``-th tick. Where one was missed, the next tick is coded in its place."""
 
-    def __init__(self, every_n: int = 1) -> None:
-        assert every_n >= 1
-        self.every_n = every_n
+    def __init__(self, decimation: int = 1) -> None:
+        assert decimation >= 1
+        self.decimation = decimation
         """Changed by `at_keyframe` only."""
         self._next: int | None = None
 
@@ -31,32 +31,32 @@ class Cadence:
         """This tick was coded. After a keyframe, which may come at any tick, the count starts anew."""
         del mean_qp
         if self._next is None or keyframe:
-            self._next = tick + self.every_n
+            self._next = tick + self.decimation
         else:
-            self._next += self.every_n * max(1, math.ceil((tick + 1 - self._next) / self.every_n))
+            self._next += self.decimation * max(1, math.ceil((tick + 1 - self._next) / self.decimation))
 
     def at_keyframe(self, tick: int) -> int:
-        """Decide on ``every_n`` from this tick on, which will be a keyframe."""
+        """Decide on ``decimation`` from this tick on, which will be a keyframe."""
         del tick
-        return self.every_n
+        return self.decimation
 
 
-class MeasuredCadence(Cadence):
+class MeasuredFrameSkip(FrameSkip):
     """``--fps auto``: decided anew at keyframes, from the mean quantiser of the frames since the last decision.
 
     Depends on the coded frames alone, so that in lockstep the same input gives the same bytes.
     """
 
-    def __init__(self, every_n: int = 1, *, most_every_n: int, rest_ticks: int) -> None:
-        super().__init__(every_n)
-        self._most_every_n = most_every_n
+    def __init__(self, decimation: int = 1, *, most_decimation: int, rest_ticks: int) -> None:
+        super().__init__(decimation)
+        self._most_decimation = most_decimation
         self._rest_ticks = rest_ticks
         self._decided_tick: int | None = None
         self._qp_sum = 0.0
         self._frames = 0
 
     def coded(self, tick: int, *, keyframe: bool, mean_qp: float) -> None:
-        """See `Cadence`. Keyframes are coarser by nature and tell nothing."""
+        """See `FrameSkip`. Keyframes are coarser by nature and tell nothing."""
         super().coded(tick, keyframe=keyframe, mean_qp=mean_qp)
         if self._decided_tick is None:
             self._decided_tick = tick
@@ -65,11 +65,11 @@ class MeasuredCadence(Cadence):
             self._frames += 1
 
     def at_keyframe(self, tick: int) -> int:
-        """See `Cadence`."""
+        """See `FrameSkip`."""
         if self._decided_tick is None or tick - self._decided_tick < self._rest_ticks or not self._frames:
-            return self.every_n
-        self.every_n = better_every_n(
-            self.every_n, mean_qp=self._qp_sum / self._frames, most_every_n=self._most_every_n
+            return self.decimation
+        self.decimation = better_decimation(
+            self.decimation, mean_qp=self._qp_sum / self._frames, most_decimation=self._most_decimation
         )
         self._decided_tick, self._qp_sum, self._frames = tick, 0.0, 0
-        return self.every_n
+        return self.decimation

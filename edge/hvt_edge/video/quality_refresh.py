@@ -1,8 +1,10 @@
 """Which regions of the next base frame get more than their share of the bits.
 
 What a frame shows well stays well shown for a while, because the frames after it are predicted from it. So bits are
-worth more where they come in pulses: a whole frame once a period (`PulsePlan`), or one cell of a grid in each frame,
-in rotation (`RollingPlan`), which keeps the frames small. `TrackRegions` (R0) spends them on the tracks instead.
+worth more where they come in pulses: a whole frame once a period (`RefreshPlan`), or one cell of a grid in
+each
+frame,
+in rotation (`RollingRefreshPlan`), which keeps the frames small. `TrackRegions` (R0) spends them on the tracks instead.
 
 A plan is asked once for each coded frame, in order, with the tracks that are known by then.
 """
@@ -19,7 +21,7 @@ import numpy.typing as npt
 from hvt_common.values import Boxes, Tracks
 from hvt_edge.video.regions import BLOCK_PX, MOST_REGIONS, Region
 
-__all__ = ["PulsePlan", "RegionPlan", "RollingPlan", "TrackRegions", "combined"]
+__all__ = ["RefreshPlan", "RegionPlan", "RollingRefreshPlan", "TrackRegions", "combined"]
 
 
 class RegionPlan(Protocol):
@@ -34,11 +36,11 @@ class RegionPlan(Protocol):
         ...
 
 
-class PulsePlan:
+class RefreshPlan:
     """The whole frame at ``-depth`` once in ``period_ticks``, on the first coded frame from then on."""
 
     def __init__(self, size: tuple[int, int], *, period_ticks: int, depth: float) -> None:
-        self._pulse = [Region((0, 0, *size), -depth)]
+        self._refresh = [Region((0, 0, *size), -depth)]
         self._period = max(1, period_ticks)
         self._next: int | None = None
 
@@ -51,10 +53,10 @@ class PulsePlan:
         if tick < self._next:
             return []
         self._next += self._period * (1 + (tick - self._next) // self._period)
-        return list(self._pulse)
+        return list(self._refresh)
 
 
-class RollingPlan:
+class RollingRefreshPlan:
     """One cell of a grid at ``-depth`` in each coded frame; each has its turn, cells that hold tracks more often.
 
     The cell with the largest product of age (in coded frames) and weight comes next, so none waits for ever: with

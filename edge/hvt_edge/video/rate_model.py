@@ -12,7 +12,7 @@ import math
 
 from hvt_common.errors import UserError
 
-__all__ = ["SIZES", "better_every_n", "choose_base", "most_every_n", "sizes_of"]
+__all__ = ["SIZES", "better_decimation", "choose_base", "most_decimation", "sizes_of"]
 
 SIZES = ((1280, 720), (960, 540), (640, 360), (480, 270), (320, 180))
 """The ladder of ``--size auto`` for a source of 16:9; others keep its areas and their own aspect ratio. It ends where
@@ -54,23 +54,23 @@ def choose_base(
     Raises:
         UserError: the source is too small for any base stream.
     """
-    ticks_fps = most_fps if fps is None else fps
-    most_n = 1 if fps is not None else most_every_n(most_fps, least_fps=least_fps)
+    nominal_fps = most_fps if fps is None else fps
+    most_n = 1 if fps is not None else most_decimation(most_fps, least_fps=least_fps)
     if size is None:
         # The rate at the lowest frame rate that is wanted: what the size costs can be had back in frames.
-        size = _size_for(payload_bps / ticks_fps * min(most_n, 3), source_size)
-    bits_per_px = payload_bps / ticks_fps / (size[0] * size[1])
+        size = _size_for(payload_bps / nominal_fps * min(most_n, 3), source_size)
+    bits_per_px = payload_bps / nominal_fps / (size[0] * size[1])
     fitting = [n for n in _STEPS if n <= most_n and bits_per_px * n >= _RATE_BITS_PER_PX]
     return size, fitting[0] if fitting else max(n for n in _STEPS if n <= most_n)
 
 
-def better_every_n(every_n: int, *, mean_qp: float, most_every_n: int) -> int:
+def better_decimation(decimation: int, *, mean_qp: float, most_decimation: int) -> int:
     """One step of the ladder, or two, towards the band of the quantiser (0…51) in which frames are worth their bits.
 
     The band is 7 wide; a step moved the quantiser by 1 to 2.5, two together by 4 at most: the choice settles.
     """
-    steps = [n for n in _STEPS if n <= most_every_n]
-    at = max((index for index, n in enumerate(steps) if n <= every_n), default=0)
+    steps = [n for n in _STEPS if n <= most_decimation]
+    at = max((index for index, n in enumerate(steps) if n <= decimation), default=0)
     if mean_qp > _QP_TOO_COARSE:
         at += 2 if mean_qp > _QP_FAR_TOO_COARSE else 1
     elif mean_qp < _QP_FINE:
@@ -78,7 +78,7 @@ def better_every_n(every_n: int, *, mean_qp: float, most_every_n: int) -> int:
     return steps[min(len(steps) - 1, max(0, at))]
 
 
-def most_every_n(fps: float, *, least_fps: float = _LEAST_FPS) -> int:
+def most_decimation(fps: float, *, least_fps: float = _LEAST_FPS) -> int:
     """The largest n of the ladder that leaves ``least_fps`` of ``fps`` ticks a second."""
     return max((n for n in _STEPS if fps / n >= least_fps), default=1)
 

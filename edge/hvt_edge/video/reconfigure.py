@@ -8,27 +8,28 @@ from dataclasses import replace
 
 from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.rate_control import Reopening
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.rate_control import ReconfigurationTrigger
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Step
-from hvt_edge.video.frame_skip import Cadence
+from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.least_rate import least_base_bps
 from hvt_edge.video.share import Split
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring import make_encoder
 
-__all__ = ["HeldCadence", "Renewal"]
+__all__ = ["EncoderReconfiguration", "LimitedFrameSkip"]
 
 _WORTH = 0.04
 """At a keyframe that comes anyway, a base rate that is off by less is left as it is."""
 
 
-class Renewal:
+class EncoderReconfiguration:
     """Called before each keyframe; watches decision steps, which may come from another thread.
 
     With a ``pacer`` the total is the rate that the link carries: the budget follows it at each tick (`follow`), the
-    base stream where `Reopening` finds it worth a keyframe. Between the two, stills give way first, then frames.
+    base stream where `ReconfigurationTrigger` finds it worth a keyframe. Between the two, stills give way
+    first, then frames.
     """
 
     def __init__(
@@ -36,20 +37,20 @@ class Renewal:
         config: EdgeConfig,
         *,
         size: tuple[int, int],
-        every_n: int,
-        sender: Sender,
+        decimation: int,
+        sender: Transmitter,
         split: Split | None,
         pacer: Pacer | None = None,
     ) -> None:
         self._config = config
         self._size = size
-        self._every_n = every_n
+        self._decimation = decimation
         self._base_bps = config.base_bps
         self._sender = sender
         self._split = split
         self._pacer = pacer
         self._total_bps = config.budget_bps
-        self._reopening = Reopening()
+        self._trigger = ReconfigurationTrigger()
         self.on_change: Callable[[], None] = lambda: None
         """Called when the budget has been told of a new split."""
         self._lock = threading.Lock()
@@ -74,10 +75,10 @@ class Renewal:
         total_bps = self._pacer.rate_bps
         if total_bps != self._total_bps:
             self._total_bps = total_bps
-            fps = self._config.tick_fps / self._every_n
+            fps = self._config.nominal_fps / self._decimation
             self._sender.set_total(total_bps, self._base_bps, fps, now_ns=now_ns)
         wanted_bps = self._base_of(self._pacer.steady_bps)
-        return self._reopening.wants(wanted_bps, self._base_bps, settled=self._pacer.settled, now_ns=now_ns)
+        return self._trigger.wants(wanted_bps, self._base_bps, settled=self._pacer.settled, now_ns=now_ns)
 
     def hold(self, now_ns: int) -> None:
         """While the link is away: what is kept has the budget that the base stream was opened for.
@@ -89,18 +90,18 @@ class Renewal:
         total_bps = min(self._config.budget_bps, round(self._base_bps / self._share))
         if total_bps != self._total_bps:
             self._total_bps = total_bps
-            fps = self._config.tick_fps / self._every_n
+            fps = self._config.nominal_fps / self._decimation
             self._sender.set_total(total_bps, self._base_bps, fps, now_ns=now_ns)
 
-    def least_every_n(self) -> int:
+    def least_decimation(self) -> int:
         """At the link's rate, each n-th tick at the most can be coded: x265 has a least for each frame."""
         if self._pacer is None:
             return 1
-        base_bps, tick_fps = self._base_of(self._pacer.steady_bps), self._config.tick_fps
-        most = max(1, int(tick_fps / LEAST_FPS))
-        for every_n in range(1, most):
-            if base_bps >= least_base_bps(self._size, tick_fps / every_n, edge_id=self._config.edge_id):
-                return every_n
+        base_bps, nominal_fps = self._base_of(self._pacer.steady_bps), self._config.nominal_fps
+        most = max(1, int(nominal_fps / LEAST_FPS))
+        for decimation in range(1, most):
+            if base_bps >= least_base_bps(self._size, nominal_fps / decimation, edge_id=self._config.edge_id):
+                return decimation
         return most
 
     def observe(self, candidates: Sequence[Candidate], step: Step) -> None:
@@ -116,40 +117,42 @@ class Renewal:
                 return True
             return self._moving and self._split is not None and self._split.wants_keyframe(now_ns)
 
-    def __call__(self, every_n: int, now_ns: int) -> BaseEncoder | None:
+    def __call__(self, decimation: int, now_ns: int) -> BaseEncoder | None:
         """Return the encoder to go on with from this keyframe, or None for the one there is."""
         changed = self._take_change()
         if self._pacer is not None:
-            return self._at_links_rate(self._pacer, every_n, now_ns, changed=changed)
+            return self._at_links_rate(self._pacer, decimation, now_ns, changed=changed)
         base_bps = self._proposed_bps(changed=changed)
-        if not changed and (every_n, base_bps) == (self._every_n, self._base_bps):
+        if not changed and (decimation, base_bps) == (self._decimation, self._base_bps):
             return None
-        self._every_n, self._base_bps = every_n, base_bps
+        self._decimation, self._base_bps = decimation, base_bps
         self.count += 1
-        fps = self._config.tick_fps / every_n
+        fps = self._config.nominal_fps / decimation
         if changed:
             self._sender.set_total(self._config.budget_bps, base_bps, fps, now_ns=now_ns)
         else:
             self._sender.set_base(base_bps, fps, now_ns=now_ns)
         self.on_change()
-        return make_encoder(self._config, size=self._size, every_n=every_n, base_bps=base_bps)
+        return make_encoder(self._config, size=self._size, decimation=decimation, base_bps=base_bps)
 
-    def _at_links_rate(self, pacer: Pacer, every_n: int, now_ns: int, *, changed: bool) -> BaseEncoder | None:
+    def _at_links_rate(
+        self, pacer: Pacer, decimation: int, now_ns: int, *, changed: bool
+    ) -> BaseEncoder | None:
         if changed:
             pacer.set_ceiling(self._config.budget_bps, floor_bps=self._config.floor_bps)
         self._proposed_bps(changed=changed)  # which moves the share
         base_bps = self._base_of(pacer.steady_bps)
         near = abs(base_bps / self._base_bps - 1) <= _WORTH and not (pacer.settled or changed)
-        if every_n == self._every_n and (near or base_bps == self._base_bps):
+        if decimation == self._decimation and (near or base_bps == self._base_bps):
             return None
-        self._every_n, self._base_bps, self._total_bps = every_n, base_bps, pacer.rate_bps
+        self._decimation, self._base_bps, self._total_bps = decimation, base_bps, pacer.rate_bps
         self.count += 1
-        self._reopening.done(now_ns)
-        fps = self._config.tick_fps / every_n
+        self._trigger.done(now_ns)
+        fps = self._config.nominal_fps / decimation
         self._sender.set_total(self._total_bps, base_bps, fps, now_ns=now_ns)
         self.on_change()
         config = replace(self._config, budget=max(base_bps, pacer.steady_bps))
-        return make_encoder(config, size=self._size, every_n=every_n, base_bps=base_bps)
+        return make_encoder(config, size=self._size, decimation=decimation, base_bps=base_bps)
 
     def _base_of(self, total_bps: int) -> int:
         """The base's part of so much in all; never less than x265 can follow at its lowest frame rate."""
@@ -189,20 +192,20 @@ class Renewal:
         return self._base_bps if share is None else round(config.budget_bps * share)
 
 
-class HeldCadence(Cadence):
-    """Another cadence, with no more frames than ``least_every_n()`` allows at the time of a keyframe."""
+class LimitedFrameSkip(FrameSkip):
+    """Another cadence, with no more frames than ``least_decimation()`` allows at the time of a keyframe."""
 
-    def __init__(self, wished: Cadence, least_every_n: Callable[[], int]) -> None:
-        super().__init__(wished.every_n)
+    def __init__(self, wished: FrameSkip, least_decimation: Callable[[], int]) -> None:
+        super().__init__(wished.decimation)
         self._wished = wished
-        self._least_every_n = least_every_n
+        self._least_decimation = least_decimation
 
     def coded(self, tick: int, *, keyframe: bool, mean_qp: float) -> None:
-        """See `Cadence`."""
+        """See `FrameSkip`."""
         super().coded(tick, keyframe=keyframe, mean_qp=mean_qp)
         self._wished.coded(tick, keyframe=keyframe, mean_qp=mean_qp)
 
     def at_keyframe(self, tick: int) -> int:
-        """See `Cadence`."""
-        self.every_n = max(self._wished.at_keyframe(tick), self._least_every_n())
-        return self.every_n
+        """See `FrameSkip`."""
+        self.decimation = max(self._wished.at_keyframe(tick), self._least_decimation())
+        return self.decimation

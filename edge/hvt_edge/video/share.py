@@ -31,7 +31,7 @@ class SplitSettings:
     """The lowest B_v at which x265 follows its target (`rate.least_base_bps`)."""
     metadata_bps: int = 0
     """What the ``tracks`` channel takes: neither the base's nor the stills'."""
-    sight_base_bps: int = 160_000
+    visible_base_bps: int = 160_000
     """Below it the base loses objects that it would else show, more than stills give back (1280x720 at 15 fps)."""
     least_still_share: float = 0.05
     """For newcomers, and for stills that a ground asks for."""
@@ -75,13 +75,13 @@ class Split:
         need_bytes = sum(self._need(one, step) for one in candidates)
         doubts = [self._gain.doubt(one, from_source=step.from_source) for one in candidates]
         shown = 1 - sum(doubts) / len(doubts) if doubts else 1.0
-        keep = 0.0
+        decay = 0.0
         if self._observed_ns is None:
             self._settled_ns = step.now_ns
         else:
-            keep = math.exp(-max(0, step.now_ns - self._observed_ns) / 1e9 / self._settings.memory_s)
-        self._need_bytes = keep * self._need_bytes + (1 - keep) * need_bytes
-        self._shown = keep * self._shown + (1 - keep) * shown
+            decay = math.exp(-max(0, step.now_ns - self._observed_ns) / 1e9 / self._settings.memory_s)
+        self._need_bytes = decay * self._need_bytes + (1 - decay) * need_bytes
+        self._shown = decay * self._shown + (1 - decay) * shown
         self._observed_ns = step.now_ns
 
     def set_total(self, total_bps: int) -> None:
@@ -122,7 +122,7 @@ class Split:
     def _floor_bps(self) -> float:
         """The least for the base: more, the more of the objects it shows by itself."""
         least = self._settings.least_base_bps
-        return least + self._shown * max(0, self._settings.sight_base_bps - least)
+        return least + self._shown * max(0, self._settings.visible_base_bps - least)
 
     def _metadata_share(self) -> float:
         return self._settings.metadata_bps / self._settings.total_bps

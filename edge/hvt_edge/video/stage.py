@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from hvt_common.values import AccessUnit, Frame, Tracks
-from hvt_edge.backlog.stage import Keep, State
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.backlog.stage import BacklogStage, State
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan
-from hvt_edge.video.frame_skip import Cadence
+from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.local_copy import BaseRecorder
 from hvt_edge.video.quality_refresh import RegionPlan
 from hvt_edge.video.x265 import BaseEncoder
@@ -39,14 +39,14 @@ class BaseStage:
         encoder: BaseEncoder,
         *,
         keyframes: KeyframePlan,
-        sender: Sender,
+        sender: Transmitter,
         recorder: BaseRecorder | None,
         first_keyframe_bytes: int,
         plan: RegionPlan | None = None,
-        cadence: Cadence | None = None,
+        frame_skip: FrameSkip | None = None,
         renew: Callable[[int, int], BaseEncoder | None] | None = None,
         admits: Callable[[int], bool] = lambda _now_ns: True,
-        keep: Keep | None = None,
+        backlog: BacklogStage | None = None,
     ) -> None:
         self._encoder = encoder
         self._keyframes = keyframes
@@ -54,19 +54,19 @@ class BaseStage:
         self._recorder = recorder
         self._keyframe_bytes = first_keyframe_bytes
         self._plan = plan
-        self._cadence = cadence or Cadence()
+        self._frame_skip = frame_skip or FrameSkip()
         self._renew = renew
         self._admits = admits
-        self._keep = keep
+        self._backlog = backlog
         self._kept = self._admitted = False
         """Of the tick encoded last: whether it goes to the store, and whether the link was free for it."""
         self.held = False
         """Whether the last tick was to be coded and could not be, because the link is busy."""
 
     @property
-    def every_n(self) -> int:
+    def decimation(self) -> int:
         """Each n-th tick is coded now."""
-        return self._cadence.every_n
+        return self._frame_skip.decimation
 
     def encode(self, frame: Frame, *, now_ns: int, tracks: Tracks | None = None) -> AccessUnit | None:
         """Encode the frame, as a keyframe where one is due and fits; None where this tick is not coded.
@@ -77,10 +77,10 @@ class BaseStage:
         keyframe = self._keyframes.now(now_ns, fits=fits)
         # Asked once a tick: between two answers the link may fill, and a frame would build on others that were kept.
         self._admitted, self.held = self._admits(now_ns), False
-        self._kept = self._keep is not None and self._keep.keeps(keyframe=keyframe and self._admitted)
-        if self._keep is not None and self._kept:
-            keyframe = self._keep.wants_keyframe(now_ns, due=keyframe)
-        if not keyframe and not self._cadence.codes(frame.index):
+        self._kept = self._backlog is not None and self._backlog.keeps(keyframe=keyframe and self._admitted)
+        if self._backlog is not None and self._kept:
+            keyframe = self._backlog.wants_keyframe(now_ns, due=keyframe)
+        if not keyframe and not self._frame_skip.codes(frame.index):
             return None
         if not self._kept and not self._admitted:
             self.held = True
@@ -89,7 +89,7 @@ class BaseStage:
             self._begin_run(frame.index, now_ns=now_ns)
         regions = [] if self._plan is None else self._plan.regions(frame.index, tracks, keyframe=keyframe)
         unit = self._encoder.encode(frame, keyframe=keyframe, regions=regions)
-        self._cadence.coded(frame.index, keyframe=unit.keyframe, mean_qp=self._encoder.mean_qp)
+        self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self._encoder.mean_qp)
         self._note(unit, now_ns)
         if self._recorder is not None:
             self._recorder.write(unit)
@@ -100,14 +100,14 @@ class BaseStage:
 
         Or keep it, where the link is away.
         """
-        if self._keep is not None and self._kept:
-            probes = self._admitted and self._keep.probes(now_ns)
-            self._keep.base(unit, now_ns=now_ns, sent=probes)
+        if self._backlog is not None and self._kept:
+            probes = self._admitted and self._backlog.probes(now_ns)
+            self._backlog.base(unit, now_ns=now_ns, sent=probes)
             if probes:
                 self._sender.base(unit, now_ns=now_ns, after_hole=not unit.keyframe)
             return
-        if self._keep is not None:
-            self._keep.sent(unit)
+        if self._backlog is not None:
+            self._backlog.sent(unit)
         line_bytes = self._sender.base(unit, now_ns=now_ns)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes
@@ -115,23 +115,23 @@ class BaseStage:
 
     def _note(self, unit: AccessUnit, now_ns: int) -> None:
         """What a keyframe means to the plan and to the store."""
-        keep = self._keep
-        if keep is None or keep.state is State.LIVE:
+        backlog = self._backlog
+        if backlog is None or backlog.state is State.LIVE:
             if unit.keyframe:
                 self._keyframes.done(now_ns)
         elif self._kept:
             # One that begins a segment while the link is back is not the one to go on with, which stays due.
-            if unit.keyframe and keep.away:
+            if unit.keyframe and backlog.offline:
                 self._keyframes.done(now_ns)
         else:
             assert unit.keyframe, "x265 makes a keyframe of each frame that is to be one"
             self._keyframes.done(now_ns)
-            keep.resume()
+            backlog.resume()
 
     def _begin_run(self, tick: int, *, now_ns: int) -> None:
         """What may change with a keyframe only. What is kept goes on with the quality that the link had."""
-        before = self._cadence.every_n
-        every_n = self._cadence.at_keyframe(tick)
-        encoder = None if self._renew is None else self._renew(every_n, now_ns)
-        assert encoder is not None or every_n == before, "a cadence that changes needs another encoder"
+        before = self._frame_skip.decimation
+        decimation = self._frame_skip.at_keyframe(tick)
+        encoder = None if self._renew is None else self._renew(decimation, now_ns)
+        assert encoder is not None or decimation == before, "a cadence that changes needs another encoder"
         self._encoder = encoder or self._encoder

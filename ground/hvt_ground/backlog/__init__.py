@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
-from hvt_ground.backlog.assembly import PastAssembly, PastContent, PastKey, StoredStill, past_content
+from hvt_ground.backlog.assembly import (
+    BacklogAssembly,
+    BacklogContent,
+    BacklogKey,
+    StoredStill,
+    backlog_content,
+)
 
-__all__ = ["PastAssembly", "PastContent", "PastKey", "StoredStill", "past_content"]
+__all__ = ["BacklogAssembly", "BacklogContent", "BacklogKey", "StoredStill", "backlog_content"]

@@ -16,22 +16,22 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 
 from hvt_common.protocol.messages import (
-    MAX_PAST_BYTES,
+    MAX_BACKLOG_BYTES,
+    AcknowledgedRange,
+    BacklogHeader,
+    BacklogKind,
+    BacklogUnit,
     Flags,
     Info,
-    PastHave,
-    PastHeader,
-    PastKind,
-    PastUnit,
     RoiHeader,
     WireError,
-    parse_past_still,
-    parse_past_units,
+    parse_backlog_still,
+    parse_backlog_units,
 )
 
-__all__ = ["PastAssembly", "PastContent", "PastKey", "StoredStill", "past_content"]
+__all__ = ["BacklogAssembly", "BacklogContent", "BacklogKey", "StoredStill", "backlog_content"]
 
-PastKey = tuple[int, str, int]
+BacklogKey = tuple[int, str, int]
 """Session id, kind, number."""
 
 _MAX_UNSAID = 512
@@ -50,7 +50,7 @@ class StoredStill:
     encoding: str
 
 
-PastContent = Info | StoredStill | tuple[PastUnit, ...]
+BacklogContent = Info | StoredStill | tuple[BacklogUnit, ...]
 """What an object holds: the facts of its session, a still, or a stretch of the base stream."""
 
 
@@ -67,7 +67,7 @@ class _Open:
         return self.total_bytes if self.handed else len(self.data)
 
 
-class PastAssembly:
+class BacklogAssembly:
     """Of one edge. Not safe for threads.
 
     Args:
@@ -78,17 +78,17 @@ class PastAssembly:
     """
 
     def __init__(
-        self, *, max_objects: int = 64, max_bytes: int = 4 * MAX_PAST_BYTES, remember: int = 8192
+        self, *, max_objects: int = 64, max_bytes: int = 4 * MAX_BACKLOG_BYTES, remember: int = 8192
     ) -> None:
-        if max_objects < 1 or max_bytes < MAX_PAST_BYTES or remember < 1:
+        if max_objects < 1 or max_bytes < MAX_BACKLOG_BYTES or remember < 1:
             raise ValueError(f"bounds are too small: {max_objects=}, {max_bytes=}, {remember=}")
         self._max_objects = max_objects
         self._max_bytes = max_bytes
         self._remember = remember
-        self._open: OrderedDict[PastKey, _Open] = OrderedDict()
-        self._done: OrderedDict[PastKey, int] = OrderedDict()
-        self._refusals: OrderedDict[PastKey, int] = OrderedDict()
-        self._unsaid: OrderedDict[PastKey, int] = OrderedDict()
+        self._open: OrderedDict[BacklogKey, _Open] = OrderedDict()
+        self._done: OrderedDict[BacklogKey, int] = OrderedDict()
+        self._refusals: OrderedDict[BacklogKey, int] = OrderedDict()
+        self._unsaid: OrderedDict[BacklogKey, int] = OrderedDict()
         self.refused = 0
         """Objects that were complete and unusable."""
 
@@ -102,7 +102,7 @@ class PastAssembly:
         """How many objects there are of which some is held or handed out."""
         return len(self._open)
 
-    def piece(self, header: PastHeader, payload: bytes, *, may_finish: bool = True) -> bytes | None:
+    def chunk(self, header: BacklogHeader, payload: bytes, *, may_finish: bool = True) -> bytes | None:
         """Take a piece; the object's bytes where it is the last one that was missing, to be `settle`d later.
 
         With ``may_finish`` False a piece that would complete its object is not taken, and will come again.
@@ -134,7 +134,7 @@ class PastAssembly:
             del self._open[key]
         return None
 
-    def settle(self, key: PastKey, *, usable: bool) -> None:
+    def settle(self, key: BacklogKey, *, usable: bool) -> None:
         """Say what came of an object that was handed out: it is where it belongs, or nothing could be made of it."""
         entry = self._open.get(key)
         if entry is None or not entry.handed:
@@ -152,7 +152,7 @@ class PastAssembly:
         _trim(self._refusals, _MAX_REFUSALS)
         self._say(key, 0)
 
-    def drop(self, key: PastKey) -> None:
+    def drop(self, key: BacklogKey) -> None:
         """Forget an object that was handed out and cannot be taken: another ground may, or this one later."""
         entry = self._open.get(key)
         if entry is not None and entry.handed:
@@ -169,22 +169,24 @@ class PastAssembly:
 
     def want_info(self, session_id: int) -> None:
         """Ask for the facts of a session: without them nothing can be made of its objects."""
-        self._say((session_id, PastKind.INFO, 0), 0)
+        self._say((session_id, BacklogKind.INFO, 0), 0)
 
     @property
     def unsaid(self) -> int:
         """How many acknowledgements the edge has not heard yet."""
         return len(self._unsaid)
 
-    def take_haves(self, most: int) -> tuple[PastHave, ...]:
+    def take_acknowledged_ranges(self, most: int) -> tuple[AcknowledgedRange, ...]:
         """Return and forget up to ``most`` acknowledgements that the edge has not heard yet, oldest first."""
         taken = [self._unsaid.popitem(last=False) for _ in range(min(most, len(self._unsaid)))]
         return tuple(
-            PastHave(session_id=session_id, kind=kind, number=number, have_bytes=have)
-            for (session_id, kind, number), have in taken
+            AcknowledgedRange(
+                session_id=session_id, kind=kind, number=number, acknowledged_bytes=acknowledged_range
+            )
+            for (session_id, kind, number), acknowledged_range in taken
         )
 
-    def _entry(self, key: PastKey, total_bytes: int) -> _Open:
+    def _entry(self, key: BacklogKey, total_bytes: int) -> _Open:
         """The object's entry, now the newest; a new one where there is none or it was of another size."""
         entry = self._open.get(key)
         if entry is None or (entry.total_bytes != total_bytes and not entry.handed):
@@ -192,7 +194,7 @@ class PastAssembly:
         self._open.move_to_end(key)
         return entry
 
-    def _make_room(self, key: PastKey, more_bytes: int) -> bool:
+    def _make_room(self, key: BacklogKey, more_bytes: int) -> bool:
         """Whether there is room for so much more of this object, which may cost others theirs."""
         while len(self._open) > self._max_objects or self.size_bytes + more_bytes > self._max_bytes:
             victim = next((one for one, entry in self._open.items() if one != key and not entry.handed), None)
@@ -201,31 +203,31 @@ class PastAssembly:
             del self._open[victim]
         return True
 
-    def _finish(self, key: PastKey, total_bytes: int) -> None:
+    def _finish(self, key: BacklogKey, total_bytes: int) -> None:
         self._refusals.pop(key, None)
-        if key[1] != PastKind.INFO:  # one that was forgotten here has to come through again
+        if key[1] != BacklogKind.INFO:  # one that was forgotten here has to come through again
             self._done[key] = total_bytes
             self._done.move_to_end(key)
             _trim(self._done, self._remember)
         self._say(key, total_bytes)
 
-    def _say_busy(self, key: PastKey, entry: _Open, total_bytes: int) -> None:
+    def _say_busy(self, key: BacklogKey, entry: _Open, total_bytes: int) -> None:
         """Of another object of the same name nothing is here."""
         self._say(key, entry.total_bytes - 1 if entry.total_bytes == total_bytes else 0)
 
-    def _say(self, key: PastKey, have_bytes: int) -> None:
-        self._unsaid[key] = have_bytes
+    def _say(self, key: BacklogKey, acknowledged_bytes: int) -> None:
+        self._unsaid[key] = acknowledged_bytes
         _trim(self._unsaid, _MAX_UNSAID)
 
 
-def past_content(key: PastKey, data: bytes, *, edge: str) -> PastContent:
+def backlog_content(key: BacklogKey, data: bytes, *, edge: str) -> BacklogContent:
     """What the bytes of a whole object hold; raises `WireError` and nothing else, for any bytes whatever."""
     session_id, kind, number = key
-    if kind == PastKind.INFO:
+    if kind == BacklogKind.INFO:
         return _info(session_id, data, edge=edge)
-    if kind == PastKind.STILL:
+    if kind == BacklogKind.STILL:
         return _still(session_id, number, data)
-    units = parse_past_units(data)
+    units = parse_backlog_units(data)
     if units[0].frame_index != number:
         raise WireError(f"past video {number} begins with frame {units[0].frame_index}")
     return units
@@ -239,26 +241,26 @@ def _info(session_id: int, data: bytes, *, edge: str) -> Info:
 
 
 def _still(session_id: int, number: int, data: bytes) -> StoredStill:
-    kept = parse_past_still(data)
+    kept = parse_backlog_still(data)
     header = RoiHeader.parse(kept.attachment, kept.payload)
     if header.session_id != session_id or header.sequence != number:
         raise WireError(f"past still {number} is another one inside")
     return StoredStill(replace(header, flags=header.flags | Flags.STORED), kept.payload, kept.encoding)
 
 
-def _check(header: PastHeader, payload: bytes) -> None:
+def _check(header: BacklogHeader, payload: bytes) -> None:
     if not payload or header.offset + len(payload) > header.total_bytes:
         raise WireError(
             f"a piece of {len(payload)} bytes at {header.offset} is none of an object of {header.total_bytes}"
         )
-    if header.kind == PastKind.INFO and (header.number or header.total_bytes > Info.MAX_BYTES):
+    if header.kind == BacklogKind.INFO and (header.number or header.total_bytes > Info.MAX_BYTES):
         raise WireError("a piece of a session's facts has a number, or is of too many")
 
 
-def _key(header: PastHeader) -> PastKey:
+def _key(header: BacklogHeader) -> BacklogKey:
     return header.session_id, header.kind, header.number
 
 
-def _trim(ring: OrderedDict[PastKey, int], most: int) -> None:
+def _trim(ring: OrderedDict[BacklogKey, int], most: int) -> None:
     while len(ring) > most:
         ring.popitem(last=False)

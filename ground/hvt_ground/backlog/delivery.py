@@ -14,15 +14,22 @@ from collections import OrderedDict, deque
 from collections.abc import Sequence
 from pathlib import Path
 
-from hvt_common.protocol.channels import DELIVERIES, Row
-from hvt_common.protocol.messages import Info, PastHave, PastHeader, PastKind, PastUnit, WireError
-from hvt_ground.backlog.assembly import PastAssembly, PastKey, StoredStill, past_content
+from hvt_common.protocol.channels import DELIVERIES, Channel
+from hvt_common.protocol.messages import (
+    AcknowledgedRange,
+    BacklogHeader,
+    BacklogKind,
+    BacklogUnit,
+    Info,
+    WireError,
+)
+from hvt_ground.backlog.assembly import BacklogAssembly, BacklogKey, StoredStill, backlog_content
 from hvt_ground.backlog.fill import Work
-from hvt_ground.backlog.recordings import PastRecordings
+from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.session.session import GroundSession
 
-__all__ = ["PastDelivery"]
+__all__ = ["BacklogDelivery"]
 
 _log = logging.getLogger(__name__)
 
@@ -30,8 +37,8 @@ _MOST_INFOS = 64
 _FINISH_NS = 1_000_000_000
 
 
-class PastDelivery:
-    """Of one edge. `piece` is for the receiving thread, `take_haves` for any.
+class BacklogDelivery:
+    """Of one edge. `chunk` is for the receiving thread, `take_acknowledged_ranges` for any.
 
     Args:
         edge: its id.
@@ -40,11 +47,11 @@ class PastDelivery:
     """
 
     def __init__(
-        self, edge: str, *, recordings: PastRecordings | None, assembly: PastAssembly | None = None
+        self, edge: str, *, recordings: BacklogRecordings | None, assembly: BacklogAssembly | None = None
     ) -> None:
         self._edge = edge
         self._recordings = recordings
-        self._assembly = assembly or PastAssembly()
+        self._assembly = assembly or BacklogAssembly()
         self._lock = threading.Lock()
         self._infos: OrderedDict[int, Info] = OrderedDict()
         self._backlog: deque[Work] = deque()
@@ -75,7 +82,7 @@ class PastDelivery:
             if len(self._infos) > _MOST_INFOS:
                 self._infos.popitem(last=False)
 
-    def piece(self, header: PastHeader, payload: bytes, *, session: GroundSession) -> bool:
+    def chunk(self, header: BacklogHeader, payload: bytes, *, session: GroundSession) -> bool:
         """Take a piece while ``session`` is open; True where it completes its object, which is handed on.
 
         Raises:
@@ -84,13 +91,13 @@ class PastDelivery:
         own = header.session_id == session.info.session_id
         if not own and (self._recordings is None or not self._recordings.takes(header.session_id)):
             raise WireError(f"it was kept of the session {header.session_id:016x}, which is not shown")
-        is_info = header.kind == PastKind.INFO
+        is_info = header.kind == BacklogKind.INFO
         with self._lock:
             known = own or header.session_id in self._infos
             if not (known or is_info):
                 self._assembly.want_info(header.session_id)
             may_finish = is_info or (known and session.has_room)
-            whole = self._assembly.piece(header, payload, may_finish=may_finish)
+            whole = self._assembly.chunk(header, payload, may_finish=may_finish)
         if whole is None:
             return False
         self._deliver((header.session_id, header.kind, header.number), whole, session)
@@ -114,10 +121,10 @@ class PastDelivery:
         """How many acknowledgements the edge has not heard yet."""
         return self._assembly.unsaid
 
-    def take_haves(self, most: int) -> tuple[PastHave, ...]:
+    def take_acknowledged_ranges(self, most: int) -> tuple[AcknowledgedRange, ...]:
         """Return and forget up to ``most`` acknowledgements."""
         with self._lock:
-            return self._assembly.take_haves(most)
+            return self._assembly.take_acknowledged_ranges(most)
 
     def finish(self) -> None:
         """Do what is left to do in the receiving thread, for a second: the session is about to be closed."""
@@ -143,9 +150,9 @@ class PastDelivery:
         if self._recordings is not None:
             self._recordings.close()
 
-    def _deliver(self, key: PastKey, whole: bytes, session: GroundSession) -> None:
+    def _deliver(self, key: BacklogKey, whole: bytes, session: GroundSession) -> None:
         try:
-            content = past_content(key, whole, edge=self._edge)
+            content = backlog_content(key, whole, edge=self._edge)
         except WireError:
             self._settle(key, usable=False)
             raise
@@ -157,7 +164,7 @@ class PastDelivery:
         else:
             self._backlog.append(self._settling(key, self._video(key, content, session)))
 
-    def _still(self, key: PastKey, content: StoredStill, session: GroundSession) -> None:
+    def _still(self, key: BacklogKey, content: StoredStill, session: GroundSession) -> None:
         still = _received(content)
         own = key[0] == session.info.session_id
         work = session.stored_still(still) if own else self._still_elsewhere(self._infos[key[0]], still)
@@ -166,7 +173,7 @@ class PastDelivery:
         else:
             session.later(self._settling(key, work))
 
-    def _video(self, key: PastKey, units: Sequence[PastUnit], session: GroundSession) -> Work:
+    def _video(self, key: BacklogKey, units: Sequence[BacklogUnit], session: GroundSession) -> Work:
         if key[0] == session.info.session_id:
             return session.stored_video(units)
         return self._video_elsewhere(self._infos[key[0]], units, session)
@@ -176,7 +183,7 @@ class PastDelivery:
         with self._recordings.using(info) as recording:
             return None if recording is None else (yield from recording.still(still))
 
-    def _video_elsewhere(self, info: Info, units: Sequence[PastUnit], session: GroundSession) -> Work:
+    def _video_elsewhere(self, info: Info, units: Sequence[BacklogUnit], session: GroundSession) -> Work:
         recordings = self._recordings
         assert recordings is not None, "without, no piece of another session is taken"
         with recordings.using(info) as recording:
@@ -188,13 +195,13 @@ class PastDelivery:
                 )
             )
 
-    def _settling(self, key: PastKey, work: Work) -> Work:
+    def _settling(self, key: BacklogKey, work: Work) -> Work:
         """The work, and then its acknowledgement."""
         with self._lock:
             self._working += 1
             return self._settled_after(key, work, session=self._sessions)
 
-    def _settled_after(self, key: PastKey, work: Work, *, session: int) -> Work:
+    def _settled_after(self, key: BacklogKey, work: Work, *, session: int) -> Work:
         usable = yield from work
         with self._lock:
             if session == self._sessions:
@@ -205,11 +212,11 @@ class PastDelivery:
                     self._assembly.settle(key, usable=usable)
         return usable
 
-    def _settle(self, key: PastKey, *, usable: bool) -> None:
+    def _settle(self, key: BacklogKey, *, usable: bool) -> None:
         with self._lock:
             self._assembly.settle(key, usable=usable)
 
 
 def _received(still: StoredStill) -> ReceivedStill:
-    media_type = still.encoding.partition(";")[0] or DELIVERIES[Row.ROI].encoding
+    media_type = still.encoding.partition(";")[0] or DELIVERIES[Channel.ROI].encoding
     return ReceivedStill(still.header, still.data, media_type)

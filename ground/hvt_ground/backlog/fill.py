@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvt_common.protocol.messages import Info, PastUnit
+from hvt_common.protocol.messages import BacklogUnit, Info
 from hvt_common.values import Image
-from hvt_ground.backlog.perception import PastLook
-from hvt_ground.backlog.video import PastVideo
+from hvt_ground.backlog.perception import BacklogPerception
+from hvt_ground.backlog.video import BacklogVideo
 from hvt_ground.events.events import Event, Overlay, VideoSample
-from hvt_ground.link.sequence_window import NumbersSeen
+from hvt_ground.link.sequence_window import SequenceWindow
 
-__all__ = ["Arrived", "PastFill", "Work"]
+__all__ = ["Arrived", "BacklogFill", "Work"]
 
 _SECOND_NS = 1_000_000_000
 _LONGEST_S = 1.0
@@ -62,7 +62,7 @@ class Arrived:
             self.first = frame_index, capture_ns
 
 
-class PastFill:
+class BacklogFill:
     """Of one session. All of it is for the receiving thread, save what it hands to the one that sees.
 
     Args:
@@ -71,14 +71,14 @@ class PastFill:
         look: finds boxes in the video; None leaves it without.
     """
 
-    def __init__(self, info: Info, *, log: Callable[[Event], None], look: PastLook | None) -> None:
+    def __init__(self, info: Info, *, log: Callable[[Event], None], look: BacklogPerception | None) -> None:
         self._info = info
         self._log = log
         self._look = look
         self._tick_ns = round(_SECOND_NS / info.fps)
-        self._video = PastVideo(base_size=info.base_size)
+        self._video = BacklogVideo(base_size=info.base_size)
         self._lock = threading.Lock()
-        self._frames = NumbersSeen()
+        self._frames = SequenceWindow()
         self.arrived = Arrived()
         """Since the start."""
         self._news = Arrived()
@@ -101,13 +101,13 @@ class PastFill:
             news, self._news = self._news, Arrived()
             return news
 
-    def fill(self, units: Sequence[PastUnit], *, boxes: Callable[[Work], bool]) -> Work:
+    def fill(self, units: Sequence[BacklogUnit], *, boxes: Callable[[Work], bool]) -> Work:
         """Log those frames of a stretch that are missing and can be decoded.
 
         ``boxes`` takes the work of finding boxes in them, for the thread that sees; False where it has too much of
         that, and only the video is shown.
         """
-        last: PastUnit | None = None
+        last: BacklogUnit | None = None
         logged: set[int] = set()
         for shown in self._video.pictures(units):
             if shown is not None and self._show(*shown, after=last):
@@ -118,7 +118,7 @@ class PastFill:
             boxes(self._watch(units, logged))
         return True
 
-    def _show(self, unit: PastUnit, image: Image | None, *, after: PastUnit | None) -> bool:
+    def _show(self, unit: BacklogUnit, image: Image | None, *, after: BacklogUnit | None) -> bool:
         """Log a frame that is missing; False where it is not, or cannot be shown."""
         if image is None:
             with self._lock:
@@ -130,10 +130,10 @@ class PastFill:
         self._note_frame(unit, after)
         return True
 
-    def _watch(self, units: Sequence[PastUnit], frames: AbstractSet[int]) -> Work:
+    def _watch(self, units: Sequence[BacklogUnit], frames: AbstractSet[int]) -> Work:
         """Log boxes for those frames of a stretch."""
         assert self._look is not None, "nobody watches without"
-        last: PastUnit | None = None
+        last: BacklogUnit | None = None
         with self._look.watch(self._log) as watch:
             for shown in self._video.pictures(units):
                 if shown is not None and shown[1] is not None and shown[0].frame_index in frames:
@@ -144,7 +144,7 @@ class PastFill:
             self._take_off(last)
         return True
 
-    def _note_frame(self, unit: PastUnit, before: PastUnit | None) -> None:
+    def _note_frame(self, unit: BacklogUnit, before: BacklogUnit | None) -> None:
         ticks = 1 if before is None else unit.frame_index - before.frame_index
         lasts_s = min(ticks / self._info.fps, _LONGEST_S)
         with self._lock:
@@ -155,7 +155,7 @@ class PastFill:
         with self._lock:
             return self._frames.add([frame_index]) > 0
 
-    def _take_off(self, last: PastUnit) -> None:
+    def _take_off(self, last: BacklogUnit) -> None:
         """The boxes of a stretch end with it, where nothing goes on from there."""
         with self._lock:
             if last.frame_index + 1 in self._frames:

@@ -26,7 +26,7 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Moment, StillStage
 
-__all__ = ["FIRST_TRACK_ID", "Lender", "PastLook", "Watch"]
+__all__ = ["FIRST_TRACK_ID", "BacklogPerception", "ModelCheckout", "Watch"]
 
 FIRST_TRACK_ID = 1_000_001
 """Tracks of kept video are others than those of the session, and told apart by their numbers."""
@@ -34,10 +34,10 @@ FIRST_TRACK_ID = 1_000_001
 Emit = Callable[[Event], None]
 
 
-class Lender(Protocol):
+class ModelCheckout(Protocol):
     """Where models come from."""
 
-    def borrow(self) -> AbstractContextManager[tuple[Detector, Classifier | None]]:
+    def checkout(self) -> AbstractContextManager[tuple[Detector, Classifier | None]]:
         """A set that may be used meanwhile, by turns with what else is done in the thread that sees."""
         ...
 
@@ -82,7 +82,7 @@ class Watch:
         )
 
 
-class PastLook:
+class BacklogPerception:
     """Of one session. For one thread at a time.
 
     Args:
@@ -97,7 +97,7 @@ class PastLook:
         self,
         info: Info,
         *,
-        models: Lender,
+        models: ModelCheckout,
         tracker_of: Callable[[], ByteTracker],
         reader_of: Callable[[Detector, Classifier | None], StillReader],
         detect_every: int,
@@ -112,7 +112,7 @@ class PastLook:
     @contextmanager
     def watch(self, emit: Emit) -> Iterator[Watch]:
         """What follows one stretch of video."""
-        with self._models.borrow() as (detector, _):
+        with self._models.checkout() as (detector, _):
             watch = Watch(
                 detector,
                 self._tracker_of(),
@@ -128,7 +128,7 @@ class PastLook:
     def read(self, still: ReceivedStill, *, emit: Emit) -> None:
         """Decode, name and give out a still of a session that is over: no track of it is here to be matched."""
         info = self._info
-        with self._models.borrow() as (detector, classifier):
+        with self._models.checkout() as (detector, classifier):
             reader = self._reader_of(detector, classifier)
             names, edge_classes = unified_names(detector.class_names, info.class_names)
             stage = StillStage(

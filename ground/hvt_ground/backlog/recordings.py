@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hvt_common.protocol.messages import Info
-from hvt_ground.backlog.fill import PastFill, Work
-from hvt_ground.backlog.perception import PastLook
+from hvt_ground.backlog.fill import BacklogFill, Work
+from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.events.events import Notice
-from hvt_ground.link.sequence_window import NumbersSeen
+from hvt_ground.link.sequence_window import SequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.sinks.rerun.recorder import Recorder
 
-__all__ = ["MOST_FILES", "MOST_OPEN", "PastRecording", "PastRecordings"]
+__all__ = ["MOST_FILES", "MOST_OPEN", "BacklogRecording", "BacklogRecordings"]
 
 MOST_OPEN = 4
 MOST_FILES = 32
@@ -31,16 +31,16 @@ _CLOSE_S = 1.0
 """For so long the end of the ground waits for footers; a file without one opens just as well."""
 
 
-class PastRecording:
+class BacklogRecording:
     """One session's. `still` is for the thread that sees, `fill` for the one that receives."""
 
-    def __init__(self, info: Info, *, path: Path | None, recorder: Recorder, look: PastLook) -> None:
+    def __init__(self, info: Info, *, path: Path | None, recorder: Recorder, look: BacklogPerception) -> None:
         self.info = info
         self.path = path
         self._recorder = recorder
         self._look = look
-        self._stills = NumbersSeen()
-        self.fill = PastFill(info, log=recorder.log, look=look)
+        self._stills = SequenceWindow()
+        self.fill = BacklogFill(info, log=recorder.log, look=look)
 
     def still(self, still: ReceivedStill) -> Work:
         """Decode, name and log one, once."""
@@ -61,12 +61,12 @@ class PastRecording:
 
 @dataclass(slots=True)
 class _Open:
-    recording: PastRecording
+    recording: BacklogRecording
     users: int = 0
     """Work that has it in hand, or waits to."""
 
 
-class PastRecordings:
+class BacklogRecordings:
     """Of one edge: opened when something comes of a session. For the threads that receive and see.
 
     Where too many are open, the one that nothing came for the longest is closed, in a thread of its own, for a footer
@@ -81,7 +81,7 @@ class PastRecordings:
 
     def __init__(
         self,
-        open_one: Callable[[Info], PastRecording],
+        open_one: Callable[[Info], BacklogRecording],
         *,
         most: int = MOST_OPEN,
         most_files: int = MOST_FILES,
@@ -91,7 +91,7 @@ class PastRecordings:
         self._left = most_files
         self._lock = threading.Lock()
         self._open: OrderedDict[int, _Open] = OrderedDict()
-        self._closer = ThreadPoolExecutor(1, thread_name_prefix="hvt-past-close")
+        self._closer = ThreadPoolExecutor(1, thread_name_prefix="hvt-backlog-close")
         self._closing: list[Future[None]] = []
         self._stop_ns: int | None = None
         """When the time for footers is over; None while more may come."""
@@ -104,7 +104,7 @@ class PastRecordings:
             return self._stop_ns is None and (self._left > 0 or session_id in self._open)
 
     @contextmanager
-    def using(self, info: Info) -> Iterator[PastRecording | None]:
+    def using(self, info: Info) -> Iterator[BacklogRecording | None]:
         """The session's recording, which stays open meanwhile; None where `takes` says no.
 
         Raises:
@@ -117,7 +117,7 @@ class PastRecordings:
             if held is not None:
                 self._release(held)
 
-    def kept(self, recording: PastRecording, work: Work) -> Work:
+    def kept(self, recording: BacklogRecording, work: Work) -> Work:
         """The work, for which a recording that is in use now stays open until it is done, or `release_all`."""
         with self._lock:
             held = next(one for one in self._open.values() if one.recording is recording)
@@ -173,7 +173,7 @@ class PastRecordings:
     def _close_later(self, held: _Open) -> None:
         self._closing.append(self._closer.submit(self._close, held.recording))
 
-    def _close(self, recording: PastRecording) -> None:
+    def _close(self, recording: BacklogRecording) -> None:
         recording.close(footer=self._stop_ns is None or time.monotonic_ns() < self._stop_ns)
 
     def _raise_error(self, *, wait: bool = False) -> None:

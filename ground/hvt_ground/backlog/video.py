@@ -10,17 +10,17 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 
-from hvt_common.protocol.messages import PastUnit
+from hvt_common.protocol.messages import BacklogUnit
 from hvt_common.values import Image
 from hvt_common.video.hevc import BaseDecoder
 
-__all__ = ["PastVideo"]
+__all__ = ["BacklogVideo"]
 
 _MOST_GOP_BYTES = 2 * 2**20
 _GAPS = 4
 
 
-class PastVideo:
+class BacklogVideo:
     """Of one session. `live` and `pictures` may be called by two threads.
 
     Args:
@@ -50,7 +50,7 @@ class PastVideo:
             if self._run_bytes > _MOST_GOP_BYTES:
                 self._run = []
 
-    def pictures(self, units: Sequence[PastUnit]) -> Iterator[tuple[PastUnit, Image | None] | None]:
+    def pictures(self, units: Sequence[BacklogUnit]) -> Iterator[tuple[BacklogUnit, Image | None] | None]:
         """Each unit with its picture, or with None where it cannot be shown; None for each that leads up to them.
 
         After one that cannot be decoded all are left out up to the next keyframe: a decoder would make garbage of

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from hvt_ground.control.api import AskedStill, EdgeClient, EdgeTrack, RefusedError, RemoteEdge
+from hvt_ground.control.api import EdgeClient, EdgeTrack, RefusedError, RemoteEdge, RequestedStill
 
-__all__ = ["AskedStill", "EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge"]
+__all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedStill"]

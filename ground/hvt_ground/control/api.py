@@ -25,7 +25,7 @@ import cv2
 import zenoh
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import EdgeKeys, Row, parse_key, selector
+from hvt_common.protocol.channels import Channel, EdgeKeys, parse_key, selector
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, Info, RoiHeader, WireError
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.inbox import Inbox, Received
@@ -33,14 +33,14 @@ from hvt_common.transport.session import ask, open_session, subscribe
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.values import Image
 from hvt_common.video.still_codecs import StillError
-from hvt_ground.control.unanswered import Asker, who_is_seen_by_way_of
+from hvt_ground.control.unanswered import Requester, who_is_seen_by_way_of
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 
-__all__ = ["AskedStill", "EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge"]
+__all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedStill"]
 
 _ANSWER_S = 2.0
 _LOOK_S = 0.3
-_FATE_S = 2.0
+_OUTCOME_S = 2.0
 """So often the edge is asked what became of a still that does not come."""
 _INBOX_MESSAGES = 64
 _JPEG_QUALITY_PCT = 95
@@ -66,7 +66,7 @@ class EdgeTrack:
 
 
 @dataclass(frozen=True, slots=True)
-class AskedStill:
+class RequestedStill:
     """A still that was asked for."""
 
     edge: str
@@ -108,15 +108,15 @@ class RemoteEdge:
     where it says no.
     """
 
-    def __init__(self, session: zenoh.Session, edge: str, *, asker: Asker | None = None) -> None:
+    def __init__(self, session: zenoh.Session, edge: str, *, asker: Requester | None = None) -> None:
         self.name = edge
         self._session = session
         self._keys = EdgeKeys(edge)
-        self._asker = asker or Asker()
+        self._asker = asker or Requester()
 
     def info(self) -> Info:
         """What the edge says of its session."""
-        answer = self._ask(Row.INFO, b"")
+        answer = self._ask(Channel.INFO, b"")
         if answer is None:
             raise UserError(self._absent())
         return self._parsed(Info.parse, answer)
@@ -155,7 +155,7 @@ class RemoteEdge:
         frame: int | None = None,
         quality_pct: int | None = None,
         timeout_s: float = 15.0,
-    ) -> AskedStill:
+    ) -> RequestedStill:
         """Ask for a still of the untouched source frame, and wait for it.
 
         Args:
@@ -175,7 +175,7 @@ class RemoteEdge:
         self._check_may_command()
         info = self.info()
         inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest")
-        subscriber = subscribe(self._session, self._keys.key(Row.ROI), inbox=inbox)
+        subscriber = subscribe(self._session, self._keys.key(Channel.ROI), inbox=inbox)
         try:
             answer = self.command(Command.STILL, arguments)
             header, item = self._wait(inbox, answer, until_s=until_s, timeout_s=timeout_s)
@@ -186,7 +186,7 @@ class RemoteEdge:
             image = decode_still(received, base_bgr=None, view=info.view)
         except StillError as error:
             raise UserError(f"{self.name} sent a still that cannot be decoded: {error}") from None
-        return AskedStill(self.name, header, item.payload, image)
+        return RequestedStill(self.name, header, item.payload, image)
 
     def command(
         self, command: str, arguments: Mapping[str, int | float | str] | None = None
@@ -195,7 +195,7 @@ class RemoteEdge:
         self._check_may_command()
         answer = self._commanded(command, arguments or {})
         if answer is None:
-            present = self._ask(Row.INFO, b"") is not None
+            present = self._ask(Channel.INFO, b"") is not None
             raise UserError(control_unanswered(self.name, who="this key") if present else self._absent())
         return answer
 
@@ -203,7 +203,7 @@ class RemoteEdge:
         self, inbox: Inbox, answer: ControlAnswer, *, until_s: float, timeout_s: float
     ) -> tuple[RoiHeader, Received]:
         """The still of that number; in between the edge is asked whether it is still to come."""
-        ask_s = time.monotonic() + _FATE_S
+        ask_s = time.monotonic() + _OUTCOME_S
         while (now_s := time.monotonic()) < until_s:
             item = inbox.get(timeout_s=min(_LOOK_S, until_s - now_s))
             header = None if item is None else _header(item)
@@ -211,12 +211,12 @@ class RemoteEdge:
                 return header, item
             if now_s >= ask_s:
                 try:
-                    self._commanded(Command.STILL_FATE, {"ask": answer.still_ask})
+                    self._commanded(Command.STILL_OUTCOME, {"ask": answer.still_request})
                 except RefusedError:
                     raise
                 except UserError:
                     pass  # an answer that cannot be used, as no answer: the still itself may come all the same
-                ask_s = now_s + _FATE_S
+                ask_s = now_s + _OUTCOME_S
         raise UserError(
             f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: "
             "the budget or the link is full"
@@ -228,7 +228,7 @@ class RemoteEdge:
             question = ControlRequest(session_id=0, command=command, arguments=arguments).pack()
         except ValueError as error:
             raise UserError(f"{command}: {error}") from None
-        data = self._ask(Row.CONTROL, question)
+        data = self._ask(Channel.CONTROL, question)
         if data is None:
             return None
         answer = self._parsed(ControlAnswer.parse, data)
@@ -240,7 +240,7 @@ class RemoteEdge:
         if refusal := self._asker.refusal(self.name):
             raise UserError(refusal)
 
-    def _ask(self, row: Row, question: bytes) -> bytes | None:
+    def _ask(self, row: Channel, question: bytes) -> bytes | None:
         try:
             return ask(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
         except zenoh.ZError:
@@ -263,7 +263,7 @@ class EdgeClient:
     """The edges that can be reached from one place; a context manager. ``client["uav-1"]`` is one of them."""
 
     def __init__(
-        self, session: zenoh.Session, *, asker: Asker | None = None, stack: ExitStack | None = None
+        self, session: zenoh.Session, *, asker: Requester | None = None, stack: ExitStack | None = None
     ) -> None:
         self._session = session
         self._asker = asker
@@ -278,7 +278,7 @@ class EdgeClient:
         """
         stack = ExitStack()
         settings = LinkSettings(role="asker", connect=endpoints, zenoh_config=zenoh_config)
-        return cls(stack.enter_context(open_session(settings)), asker=Asker.of(settings), stack=stack)
+        return cls(stack.enter_context(open_session(settings)), asker=Requester.of(settings), stack=stack)
 
     def nobody(self) -> str:
         """What to tell a user where `names` is empty."""
@@ -286,7 +286,7 @@ class EdgeClient:
 
     def names(self) -> list[str]:
         """The edges that are there now."""
-        replies = self._session.liveliness().get(selector(Row.ALIVE), timeout=_ANSWER_S)
+        replies = self._session.liveliness().get(selector(Channel.ALIVE), timeout=_ANSWER_S)
         keys = [parse_key(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None]
         return sorted({key[0] for key in keys if key is not None})
 
@@ -330,4 +330,4 @@ def _header(item: Received) -> RoiHeader | None:
 
 
 def _is_answer(header: RoiHeader, answer: ControlAnswer) -> bool:
-    return header.session_id == answer.session_id and header.parameters.get("ask") == answer.still_ask
+    return header.session_id == answer.session_id and header.parameters.get("ask") == answer.still_request

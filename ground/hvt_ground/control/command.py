@@ -11,7 +11,7 @@ from typing import NoReturn
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
 from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s
-from hvt_ground.control.api import AskedStill, EdgeClient, RemoteEdge, check_suffix
+from hvt_ground.control.api import EdgeClient, RemoteEdge, RequestedStill, check_suffix
 
 __all__ = ["COMMANDS", "run"]
 
@@ -82,7 +82,7 @@ def _still(arguments: argparse.Namespace) -> Callable[[RemoteEdge], None]:
     return do
 
 
-def _described(still: AskedStill) -> str:
+def _described(still: RequestedStill) -> str:
     header, (height, width) = still.header, still.image_bgr.shape[:2]
     x1, y1, x2, y2 = header.crop_source_px
     whose = f"track {header.track_id}, {header.class_name}" if header.track_id >= 0 else "box"

@@ -7,31 +7,31 @@ from pathlib import Path
 
 import zenoh
 
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 
-__all__ = ["Asker", "who_is_seen_by_way_of"]
+__all__ = ["Requester", "who_is_seen_by_way_of"]
 
 
 @dataclass(frozen=True, slots=True)
-class Asker:
+class Requester:
     """What our own file lets us do."""
 
     file: Path | None = None
     rights: Rights = field(default_factory=Rights)
 
     @classmethod
-    def of(cls, settings: LinkSettings) -> Asker:
+    def of(cls, settings: LinkSettings) -> Requester:
         """From the settings of the session; `UserError` where they cannot be used."""
         return cls(settings.zenoh_config, Rights.of(configure(settings)[0]))
 
     def refusal(self, edge: str) -> str:
         """Why ``control`` of this edge need not be tried; empty where our own file allows it."""
-        key = EdgeKeys(edge).key(Row.CONTROL)
+        key = EdgeKeys(edge).key(Channel.CONTROL)
         if self.rights.allow_somebody(flow="egress", message="query", key=key):
             return ""
-        if self.rights.allow_somebody(flow="egress", message="query", key=EdgeKeys(edge).key(Row.INFO)):
+        if self.rights.allow_somebody(flow="egress", message="query", key=EdgeKeys(edge).key(Channel.INFO)):
             return (
                 f"{self.file} lets us watch {edge}, not command it: a key that hvt-ground keys add-ground makes "
                 "without --watch-only may"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-__all__ = ["Rivals"]
+__all__ = ["DuplicatePublishers"]
 
 _SECOND_NS = 1_000_000_000
 _AGAIN_NS = 60 * _SECOND_NS
 """Between two warnings: sessions' ids cost a forger nothing, and a log is not to fill."""
 
 
-class Rivals:
+class DuplicatePublishers:
     """Notes the sessions of a second edge with the id of ``edge``."""
 
     def __init__(self, edge: str) -> None:

@@ -7,12 +7,12 @@ from collections import deque
 from hvt_common.protocol.messages import RoiHeader, Status
 from hvt_common.transport.inbox import Received
 
-__all__ = ["Early"]
+__all__ = ["PreSessionBuffer"]
 
 _MOST_STILLS = 16
 
 
-class Early:
+class PreSessionBuffer:
     """Holds the first report and the newest stills that came while no session was open."""
 
     def __init__(self) -> None:

@@ -13,9 +13,9 @@ keyframe never waits: what is missing before it no longer matters.
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
 `ADOPTION_INTERVAL_NS`: late units of the old session or a flood of invented ids cannot make the picture jump to
-and fro. Where the present session still goes on `RIVAL_AFTER_NS` after another was first heard, that is no restart
-but a second edge of the same name: a *rival*, which is shown only when the first has been silent for
-`RIVAL_SILENCE_NS`. A session that was left may come back, but only beyond where it had been. One that the edge
+and fro. Where the present session still goes on `DUPLICATE_AFTER_NS` after another was first heard, that is no
+restart but a second edge of the same name: a *rival*, which is shown only when the first has been silent for
+`DUPLICATE_SILENCE_NS`. A session that was left may come back, but only beyond where it had been. One that the edge
 does not know (`Reassembler.disown`) is nobody's, and the one before it goes on.
 
 *Plausibility.* A sequence number or frame index that is further ahead than `MAX_RATE_HZ` allows since the last
@@ -54,8 +54,8 @@ REORDER_UNITS = 2
 REORDER_WAIT_NS = 100_000_000
 SILENCE_NS = 500_000_000
 ADOPTION_INTERVAL_NS = 1_000_000_000
-RIVAL_AFTER_NS = 1_000_000_000
-RIVAL_SILENCE_NS = 5_000_000_000
+DUPLICATE_AFTER_NS = 1_000_000_000
+DUPLICATE_SILENCE_NS = 5_000_000_000
 RESTART_SILENCE_NS = 2_000_000_000
 MAX_RATE_HZ = 240
 SEQUENCE_SLACK = 64
@@ -113,7 +113,7 @@ class Arrival(Generic[H]):
     """The first unit of another session, or of one whose count was lost: reset whatever counts frames."""
     lost_before: int = 0
     """How many units were given up just before this one; above 0 it is the end of a gap."""
-    rival: bool = False
+    duplicate: bool = False
     """Foreign, and the present session goes on beside it: two edges of one name."""
 
 
@@ -183,13 +183,13 @@ class Reassembler(Generic[H]):
         if header.session_id in self._disowned:
             return [self._judged(unit, "foreign")]
         if self._adopted_ns is None or header.session_id != self._session:
-            rival = self._is_rival(header.session_id, now_ns)
+            duplicate = self._is_duplicate(header.session_id, now_ns)
             patience_ns = max(SILENCE_NS, 3 * self._interval_ns)
             return self._accept_outsider(
                 unit,
                 "foreign",
-                patience_ns=RIVAL_SILENCE_NS if rival else min(patience_ns, RIVAL_SILENCE_NS),
-                rival=rival,
+                patience_ns=DUPLICATE_SILENCE_NS if duplicate else min(patience_ns, DUPLICATE_SILENCE_NS),
+                duplicate=duplicate,
             )
         if self._first <= header.sequence < self._next or header.sequence in self._held:
             if now_ns - self._progress_ns < RESTART_SILENCE_NS or self._has_been(header.sequence):
@@ -306,7 +306,7 @@ class Reassembler(Generic[H]):
 
     # Between sessions.
 
-    def _is_rival(self, session_id: Hashable, now_ns: int) -> bool:
+    def _is_duplicate(self, session_id: Hashable, now_ns: int) -> bool:
         """Whether the present session has gone on for a while since that one was first heard."""
         if self._adopted_ns is None:
             return False
@@ -314,10 +314,10 @@ class Reassembler(Generic[H]):
         self._outsiders.move_to_end(session_id)
         if len(self._outsiders) > _REMEMBERED_SESSIONS:
             self._outsiders.popitem(last=False)
-        return self._progress_ns - since_ns > RIVAL_AFTER_NS
+        return self._progress_ns - since_ns > DUPLICATE_AFTER_NS
 
     def _accept_outsider(
-        self, unit: Arrival[H], refusal: Verdict, *, patience_ns: int, rival: bool = False
+        self, unit: Arrival[H], refusal: Verdict, *, patience_ns: int, duplicate: bool = False
     ) -> list[Arrival[H]]:
         """A unit that does not continue the session: adopted with a keyframe when the session is silent."""
         header, now_ns = unit.header, unit.received_ns
@@ -328,21 +328,21 @@ class Reassembler(Generic[H]):
         else:
             silent_ns, adopted_ns = now_ns - self._progress_ns, now_ns - self._adopted_ns
             too_soon = silent_ns < patience_ns or adopted_ns < ADOPTION_INTERVAL_NS
-        if not (too_soon and rival):  # while the first edge goes on, nothing of the second is missed
+        if not (too_soon and duplicate):  # while the first edge goes on, nothing of the second is missed
             self._unshown = True
         if too_soon or not header.keyframe:
-            return [self._judged(unit, refusal, rival=rival and too_soon)]
-        settled = self._leave()
+            return [self._judged(unit, refusal, duplicate=duplicate and too_soon)]
+        resolved = self._leave()
         self._adopt(header, now_ns)
         verdict = self._take(unit, now_ns)
-        return [*settled, self._judged(unit, verdict, starts_session=True)]
+        return [*resolved, self._judged(unit, verdict, starts_session=True)]
 
     def _leave(self) -> list[Arrival[H]]:
         """End the present session, if any; what waited behind a hole is skipped."""
-        settled = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
+        resolved = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
         self._held.clear()
         self._synced = False
-        return settled
+        return resolved
 
     def _adopt(self, header: H, now_ns: int) -> None:
         if self._adopted_ns is not None and header.session_id != self._session:
@@ -365,7 +365,7 @@ class Reassembler(Generic[H]):
         *,
         lost_before: int = 0,
         starts_session: bool = False,
-        rival: bool = False,
+        duplicate: bool = False,
     ) -> Arrival[H]:
         """The unit with its verdict, counted."""
         name = _COUNTER_OF[verdict]
@@ -380,5 +380,5 @@ class Reassembler(Generic[H]):
             starts_run=starts_run,
             starts_session=starts_session,
             lost_before=lost_before,
-            rival=rival,
+            duplicate=duplicate,
         )

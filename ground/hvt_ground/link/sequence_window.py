@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterable
 
-__all__ = ["NumbersSeen"]
+__all__ = ["SequenceWindow"]
 
 _PAGE_BITS = 12
 
 
-class NumbersSeen:
+class SequenceWindow:
     """A set of numbers from 0, one bit each. What was missed long ago may still come, and is known to be new.
 
     Args:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
 
-__all__ = ["REPORT_LINE_BYTES", "Measured", "Reception"]
+__all__ = ["REPORT_LINE_BYTES", "Measured", "ReceptionStatistics"]
 
 _MS = 1_000_000
 _SECOND_NS = 1_000_000_000
@@ -41,7 +41,7 @@ class Measured:
     """Of the base messages since the last report."""
 
 
-class Reception:
+class ReceptionStatistics:
     """Of one session. ``now_ns`` is one clock without steps in all calls.
 
     Safe for threads: messages come in one, and a still that was read in another is reported at once.
@@ -82,7 +82,7 @@ class Reception:
                 self._still_sequence = sequence
             self._note(size_bytes, arrived_ns)
 
-    def past(self, *, size_bytes: int, arrived_ns: int) -> None:
+    def backlog(self, *, size_bytes: int, arrived_ns: int) -> None:
         """A piece of what was kept while the link was away has arrived."""
         with self._lock:
             self._note(size_bytes, arrived_ns)

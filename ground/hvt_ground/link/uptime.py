@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-__all__ = ["LivedTime"]
+__all__ = ["Uptime"]
 
 
-class LivedTime:
+class Uptime:
     """Counts a gap between two messages only as far as both their arrival and their handling show it.
 
     While the thread was away the sender was not silent, so by arrival the gap is small. And a sender that waited for

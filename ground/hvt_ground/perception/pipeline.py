@@ -23,7 +23,7 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, Shown
 from hvt_ground.perception.stills.stage import Carried, Moment, StillStage
 
-__all__ = ["GroundSight", "Picture", "ReceivedStill", "SightParts"]
+__all__ = ["Picture", "Pipeline", "PipelineParts", "ReceivedStill"]
 
 _SECOND_NS = 1_000_000_000
 _FARTHEST_S = 5
@@ -57,7 +57,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class SightParts:
+class PipelineParts:
     """What the eyes of one session are made of; none of it may be shared with another session."""
 
     detector: Detector
@@ -74,7 +74,7 @@ class SightParts:
     """Called when the session has ended: its models may serve another."""
 
 
-class GroundSight:
+class Pipeline:
     """One session's eyes. Used by one thread; ``emit`` takes the events.
 
     Args:
@@ -88,7 +88,7 @@ class GroundSight:
 
     def __init__(
         self,
-        parts: SightParts,
+        parts: PipelineParts,
         *,
         view: View,
         fps: float,

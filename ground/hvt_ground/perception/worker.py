@@ -14,11 +14,11 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
-from hvt_common.runtime.priority import give_way
+from hvt_common.runtime.priority import lower_priority
 from hvt_common.values import Tracks
 from hvt_ground.perception.pipeline import Picture, ReceivedStill
 
-__all__ = ["Eyes", "LockstepEyes", "RealtimeEyes"]
+__all__ = ["LockstepWorker", "PerceptionWorker", "RealtimeWorker"]
 
 _WAITING_PICTURES = 24
 """How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
@@ -50,7 +50,7 @@ Work = Generator[None, None, object]
 """Done step by step."""
 
 
-class Eyes(Protocol):
+class PerceptionWorker(Protocol):
     """Where the receiving thread hands over what is to be seen."""
 
     untracked: int
@@ -97,7 +97,7 @@ class Eyes(Protocol):
         ...
 
 
-class RealtimeEyes:
+class RealtimeWorker:
     """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still."""
 
     def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
@@ -200,7 +200,7 @@ class RealtimeEyes:
             raise error
 
     def _run(self) -> None:
-        give_way()
+        lower_priority()
         try:
             while not self._given_up.is_set():
                 self._wake.wait(0.2)
@@ -251,7 +251,7 @@ class RealtimeEyes:
             self._later_s = time.monotonic()
 
 
-class LockstepEyes:
+class LockstepWorker:
     """Sees one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
 
     def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:

@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from hvt_common.protocol.channels import DELIVERIES, ROOT, Direction, EdgeKeys, Row
+from hvt_common.protocol.channels import DELIVERIES, ROOT, Channel, Direction, EdgeKeys
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
 from hvt_ground.pki.roster import Ground, Roster, Router
 
@@ -94,15 +94,15 @@ def router_file(router: Router, roster: Roster, *, folder: str = KEYS_FOLDER) ->
 def _toward_edge(edge: str, *, command: bool) -> list[_Rule]:
     """What passes where an edge is at the other end."""
     keys = EdgeKeys(edge)
-    asked = [keys.key(Row.INFO), *([keys.key(Row.CONTROL)] if command else [])]
+    asked = [keys.key(Channel.INFO), *([keys.key(Channel.CONTROL)] if command else [])]
     return [
         _rule("subscribe", "egress", ["declare_subscriber"], [_EVERYBODY]),
         _rule("watch", "egress", ["declare_liveliness_subscriber", "liveliness_query"], [_EVERYBODY]),
         _rule(f"{edge}-publishes", "ingress", ["put"], _written([edge])),
         _rule(f"{edge}-answers", "ingress", ["declare_queryable", "reply"], _answered([edge])),
-        _rule(f"{edge}-is-present", "ingress", ["liveliness_token"], [keys.key(Row.ALIVE)]),
-        _rule(f"{edge}-listens", "ingress", ["declare_subscriber"], [keys.key(Row.FEEDBACK)]),
-        _rule(f"{edge}-is-told", "egress", ["put"], [keys.key(Row.FEEDBACK)]),
+        _rule(f"{edge}-is-present", "ingress", ["liveliness_token"], [keys.key(Channel.ALIVE)]),
+        _rule(f"{edge}-listens", "ingress", ["declare_subscriber"], [keys.key(Channel.FEEDBACK)]),
+        _rule(f"{edge}-is-told", "egress", ["put"], [keys.key(Channel.FEEDBACK)]),
         _rule(f"{edge}-is-asked", "egress", ["query"], asked),
     ]
 
@@ -110,28 +110,30 @@ def _toward_edge(edge: str, *, command: bool) -> list[_Rule]:
 def _toward_ground(edges: Sequence[str], *, command: bool, label: str) -> list[_Rule]:
     """What passes where a ground is at the other end that may watch these edges."""
     keys = [EdgeKeys(edge) for edge in edges]
-    asked = [Row.INFO, *([Row.CONTROL] if command else [])]
+    asked = [Channel.INFO, *([Channel.CONTROL] if command else [])]
     named = f"{label}-{'commands' if command else 'watches'}"
     return [
         _rule("subscribed", "ingress", ["declare_subscriber"], [_EVERYBODY]),
         _rule("watched", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], [_EVERYBODY]),
         _rule(f"{label}-receives", "egress", ["put"], _written(edges)),
         _rule(f"{label}-hears-answers", "egress", ["declare_queryable", "reply"], _answered(edges)),
-        _rule(f"{label}-sees", "egress", ["liveliness_token"], [one.key(Row.ALIVE) for one in keys]),
-        _rule(f"{label}-is-heard", "egress", ["declare_subscriber"], [one.key(Row.FEEDBACK) for one in keys]),
-        _rule(f"{label}-reports", "ingress", ["put"], [one.key(Row.FEEDBACK) for one in keys]),
+        _rule(f"{label}-sees", "egress", ["liveliness_token"], [one.key(Channel.ALIVE) for one in keys]),
+        _rule(
+            f"{label}-is-heard", "egress", ["declare_subscriber"], [one.key(Channel.FEEDBACK) for one in keys]
+        ),
+        _rule(f"{label}-reports", "ingress", ["put"], [one.key(Channel.FEEDBACK) for one in keys]),
         _rule(named, "ingress", ["query"], [one.key(row) for one in keys for row in asked]),
     ]
 
 
 def _written(edges: Sequence[str]) -> list[str]:
     """What edges publish."""
-    rows = [row for row in Row if DELIVERIES[row].direction is Direction.EDGE_TO_GROUND]
+    rows = [row for row in Channel if DELIVERIES[row].direction is Direction.EDGE_TO_GROUND]
     return [EdgeKeys(edge).key(row) for edge in edges for row in rows]
 
 
 def _answered(edges: Sequence[str]) -> list[str]:
-    rows = [row for row in Row if DELIVERIES[row].direction is Direction.GROUND_ASKS]
+    rows = [row for row in Channel if DELIVERIES[row].direction is Direction.GROUND_QUERIES]
     return [EdgeKeys(edge).key(row) for edge in edges for row in rows]
 
 

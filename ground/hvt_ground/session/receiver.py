@@ -9,14 +9,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from hvt_common import __version__
-from hvt_common.protocol.channels import DELIVERIES, Row, parse_key
+from hvt_common.protocol.channels import DELIVERIES, Channel, parse_key
 from hvt_common.protocol.clock_offset import ClockOffset
-from hvt_common.protocol.ledger import Channel
+from hvt_common.protocol.ledger import Account
 from hvt_common.protocol.messages import (
+    BacklogHeader,
+    BacklogKind,
     BaseHeader,
     Info,
-    PastHeader,
-    PastKind,
     RoiHeader,
     Status,
     TrackStep,
@@ -25,12 +25,12 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.inbox import Received
-from hvt_ground.backlog.delivery import PastDelivery
-from hvt_ground.backlog.recordings import PastRecording, PastRecordings
-from hvt_ground.link.duplicates import Rivals
-from hvt_ground.link.pre_session import Early
+from hvt_ground.backlog.delivery import BacklogDelivery
+from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
+from hvt_ground.link.duplicates import DuplicatePublishers
+from hvt_ground.link.pre_session import PreSessionBuffer
 from hvt_ground.link.reassemble import Arrival, Counters, Reassembler
-from hvt_ground.link.uptime import LivedTime
+from hvt_ground.link.uptime import Uptime
 from hvt_ground.session.receiver_report import Reports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort
@@ -58,7 +58,7 @@ class EdgeReceiver:
         port: of the edge.
         open_session: makes what the messages of a session go to.
         clock: the port's, Unix nanoseconds without steps; one of its own by default.
-        open_past: makes what goes to a session that is over; without it nothing of one is taken.
+        open_backlog: makes what goes to a session that is over; without it nothing of one is taken.
         patience_s: an edge whose token is gone and that sends nothing for so long has ended without saying so.
     """
 
@@ -68,7 +68,7 @@ class EdgeReceiver:
         *,
         open_session: Callable[[Info, EdgeReceiver], GroundSession],
         clock: Callable[[], int] | None = None,
-        open_past: Callable[[Info], PastRecording] | None = None,
+        open_backlog: Callable[[Info], BacklogRecording] | None = None,
         patience_s: float = 5.0,
     ) -> None:
         self.port = port
@@ -85,21 +85,21 @@ class EdgeReceiver:
         self._patience_ns = round(patience_s * _SECOND_NS)
         self._ended_ns: int | None = None
         self._ended_id: int | None = None
-        self._early = Early()
-        self._rivals = Rivals(port.edge)
-        self.past = PastDelivery(
-            port.edge, recordings=None if open_past is None else PastRecordings(open_past)
+        self._early = PreSessionBuffer()
+        self._duplicates = DuplicatePublishers(port.edge)
+        self.backlog = BacklogDelivery(
+            port.edge, recordings=None if open_backlog is None else BacklogRecordings(open_backlog)
         )
         """What was kept while the link was away."""
-        self._reports = Reports(port, clock=self._clock, clock_offset=self.clock_offset, past=self.past)
-        self._past_ns: int | None = None
+        self._reports = Reports(port, clock=self._clock, clock_offset=self.clock_offset, backlog=self.backlog)
+        self._backlog_ns: int | None = None
         """When the last piece of it came, of which nothing has been told yet."""
         self._worked_ns = 0
         self._stop_ns = 0
         self._counted = Counters()
         """The counters when the session before ended."""
         self._heard_ns = time.monotonic_ns()
-        self._time = LivedTime()
+        self._time = Uptime()
         """That the reassembly goes by."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"hvt-receive-{port.edge}", daemon=True)
@@ -127,24 +127,24 @@ class EdgeReceiver:
     def _run(self) -> None:
         try:
             while not self._finished():
-                item = self.port.inbox.get(timeout_s=0.0 if self.past.has_work else 0.05)
+                item = self.port.inbox.get(timeout_s=0.0 if self.backlog.has_work else 0.05)
                 if item is not None:
                     self._handle(item)
-                self._work_on_past(came=item is not None)
+                self._work_on_backlog(came=item is not None)
                 self._keep_house()
             self._end_session()
-            self.past.close()
+            self.backlog.close()
         except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
             self.error = error
 
-    def _work_on_past(self, *, came: bool) -> None:
+    def _work_on_backlog(self, *, came: bool) -> None:
         """A frame of it when nothing came, and where something always does ten a second."""
-        if not self.past.has_work:
+        if not self.backlog.has_work:
             return
         now_ns = time.monotonic_ns()
         if not came or now_ns - self._worked_ns > _SECOND_NS // 10:
             self._worked_ns = now_ns
-            self.past.work()
+            self.backlog.work()
 
     def _finished(self) -> bool:
         if not self._stop.is_set():
@@ -157,25 +157,25 @@ class EdgeReceiver:
         parsed = parse_key(item.key)
         row = parsed[1] if parsed else None
         try:
-            if row is Row.BASE:
+            if row is Channel.BASE:
                 self._base(BaseHeader.parse(item.attachment, item.payload), item, at_ns=at_ns)
-            elif row is Row.ROI:
+            elif row is Channel.ROI:
                 self._still(RoiHeader.parse(item.attachment, item.payload), item)
-            elif row is Row.TRACKS:
+            elif row is Channel.TRACKS:
                 self._tracks(TrackStep.parse(item.payload), item)
-            elif row is Row.PAST:
-                self._past(PastHeader.parse(item.attachment, item.payload), item)
-            elif row is Row.STATUS:
+            elif row is Channel.BACKLOG:
+                self._backlog(BacklogHeader.parse(item.attachment, item.payload), item)
+            elif row is Channel.STATUS:
                 self._status(Status.parse(item.payload), item)
         except WireError as error:
-            if row is Row.BASE:
+            if row is Channel.BASE:
                 self.reassembler.corrupt()
             self._skip(str(row), error)
 
     def _base(self, header: BaseHeader, item: Received, *, at_ns: int) -> None:
         for arrival in self.reassembler.accept(header, item.payload, now_ns=at_ns):
-            if arrival.rival:
-                self._note_rival(arrival.header.session_id)
+            if arrival.duplicate:
+                self._note_duplicate(arrival.header.session_id)
             if (arrival.starts_session and not self._goes_on(arrival.header)) or (
                 arrival.starts_run and self._may_resume(arrival.header.session_id)
             ):
@@ -198,7 +198,7 @@ class EdgeReceiver:
             own = replace(item, payload=arrival.payload, attachment=arrival.header.pack(arrival.payload))
         # Of one that waited behind a hole only the number counts: the time is that of the message that freed it.
         if own is item:
-            self._reports.reception.base(
+            self._reports.reception_statistics.base(
                 arrival.header,
                 size_bytes=own.size_bytes,
                 arrived_ns=item.received_ns,
@@ -216,8 +216,8 @@ class EdgeReceiver:
         if header.session_id != session.info.session_id:
             self._skip_stranger("roi", header.session_id)
             return
-        media_type = item.encoding.partition(";")[0] or DELIVERIES[Row.ROI].encoding
-        self._reports.reception.still(
+        media_type = item.encoding.partition(";")[0] or DELIVERIES[Channel.ROI].encoding
+        self._reports.reception_statistics.still(
             header.sequence, size_bytes=item.size_bytes, arrived_ns=item.received_ns
         )
         session.still(header, item, media_type=media_type)
@@ -229,20 +229,20 @@ class EdgeReceiver:
             return
         session.tracks(step, item)
 
-    def _past(self, header: PastHeader, item: Received) -> None:
+    def _backlog(self, header: BacklogHeader, item: Received) -> None:
         session = self.session
         if session is None:
-            self._skip("past", WireError("it was kept, and no session is open to take it"))
+            self._skip("backlog", WireError("it was kept, and no session is open to take it"))
             return
-        self._reports.reception.past(size_bytes=item.size_bytes, arrived_ns=item.received_ns)
-        self._past_ns = time.monotonic_ns()
+        self._reports.reception_statistics.backlog(size_bytes=item.size_bytes, arrived_ns=item.received_ns)
+        self._backlog_ns = time.monotonic_ns()
         delivered = False
         try:
-            delivered = self.past.piece(header, item.payload, session=session)
+            delivered = self.backlog.chunk(header, item.payload, session=session)
         finally:
-            session.past_piece(header, item, delivered=delivered)
-        if delivered and header.kind == PastKind.STILL and header.session_id == session.info.session_id:
-            self._reports.reception.stored_still(header.number)
+            session.backlog_chunk(header, item, delivered=delivered)
+        if delivered and header.kind == BacklogKind.STILL and header.session_id == session.info.session_id:
+            self._reports.reception_statistics.stored_still(header.number)
 
     def _status(self, status: Status, item: Received) -> None:
         session = self.session
@@ -322,12 +322,12 @@ class EdgeReceiver:
         session.counters = self.reassembler.counters.since(self._counted)
         self.done.append(session)
         try:
-            self.past.finish()
+            self.backlog.finish()
             session.close()
             self._report(session)
-            while self.past.unsaid:  # one report names a few
+            while self.backlog.unsaid:  # one report names a few
                 self._report(session)
-            self.past.session_ended(session.info)
+            self.backlog.session_ended(session.info)
         finally:
             self._counted = replace(self.reassembler.counters)
 
@@ -350,10 +350,10 @@ class EdgeReceiver:
         if session is None:
             return
         session.raise_error()
-        if self._past_ns is not None and now_ns - self._past_ns > _TELL_NS and self.past.idle:
-            self._past_ns = None
-            session.tell_past()
-        if self._reports.reception.due(now_ns=self._clock()):
+        if self._backlog_ns is not None and now_ns - self._backlog_ns > _TELL_NS and self.backlog.idle:
+            self._backlog_ns = None
+            session.report_backlog()
+        if self._reports.reception_statistics.due(now_ns=self._clock()):
             self._report(session)
         if self._is_over(session, now_ns):
             gone = self._ended_ns is None
@@ -364,31 +364,33 @@ class EdgeReceiver:
     def _is_over(self, session: GroundSession, now_ns: int) -> bool:
         if self._ended_ns is not None and session.last_status is not None:
             last, messages = session.last_status, session.ledger.messages
-            wanted = last.base_messages, last.roi_messages, last.past_messages
-            have = session.frames_received, messages(Channel.ROI), messages(Channel.PAST)
+            wanted = last.base_messages, last.roi_messages, last.backlog_messages
+            acknowledged_range = session.frames_received, messages(Account.ROI), messages(Account.BACKLOG)
             # A report does not count itself. Track steps have no number of their own there: they are metadata.
-            metadata = messages(Channel.META) > last.meta_messages
-            whole = metadata and all(one >= other for one, other in zip(have, wanted, strict=True))
-            return (whole and self.past.idle) or now_ns - self._ended_ns > _ENDED_PATIENCE_NS
+            metadata = messages(Account.META) > last.meta_messages
+            whole = metadata and all(
+                one >= other for one, other in zip(acknowledged_range, wanted, strict=True)
+            )
+            return (whole and self.backlog.idle) or now_ns - self._ended_ns > _ENDED_PATIENCE_NS
         return not self.port.present.is_set() and now_ns - self._heard_ns > self._patience_ns
 
     def _report(self, session: GroundSession) -> None:
         counters = self.reassembler.counters.since(self._counted)
         self._reports.send(session, lost=counters.lost, corrupt=counters.corrupt)
 
-    def _note_rival(self, session_id: int) -> None:
+    def _note_duplicate(self, session_id: int) -> None:
         """A second edge of this id is there, and not shown."""
         if self.session is None:
             return
         shown, now_ns = self.session.info.session_id, time.monotonic_ns()
-        text = self._rivals.note(session_id, shown=shown, now_ns=now_ns)
+        text = self._duplicates.note(session_id, shown=shown, now_ns=now_ns)
         if text is not None:
             _log.warning("%s", text)
             self.session.note("warning", text)
 
     def _skip_stranger(self, row: str, session_id: int) -> None:
         """What is of neither this session nor the one that follows."""
-        if self._rivals.knows(session_id):
+        if self._duplicates.knows(session_id):
             self.unusable += 1
         else:
             self._skip(row, WireError(f"it belongs to the session {session_id:016x}, which is not shown"))

@@ -7,10 +7,10 @@ import threading
 from collections.abc import Callable
 
 from hvt_common.protocol.clock_offset import ClockOffset
-from hvt_common.protocol.messages import MAX_PAST_HAVES, MAX_STILL_RESULTS, BaseHeader, Feedback
+from hvt_common.protocol.messages import MAX_ACKNOWLEDGED_RANGES, MAX_STILL_RESULTS, BaseHeader, Feedback
 from hvt_common.transport.inbox import Received
-from hvt_ground.backlog.delivery import PastDelivery
-from hvt_ground.link.statistics import Reception
+from hvt_ground.backlog.delivery import BacklogDelivery
+from hvt_ground.link.statistics import ReceptionStatistics
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort
 
@@ -30,22 +30,22 @@ class Reports:
     """
 
     def __init__(
-        self, port: EdgePort, *, clock: Callable[[], int], clock_offset: ClockOffset, past: PastDelivery
+        self, port: EdgePort, *, clock: Callable[[], int], clock_offset: ClockOffset, backlog: BacklogDelivery
     ) -> None:
         self._port = port
         self._clock = clock
         self._clock_offset = clock_offset
-        self._past = past
+        self._backlog = backlog
         self._receiver_id = secrets.randbits(64)
         self._sequence = 0
         self._lock = threading.Lock()
-        self.reception = Reception()
+        self.reception_statistics = ReceptionStatistics()
         """Of the session that is open."""
 
     def begin(self, *, lockstep: bool) -> None:
         """Another session is open."""
         with self._lock:
-            self.reception = Reception(lockstep=lockstep)
+            self.reception_statistics = ReceptionStatistics(lockstep=lockstep)
 
     def delay_ms(self, header: BaseHeader, item: Received) -> float:
         """How old an access unit was when it came, clocks reconciled."""
@@ -55,7 +55,7 @@ class Reports:
         """Report on a session as it is now; ``lost`` and ``corrupt`` count messages."""
         with self._lock:
             send_ns = self._clock()
-            measured = self.reception.take(send_ns)
+            measured = self.reception_statistics.take(send_ns)
             delay_ms = measured.delay_p50_ms
             error_ns = self._clock_offset.error_ns
             feedback = Feedback(
@@ -78,7 +78,7 @@ class Reports:
                 clock_offset_ns=self._clock_offset.offset_ns or 0,
                 clock_error_ns=-1 if error_ns is None else error_ns,
                 stills=session.take_results(MAX_STILL_RESULTS),
-                past=self._past.take_haves(MAX_PAST_HAVES),
+                backlog=self._backlog.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES),
             )
             self._sequence += 1
             self._port.report(feedback)

@@ -8,13 +8,13 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hvt_common.protocol.channels import EdgeKeys, Row
-from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import (
+    BacklogHeader,
+    BacklogUnit,
     BaseHeader,
     Info,
-    PastHeader,
-    PastUnit,
     RoiHeader,
     Status,
     StillResult,
@@ -25,13 +25,13 @@ from hvt_common.runtime.latency import LatencyStats
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
-from hvt_ground.backlog.fill import Arrived, PastFill, Work
-from hvt_ground.backlog.perception import PastLook
+from hvt_ground.backlog.fill import Arrived, BacklogFill, Work
+from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.events.events import Event, Notice, Traffic, VideoSample
 from hvt_ground.link.reassemble import Counters
-from hvt_ground.perception.pipeline import GroundSight, Picture, ReceivedStill
-from hvt_ground.perception.stills.numbers import StillNumbers
-from hvt_ground.perception.worker import Eyes, LockstepEyes, RealtimeEyes
+from hvt_ground.perception.pipeline import Picture, Pipeline, ReceivedStill
+from hvt_ground.perception.stills.numbers import StillSequenceWindow
+from hvt_ground.perception.worker import LockstepWorker, PerceptionWorker, RealtimeWorker
 from hvt_ground.sinks.rerun.recorder import Recorder
 from hvt_ground.sinks.timing import SessionTiming
 from hvt_ground.sinks.tracks_table import TrackTable
@@ -51,8 +51,8 @@ class GroundSession:
 
     In lockstep it sees in the receiving thread instead: nothing is skipped, and the same input gives the same tracks.
 
-    ``sight_of(emit)`` builds the eyes. ``report()`` is called when there is something for the edge to hear.
-    ``past_look`` finds boxes in video that was kept while the link was away.
+    ``pipeline_of(emit)`` builds the eyes. ``report()`` is called when there is something for the edge to hear.
+    ``backlog_perception`` finds boxes in video that was kept while the link was away.
     """
 
     def __init__(
@@ -63,11 +63,11 @@ class GroundSession:
         recording: Path | None,
         tables: Sequence[TrackTable] = (),
         timing: SessionTiming | None = None,
-        sight_of: Callable[[Callable[[Event], None]], GroundSight],
+        pipeline_of: Callable[[Callable[[Event], None]], Pipeline],
         to_local_ns: Callable[[int], int],
         clock: Callable[[], int],
         report: Callable[[], None],
-        past_look: PastLook | None = None,
+        backlog_perception: BacklogPerception | None = None,
     ) -> None:
         self.info = info
         self.recorder = recorder
@@ -76,7 +76,7 @@ class GroundSession:
         self._timing = timing
         self.lockstep = info.pace == "lockstep"
         self.ledger = Ledger(window_ns=info.window_ns)
-        self.sight = sight_of(self._emit)
+        self.pipeline = pipeline_of(self._emit)
         self.receive_latency = LatencyStats()
         self.overlay_latency = LatencyStats()
         self.frames_decoded = 0
@@ -104,10 +104,10 @@ class GroundSession:
         self._next_traffic_ns = 0
         self._results: list[StillResult] = []
         self._results_lock = threading.Lock()
-        self._still_numbers = StillNumbers()
-        self._past = PastFill(info, log=self._log_past, look=past_look)
-        eyes = LockstepEyes if self.lockstep else RealtimeEyes
-        self._eyes: Eyes = eyes(self._see, self._step, self._read, name=info.edge)
+        self._still_window = StillSequenceWindow()
+        self._backlog = BacklogFill(info, log=self._log_backlog, look=backlog_perception)
+        worker = LockstepWorker if self.lockstep else RealtimeWorker
+        self._worker: PerceptionWorker = worker(self._see, self._step, self._read, name=info.edge)
 
     # What the receiving thread brings
 
@@ -116,7 +116,7 @@ class GroundSession:
         good = self._access_unit(header, item, decode=decode, starts_run=starts_run)
         if self._timing is not None:
             self._timing.message(
-                Row.BASE,
+                Channel.BASE,
                 item,
                 sequence=header.sequence,
                 frame_index=header.frame_index,
@@ -128,7 +128,7 @@ class GroundSession:
 
     def _access_unit(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
         at_ns = header.send_ns
-        self._count(Row.BASE, Channel.BASE, item, at_ns=at_ns)
+        self._count(Channel.BASE, Account.BASE, item, at_ns=at_ns)
         self.frames_received += 1
         if self._first_index is None:
             self._first_index = header.frame_index
@@ -142,21 +142,21 @@ class GroundSession:
             return False
         self.frames_decoded += 1
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
-        self._past.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
+        self._backlog.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
         reference_ns = item.received_ns if self.lockstep else self._to_local_ns(header.capture_ns)
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
-        self._eyes.picture(Picture(header.frame_index, header.capture_ns, reference_ns, image))
+        self._worker.picture(Picture(header.frame_index, header.capture_ns, reference_ns, image))
         self._traffic(at_ns)
         return True
 
     def still(self, header: RoiHeader, item: Received, *, media_type: str) -> None:
         """Take one still; a second one of the same number is counted and not shown, a third ignored."""
-        if not self._still_numbers.is_new(header.sequence, send_ns=header.send_ns):
-            if self._still_numbers.is_copy(header.sequence, send_ns=header.send_ns):
-                self._count(Row.ROI, Channel.ROI, item, at_ns=header.send_ns)
+        if not self._still_window.is_new(header.sequence, send_ns=header.send_ns):
+            if self._still_window.is_copy(header.sequence, send_ns=header.send_ns):
+                self._count(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
             return
-        self._count(Row.ROI, Channel.ROI, item, at_ns=header.send_ns)
+        self._count(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
         if self._timing is not None:
             self._timing.still(
                 item,
@@ -166,9 +166,9 @@ class GroundSession:
                 send_ns=header.send_ns,
             )
         self.stills_received += 1
-        self.ledger.record_fate("received", header.reason)
+        self.ledger.record_outcome("received", header.reason)
         still = ReceivedStill(header, item.payload, media_type)
-        self._eyes.still(still)
+        self._worker.still(still)
 
     def tracks(self, step: TrackStep, item: Received) -> None:
         """Take what the edge tracked at one tick; one that is not newer than the last is ignored.
@@ -182,12 +182,12 @@ class GroundSession:
                 return
             self._step_decoder = TrackStepDecoder()
         self._last_step, self._stepped_ns = step.sequence, now_ns
-        self._count(Row.TRACKS, Channel.META, item, at_ns=step.send_ns)
+        self._count(Channel.TRACKS, Account.META, item, at_ns=step.send_ns)
         self.steps_received += 1
         tracks = self._step_decoder.decode(step)
         if self._timing is not None:
             self._timing.message(
-                Row.TRACKS,
+                Channel.TRACKS,
                 item,
                 sequence=step.sequence,
                 frame_index=step.frame_index,
@@ -196,7 +196,7 @@ class GroundSession:
                 shown=tracks is not None,
             )
         if tracks is not None:
-            self._eyes.step(tracks, step.capture_ns)
+            self._worker.step(tracks, step.capture_ns)
 
     def status(self, status: Status, item: Received) -> None:
         """Take the edge's report; one that is not newer than the last is ignored."""
@@ -205,29 +205,29 @@ class GroundSession:
         if old and now_ns - self._reported_ns < _ANEW_NS:
             return
         self._reported_ns = now_ns
-        self._count(Row.STATUS, Channel.META, item, at_ns=status.send_ns)
+        self._count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
         if self._timing is not None:
-            self._timing.message(Row.STATUS, item, sequence=status.sequence, send_ns=status.send_ns)
+            self._timing.message(Channel.STATUS, item, sequence=status.sequence, send_ns=status.send_ns)
         self.last_status = status
 
     # What was kept while the link was away
 
     @property
-    def past(self) -> Arrived:
+    def backlog(self) -> Arrived:
         """How much of it has come."""
-        return self._past.arrived
+        return self._backlog.arrived
 
     @property
     def has_room(self) -> bool:
         """Whether `later` takes more."""
-        return self._eyes.has_room
+        return self._worker.has_room
 
-    def past_piece(self, header: PastHeader, item: Received, *, delivered: bool) -> None:
+    def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
         """Count a piece, of whichever session; ``delivered``: with it an object was whole, and is of use."""
-        self._count(Row.PAST, Channel.PAST, item, at_ns=header.send_ns)
+        self._count(Channel.BACKLOG, Account.BACKLOG, item, at_ns=header.send_ns)
         if self._timing is not None:
             self._timing.message(
-                f"{Row.PAST}-{header.kind}",
+                f"{Channel.BACKLOG}-{header.kind}",
                 item,
                 sequence=header.number,
                 send_ns=header.send_ns,
@@ -236,25 +236,25 @@ class GroundSession:
 
     def stored_still(self, still: ReceivedStill) -> Work | None:
         """What the eyes are to do with a still of this session; None where it has come before, on whichever way."""
-        if not self._still_numbers.is_new_stored(still.header.sequence):
+        if not self._still_window.is_new_stored(still.header.sequence):
             return None
         return self._read_stored(still)
 
-    def stored_video(self, units: Sequence[PastUnit]) -> Work:
+    def stored_video(self, units: Sequence[BacklogUnit]) -> Work:
         """What the receiving thread is to do with a stretch of this session's base stream, when nothing comes."""
-        return self._past.fill(units, boxes=self.at_leisure)
+        return self._backlog.fill(units, boxes=self.at_leisure)
 
     def later(self, work: Work) -> bool:
         """Let the eyes do it, as far as the picture of now leaves them time; False where too much waits already."""
-        return self._eyes.later(work)
+        return self._worker.later(work)
 
     def at_leisure(self, work: Work) -> bool:
         """The same for what gives way to that, too."""
-        return self._eyes.at_leisure(work)
+        return self._worker.at_leisure(work)
 
-    def tell_past(self) -> None:
+    def report_backlog(self) -> None:
         """Put a line into the recording's log on what has come since the last one."""
-        news = self._past.take_news()
+        news = self._backlog.take_news()
         if news.first is not None:
             at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // _SECOND_NS))
             self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
@@ -285,9 +285,9 @@ class GroundSession:
     def close(self) -> None:
         """Finish what waits (for a second or two), close the recording, raise what went wrong in the thread."""
         try:
-            if self._eyes.close():
-                self.sight.end()
-            self.tell_past()
+            if self._worker.close():
+                self.pipeline.end()
+            self.report_backlog()
             self._decoder.reset()
             self.note("info", f"session {self.info.session_id:016x} ended")
         finally:
@@ -302,26 +302,26 @@ class GroundSession:
     @property
     def frames_untracked(self) -> int:
         """Frames that were decoded, and passed over by detection and tracking."""
-        return self._eyes.untracked
+        return self._worker.untracked
 
     @property
     def stills_dropped(self) -> Counter[str]:
         """Stills of which nothing was made, by reason."""
-        return +(self.sight.stills_dropped + self._eyes.dropped)
+        return +(self.pipeline.stills_dropped + self._worker.dropped)
 
     @property
     def idle(self) -> bool:
         """Nothing waits to be seen."""
-        return self._eyes.idle
+        return self._worker.idle
 
     def raise_error(self) -> None:
         """Raise what went wrong while seeing."""
-        self._eyes.raise_error()
+        self._worker.raise_error()
 
     # Seeing, in the thread of the eyes
 
     def _see(self, picture: Picture, hurry: bool) -> None:  # noqa: FBT001 - called by the eyes only
-        self.sight.see(picture, hurry=hurry)
+        self.pipeline.see(picture, hurry=hurry)
         self.last_frame_index = picture.frame_index
         self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
         self._hear_results()
@@ -329,19 +329,19 @@ class GroundSession:
             self._report()
 
     def _step(self, tracks: Tracks, capture_ns: int) -> None:
-        self.sight.edge_step(tracks, capture_ns=capture_ns)
+        self.pipeline.edge_step(tracks, capture_ns=capture_ns)
         self._hear_results()
 
     def _read(self, stills: Sequence[ReceivedStill]) -> None:
-        self.sight.read(stills)
+        self.pipeline.read(stills)
         if self._timing is not None:
             self._timing.read(one.header.sequence for one in stills)
         self._hear_results()
         self._report()
 
     def _read_stored(self, still: ReceivedStill) -> Work:
-        self.sight.read([still])
-        self._past.note_still(still.header.frame_index, still.header.capture_ns)
+        self.pipeline.read([still])
+        self._backlog.note_still(still.header.frame_index, still.header.capture_ns)
         self._hear_results()
         self._report()
         yield
@@ -349,11 +349,11 @@ class GroundSession:
 
     def _hear_results(self) -> None:
         with self._results_lock:
-            self._results = (self._results + self.sight.take_results())[-_MOST_RESULTS:]
+            self._results = (self._results + self.pipeline.take_results())[-_MOST_RESULTS:]
 
     # Account
 
-    def _count(self, row: Row, channel: Channel, item: Received, *, at_ns: int) -> None:
+    def _count(self, row: Channel, channel: Account, item: Received, *, at_ns: int) -> None:
         encoding = item.encoding
         self.ledger.count(
             channel,
@@ -375,18 +375,18 @@ class GroundSession:
             Traffic(
                 frame_index=self._last_index,
                 capture_ns=self._last_capture_ns,
-                base_bps=self.ledger.window_bytes(Channel.BASE, at_ns) * to_bps,
-                roi_bps=self.ledger.window_bytes(Channel.ROI, at_ns) * to_bps,
+                base_bps=self.ledger.window_bytes(Account.BASE, at_ns) * to_bps,
+                roi_bps=self.ledger.window_bytes(Account.ROI, at_ns) * to_bps,
                 total_bps=self.ledger.window_bytes(None, at_ns) * to_bps,
                 budget_bps=self.info.budget_bps,
                 receive_latency_ms=None if self.lockstep else self.receive_latency.percentile(50),
                 overlay_latency_ms=None if self.lockstep else self.overlay_latency.percentile(50),
-                tracks=self.sight.tracks,
-                tracks_refined=self.sight.refined,
+                tracks=self.pipeline.tracks,
+                tracks_refined=self.pipeline.refined,
             )
         )
 
-    def _log_past(self, event: Event) -> None:
+    def _log_backlog(self, event: Event) -> None:
         """Into the recording only: a table of tracks is in the order of frames."""
         if self.recorder is not None:
             self.recorder.log(event)

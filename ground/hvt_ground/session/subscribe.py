@@ -11,7 +11,7 @@ from typing import Self
 
 import zenoh
 
-from hvt_common.protocol.channels import EdgeKeys, Row, matches, parse_key, selector
+from hvt_common.protocol.channels import Channel, EdgeKeys, matches, parse_key, selector
 from hvt_common.protocol.messages import Command, ControlRequest, Feedback, Info, WireError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.doctor.diagnose import control_unanswered
@@ -31,7 +31,7 @@ _INBOX_SHARE = 0.75
 """Of the inbox for one row: reports by the thousand do not keep pictures out."""
 _MOST_PER_S = 2000
 """Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
-_SUBSCRIBED = (Row.BASE, Row.ROI, Row.TRACKS, Row.PAST, Row.STATUS)
+_SUBSCRIBED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.BACKLOG, Channel.STATUS)
 _ASK_S = 1.0
 _UNANSWERED = 3
 """So many questions on control in a row without an answer are no accident."""
@@ -52,7 +52,7 @@ class EdgePort:
         self._unanswered = 0
         self._session = session
         self._keys = EdgeKeys(edge)
-        self._feedback = declare_publisher(session, Row.FEEDBACK, keys=self._keys)
+        self._feedback = declare_publisher(session, Channel.FEEDBACK, keys=self._keys)
 
     def ask_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
         """Return the session's facts with the times of asking and hearing (ns); None without an answer in time.
@@ -75,12 +75,12 @@ class EdgePort:
             return found is not None
 
         try:
-            ask(self._session, Row.INFO, keys=self._keys, question=b"", timeout_s=_ASK_S, wanted=wanted)
+            ask(self._session, Channel.INFO, keys=self._keys, question=b"", timeout_s=_ASK_S, wanted=wanted)
         except zenoh.ZError as error:
             _log.warning("%s: it could not be asked for info: %s", self.edge, error)
         return None if found is None else (found, asked_ns, heard_ns)
 
-    def put(self, item: Received, row: Row) -> None:
+    def put(self, item: Received, row: Channel) -> None:
         """Take a message in; what finds no room is dropped."""
         self.inbox.put(item)
         if self._flood.note(row, now_ns=item.received_ns) is not None:
@@ -100,7 +100,9 @@ class EdgePort:
             lambda _reply: answered.set(), lambda: self._note_control(answered=answered.is_set())
         )
         try:
-            self._session.get(self._keys.key(Row.CONTROL), handler, payload=request.pack(), timeout=_ASK_S)
+            self._session.get(
+                self._keys.key(Channel.CONTROL), handler, payload=request.pack(), timeout=_ASK_S
+            )
         except zenoh.ZError as error:
             _log.debug("%s: keyframe request not sent: %s", self.edge, error)
 
@@ -145,7 +147,7 @@ class GroundLink:
         for row in _SUBSCRIBED:
             subscribe(session, selector(row, edges=edges), inbox=self, clock=self._clock)
         self._presence = session.liveliness().declare_subscriber(
-            selector(Row.ALIVE, edges=edges), self._on_presence, history=True
+            selector(Channel.ALIVE, edges=edges), self._on_presence, history=True
         )
 
     def ports(self) -> list[EdgePort]:

@@ -17,8 +17,8 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import check_shape
-from hvt_study.sight import SightPlan, SightResult, SightRow, compare
-from hvt_study.sight_methods import METHODS, method_rows
+from hvt_study.compare_methods import METHODS, method_rows
+from hvt_study.sight import ComparePlan, CompareResult, CompareRow, compare
 
 __all__ = ["SUMMARY", "add_arguments", "print_result", "run"]
 
@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def print_result(result: SightResult) -> None:
+def print_result(result: CompareResult) -> None:
     """Both halves side by side, one line a method and rate."""
     console = Console(highlight=False)
     table = Table(
@@ -124,7 +124,7 @@ def print_result(result: SightResult) -> None:
         console.print(f"{one.method} at {one.rate_kbps:g} kbps: not available, {one.reason}", markup=False)
 
 
-def _cells(first: SightRow, second: SightRow) -> tuple[str, ...]:
+def _cells(first: CompareRow, second: CompareRow) -> tuple[str, ...]:
     return (
         _pair(first.f1, second.f1),
         _pair(first.class_agreement, second.class_agreement),
@@ -143,7 +143,7 @@ def _pair(first: float, second: float) -> str:
     return f"{first:.3f} {second:.3f}".replace("0.", ".")
 
 
-def _plan(arguments: argparse.Namespace) -> SightPlan:
+def _plan(arguments: argparse.Namespace) -> ComparePlan:
     size = parse_size(arguments.size, name="--size")
     check_shape(size=size, fps=15)
     jobs = getattr(arguments, "jobs", os.cpu_count() or 1)
@@ -151,7 +151,7 @@ def _plan(arguments: argparse.Namespace) -> SightPlan:
         raise UserError(f"--jobs {jobs} is not accepted: give a whole number from 1 to 256")
     if arguments.max_frames < _LEAST_FRAMES:
         raise UserError(f"--max-frames {arguments.max_frames} is too few: give {_LEAST_FRAMES} or more")
-    return SightPlan(
+    return ComparePlan(
         clip=arguments.clip,
         detector=arguments.detector,
         edge_detector=getattr(arguments, "edge_detector", arguments.detector),
@@ -181,10 +181,10 @@ def _rates(text: str) -> tuple[int, ...]:
     return tuple(sorted(rates))
 
 
-def _plotter() -> Callable[[SightResult, Path], None]:
+def _plotter() -> Callable[[CompareResult, Path], None]:
     """Matplotlib comes with ``hvt[study]``; the other commands do without it."""
     try:
-        from hvt_study.sight_plot import plot  # noqa: PLC0415
+        from hvt_study.compare_plot import plot  # noqa: PLC0415
     except ImportError:
         raise UserError("the plot needs matplotlib: pip install 'hvt[study]'") from None
     return plot

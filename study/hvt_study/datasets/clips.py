@@ -15,9 +15,9 @@ from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_edge.source.resample import hold
 from hvt_edge.source.video import VideoSource
+from hvt_study.compare_clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.options import Options
-from hvt_study.sight_clip import TICK_FPS, Clip
 
 __all__ = ["open_clips", "shown_frames"]
 
@@ -75,7 +75,7 @@ def shown_frames(path: Path, *, rate: Fraction | None = None) -> tuple[int, tupl
             stream = container.streams.video[0]
             tick_s = Fraction(stream.time_base or 0)
             own = Fraction(
-                stream.average_rate or stream.guessed_rate or stream.base_rate or exact_rate(TICK_FPS)
+                stream.average_rate or stream.guessed_rate or stream.base_rate or exact_rate(NOMINAL_FPS)
             )
             packets: Any = container.demux(stream)
             stamps = [packet.pts for packet in packets if packet.size and not packet.is_discard]
@@ -88,13 +88,13 @@ def shown_frames(path: Path, *, rate: Fraction | None = None) -> tuple[int, tupl
         tick_s, known = 1 / (rate or own), list(range(len(stamps)))
     timed = [(stamp * tick_s, index) for index, stamp in enumerate(sorted(known))]
     slack_s = Fraction(0) if rate is not None else tick_s
-    held = hold(timed, fps=exact_rate(TICK_FPS), tail_s=1 / (rate or own), slack_s=slack_s)
+    held = hold(timed, fps=exact_rate(NOMINAL_FPS), tail_s=1 / (rate or own), slack_s=slack_s)
     return len(timed), tuple(index for _, index in held)
 
 
 def _open(name: str, path: Path, options: Options) -> Sequence:
     rate = None if options.fps is None else exact_rate(options.fps)
-    source = VideoSource(str(path), size=_ANY_SIZE, fps=TICK_FPS, fit="letterbox", source_fps=options.fps)
+    source = VideoSource(str(path), size=_ANY_SIZE, fps=NOMINAL_FPS, fit="letterbox", source_fps=options.fps)
     size, fps = source.view.source_size, source.source_fps
     source.close()
     count, shown = shown_frames(path, rate=rate)

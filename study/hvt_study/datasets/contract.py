@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hvt_common.units import exact_rate
+from hvt_study.compare_clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.labels import NO_ID, UNKNOWN, FrameLabels
-from hvt_study.sight_clip import TICK_FPS, Clip
 
 __all__ = ["NO_ID", "UNKNOWN", "FrameLabels", "Sequence", "shown_frame"]
 
@@ -70,4 +70,4 @@ class Sequence:
 
 def shown_frame(tick: int, *, fps: float) -> int:
     """The latest of frames taken ``fps`` times a second at or before a tick, the first at 0, in exact fractions."""
-    return int(tick * exact_rate(fps) / exact_rate(TICK_FPS))
+    return int(tick * exact_rate(fps) / exact_rate(NOMINAL_FPS))

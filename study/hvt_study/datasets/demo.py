@@ -10,10 +10,10 @@ from hvt_common.units import exact_rate
 from hvt_edge.source.resample import base_frame_count
 from hvt_scene import Scene
 from hvt_scene.vehicles import CLASS_NAMES
+from hvt_study.compare_clip import DEMO_LEAST_VISIBLE, NOMINAL_FPS, Clip
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.options import parse_numbers
-from hvt_study.sight_clip import DEMO_LEAST_VISIBLE, TICK_FPS, Clip
 
 __all__ = ["DemoLabels", "open_demo"]
 
@@ -28,7 +28,7 @@ class DemoLabels:
 
     def __call__(self, index: int) -> FrameLabels:
         """Of the frame at ``index / 15`` seconds."""
-        truth = _scene(self.seed).truth(index / TICK_FPS)
+        truth = _scene(self.seed).truth(index / NOMINAL_FPS)
         asked = truth.visible >= DEMO_LEAST_VISIBLE
         return FrameLabels(
             boxes_xyxy_px=truth.boxes_source_px[asked],
@@ -44,13 +44,13 @@ def open_demo(uri: str, seeds: str) -> Mapping[str, Callable[[], Sequence]]:
 
 
 def _open(seed: int) -> Sequence:
-    count = base_frame_count(exact_rate(Scene.duration_s), fps=exact_rate(TICK_FPS))
+    count = base_frame_count(exact_rate(Scene.duration_s), fps=exact_rate(NOMINAL_FPS))
     return Sequence(
         name=f"demo-{seed}",
         dataset="demo",
         clip=Clip("demo", _SIZE, count, None, None, seed=seed),
         frame_count=count,
-        fps=TICK_FPS,
+        fps=NOMINAL_FPS,
         source_size=_SIZE,
         labels=DemoLabels(seed),
         class_set=tuple(sorted(CLASS_NAMES)),

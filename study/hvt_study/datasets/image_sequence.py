@@ -14,9 +14,9 @@ from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_edge.source.folder import sequence_files
 from hvt_edge.source.resample import base_frame_count
+from hvt_study.compare_clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.label_table import LabelTable, TableLabels
-from hvt_study.sight_clip import TICK_FPS, Clip
 
 __all__ = ["ImageSequence", "find_folders", "image_size"]
 
@@ -65,7 +65,7 @@ class ImageSequence:
         attributes: Mapping[str, str] | None = None,
     ) -> Sequence:
         """The sequence as a flight plays it. Labels are read once, to say what is wrong before anything is flown."""
-        ticks = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(TICK_FPS))
+        ticks = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
         known = None if labels is None else labels.table()
         found = () if labels is None else (path for path in labels.arguments if isinstance(path, Path))
         return Sequence(

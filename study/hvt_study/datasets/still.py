@@ -15,12 +15,12 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_edge.source.folder import sequence_files
+from hvt_study.compare_clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.image_sequence import find_folders
 from hvt_study.datasets.label_table import file_stamp
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.options import Options
-from hvt_study.sight_clip import TICK_FPS, Clip
 from hvt_study.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
 
 __all__ = ["StillLabels", "open_stills"]
@@ -96,7 +96,7 @@ def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
         dataset="still",
         clip=Clip(f"{SCHEME}{picture}@{view:g}", camera.size, camera.frame_count, None, None, seed=seed),
         frame_count=camera.frame_count,
-        fps=TICK_FPS,
+        fps=NOMINAL_FPS,
         source_size=camera.size,
         labels=None if known is None else StillLabels(picture, view, seed),
         class_set=() if known is None else tuple(sorted(VISDRONE_NAMES)),
@@ -113,7 +113,7 @@ def _camera(
     annotated: bool,  # noqa: FBT001 - part of the key
     stamps: tuple[Hashable, ...],  # noqa: ARG001 - likewise
 ) -> VirtualCamera:
-    return VirtualCamera(picture, view, TICK_FPS, seed, annotated)
+    return VirtualCamera(picture, view, NOMINAL_FPS, seed, annotated)
 
 
 def _stamps(picture: Path) -> tuple[Hashable, ...]:

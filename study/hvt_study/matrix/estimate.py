@@ -8,12 +8,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hvt_common.errors import UserError
+from hvt_study.compare_clip import staged_bytes
 from hvt_study.datasets.contract import Sequence
 from hvt_study.matrix.execute import run_spec
 from hvt_study.matrix.methods import METHODS, Kind, MatrixMethod
 from hvt_study.matrix.plan import StudyPlan, first_runs
-from hvt_study.matrix.workshop import open_workshop
-from hvt_study.sight_clip import staged_bytes
+from hvt_study.matrix.run_context import open_run_context
 
 __all__ = ["Estimate", "estimate", "time_of_a_tick"]
 
@@ -84,7 +84,7 @@ def time_of_a_tick(plan: StudyPlan) -> float:
     spec = replace(spec, max_ticks=_TRIAL_TICKS)
     with TemporaryDirectory(prefix="hvt-study-") as folder:
         trial = replace(plan, cache=Path(folder))
-        shop = open_workshop(spec, cache=trial.cache)  # what is done once for all runs over a sequence
+        shop = open_run_context(spec, cache=trial.cache)  # what is done once for all runs over a sequence
         began_s = time.monotonic()
         row = run_spec(spec, trial)
         took_s = time.monotonic() - began_s

@@ -19,10 +19,10 @@ from hvt_study.matrix.materials import Materials, open_materials
 from hvt_study.matrix.methods import METHODS
 from hvt_study.matrix.plan import StudyPlan
 from hvt_study.matrix.results import COLUMNS
+from hvt_study.matrix.run_context import RunContext, open_run_context
 from hvt_study.matrix.scoring import figures
 from hvt_study.matrix.spec import RunSpec
 from hvt_study.matrix.whereabouts import located
-from hvt_study.matrix.workshop import Workshop, open_workshop
 
 __all__ = ["run_spec"]
 
@@ -110,7 +110,7 @@ class _Bench:
         return self._flight(found.budget_bps, fps)
 
     def _flight(self, budget_bps: int, fps: float | None) -> Row:
-        def fly(shop: Workshop) -> Row:
+        def fly(shop: RunContext) -> Row:
             report = _asked(lambda: flown(self._spec, shop, budget_bps=budget_bps, fps=fps))
             used = settings(self._spec, shop, budget_bps=budget_bps, fps=fps)
             return {**figures(report, shop), "settings": used}
@@ -121,12 +121,12 @@ class _Bench:
     def _weight(self, budget_bps: int, fps: float | None) -> float:
         """What a flight at this budget spends; without a ground, which has no say in it."""
 
-        def weigh(shop: Workshop) -> Row:
+        def weigh(shop: RunContext) -> Row:
             return {"bps": _asked(lambda: weighed(self._spec, shop, budget_bps=budget_bps, fps=fps))}
 
         return float(self._known(self._key("weight", budget_bps, fps), weigh)["bps"])
 
-    def _known(self, key: str, make: Callable[[Workshop], Row]) -> Row:
+    def _known(self, key: str, make: Callable[[RunContext], Row]) -> Row:
         """Out of the cache; else it is made, which alone needs pictures."""
         row = self._cache.get(key)
         if row is None:
@@ -137,9 +137,9 @@ class _Bench:
         self.wall_s += row["wall_s"]
         return row
 
-    def _made(self, make: Callable[[Workshop], Row]) -> Row:
+    def _made(self, make: Callable[[RunContext], Row]) -> Row:
         try:
-            return make(open_workshop(self._here, cache=self._plan.cache))
+            return make(open_run_context(self._here, cache=self._plan.cache))
         except (UserError, _RefusedError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - one bad flight of thousands must not end them all

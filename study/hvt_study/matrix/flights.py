@@ -11,15 +11,15 @@ from hvt_edge.config import REGIMES, EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_study.compare_clip import NOMINAL_FPS
 from hvt_study.flight import FlightPlan, FlightReport, fly, weigh
 from hvt_study.flight_ground import SharedModels
 from hvt_study.matrix.materials import CONFIDENCE
 from hvt_study.matrix.methods import METHODS, Kind
+from hvt_study.matrix.run_context import RunContext
 from hvt_study.matrix.spec import RunSpec
-from hvt_study.matrix.workshop import Workshop
 from hvt_study.peers.dds import fly_dds
 from hvt_study.peers.dds_settings import DdsSettings
-from hvt_study.sight_clip import TICK_FPS
 
 __all__ = ["edge_flags", "flight_plan", "flown", "settings", "weighed"]
 
@@ -39,13 +39,13 @@ def edge_flags(spec: RunSpec, *, budget_bps: int, fps: float | None) -> tuple[st
             flags += ["--video-share", f"{REGIMES[spec.regime].video_share:.6f}"]
     for parameter in spec.tune:
         flags += ["--tune", parameter]
-    if fps is not None and fps != TICK_FPS:
+    if fps is not None and fps != NOMINAL_FPS:
         # The budget's window has to hold two frames.
         flags += ["--fps", f"{fps:g}", "--window", f"{max(1.0, 2 / fps):g}s"]
     return tuple(flags)
 
 
-def flight_plan(spec: RunSpec, shop: Workshop, *, budget_bps: int, fps: float | None) -> FlightPlan:
+def flight_plan(spec: RunSpec, shop: RunContext, *, budget_bps: int, fps: float | None) -> FlightPlan:
     """The flight of this run at a budget; its link carries what the regime allows, whatever the budget.
 
     Raises:
@@ -61,7 +61,7 @@ def flight_plan(spec: RunSpec, shop: Workshop, *, budget_bps: int, fps: float | 
     )
 
 
-def flown(spec: RunSpec, shop: Workshop, *, budget_bps: int, fps: float | None) -> FlightReport:
+def flown(spec: RunSpec, shop: RunContext, *, budget_bps: int, fps: float | None) -> FlightReport:
     """Fly it."""
     if METHODS[spec.method].kind is Kind.PEER:
         return fly_dds(
@@ -76,13 +76,13 @@ def flown(spec: RunSpec, shop: Workshop, *, budget_bps: int, fps: float | None) 
     return fly(plan, detector=shop.edge_detector, models=SharedModels(shop.detector, shop.classifier))
 
 
-def weighed(spec: RunSpec, shop: Workshop, *, budget_bps: int, fps: float | None) -> float:
+def weighed(spec: RunSpec, shop: RunContext, *, budget_bps: int, fps: float | None) -> float:
     """Line bits a second of a method that no ground's answer changes."""
     plan = flight_plan(spec, shop, budget_bps=budget_bps, fps=fps)
     return weigh(plan, detector=shop.edge_detector)
 
 
-def settings(spec: RunSpec, shop: Workshop, *, budget_bps: int, fps: float | None) -> dict[str, Any]:
+def settings(spec: RunSpec, shop: RunContext, *, budget_bps: int, fps: float | None) -> dict[str, Any]:
     """All settings of a flight, as JSON holds them."""
     if METHODS[spec.method].kind is Kind.PEER:
         peer = {**asdict(_dds_settings(fps)), "budget_bps": budget_bps, "size": list(spec.size)}

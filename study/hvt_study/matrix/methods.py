@@ -8,7 +8,7 @@ from enum import StrEnum
 from types import MappingProxyType
 
 from hvt_common.errors import UserError
-from hvt_study import sight_methods
+from hvt_study import compare_methods
 
 __all__ = ["DDS", "METHODS", "Kind", "MatrixMethod", "chosen_methods"]
 
@@ -42,7 +42,7 @@ class MatrixMethod:
     """Fixed frame rates of which the best counts; none: as the flags say."""
 
 
-_SIGHT = sight_methods.METHODS
+_SIGHT = compare_methods.METHODS
 _FPS_CHOICES = (15.0, 7.5, 5.0, 3.0, 2.0)
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
+from hvt_study.compare_clip import NOMINAL_FPS
 from hvt_study.flight import FlightReport
-from hvt_study.matrix.workshop import Workshop
+from hvt_study.matrix.run_context import RunContext
 from hvt_study.metrics.bits import Accounting, bit_split, still_counts
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.delay import delay_score
@@ -22,21 +23,20 @@ from hvt_study.metrics.seen import (
     shown_times_s,
 )
 from hvt_study.metrics.tracking import tracking_score
-from hvt_study.sight_clip import TICK_FPS
 
 __all__ = ["figures"]
 
 _DIGITS = 6
 
 
-def figures(report: FlightReport, shop: Workshop) -> dict[str, Any]:
+def figures(report: FlightReport, shop: RunContext) -> dict[str, Any]:
     """Every metric column of `hvt_study.matrix.results.COLUMNS`; None where a run has none."""
     found = {**_bits(report, shop), **_labelled(report, shop), **_delays(report), **_proxies(report)}
     found |= {"digest": report.digest, "edge_cpu_ms": report.edge_cpu_ms}
     return {name: _plain(value) for name, value in found.items()}
 
 
-def _bits(report: FlightReport, shop: Workshop) -> dict[str, Any]:
+def _bits(report: FlightReport, shop: RunContext) -> dict[str, Any]:
     stills, refined = arrivals(report.lists), refined_objects(report.lists)
 
     def split(accounting: Accounting) -> tuple[float, ...]:
@@ -73,17 +73,17 @@ def _bits(report: FlightReport, shop: Workshop) -> dict[str, Any]:
 
 def _back_bytes(report: FlightReport) -> int:
     """Of a server its questions, which are a row of what crossed the line."""
-    return report.back_bytes + report.line_bytes.get(Row.CONTROL, 0)
+    return report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)
 
 
-def _labelled(report: FlightReport, shop: Workshop) -> dict[str, Any]:
+def _labelled(report: FlightReport, shop: RunContext) -> dict[str, Any]:
     words: dict[str, Any] = {"word": shop.classes.word, "classes": shop.classes.classes}
     ticks = refined_ticks(report.lists, shop.labels)
     detection = detection_score(detected_ticks(report.lists, shop.labels), **words)
     after = class_score(ticks, **words)
     before = class_score(ticks, refined=False, **words)
     tracking = tracking_score(ticks, **words)
-    first = first_correct(ticks, fps=TICK_FPS, shown_s=shown_times_s(report.lists), **words)
+    first = first_correct(ticks, fps=NOMINAL_FPS, shown_s=shown_times_s(report.lists), **words)
     return {
         "map_50": detection.mean.at_50,
         "map_50_95": detection.mean.at_50_95,

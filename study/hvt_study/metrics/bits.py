@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_study.metrics.contract import NO_ID
 from hvt_study.metrics.stills import RefinedObject, StillArrival
 
@@ -69,11 +69,11 @@ def bit_split(
         ValueError: the time to divide by is missing or not above 0.
     """
     seconds = _seconds(processed_s, clip_s, accounting)
-    known = {row: 8 * row_bytes.get(row, 0) / seconds for row in (Row.BASE, Row.ROI, Row.TRACKS)}
+    known = {row: 8 * row_bytes.get(row, 0) / seconds for row in (Channel.BASE, Channel.ROI, Channel.TRACKS)}
     return BitSplit(
-        base_bps=known[Row.BASE],
-        roi_bps=known[Row.ROI],
-        track_bps=known[Row.TRACKS],
+        base_bps=known[Channel.BASE],
+        roi_bps=known[Channel.ROI],
+        track_bps=known[Channel.TRACKS],
         other_bps=sum(8 * size / seconds for row, size in row_bytes.items() if row not in known),
     )
 

@@ -14,7 +14,7 @@ from hvt_study.metrics.contract import NO_ID, FrameLabels, FrameView, Tick
 from hvt_study.metrics.stills import RefinedObject, StillArrival
 
 __all__ = [
-    "SeenTick",
+    "ObservedFrame",
     "arrivals",
     "base_ticks",
     "detected_ticks",
@@ -29,7 +29,7 @@ def _none_32() -> npt.NDArray[np.float32]:
 
 
 @dataclass(frozen=True, slots=True)
-class SeenTick(Listed):
+class ObservedFrame(Listed):
     """The list at one tick (`Listed`, boxes in source pixels), with all that metrics ask of it; N tracks."""
 
     ids: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
@@ -73,7 +73,7 @@ def refined_ticks(lists: Sequence[Listed], labels: Iterable[FrameLabels]) -> lis
 
 
 def base_ticks(lists: Sequence[Listed], labels: Iterable[FrameLabels]) -> list[Tick]:
-    """Every tick as the base stream alone shows it; see `SeenTick.base_view`."""
+    """Every tick as the base stream alone shows it; see `ObservedFrame.base_view`."""
     return [(truth, _seen(one).base_view()) for one, truth in zip(lists, labels, strict=True)]
 
 
@@ -100,6 +100,6 @@ def refined_objects(lists: Iterable[Listed], *, track_id: int | None = None) -> 
     return [done for done in every if track_id in (None, done.track_id)]
 
 
-def _seen(one: Listed) -> SeenTick:
-    assert isinstance(one, SeenTick), "a flight lists what was seen"
+def _seen(one: Listed) -> ObservedFrame:
+    assert isinstance(one, ObservedFrame), "a flight lists what was seen"
     return one

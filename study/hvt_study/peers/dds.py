@@ -23,13 +23,13 @@ from hvt_common.inference.detect import Detector
 from hvt_common.values import Frame
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.source.resample import Resizer
+from hvt_study.compare_clip import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flight import FlightReport, coded_ticks
 from hvt_study.peers.dds_edge import DdsEdge, pass_rates
 from hvt_study.peers.dds_ground import DdsGround
 from hvt_study.peers.dds_line import Line
 from hvt_study.peers.dds_settings import DdsSettings
 from hvt_study.serial_link import LinkReport
-from hvt_study.sight_clip import TICK_FPS, Clip, TickSource
 
 __all__ = ["DdsSettings", "fly_dds"]
 
@@ -66,11 +66,11 @@ def fly_dds(
     )
     coded = coded_ticks(clip.ticks, settings.rate)
     segments = _segments(coded, settings.segment_ticks)
-    most_bytes = int(budget_bps * clip.ticks / TICK_FPS / 8)
+    most_bytes = int(budget_bps * clip.ticks / NOMINAL_FPS / 8)
     resizer = Resizer(clip.source_size, size, fit="letterbox")
     edge = DdsEdge(rates, size=size, settings=settings, segments=segments, line=line, most_bytes=most_bytes)
     ground = DdsGround(detector, settings, resizer.view, segments, line, started_ns=_tick_ns(0))
-    with closing(_by_tick(TickSource(clip, resizer, ticks=coded), clip.ticks)) as frames:
+    with closing(_by_tick(FrameSource(clip, resizer, ticks=coded), clip.ticks)) as frames:
         for now_ns, frame in frames:
             ground.advance(now_ns)
             while ground.requests and ground.requests[0][0] <= now_ns:
@@ -89,7 +89,7 @@ def _segments(coded: frozenset[int], segment_ticks: int) -> tuple[tuple[int, ...
     return tuple(tuple(ticks) for _, ticks in groupby(sorted(coded), key=lambda tick: tick // segment_ticks))
 
 
-def _by_tick(source: TickSource, ticks: int) -> Generator[tuple[int, Frame | None], None, None]:
+def _by_tick(source: FrameSource, ticks: int) -> Generator[tuple[int, Frame | None], None, None]:
     """(time, frame to code) of every tick, and empty ones after the clip for what is still to come."""
     tick = 0
     for frame in source.frames(start_ns=_START_NS):
@@ -97,18 +97,18 @@ def _by_tick(source: TickSource, ticks: int) -> Generator[tuple[int, Frame | Non
             yield _tick_ns(between), None
         yield frame.capture_ns, frame
         tick = frame.index + 1
-    for after in range(tick, ticks + round(_LONGEST_TAIL_S * TICK_FPS)):
+    for after in range(tick, ticks + round(_LONGEST_TAIL_S * NOMINAL_FPS)):
         yield _tick_ns(after), None
 
 
 def _tick_ns(tick: int) -> int:
-    return _START_NS + round(tick * _SECOND_NS / TICK_FPS)
+    return _START_NS + round(tick * _SECOND_NS / NOMINAL_FPS)
 
 
 def _report(ticks: int, *, edge: DdsEdge, ground: DdsGround, line: Line) -> FlightReport:
     return FlightReport(
         lists=tuple(ground.lists[tick] for tick in range(ticks)),
-        account=line.ledger.summary(ticks / TICK_FPS),
+        account=line.ledger.summary(ticks / NOMINAL_FPS),
         line_bytes=dict(line.line_bytes),
         messages=dict(line.messages),
         max_frame_bytes=line.max_frame_bytes,

@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.video.x265 import VBV_S, BaseEncoder, EncoderSettings, keyframe_floor_bytes, minimum_bps
+from hvt_study.compare_clip import NOMINAL_FPS
 from hvt_study.peers.dds_line import Line, header_bps
 from hvt_study.peers.dds_regions import Blocks, block_grid, pasted
 from hvt_study.peers.dds_request import RegionRequest
 from hvt_study.peers.dds_settings import DdsSettings
-from hvt_study.sight_clip import TICK_FPS
 
 __all__ = ["DdsEdge", "PassRates", "most_kept", "pass_rates"]
 
@@ -50,14 +50,14 @@ def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings,
     first_line = settings.share * (budget_bps - request_bps)
     second_line = budget_bps - request_bps - first_line
     fps = settings.rate
-    questions = TICK_FPS / settings.segment_ticks
+    questions = NOMINAL_FPS / settings.segment_ticks
     bundles = min(fps, max(questions, second_line / 8 / settings.bundle_bytes))
     small = settings.first_size(size)
     first = first_line - _beside_bps(
-        first_line, Row.BASE, small, fps=fps, messages_per_s=fps, edge_id=edge_id
+        first_line, Channel.BASE, small, fps=fps, messages_per_s=fps, edge_id=edge_id
     )
     second = second_line - _beside_bps(
-        second_line, Row.ROI, size, fps=fps, messages_per_s=bundles, edge_id=edge_id
+        second_line, Channel.ROI, size, fps=fps, messages_per_s=bundles, edge_id=edge_id
     )
     # Of the second pass most is black.
     for payload, least in ((first, minimum_bps(small, fps)), (second, 8 * _BLACK_FRAME_BYTES * fps)):
@@ -72,13 +72,13 @@ def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings,
         fps=fps,
         window_ns=settings.window_ns,
         metadata_bps=round(request_bps),
-        lend=True,
+        borrow_unused=True,
     )
     return PassRates(round(first), round(second), shared)
 
 
 def _beside_bps(
-    line_bps: float, row: Row, size: tuple[int, int], *, fps: float, messages_per_s: float, edge_id: str
+    line_bps: float, row: Channel, size: tuple[int, int], *, fps: float, messages_per_s: float, edge_id: str
 ) -> float:
     """What of a pass's rate is not x265's to spend."""
     headers = header_bps(line_bps, units_per_s=fps, messages_per_s=messages_per_s, row=row, edge_id=edge_id)
@@ -87,7 +87,7 @@ def _beside_bps(
 
 def most_kept(settings: DdsSettings) -> int:
     """How many frames either end keeps at most while it waits for the other."""
-    return max(_KEPT_LEAST, round(_KEPT_SEGMENTS * settings.segment_ticks * settings.rate / TICK_FPS) + 1)
+    return max(_KEPT_LEAST, round(_KEPT_SEGMENTS * settings.segment_ticks * settings.rate / NOMINAL_FPS) + 1)
 
 
 class DdsEdge:
@@ -141,9 +141,9 @@ class DdsEdge:
         small = replace(frame, base_bgr=self._shrunk(frame))
         unit = self._first.encode(small, keyframe=not self._first_done)
         self._first_done = True
-        size_bytes = self._line.weigh(Row.BASE, (unit,), at_ns=frame.capture_ns)
+        size_bytes = self._line.weigh(Channel.BASE, (unit,), at_ns=frame.capture_ns)
         at_ns = self._budget.earliest_ns(size_bytes, now_ns=frame.capture_ns, base=True)
-        sent = self._line.send(Row.BASE, (unit,), at_ns=at_ns)
+        sent = self._line.send(Channel.BASE, (unit,), at_ns=at_ns)
         self._budget.record_base(sent, now_ns=at_ns, keyframe=unit.keyframe)
         self.cpu_s += time.process_time() - began_s
 
@@ -165,7 +165,7 @@ class DdsEdge:
         began_s = time.process_time()
         while not self.idle:
             self._fill()
-            size_bytes = self._line.weigh(Row.ROI, self._ready, at_ns=now_ns)
+            size_bytes = self._line.weigh(Channel.ROI, self._ready, at_ns=now_ns)
             if self._line.total_bytes + size_bytes > self._most_bytes:
                 self._ready.clear()
                 self._asked.clear()
@@ -174,7 +174,7 @@ class DdsEdge:
             if size_bytes > self._budget.still_room(now_ns):
                 break
             self._budget.record_still(size_bytes, now_ns=now_ns)
-            self._line.send(Row.ROI, self._ready, at_ns=now_ns)
+            self._line.send(Channel.ROI, self._ready, at_ns=now_ns)
             self._ready.clear()
         self.cpu_s += time.process_time() - began_s
 

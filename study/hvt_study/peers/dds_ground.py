@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 
 from hvt_common.inference.detect import Detector
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import AccessUnit, Detections, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
+from hvt_study.compare_clip import NOMINAL_FPS
 from hvt_study.metrics.contract import NO_ID, FrameView
-from hvt_study.metrics.seen import SeenTick
+from hvt_study.metrics.seen import ObservedFrame
 from hvt_study.peers.dds_edge import most_kept
 from hvt_study.peers.dds_line import Line
 from hvt_study.peers.dds_regions import Blocks, asked_blocks, asked_boxes, combined, pasted
 from hvt_study.peers.dds_request import RegionRequest
 from hvt_study.peers.dds_settings import DdsSettings
-from hvt_study.sight_clip import TICK_FPS
 
 __all__ = ["DdsGround"]
 
@@ -58,7 +58,7 @@ class DdsGround:
     line: Line
     started_ns: int
     """Capture of the first tick."""
-    lists: dict[int, SeenTick] = field(default_factory=dict)
+    lists: dict[int, ObservedFrame] = field(default_factory=dict)
     """By tick."""
     delays_ns: list[int] = field(default_factory=list)
     """Of every coded frame, in order: capture to the arrival that finished it."""
@@ -81,14 +81,14 @@ class DdsGround:
         tracking = TrackerSettings.starting_at(
             self.settings.confidence, camera_motion=self.settings.camera_motion
         )
-        self._tracker = ByteTracker(tracking, fps=TICK_FPS)
+        self._tracker = ByteTracker(tracking, fps=NOMINAL_FPS)
 
     def advance(self, now_ns: int) -> None:
         """Take in what has arrived by now."""
         for arrival in self.line.arrived(now_ns):
             self._at_ns = arrival.arrival_ns
             for unit in arrival.message.units:
-                if arrival.message.row is Row.BASE:
+                if arrival.message.row is Channel.BASE:
                     self._first_pass(unit)
                 else:
                     self._second_pass(unit)
@@ -160,10 +160,10 @@ class DdsGround:
             self.lists[between] = self._seen(self._tracker.extrapolated(frame_index=between))
         self._listed_to = max(self._listed_to, tick)
 
-    def _seen(self, tracks: Tracks, *, found: Detections | None = None) -> SeenTick:
+    def _seen(self, tracks: Tracks, *, found: Detections | None = None) -> ObservedFrame:
         names = self._names(tracks.class_ids)
         confidences = tracks.confidences.astype(np.float32)
-        return SeenTick(
+        return ObservedFrame(
             self._inside(tracks.boxes_xyxy_px),
             names,
             ids=tracks.ids,

@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row
-from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
+from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import BaseHeader, Flags
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import RollingBudget
@@ -19,12 +19,12 @@ __all__ = ["HEADER_BYTES", "PASS_ROWS", "Line", "UnitMessage", "header_bps"]
 
 HEADER_BYTES = 48
 """What a `BaseHeader` takes at most."""
-PASS_ROWS = (Row.BASE, Row.ROI)
+PASS_ROWS = (Channel.BASE, Channel.ROI)
 """The rows of the first and of the second pass."""
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
 _SECOND_NS = 1_000_000_000
-_CHANNELS = {Row.BASE: Channel.BASE, Row.ROI: Channel.ROI, Row.CONTROL: Channel.META}
-_VIDEO = DELIVERIES[Row.BASE].encoding
+_CHANNELS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.CONTROL: Account.META}
+_VIDEO = DELIVERIES[Channel.BASE].encoding
 _FURTHER = struct.Struct(">II")
 """Before each access unit but the first: its tick and its length."""
 
@@ -33,12 +33,12 @@ _FURTHER = struct.Struct(">II")
 class UnitMessage:
     """Access units of one of the passes, as the ground gets them: one of the first, or some of the second."""
 
-    row: Row
+    row: Channel
     units: tuple[AccessUnit, ...]
 
 
 def header_bps(
-    line_bps: float, *, units_per_s: float, messages_per_s: float, row: Row, edge_id: str
+    line_bps: float, *, units_per_s: float, messages_per_s: float, row: Channel, edge_id: str
 ) -> float:
     """What headers and transport take of ``line_bps``."""
     payload = round(line_bps / 8 / messages_per_s)
@@ -80,13 +80,13 @@ class Line:
         """Whether everything that was sent to the ground has been taken out."""
         return not self._under_way
 
-    def weigh(self, row: Row, units: Sequence[AccessUnit], *, at_ns: int) -> int:
+    def weigh(self, row: Channel, units: Sequence[AccessUnit], *, at_ns: int) -> int:
         """Line bytes of a message with these access units, were it sent then."""
         payload = _payload(units)
         attachment = self._header(row, units[0], at_ns=at_ns).pack(payload)
         return self._weight(row, payload, attachment, encoding=_VIDEO)
 
-    def send(self, row: Row, units: Sequence[AccessUnit], *, at_ns: int) -> int:
+    def send(self, row: Channel, units: Sequence[AccessUnit], *, at_ns: int) -> int:
         """Edge to ground; return the line bytes. The budget is the caller's to tell."""
         payload = _payload(units)
         attachment = self._header(row, units[0], at_ns=at_ns).pack(payload)
@@ -96,16 +96,18 @@ class Line:
             UnitMessage(row, tuple(units)),
             size_bytes=size_bytes,
             enter_ns=at_ns,
-            urgent=row is Row.BASE,
+            urgent=row is Channel.BASE,
         )
         self._under_way += 1
         return size_bytes
 
     def send_request(self, payload: bytes, *, now_ns: int) -> int:
         """Ground to edge as soon as the budget's window has room; return when it is there."""
-        size_bytes = self._weight(Row.CONTROL, payload, b"", encoding=DELIVERIES[Row.CONTROL].encoding)
+        size_bytes = self._weight(
+            Channel.CONTROL, payload, b"", encoding=DELIVERIES[Channel.CONTROL].encoding
+        )
         at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
-        self._count(Row.CONTROL, payload, b"", encoding=DELIVERIES[Row.CONTROL].encoding, at_ns=at_ns)
+        self._count(Channel.CONTROL, payload, b"", encoding=DELIVERIES[Channel.CONTROL].encoding, at_ns=at_ns)
         self.budget.record_metadata(size_bytes, now_ns=at_ns)
         return at_ns + round(size_bytes * 8 * _SECOND_NS / self._link_bps)
 
@@ -118,7 +120,7 @@ class Line:
         ]
         return there
 
-    def _header(self, row: Row, unit: AccessUnit, *, at_ns: int) -> BaseHeader:
+    def _header(self, row: Channel, unit: AccessUnit, *, at_ns: int) -> BaseHeader:
         return BaseHeader(
             session_id=_SESSION,
             sequence=self.messages[row],
@@ -128,12 +130,12 @@ class Line:
             flags=int(Flags.LOCKSTEP | ((Flags.KEYFRAME | Flags.PARAMETER_SETS) if unit.keyframe else 0)),
         )
 
-    def _weight(self, row: Row, payload: bytes, attachment: bytes, *, encoding: str) -> int:
+    def _weight(self, row: Channel, payload: bytes, attachment: bytes, *, encoding: str) -> int:
         key = self._keys.key(row)
         around = overhead_bytes(len(payload), len(attachment), key=key, encoding=encoding)
         return len(payload) + len(attachment) + around
 
-    def _count(self, row: Row, payload: bytes, attachment: bytes, *, encoding: str, at_ns: int) -> int:
+    def _count(self, row: Channel, payload: bytes, attachment: bytes, *, encoding: str, at_ns: int) -> int:
         size_bytes = self._weight(row, payload, attachment, encoding=encoding)
         self.ledger.count(
             _CHANNELS[row],

@@ -8,11 +8,11 @@ from typing import Literal
 
 from hvt_common.errors import UserError
 from hvt_edge.video.x265 import PRESETS
-from hvt_study.sight_clip import TICK_FPS
+from hvt_study.compare_clip import NOMINAL_FPS
 
 __all__ = ["RATES", "DdsSettings"]
 
-RATES = (TICK_FPS, 7.5, 5.0, 3.0, 2.0)
+RATES = (NOMINAL_FPS, 7.5, 5.0, 3.0, 2.0)
 """Those that the study's video-only methods choose from too."""
 _LEAST_BITS_PER_PX = 0.1
 """Of the whole budget, for each frame: with less, both passes are too coarse to tell objects (docs/study-dds.md)."""
@@ -91,7 +91,7 @@ class DdsSettings:
     @property
     def segment_ticks(self) -> int:
         """At least one."""
-        return max(1, round(self.segment_s * TICK_FPS))
+        return max(1, round(self.segment_s * NOMINAL_FPS))
 
     @property
     def window_ns(self) -> int:
@@ -101,7 +101,7 @@ class DdsSettings:
     @property
     def request_bps(self) -> float:
         """What requests may take of the budget."""
-        return 8 * self.request_bytes * TICK_FPS / self.segment_ticks
+        return 8 * self.request_bytes * NOMINAL_FPS / self.segment_ticks
 
     def first_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """(width, height) of the first pass, even numbers."""
@@ -111,8 +111,8 @@ class DdsSettings:
 
 _RANGES: tuple[tuple[str, float, float], ...] = (
     ("share", 0.05, 0.95),
-    ("segment_s", 1 / TICK_FPS, 10),
-    ("fps", 0.5, TICK_FPS),
+    ("segment_s", 1 / NOMINAL_FPS, 10),
+    ("fps", 0.5, NOMINAL_FPS),
     ("scale", 0.1, 1),
     ("low", 0, 1),
     ("high", 0, 1),

@@ -15,32 +15,32 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hvt_common.protocol.channels import Row, parse_key
+from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import Info, RoiHeader
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Image, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.still_codecs import psnr_y_db
 from hvt_ground.events.events import Event, Refinement
+from hvt_study.compare_clip import NOMINAL_FPS, Clip
 from hvt_study.flight import FlightPlan, FlightReport, _Edge
 from hvt_study.flight_ground import GroundSide, SharedModels
 from hvt_study.matrix.flights import flight_plan
 from hvt_study.matrix.plan import StudyPlan
+from hvt_study.matrix.run_context import RunContext, open_run_context
 from hvt_study.matrix.spec import RunSpec
-from hvt_study.matrix.workshop import Workshop, open_workshop
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.contract import NO_ID
-from hvt_study.metrics.seen import SeenTick, refined_objects, refined_ticks
+from hvt_study.metrics.seen import ObservedFrame, refined_objects, refined_ticks
 from hvt_study.report.examples import CropExample, Example, Lane, Timeline, Word, percentile_rows
 from hvt_study.serial_link import Arrival, SerialLink
-from hvt_study.sight_clip import TICK_FPS, Clip
 
 __all__ = ["example_of", "fly_again"]
 
 _MOST_STILLS = 2000
 """Of which the pixels are kept."""
 _MOST_LANES = 14
-_SECOND_TICKS = round(TICK_FPS)
+_SECOND_TICKS = round(NOMINAL_FPS)
 _BEST_DB = 99.0
 """Stands for a still without any loss."""
 
@@ -51,13 +51,13 @@ def fly_again(spec: RunSpec, plan: StudyPlan, *, rule: str) -> Example:
     Raises:
         UserError: dataset or models cannot be used, or the edge refuses its settings.
     """
-    shop = open_workshop(spec, cache=plan.cache)
+    shop = open_run_context(spec, cache=plan.cache)
     flight = flight_plan(spec, shop, budget_bps=spec.budget_bps, fps=None)
     title = f"{spec.sequence}, {spec.method} {spec.still_codec}, {spec.regime} regime, {spec.labels} labels"
     return example_of(flight, shop, key=spec.key, rule=rule, title=title)
 
 
-def example_of(flight: FlightPlan, shop: Workshop, *, key: str, rule: str, title: str) -> Example:
+def example_of(flight: FlightPlan, shop: RunContext, *, key: str, rule: str, title: str) -> Example:
     """Fly, and look at it.
 
     Raises:
@@ -115,7 +115,7 @@ class _WatchedGround(GroundSide):
         headers = {
             header.sequence: header
             for arrival in self.arrivals
-            if _row_of(arrival) is Row.ROI
+            if _row_of(arrival) is Channel.ROI
             for header in [RoiHeader.parse(arrival.message.attachment, arrival.message.payload)]
         }
         return [_Shown(event, headers[number]) for number, event in sorted(self._events.items())]
@@ -164,7 +164,7 @@ def _crop(one: _Shown, source_bgr: Image, *, view: View) -> CropExample:
         percentile=0,
         gain_db=still_db - base_db,
         base_db=base_db,
-        at_s=header.frame_index / TICK_FPS,
+        at_s=header.frame_index / NOMINAL_FPS,
         track_id=event.edge_track_id,
         class_before=event.class_before,
         class_after=event.class_after,
@@ -182,7 +182,7 @@ def _view_of(patch: Image, crop_source_px: tuple[int, int, int, int], view: View
     return replace(view, base_size=(patch.shape[1], patch.shape[0]), offset_px=offset)
 
 
-def _timeline(report: FlightReport, ground: _WatchedGround, shop: Workshop, *, budget_bps: int) -> Timeline:
+def _timeline(report: FlightReport, ground: _WatchedGround, shop: RunContext, *, budget_bps: int) -> Timeline:
     seconds = -(-len(report.lists) // _SECOND_TICKS)
     kbps = _rates(ground.arrivals, started_ns=ground.started_ns, seconds=seconds)
     lanes = list(_lanes(report))
@@ -205,14 +205,16 @@ def _rates(
     for one in arrivals:
         row = _row_of(one)
         second = min(seconds - 1, max(0, (one.enter_ns - started_ns) // 1_000_000_000))
-        size_bytes[str(row.value) if row in (Row.BASE, Row.ROI) else "other", second] += one.size_bytes
+        size_bytes[str(row.value) if row in (Channel.BASE, Channel.ROI) else "other", second] += (
+            one.size_bytes
+        )
     return {
         name: tuple(size_bytes[name, second] * 8 / 1e3 for second in range(seconds))
         for name in ("base", "roi", "other")
     }
 
 
-def _scores(report: FlightReport, shop: Workshop) -> dict[str, tuple[float, ...]]:
+def _scores(report: FlightReport, shop: RunContext) -> dict[str, tuple[float, ...]]:
     """Of each second, by the metrics of the table."""
     ticks = refined_ticks(report.lists, shop.labels)
     words: dict[str, Any] = {"word": shop.classes.word, "classes": shop.classes.classes}
@@ -232,7 +234,9 @@ def _lanes(report: FlightReport) -> Iterator[Lane]:
         if done.track_id != NO_ID:
             words.setdefault(done.track_id, []).append(Word(done.at_s, done.name_before, done.name_after))
     for track_id, said in words.items():
-        listed = [isinstance(one, SeenTick) and bool((one.ids == track_id).any()) for one in report.lists]
+        listed = [
+            isinstance(one, ObservedFrame) and bool((one.ids == track_id).any()) for one in report.lists
+        ]
         yield Lane(track_id, tuple(_spans(listed)), tuple(said))
 
 
@@ -246,10 +250,10 @@ def _spans(listed: Sequence[bool]) -> Iterator[tuple[float, float]]:
     """Runs of True, in seconds."""
     edges = np.flatnonzero(np.diff([0, *map(int, listed), 0]))
     for first, last in edges.reshape(-1, 2).tolist():
-        yield first / TICK_FPS, last / TICK_FPS
+        yield first / NOMINAL_FPS, last / NOMINAL_FPS
 
 
-def _row_of(arrival: Arrival[Received]) -> Row | None:
+def _row_of(arrival: Arrival[Received]) -> Channel | None:
     return (parse_key(arrival.message.key) or ("", None))[1]
 
 

@@ -11,7 +11,7 @@ from hvt_study.report.appendix_tables import failed_table, metrics_table
 from hvt_study.report.captions import time_of
 from hvt_study.report.curve_figures import codec_figure, utility_figure
 from hvt_study.report.document import Part, Report, Section, Table
-from hvt_study.report.equal_sight import equal_sight
+from hvt_study.report.equal_quality import equal_quality
 from hvt_study.report.example_figures import crop_pictures, timeline_figure
 from hvt_study.report.examples import Example
 from hvt_study.report.intervals import ENOUGH
@@ -134,7 +134,7 @@ def _against(found: Sequence[Setting]) -> Iterator[Part]:
         if index:  # the first stands above all
             yield from forests(setting, name=f"differences-{index + 1}")
         equal = [
-            equal_sight(setting, arm, reference=reference, column=DECIDES)
+            equal_quality(setting, arm, reference=reference, column=DECIDES)
             for regime in setting.regimes
             for arm in setting.hybrids(regime)
             for reference in REFERENCES

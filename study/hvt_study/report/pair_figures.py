@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from hvt_study.report.captions import INTERVALS, under
 from hvt_study.report.document import Drawing
 from hvt_study.report.drawing import GREY, INK, drawn, look_of, mark_of, plain_axes
-from hvt_study.report.equal_sight import EqualSight
+from hvt_study.report.equal_quality import EqualQuality
 from hvt_study.report.metric_names import METRICS
 from hvt_study.report.pairs import Pair
 from hvt_study.report.runs import Arm, Setting
@@ -41,7 +41,7 @@ def difference_figures(
 
 
 def equal_figures(
-    setting: Setting, found: Sequence[EqualSight], *, name: str, column: str
+    setting: Setting, found: Sequence[EqualQuality], *, name: str, column: str
 ) -> Iterator[Drawing]:
     """How many times the bits video needs, each sequence and the median; arrows where a curve ends too soon."""
     found = [one for one in found if one.ratios]
@@ -85,7 +85,7 @@ def _differences(setting: Setting, found: Sequence[Pair], *, name: str, column: 
     )
 
 
-def _ratios(setting: Setting, found: Sequence[EqualSight], *, name: str, column: str) -> Drawing:
+def _ratios(setting: Setting, found: Sequence[EqualQuality], *, name: str, column: str) -> Drawing:
     """Of one regime."""
     read = [ratio for one in found for ratio in one.ratios if 0 < ratio < math.inf]
     arms = list(dict.fromkeys(one.arm for one in found))
@@ -141,7 +141,7 @@ def _draw_gap(axes: Axes, pair: Pair, column: str, *, row: int) -> None:
     )
 
 
-def _draw_ratios(axes: Axes, one: EqualSight, *, row: int, ends: tuple[float, float]) -> None:
+def _draw_ratios(axes: Axes, one: EqualQuality, *, row: int, ends: tuple[float, float]) -> None:
     low, high = ends
     read = [ratio for ratio in one.ratios if 0 < ratio < math.inf]
     axes.scatter(read, [row] * len(read), s=_DOT, color=GREY, alpha=0.6, linewidths=0, zorder=2)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from hvt_study.report.captions import INTERVALS, under
 from hvt_study.report.document import Cell, Head, Table, words
-from hvt_study.report.equal_sight import EqualSight
+from hvt_study.report.equal_quality import EqualQuality
 from hvt_study.report.intervals import ENOUGH
 from hvt_study.report.metric_names import METRICS, NOTHING, written
 from hvt_study.report.pairs import Pair
@@ -52,7 +52,7 @@ def differences_table(setting: Setting, found: Sequence[Pair]) -> Table | None:
     return Table(caption, heads, tuple(rows), frozenset(breaks))
 
 
-def equal_table(setting: Setting, found: Sequence[EqualSight], *, column: str) -> Table | None:
+def equal_table(setting: Setting, found: Sequence[EqualQuality], *, column: str) -> Table | None:
     """How many times the bits video needs; None where no curve can be read."""
     found = [one for one in found if one.ratios or one.unread]
     if not any(one.ratios for one in found):

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import (
     DELIVERIES,
+    Channel,
     Direction,
     EdgeKeys,
-    Row,
     check_edge_pattern,
     matches,
     parse_key,
@@ -25,7 +25,7 @@ EDGE_IDS = st.from_regex(r"[a-z0-9-]{1,32}", fullmatch=True)
 PATTERNS = st.from_regex(r"[ab*-]{1,8}", fullmatch=True)
 
 
-@given(edge=EDGE_IDS, row=st.sampled_from(Row))
+@given(edge=EDGE_IDS, row=st.sampled_from(Channel))
 def test_a_key_parses_back(edge, row):
     """The ground would not know which edge a message is from."""
     assert parse_key(EdgeKeys(edge).key(row)) == (edge, row)
@@ -70,8 +70,8 @@ def test_no_key_raises(key):
 @given(edge=st.from_regex(r"[ab-]{1,8}", fullmatch=True), pattern=PATTERNS)
 def test_the_selector_and_the_pattern_agree(edge, pattern):
     """The ground would record edges that were not asked for, or miss some that were."""
-    key_expr = zenoh.KeyExpr(selector(Row.BASE, edges=pattern))
-    key = zenoh.KeyExpr(EdgeKeys(edge).key(Row.BASE))
+    key_expr = zenoh.KeyExpr(selector(Channel.BASE, edges=pattern))
+    key = zenoh.KeyExpr(EdgeKeys(edge).key(Channel.BASE))
     assert key_expr.includes(key) == matches(edge, edges=pattern)
 
 
@@ -80,8 +80,8 @@ def test_matches_examples():
     assert matches("uav-1", edges="uav-*")
     assert matches("uav-", edges="uav-*")
     assert not matches("rover-1", edges="uav-*")
-    assert selector(Row.ROI, edges="uav-*") == "hvt/uav-$*/roi"
-    assert selector(Row.ROI) == "hvt/*/roi"
+    assert selector(Channel.ROI, edges="uav-*") == "hvt/uav-$*/roi"
+    assert selector(Channel.ROI) == "hvt/*/roi"
 
 
 @pytest.mark.parametrize("pattern", ["", "uav?", "a/b", "[a-z]", "UAV-*", "$*", "a" * 65])
@@ -93,7 +93,7 @@ def test_a_pattern_outside_the_alphabet_is_one_sentence(pattern):
 
 def test_the_table_is_whole_and_its_names_are_zenohs():
     """A stream without a delivery would go out with Zenoh's defaults: dropped under load."""
-    assert set(DELIVERIES) == set(Row)
+    assert set(DELIVERIES) == set(Channel)
     for delivery in DELIVERIES.values():
         assert hasattr(zenoh.Priority, delivery.priority)
         assert hasattr(zenoh.CongestionControl, delivery.congestion)
@@ -121,4 +121,4 @@ def test_stills_yield_to_video_and_video_to_commands():
         "BACKGROUND",
     ]
     rank = {row: order.index(delivery.priority) for row, delivery in DELIVERIES.items()}
-    assert rank[Row.CONTROL] < rank[Row.STATUS] < rank[Row.BASE] < rank[Row.ROI]
+    assert rank[Channel.CONTROL] < rank[Channel.STATUS] < rank[Channel.BASE] < rank[Channel.ROI]

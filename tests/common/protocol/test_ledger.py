@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 
 WINDOW = 1_000
 SLACK = 2_000
-CHANNELS = list(Channel)
+CHANNELS = list(Account)
 
 events = st.lists(
     st.tuples(st.integers(0, 400), st.sampled_from(CHANNELS), st.integers(0, 5_000), st.integers(0, 60)),
@@ -39,7 +39,7 @@ def fed(items: list) -> Ledger:
     return ledger
 
 
-def brute(items: list, channel: Channel | None, now: int) -> int:
+def brute(items: list, channel: Account | None, now: int) -> int:
     """A window's line bytes, from the definition."""
     return sum(
         payload + attachment + 66
@@ -48,7 +48,7 @@ def brute(items: list, channel: Channel | None, now: int) -> int:
     )
 
 
-def brute_worst(items: list, channel: Channel | None) -> int:
+def brute_worst(items: list, channel: Account | None) -> int:
     """The fullest window in bits a second, from the definition."""
     return max(brute(items, channel, at) for at, *_ in items) * 8 * 1_000_000
 
@@ -60,8 +60,8 @@ def test_windows_and_worst_windows_are_exact(gaps):
     items = dated(gaps)
     ledger = fed(items)
     worst = ledger.worst_window_bps
-    assert worst.base == brute_worst(items, Channel.BASE)
-    assert worst.roi == brute_worst(items, Channel.ROI)
+    assert worst.base == brute_worst(items, Account.BASE)
+    assert worst.roi == brute_worst(items, Account.ROI)
     assert worst.total == brute_worst(items, None)
     newest = items[-1][0]
     for now in (newest, newest + 1, newest + 500, newest + WINDOW, newest - 700, newest - SLACK):
@@ -84,19 +84,19 @@ def test_slightly_other_order_gives_the_same_account(gaps, seed):
 def test_totals_put_every_byte_in_one_place():
     """Metadata would hide in the payload or be counted twice."""
     ledger = Ledger()
-    ledger.count(Channel.BASE, payload_bytes=5_000, attachment_bytes=39, overhead_bytes=240, at_ns=0)
-    ledger.count(Channel.ROI, payload_bytes=1_500, attachment_bytes=90, overhead_bytes=136, at_ns=10)
-    ledger.count(Channel.META, payload_bytes=200, attachment_bytes=0, overhead_bytes=84, at_ns=20)
-    ledger.count(Channel.PAST, payload_bytes=700, attachment_bytes=40, overhead_bytes=120, at_ns=20)
+    ledger.count(Account.BASE, payload_bytes=5_000, attachment_bytes=39, overhead_bytes=240, at_ns=0)
+    ledger.count(Account.ROI, payload_bytes=1_500, attachment_bytes=90, overhead_bytes=136, at_ns=10)
+    ledger.count(Account.META, payload_bytes=200, attachment_bytes=0, overhead_bytes=84, at_ns=20)
+    ledger.count(Account.BACKLOG, payload_bytes=700, attachment_bytes=40, overhead_bytes=120, at_ns=20)
     summary = ledger.summary(2.0)
-    assert (summary.base_bytes, summary.roi_bytes, summary.past_bytes) == (5_000, 1_500, 700)
+    assert (summary.base_bytes, summary.roi_bytes, summary.backlog_bytes) == (5_000, 1_500, 700)
     assert (summary.meta_bytes, summary.overhead_bytes) == (39 + 90 + 40 + 200, 240 + 136 + 120 + 84)
     assert summary.line_bytes == ledger.line_bytes == 5_279 + 1_726 + 860 + 284
-    assert summary.messages == {"base": 1, "roi": 1, "past": 1, "meta": 1}
+    assert summary.messages == {"base": 1, "roi": 1, "backlog": 1, "meta": 1}
     assert (summary.base_bps, summary.roi_bps) == (5_279 * 4, 1_726 * 4)
     assert summary.total_bps == (5_279 + 1_726 + 860 + 284) * 4
     assert (ledger.first_ns, ledger.last_ns) == (0, 20)
-    assert ledger.messages(Channel.ROI) == 1
+    assert ledger.messages(Account.ROI) == 1
 
 
 def test_an_empty_run_has_rates_of_zero():
@@ -112,7 +112,7 @@ def test_memory_stays_flat():
     sizes = set()
     for frame in range(20_000):
         ledger.count(
-            Channel.BASE,
+            Account.BASE,
             payload_bytes=5_000,
             attachment_bytes=40,
             overhead_bytes=240,
@@ -126,10 +126,10 @@ def test_memory_stays_flat():
 
 def test_a_clock_set_back_starts_the_windows_afresh():
     """An hour's step of the clock would pile every later message into one window."""
-    ledger = fed([(10_000_000 + n * 100, Channel.BASE, 934, 0) for n in range(50)])
+    ledger = fed([(10_000_000 + n * 100, Account.BASE, 934, 0) for n in range(50)])
     before = ledger.worst_window_bps.base
     for n in range(50):
-        ledger.count(Channel.BASE, payload_bytes=934, attachment_bytes=0, overhead_bytes=66, at_ns=n * 100)
+        ledger.count(Account.BASE, payload_bytes=934, attachment_bytes=0, overhead_bytes=66, at_ns=n * 100)
     assert before == ledger.worst_window_bps.base == 10 * 1_000 * 8 * 1_000_000
     assert ledger.window_bytes(None, 4_900) == 10_000
     assert ledger.base_bytes == 100 * 934
@@ -138,11 +138,11 @@ def test_a_clock_set_back_starts_the_windows_afresh():
 def test_fates_are_counted_by_reason():
     """Nobody could tell why a still never came."""
     ledger = Ledger()
-    ledger.record_fate("sent", "small")
-    ledger.record_fate("sent", "small")
-    ledger.record_fate("dropped", "stale")
-    assert ledger.fates("sent") == {"small": 2}
-    assert ledger.summary(1.0).fates == {
+    ledger.record_outcome("sent", "small")
+    ledger.record_outcome("sent", "small")
+    ledger.record_outcome("dropped", "stale")
+    assert ledger.outcomes("sent") == {"small": 2}
+    assert ledger.summary(1.0).outcomes == {
         "sent": {"small": 2},
         "deferred": {},
         "dropped": {"stale": 1},

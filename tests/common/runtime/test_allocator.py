@@ -14,9 +14,9 @@ pytestmark = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is
 PROGRAM = """
 import threading
 import numpy as np, psutil
-from hvt_common.runtime.allocator import keep_to_few_heaps
+from hvt_common.runtime.allocator import limit_malloc_arenas
 if {asked}:
-    keep_to_few_heaps()
+    limit_malloc_arenas()
 np.ones(1 << 22, np.uint8)  # the first that is freed teaches glibc that frames are common
 go_on, kept = threading.Event(), []
 

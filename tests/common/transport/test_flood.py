@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hvt_common.protocol.ledger import Channel, Ledger
+from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.inbox import Inbox, Received
 
@@ -55,10 +55,10 @@ def test_the_account_of_a_flood_stays_small():
     """A sender whose clock stands still, or who invents reasons, would fill the memory of the ground."""
     ledger = Ledger()
     for number in range(150_000):
-        ledger.count(Channel.ROI, payload_bytes=10, attachment_bytes=5, overhead_bytes=5, at_ns=SECOND_NS)
-        ledger.record_fate("received", f"reason {number}")
+        ledger.count(Account.ROI, payload_bytes=10, attachment_bytes=5, overhead_bytes=5, at_ns=SECOND_NS)
+        ledger.record_outcome("received", f"reason {number}")
     assert len(ledger._pending) + len(ledger._windows.entries) < 140_000
     assert ledger.line_bytes == 150_000 * 20
-    reasons = ledger.fates("received")
+    reasons = ledger.outcomes("received")
     assert len(reasons) == 24
     assert reasons["other"] == 150_000 - 23

@@ -18,7 +18,7 @@ import pytest
 import zenoh
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import EdgeKeys, Row, selector
+from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.protocol.messages import BaseHeader, Command, ControlAnswer, ControlRequest, Flags
 from hvt_common.transport.session import (
     Inbox,
@@ -69,9 +69,9 @@ def test_messages_cross_with_attachment_and_encoding(endpoint):
     """Nothing would arrive, or without what HVT knows about it."""
     inbox = Inbox(capacity=8, overflow="newest")
     with open_session(ground(endpoint)) as listener, open_session(edge(endpoint)) as connector:
-        subscriber = subscribe(listener, selector(Row.BASE, edges="uav-*"), inbox=inbox)
-        publisher = declare_publisher(connector, Row.BASE, keys=KEYS)
-        other = declare_publisher(connector, Row.BASE, keys=EdgeKeys("rover-1"))
+        subscriber = subscribe(listener, selector(Channel.BASE, edges="uav-*"), inbox=inbox)
+        publisher = declare_publisher(connector, Channel.BASE, keys=KEYS)
+        other = declare_publisher(connector, Channel.BASE, keys=EdgeKeys("rover-1"))
         wait_for(lambda: publisher.matching_status.matching)
         keyframe = bytes(range(256)) * 400
         publisher.put(keyframe, attachment=b"header")
@@ -90,12 +90,12 @@ def test_messages_cross_with_attachment_and_encoding(endpoint):
 def test_the_edge_may_start_first(endpoint):
     """Whoever starts the drone before the ground station would have to start it again."""
     with open_session(edge(endpoint)) as connector:
-        publisher = declare_publisher(connector, Row.BASE, keys=KEYS)
+        publisher = declare_publisher(connector, Channel.BASE, keys=KEYS)
         publisher.put(b"nobody hears this")
         inbox = Inbox(capacity=8, overflow="newest")
         for _ in range(2):  # and the ground may come and go
             with open_session(ground(endpoint)) as listener:
-                subscriber = subscribe(listener, selector(Row.BASE), inbox=inbox)
+                subscriber = subscribe(listener, selector(Channel.BASE), inbox=inbox)
                 wait_for(lambda: publisher.matching_status.matching)
                 publisher.put(b"heard")
                 assert inbox.get(timeout_s=5).payload == b"heard"
@@ -107,10 +107,12 @@ def test_questions_are_answered_and_silence_ends(endpoint):
     """A ground that joins late would wait for ever for an edge that is not there."""
     with open_session(ground(endpoint)) as listener, open_session(edge(endpoint)) as connector:
         answers = {b"size?": b"1280x720"}
-        queryable = serve(connector, Row.INFO, keys=KEYS, answer=answers.get)
-        wait_for(lambda: ask(listener, Row.INFO, keys=KEYS, question=b"size?", timeout_s=1) == b"1280x720")
-        assert ask(listener, Row.INFO, keys=KEYS, question=b"other?", timeout_s=1) is None
-        assert ask(listener, Row.CONTROL, keys=KEYS, question=b"size?", timeout_s=1) is None
+        queryable = serve(connector, Channel.INFO, keys=KEYS, answer=answers.get)
+        wait_for(
+            lambda: ask(listener, Channel.INFO, keys=KEYS, question=b"size?", timeout_s=1) == b"1280x720"
+        )
+        assert ask(listener, Channel.INFO, keys=KEYS, question=b"other?", timeout_s=1) is None
+        assert ask(listener, Channel.CONTROL, keys=KEYS, question=b"size?", timeout_s=1) is None
         queryable.undeclare()
 
 
@@ -215,18 +217,18 @@ def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
         inbox = Inbox(capacity=64, overflow="newest")
         subscriber = subscribe(listener, "hvt/uav-1/*", inbox=inbox)
         with open_session(LinkSettings("edge", connect=(endpoint,), links=2)) as connector:
-            queryable = serve(connector, Row.INFO, keys=KEYS, answer=lambda question: question)
+            queryable = serve(connector, Channel.INFO, keys=KEYS, answer=lambda question: question)
             wait_for(lambda: all(len(session.info.links()) == 2 for session in (connector, listener)))
             for session in (connector, listener):
                 assert sorted(one.priorities for one in session.info.links()) == [(1, 3), (4, 7)]
-            rows = (Row.BASE, Row.ROI, Row.TRACKS, Row.PAST, Row.STATUS)
+            rows = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.BACKLOG, Channel.STATUS)
             publishers = {row: declare_publisher(connector, row, keys=KEYS) for row in rows}
             wait_for(lambda: all(one.matching_status.matching for one in publishers.values()))
             for row, publisher in publishers.items():
                 publisher.put(str(row).encode())
             came = {inbox.get(timeout_s=5).payload.decode() for _ in rows}
             assert came == {str(row) for row in rows}
-            assert ask(listener, Row.INFO, keys=KEYS, question=b"who?", timeout_s=5) == b"who?"
+            assert ask(listener, Channel.INFO, keys=KEYS, question=b"who?", timeout_s=5) == b"who?"
             queryable.undeclare()
         subscriber.undeclare()
 
@@ -433,12 +435,12 @@ def test_the_subscriber_of_the_document_writes_the_video(endpoint, tmp_path):
         if ControlRequest.parse(question).command == Command.KEYFRAME:
             asked.set()
         return ControlAnswer(
-            session_id=7, accepted=True, reason="", still_ask=-1, frame_index=-1, tracks=()
+            session_id=7, accepted=True, reason="", still_request=-1, frame_index=-1, tracks=()
         ).pack()
 
     with open_session(LinkSettings("edge", listen=(endpoint,))) as session:
-        publisher = declare_publisher(session, Row.BASE, keys=KEYS)
-        queryable = serve(session, Row.CONTROL, keys=KEYS, answer=answer)
+        publisher = declare_publisher(session, Channel.BASE, keys=KEYS)
+        queryable = serve(session, Channel.CONTROL, keys=KEYS, answer=answer)
         reader = start(code, endpoint, "uav-1", str(tmp_path / "out.hevc"))
         try:
             assert asked.wait(20)

@@ -8,9 +8,15 @@ from collections import Counter
 
 import pytest
 
-from hvt_common.protocol.messages import MAX_PAST_HAVES, PastHave, PastHeader, PastKind, parse_past_units
-from hvt_edge.backlog.backfill import Backfill, Piece
-from hvt_ground.backlog import PastAssembly, past_content
+from hvt_common.protocol.messages import (
+    MAX_ACKNOWLEDGED_RANGES,
+    AcknowledgedRange,
+    BacklogHeader,
+    BacklogKind,
+    parse_backlog_units,
+)
+from hvt_edge.backlog.backfill import Backfill, Chunk
+from hvt_ground.backlog import BacklogAssembly, backlog_content
 from kept import UNITS, S, add_stills, add_units, opened, shifted
 
 RTT = 100_000_000
@@ -21,33 +27,33 @@ class Ground:
 
     def __init__(self, receiver_id: int = 1) -> None:
         self.receiver_id = receiver_id
-        self.assembly = PastAssembly()
+        self.assembly = BacklogAssembly()
         self.objects: dict[tuple, bytes] = {}
         self.order: list[tuple] = []
         self.knows = {7}
         self.twice = Counter()
 
-    def take(self, piece: Piece) -> None:
+    def take(self, chunk: Chunk) -> None:
         """A piece arrives."""
-        header = PastHeader(
-            session_id=piece.session_id,
-            kind=piece.kind,
-            number=piece.number,
-            offset=piece.offset,
-            total_bytes=piece.total_bytes,
+        header = BacklogHeader(
+            session_id=chunk.session_id,
+            kind=chunk.kind,
+            number=chunk.number,
+            offset=chunk.offset,
+            total_bytes=chunk.total_bytes,
             send_ns=1,
         )
-        whole = self.assembly.piece(PastHeader.parse(header.pack(piece.data), piece.data), piece.data)
+        whole = self.assembly.chunk(BacklogHeader.parse(header.pack(chunk.data), chunk.data), chunk.data)
         if whole is None:
             return
-        key = (piece.session_id, piece.kind, piece.number)
-        if piece.kind == PastKind.INFO:
-            self.knows.add(piece.session_id)
-        elif piece.session_id not in self.knows:
-            self.assembly.want_info(piece.session_id)
+        key = (chunk.session_id, chunk.kind, chunk.number)
+        if chunk.kind == BacklogKind.INFO:
+            self.knows.add(chunk.session_id)
+        elif chunk.session_id not in self.knows:
+            self.assembly.want_info(chunk.session_id)
             self.assembly.settle(key, usable=False)
             return
-        past_content(key, whole, edge="uav-1") if piece.kind != PastKind.INFO else None
+        backlog_content(key, whole, edge="uav-1") if chunk.kind != BacklogKind.INFO else None
         self.twice[key] += 1
         self.objects[key] = whole
         self.order.append(key)
@@ -66,25 +72,25 @@ class Rig:
         self.ground = Ground()
         self.now_ns = 0
         self.loss, self.random = loss, random.Random(seed)
-        self.sent: list[Piece] = []
+        self.sent: list[Chunk] = []
         self.listening = True
 
-    def run(self, seconds: float, *, piece_bytes: int = 5000, reports: bool = True) -> None:
+    def run(self, seconds: float, *, chunk_bytes: int = 5000, reports: bool = True) -> None:
         """Time passes."""
         for step in range(round(seconds * 20)):
             self.now_ns += S // 20
-            piece = self.backfill.next_piece(piece_bytes, now_ns=self.now_ns, round_trip_ns=RTT)
-            if piece is not None:
-                self.sent.append(piece)
+            chunk = self.backfill.next_chunk(chunk_bytes, now_ns=self.now_ns, round_trip_ns=RTT)
+            if chunk is not None:
+                self.sent.append(chunk)
                 if self.listening and self.random.random() >= self.loss:
-                    self.ground.take(piece)
+                    self.ground.take(chunk)
             if reports and step % 4 == 3 and self.random.random() >= self.loss:
                 self.report()
 
     def report(self) -> None:
         """What the ground has to say."""
-        haves = self.ground.assembly.take_haves(MAX_PAST_HAVES)
-        self.backfill.hear(haves, receiver_id=self.ground.receiver_id, now_ns=self.now_ns)
+        acknowledged_ranges = self.ground.assembly.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES)
+        self.backfill.hear(acknowledged_ranges, receiver_id=self.ground.receiver_id, now_ns=self.now_ns)
 
 
 def fill(folder, *, stills: int = 6) -> None:
@@ -108,7 +114,7 @@ def test_stills_come_by_worth_then_video_newest_first_and_the_disk_is_free(tmp_p
         assert rig.done == rig.ground.order
         assert (folder.stills, folder.segments) == (0, 0)
         assert set(rig.ground.twice.values()) == {1}
-        assert sum(len(piece.data) for piece in rig.sent) == sum(len(one) for one in expected.values())
+        assert sum(len(chunk.data) for chunk in rig.sent) == sum(len(one) for one in expected.values())
 
 
 def test_video_comes_first_where_somebody_asked_for_it(tmp_path):
@@ -165,11 +171,11 @@ def test_after_an_outage_it_goes_on_where_the_ground_left_off(tmp_path):
         total = len(folder.read(next(folder.newest_segments())))
         rig = Rig(folder)
         rig.run(0.6)
-        have = sum(len(piece.data) for piece in rig.sent)
-        assert 0 < have < total
+        acknowledged_range = sum(len(chunk.data) for chunk in rig.sent)
+        assert 0 < acknowledged_range < total
         rig.backfill.interrupt()
         rig.run(30)
-        resent = sum(len(piece.data) for piece in rig.sent) - total
+        resent = sum(len(chunk.data) for chunk in rig.sent) - total
         assert len(rig.ground.objects) == 1
         assert resent <= 4 * 5000, "what went out before the first report"
 
@@ -184,7 +190,7 @@ def test_a_ground_that_was_started_again_gets_it_from_the_beginning(tmp_path):
         rig.run(60)
         assert len(rig.ground.objects) == 3
         for key, data in rig.ground.objects.items():
-            assert parse_past_units(data)[0].frame_index == key[2]
+            assert parse_backlog_units(data)[0].frame_index == key[2]
 
 
 def test_what_a_ground_does_not_take_is_put_aside_and_never_deleted(tmp_path, caplog):
@@ -199,9 +205,9 @@ def test_what_a_ground_does_not_take_is_put_aside_and_never_deleted(tmp_path, ca
             assert rig.backfill.given_up == 0
             rig.run(60)
         assert rig.backfill.given_up == 3
-        assert Counter(piece.number for piece in rig.sent if piece.offset == 0) == {1: 3, 2: 3, 0: 3}
+        assert Counter(chunk.number for chunk in rig.sent if chunk.offset == 0) == {1: 3, 2: 3, 0: 3}
         assert (folder.stills, folder.segments) == (2, 1)
-        assert len(list(tmp_path.rglob("*.past"))) == 2
+        assert len(list(tmp_path.rglob("*.still"))) == 2
         assert len(list(tmp_path.rglob("*.mkv"))) == 1
         assert "3 tries" in caplog.text
         assert "stays on disk" in caplog.text
@@ -222,11 +228,11 @@ def test_a_ground_that_answers_is_busy_and_not_gone(tmp_path):
         add_stills(folder, {1: 1.0})
         rig = Rig(folder)
         rig.listening = False  # it has no room: the piece is not kept, and it says so
-        key = (7, PastKind.STILL, 1)
+        key = (7, BacklogKind.STILL, 1)
         for _ in range(60):
             rig.run(1, reports=False)
-            have = PastHave(session_id=7, kind=key[1], number=1, have_bytes=0)
-            rig.backfill.hear([have], receiver_id=1, now_ns=rig.now_ns)
+            acknowledged_range = AcknowledgedRange(session_id=7, kind=key[1], number=1, acknowledged_bytes=0)
+            rig.backfill.hear([acknowledged_range], receiver_id=1, now_ns=rig.now_ns)
         assert rig.backfill.given_up == 0
         rig.listening = True
         rig.run(5)
@@ -243,11 +249,13 @@ def test_a_word_that_comes_late_still_counts(tmp_path):
         rig.run(30, reports=False)
         assert rig.backfill.given_up == 1
         ((_, data),) = rig.ground.objects.items()
-        for have_bytes, left in ((len(data) - 1, 1), (len(data), 0)):
-            have = PastHave(session_id=7, kind=PastKind.STILL, number=1, have_bytes=have_bytes)
-            rig.backfill.hear([have], receiver_id=1, now_ns=rig.now_ns)
+        for acknowledged_bytes, left in ((len(data) - 1, 1), (len(data), 0)):
+            acknowledged_range = AcknowledgedRange(
+                session_id=7, kind=BacklogKind.STILL, number=1, acknowledged_bytes=acknowledged_bytes
+            )
+            rig.backfill.hear([acknowledged_range], receiver_id=1, now_ns=rig.now_ns)
             assert folder.stills == left
-        assert rig.done == [(7, PastKind.STILL, 1)]
+        assert rig.done == [(7, BacklogKind.STILL, 1)]
 
 
 def test_an_outage_is_no_try(tmp_path):
@@ -274,12 +282,17 @@ def test_reports_of_nonsense_and_of_other_grounds_change_nothing(tmp_path):
         entry = next(folder.newest_segments())
         total = len(folder.read(entry))
 
-        def have(bytes_: int, *, number: int = 0, kind: str = "base") -> PastHave:
-            return PastHave(session_id=7, kind=kind, number=number, have_bytes=bytes_)
+        def acknowledged_range(bytes_: int, *, number: int = 0, kind: str = "base") -> AcknowledgedRange:
+            return AcknowledgedRange(session_id=7, kind=kind, number=number, acknowledged_bytes=bytes_)
 
-        rig.backfill.hear([have(total)], receiver_id=99, now_ns=rig.now_ns)
+        rig.backfill.hear([acknowledged_range(total)], receiver_id=99, now_ns=rig.now_ns)
         rig.backfill.hear(
-            [have(total + 1), have(5, number=77), have(0, kind="still"), have(0, kind="info", number=4)],
+            [
+                acknowledged_range(total + 1),
+                acknowledged_range(5, number=77),
+                acknowledged_range(0, kind="still"),
+                acknowledged_range(0, kind="info", number=4),
+            ],
             receiver_id=1,
             now_ns=rig.now_ns,
         )
@@ -293,7 +306,10 @@ def test_only_facts_that_are_here_can_be_asked_for(tmp_path):
     with opened(tmp_path) as folder:
         add_stills(folder, {1: 1.0})
         backfill = Backfill(folder, session_id=7)
-        strangers = [PastHave(session_id=n, kind="info", number=0, have_bytes=0) for n in range(7, 2000)]
+        strangers = [
+            AcknowledgedRange(session_id=n, kind="info", number=0, acknowledged_bytes=0)
+            for n in range(7, 2000)
+        ]
         backfill.hear(strangers, receiver_id=1, now_ns=1)
         assert backfill._asked == {7}
 
@@ -305,7 +321,7 @@ def test_bytes_count_as_arrived_once_whatever_the_link_does(tmp_path):
         total = len(folder.read(next(folder.newest_segments())))
         rig = Rig(folder)
         for _ in range(3):
-            rig.run(0.4, piece_bytes=3000)
+            rig.run(0.4, chunk_bytes=3000)
             rig.backfill.interrupt()
         rig.run(30)
         assert folder.segments == 0
@@ -317,10 +333,10 @@ def test_a_piece_whose_room_was_gone_goes_out_next(tmp_path):
     with opened(tmp_path) as folder:
         add_stills(folder, {1: 1.0})
         backfill = Backfill(folder, session_id=7)
-        first = backfill.next_piece(1000, now_ns=1, round_trip_ns=RTT)
-        second = backfill.next_piece(600, now_ns=1, round_trip_ns=RTT)
+        first = backfill.next_chunk(1000, now_ns=1, round_trip_ns=RTT)
+        second = backfill.next_chunk(600, now_ns=1, round_trip_ns=RTT)
         backfill.take_back(second)
-        again = backfill.next_piece(2000, now_ns=1, round_trip_ns=RTT)
+        again = backfill.next_chunk(2000, now_ns=1, round_trip_ns=RTT)
         assert (first.offset, again.offset) == (0, second.offset)
         backfill.interrupt()
         backfill.take_back(again)  # it was on its way when the link went: nothing to take back
@@ -356,9 +372,9 @@ def test_pieces_are_no_smaller_than_they_are_worth(tmp_path):
     with opened(tmp_path) as folder:
         add_stills(folder, {1: 1.0})
         backfill = Backfill(folder, session_id=7)
-        assert backfill.next_piece(300, now_ns=1, round_trip_ns=RTT) is None
-        assert backfill.next_piece(0, now_ns=1, round_trip_ns=RTT) is None
-        first = backfill.next_piece(1000, now_ns=1, round_trip_ns=RTT)
+        assert backfill.next_chunk(300, now_ns=1, round_trip_ns=RTT) is None
+        assert backfill.next_chunk(0, now_ns=1, round_trip_ns=RTT) is None
+        first = backfill.next_chunk(1000, now_ns=1, round_trip_ns=RTT)
         assert (first.offset, len(first.data)) == (0, 1000)
         rest = first.total_bytes - 1000
-        assert backfill.next_piece(rest, now_ns=1, round_trip_ns=RTT).offset == 1000
+        assert backfill.next_chunk(rest, now_ns=1, round_trip_ns=RTT).offset == 1000

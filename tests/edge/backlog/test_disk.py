@@ -18,7 +18,7 @@ import pytest
 
 from clips import START_NS
 from hvt_common.errors import UserError
-from hvt_common.protocol.messages import Info, RoiHeader, parse_past_still, parse_past_units
+from hvt_common.protocol.messages import Info, RoiHeader, parse_backlog_still, parse_backlog_units
 from hvt_edge.app import Edge
 from hvt_edge.backlog.disk import check_folder, default_folder
 from hvt_edge.backlog.segment import DamagedError, SegmentWriter, index_of, read_segment
@@ -36,7 +36,7 @@ def numbers(entries) -> list[int]:
 def read_units(folder):
     """All frames that are kept and can be read, in order of capture."""
     objects = [folder.read(entry) for entry in reversed(list(folder.newest_segments()))]
-    return [unit for data in objects if data is not None for unit in parse_past_units(data)]
+    return [unit for data in objects if data is not None for unit in parse_backlog_units(data)]
 
 
 # Segments
@@ -124,7 +124,7 @@ def test_what_was_kept_is_there_after_a_restart(tmp_path):
         assert folder.disk_bytes == before
         info = folder.info_of(7)
         assert Info.parse(folder.read(info)) == INFO
-        still = parse_past_still(folder.read(next(folder.best_stills())))
+        still = parse_backlog_still(folder.read(next(folder.best_stills())))
         assert RoiHeader.parse(still.attachment, still.payload).sequence == 6
         for entry in [*folder.best_stills(), *folder.newest_segments()]:
             folder.remove(entry)
@@ -148,7 +148,7 @@ def test_what_is_too_old_is_dropped_at_the_start(tmp_path, caplog):
     assert "--store-age" in said
     assert sorted(one.name for one in (tmp_path / f"{7:016x}").iterdir()) == [
         "info",
-        f"still-2-{START_NS + 100 * S}-1.past",
+        f"still-2-{START_NS + 100 * S}-1.still",
     ]
 
 
@@ -159,16 +159,16 @@ def test_half_written_files_are_dropped_and_other_peoples_are_not(tmp_path):
         add_units(folder, UNITS[:5])
     session = tmp_path / f"{7:016x}"
     for name in (
-        f"still-2-{START_NS}-1.past.part",
+        f"still-2-{START_NS}-1.still.part",
         f"base-9-{START_NS}.mkv",
         f"base-8-{START_NS}.index",
-        f"still-3-{START_NS}-nan.past",
+        f"still-3-{START_NS}-nan.still",
         "notes.txt",
     ):
         (session / name).write_bytes(b"x")
     with opened(tmp_path, session_id=8) as folder:
         assert (folder.stills, folder.segments) == (1, 1)
-    assert sorted(one.suffix for one in session.iterdir()) == ["", ".index", ".mkv", ".past", ".txt"]
+    assert sorted(one.suffix for one in session.iterdir()) == ["", ".index", ".mkv", ".still", ".txt"]
 
 
 def test_corrupt_entries_are_skipped_with_one_warning(tmp_path, caplog):
@@ -229,7 +229,7 @@ def test_two_edges_do_not_share_a_folder(tmp_path):
         with pytest.raises(OSError, match="another edge"):
             add_stills(second, {2: 1.0})
         second.close()
-        assert len(list(tmp_path.rglob("*.past"))) == 1
+        assert len(list(tmp_path.rglob("*.still"))) == 1
     opened(tmp_path, session_id=8).close()
 
 

@@ -15,7 +15,7 @@ def states(outage: Outage, *, first: float, last: float, linked: bool, reports: 
         if reports and now >= next_report:
             outage.reported(round(now * S))
             next_report += reports
-        answers.append(outage.away(round(now * S), linked=linked))
+        answers.append(outage.offline(round(now * S), linked=linked))
     return answers
 
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from clips import START_NS
-from hvt_common.protocol.channels import Row
-from hvt_common.protocol.messages import Flags, RoiHeader, parse_past_still
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.messages import Flags, RoiHeader, parse_backlog_still
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.wiring import make_keep
+from hvt_edge.wiring import make_backlog
 from keeping import STILL, Rig
 from kept import INFO, opened
 from processes import eventually
@@ -27,7 +27,7 @@ def test_what_is_coded_in_an_outage_is_kept_and_all_else_is_sent(tmp_path):
     sent = [header.frame_index for header in rig.out.base]
     assert sent == [*range(30), *range(60, 90)]
     assert [header.sequence for header in rig.out.base] == list(range(60)), "no hole for what was kept"
-    assert rig.keep.frames == 30
+    assert rig.backlog.frames == 30
     assert [header.frame_index for header in rig.out.base if header.keyframe] == [0, 60]
     kept = rig.kept()
     # No report ever came: what was sent shortly before is kept too.
@@ -44,27 +44,29 @@ def test_the_picture_after_an_outage_can_be_shown_at_once(tmp_path):
     rig.play(20, 50, linked=False)
     rig.play(50, 70, linked=True)
     decoder = BaseDecoder()
-    shown = [decoder.decode(data) for row, data, _ in rig.out.puts if row is Row.BASE]
+    shown = [decoder.decode(data) for row, data, _ in rig.out.puts if row is Channel.BASE]
     assert all(picture is not None for picture in shown)
-    rig.keep.close()
+    rig.backlog.close()
 
 
 def test_a_silent_ground_is_asked_with_a_frame_a_second_that_nobody_shows(tmp_path):
     """Nobody would notice that the link is back; or the ground would show garbage."""
     rig = Rig(tmp_path / "store")
     rig.play(0, 15, linked=True)
-    rig.keep._outage.reported(rig.now_ns)
+    rig.backlog._outage.reported(rig.now_ns)
     rig.play(15, 120, linked=True)
     headers = rig.out.base
-    away = next(n for n, one in enumerate(headers[:-1]) if headers[n + 1].frame_index > one.frame_index + 1)
-    probes = headers[away + 1 :]
-    assert 15 + 22 <= headers[away].frame_index <= 15 + 23, "a second and a half"
+    offline = next(
+        n for n, one in enumerate(headers[:-1]) if headers[n + 1].frame_index > one.frame_index + 1
+    )
+    probes = headers[offline + 1 :]
+    assert 15 + 22 <= headers[offline].frame_index <= 15 + 23, "a second and a half"
     assert 4 <= len(probes) <= 6
-    before = headers[away].sequence
+    before = headers[offline].sequence
     for probe in probes:
         assert probe.keyframe or probe.sequence == before + 2, "a number is left out"
         before = probe.sequence
-    rig.keep._outage.reported(rig.now_ns)
+    rig.backlog._outage.reported(rig.now_ns)
     rig.play(120, 135, linked=True)
     assert [one.frame_index for one in rig.out.base[-15:]] == list(range(120, 135))
     assert rig.out.base[-15].keyframe
@@ -88,16 +90,16 @@ def test_a_kept_still_is_as_it_would_have_come_and_takes_its_budget(tmp_path):
     rig.play(0, 5, linked=True)
     rig.play(5, 8, linked=False)
     for _ in range(40):
-        rig.keep.still(STILL, utility=1.5, now_ns=rig.now_ns)
+        rig.backlog.still(STILL, utility=1.5, now_ns=rig.now_ns)
     assert rig.sender.still_room_bytes(rig.now_ns, paced=False) <= 100_000 - 40 * 1500
-    rig.keep.close()
+    rig.backlog.close()
     with opened(tmp_path / "store", session_id=8) as folder:
         (entry,) = folder.best_stills()
-        kept = parse_past_still(folder.read(entry))
+        kept = parse_backlog_still(folder.read(entry))
     header = RoiHeader.parse(kept.attachment, kept.payload)
     assert (kept.payload, kept.encoding) == (STILL.data, "image/jpeg")
     assert (header.sequence, header.session_id, header.flags & Flags.STORED) == (2**31, 7, Flags.STORED)
-    assert not [row for row, _, _ in rig.out.puts if row is Row.ROI]
+    assert not [row for row, _, _ in rig.out.puts if row is Channel.ROI]
 
 
 def test_stills_that_the_outage_swallowed_are_known_with_their_worth(tmp_path):
@@ -106,15 +108,15 @@ def test_stills_that_the_outage_swallowed_are_known_with_their_worth(tmp_path):
     rig.play(0, 5, linked=True)
     still = replace(STILL, sequence=0)
     rig.sender.still(still, now_ns=rig.now_ns, utility=2.5)
-    rig.keep.note_utility(still, 2.5)
+    rig.backlog.note_utility(still, 2.5)
     rig.play(5, 8, linked=False)
-    rig.keep.keep_lost(rig.now_ns)
-    rig.keep.close()
+    rig.backlog.store_lost(rig.now_ns)
+    rig.backlog.close()
     with opened(tmp_path / "store", session_id=8) as folder:
         (entry,) = folder.best_stills()
-        kept = parse_past_still(folder.read(entry))
+        kept = parse_backlog_still(folder.read(entry))
         assert (entry.number, kept.payload) == (0, still.data)
-        assert entry.path.name.endswith("-2.5.past"), "with its utility"
+        assert entry.path.name.endswith("-2.5.still"), "with its utility"
 
 
 def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, caplog):
@@ -124,11 +126,11 @@ def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, c
     with caplog.at_level(logging.WARNING):
         rig.play(0, 15, linked=True)
         rig.play(15, 25, linked=False)
-        eventually(lambda: rig.keep._worker.failed, within_s=10, what="the disk has said no")
+        eventually(lambda: rig.backlog._worker.failed, within_s=10, what="the disk has said no")
         rig.play(25, 60, linked=False)
         rig.play(60, 80, linked=True)
         rig.play(80, 90, linked=False)
-    rig.keep.close()
+    rig.backlog.close()
     assert len(caplog.records) == 1
     assert "--store-folder" in caplog.text
     again = rig.out.base[15:]
@@ -143,7 +145,7 @@ def test_nobody_keeps_where_nothing_is_to_be_kept(tmp_path, settings):
     """The same input would not give the same bytes; or a folder would appear that was not wanted."""
     config = check(EdgeConfig(source="demo", store_folder=tmp_path / "store", **settings))
     rig = Rig(tmp_path / "other")
-    keep = make_keep(
+    backlog = make_backlog(
         config,
         session_id=1,
         live=True,
@@ -153,18 +155,18 @@ def test_nobody_keeps_where_nothing_is_to_be_kept(tmp_path, settings):
         clock=lambda: START_NS,
         info=INFO.pack,
     )
-    rig.keep.close()
-    assert keep is None
+    rig.backlog.close()
+    assert backlog is None
 
 
 def test_asking_for_the_video_of_an_empty_store_is_refused(tmp_path):
     """Whoever asks would wait for something that never comes."""
     rig = Rig(tmp_path / "store")
-    assert not rig.keep.send_video()
-    assert rig.keep.text() == ""
+    assert not rig.backlog.send_video()
+    assert rig.backlog.text() == ""
     rig.play(0, 5, linked=True)
     rig.play(5, 35, linked=False)
-    eventually(lambda: rig.keep.numbers.video_s > 1.9, within_s=10, what="the frames are on disk")
-    assert rig.keep.send_video()
-    assert rig.keep.text() == "kept 0 stills, 2 s"
-    rig.keep.close()
+    eventually(lambda: rig.backlog.numbers.video_s > 1.9, within_s=10, what="the frames are on disk")
+    assert rig.backlog.send_video()
+    assert rig.backlog.text() == "kept 0 stills, 2 s"
+    rig.backlog.close()

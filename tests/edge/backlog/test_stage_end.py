@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from keeping import STILL, NoStills, Rig
 from kept import S, add_stills, opened
 
@@ -18,7 +18,7 @@ def test_what_nobody_acknowledged_is_kept_when_the_run_ends(tmp_path):
     rig.still(0, utility=2.5)
     kept = [unit.frame_index for unit in rig.kept()]
     assert kept == list(range(28, 40))
-    assert rig.kept_stills() == {0: f"still-0-{STILL.capture_ns}-2.5.past"}
+    assert rig.stored_stills() == {0: f"still-0-{STILL.capture_ns}-2.5.still"}
 
 
 def test_a_run_that_was_heard_to_its_end_keeps_nothing(tmp_path):
@@ -27,7 +27,7 @@ def test_a_run_that_was_heard_to_its_end_keeps_nothing(tmp_path):
     rig.play(0, 28, reports=True)
     rig.still(0)
     rig.report()
-    rig.keep.close()
+    rig.backlog.close()
     assert not (tmp_path / "store").exists()
 
 
@@ -36,7 +36,7 @@ def test_where_no_ground_ever_reports_nothing_is_kept_at_the_end(tmp_path):
     rig = Rig(tmp_path / "store")
     rig.play(0, 28)
     assert rig.finish(reports=False) == []
-    rig.keep.close()
+    rig.backlog.close()
     assert not (tmp_path / "store").exists()
 
 
@@ -53,14 +53,14 @@ def test_frames_and_stills_lost_at_the_end_of_a_clip_come_as_what_was_kept(tmp_p
     rig.out.dark = False
     notes = rig.finish()
     ground = rig.out.ground
-    assert set(ground.past_frames) == set(rig.coded) - ground.frames >= {36}
-    assert ground.past_stills == {1}
+    assert set(ground.backlog_frames) == set(rig.coded) - ground.frames >= {36}
+    assert ground.backlog_stills == {1}
     assert ground.frames >= set(rig.coded) - {35, 36}
     assert set(ground.twice.values()) == {1}
     assert len(notes) == 1
-    rig.keep.close()
-    assert not list((tmp_path / "store").rglob("*.past"))
-    assert ("sent", "stored") not in rig.fates, "it counted when it was sent"
+    rig.backlog.close()
+    assert not list((tmp_path / "store").rglob("*.still"))
+    assert ("sent", "stored") not in rig.outcomes, "it counted when it was sent"
 
 
 def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path):
@@ -68,16 +68,16 @@ def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path):
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
     rig.play(21, 45, linked=False)
-    rig.keep.still(STILL, utility=1.0, now_ns=rig.now_ns)
+    rig.backlog.still(STILL, utility=1.0, now_ns=rig.now_ns)
     rig.linked = True
     rig.finish()
     ground = rig.out.ground
-    assert ground.frames | set(ground.past_frames) == set(range(45))
-    assert {number: ground.past_frames[number] for number in range(21, 45)}.items() <= rig.coded.items()
-    assert ground.past_stills == {STILL.sequence}
-    assert rig.fates == [("sent", "stored")]
-    assert rig.keep.numbers.empty
-    rig.keep.close()
+    assert ground.frames | set(ground.backlog_frames) == set(range(45))
+    assert {number: ground.backlog_frames[number] for number in range(21, 45)}.items() <= rig.coded.items()
+    assert ground.backlog_stills == {STILL.sequence}
+    assert rig.outcomes == [("sent", "stored")]
+    assert rig.backlog.numbers.empty
+    rig.backlog.close()
 
 
 def test_the_end_of_a_clip_without_a_link_does_not_wait_for_ever(tmp_path):
@@ -96,12 +96,12 @@ def test_stills_sent_while_the_link_was_coming_back_are_kept(tmp_path):
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
     rig.play(21, 30, linked=False)
-    assert rig.keep.away
+    assert rig.backlog.offline
     rig.still(0, utility=1.5)  # the other thread had not noticed
     rig.play(30, 31, linked=True)
-    assert not rig.keep.away
-    rig.keep.keep_lost(rig.now_ns)
-    assert rig.kept_stills() == {0: f"still-0-{STILL.capture_ns}-1.5.past"}
+    assert not rig.backlog.offline
+    rig.backlog.store_lost(rig.now_ns)
+    assert rig.stored_stills() == {0: f"still-0-{STILL.capture_ns}-1.5.still"}
 
 
 def test_after_frames_that_were_kept_the_link_goes_on_with_a_keyframe(tmp_path):
@@ -132,14 +132,14 @@ def test_a_segment_that_begins_while_the_link_returns_does_not_put_the_picture_o
     rig.play(21, 30, linked=False)
     rig.admits = lambda _now_ns: False
     rig.play(30, 32, linked=True)
-    rig.keep._segment_ns = None  # as after ten seconds, or after a frame that the disk refused
+    rig.backlog._segment_ns = None  # as after ten seconds, or after a frame that the disk refused
     rig.play(32, 40, linked=True)
     rig.admits = lambda _now_ns: True
     rig.play(40, 60, linked=True)
     after = [header.frame_index for header in rig.out.base if header.frame_index >= 30]
     assert after == list(range(after[0], 60))
     assert after[0] <= 50, "within the patience of a keyframe that is due"
-    rig.keep.close()
+    rig.backlog.close()
 
 
 def test_only_to_who_reports_is_anything_sent_that_was_kept(tmp_path):
@@ -148,54 +148,56 @@ def test_only_to_who_reports_is_anything_sent_that_was_kept(tmp_path):
         add_stills(folder, {1: 1.0})
     rig = Rig(tmp_path / "store")
     rig.play(0, 60)
-    assert not rig.keep.may_send(rig.now_ns)
+    assert not rig.backlog.may_send(rig.now_ns)
     rig.report()
-    assert rig.keep.may_send(rig.now_ns)
-    assert not rig.keep.may_send(rig.now_ns + 2 * S), "it has fallen silent"
-    rig.keep.close()
+    assert rig.backlog.may_send(rig.now_ns)
+    assert not rig.backlog.may_send(rig.now_ns + 2 * S), "it has fallen silent"
+    rig.backlog.close()
 
 
 def test_what_may_be_sent_now_and_how_much(tmp_path):
     """Backfill would go before the picture, or before a live still."""
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
-    assert not rig.keep.may_send(rig.now_ns), "the link is two seconds old at the least"
+    assert not rig.backlog.may_send(rig.now_ns), "the link is two seconds old at the least"
     rig.play(21, 60, reports=True)
-    assert rig.keep.may_send(rig.now_ns)
+    assert rig.backlog.may_send(rig.now_ns)
     rig.keyframes.request(rig.now_ns)
-    assert not rig.keep.may_send(rig.now_ns), "a keyframe is to come"
+    assert not rig.backlog.may_send(rig.now_ns), "a keyframe is to come"
     rig.play(60, 75, reports=True)
-    assert rig.keep.may_send(rig.now_ns)
-    assert rig.keep.room_bytes(rig.now_ns, live_waits=False) == 5000, "50 ms of 800 kbps"
-    assert rig.keep.room_bytes(rig.now_ns, live_waits=True) == 1400
-    rig.keep.attend(NoStills(live_waits=True))
-    assert rig.keep.live_waits()
+    assert rig.backlog.may_send(rig.now_ns)
+    assert rig.backlog.room_bytes(rig.now_ns, live_waits=False) == 5000, "50 ms of 800 kbps"
+    assert rig.backlog.room_bytes(rig.now_ns, live_waits=True) == 1400
+    rig.backlog.attend(NoStills(live_waits=True))
+    assert rig.backlog.live_waits()
     for number in range(22):
         rig.still(number)
-    assert rig.keep.room_bytes(rig.now_ns, live_waits=False) == 0, "a third of the stills' share stays free"
-    assert rig.keep.room_bytes(rig.now_ns, live_waits=True) == 1400
+    assert rig.backlog.room_bytes(rig.now_ns, live_waits=False) == 0, (
+        "a third of the stills' share stays free"
+    )
+    assert rig.backlog.room_bytes(rig.now_ns, live_waits=True) == 1400
     rig.play(75, 90, linked=False)
-    assert not rig.keep.may_send(rig.now_ns)
-    rig.keep.close()
+    assert not rig.backlog.may_send(rig.now_ns)
+    rig.backlog.close()
 
 
 def test_kept_video_leaves_the_stills_its_share_and_no_more(tmp_path):
-    """With --lend the stills of an outage would take all that the video had: the store would hold stills only."""
-    rig = Rig(tmp_path / "store", lend=True, budget=(400_000, 300_000))
+    """With --borrow-unused the stills of an outage would take all that the video had, and leave none to it."""
+    rig = Rig(tmp_path / "store", borrow_unused=True, budget=(400_000, 300_000))
     rig.play(0, 15, reports=True)
     stills = 0
     for first in range(15, 150):
         rig.play(first, first + 1, linked=False)
         room = rig.sender.still_room_bytes(rig.now_ns, paced=False)
         while room >= 1500:
-            rig.keep.still(STILL, utility=1.0, now_ns=rig.now_ns)
+            rig.backlog.still(STILL, utility=1.0, now_ns=rig.now_ns)
             stills += 1
             room = rig.sender.still_room_bytes(rig.now_ns, paced=False)
     video = sum(len(rig.coded[index]) for index in range(15, 150))
     carry = 2.0 * 100_000 / 8
     assert stills * 1500 + video <= 9 * 400_000 / 8 + carry
     assert stills * 1500 >= 9 * 100_000 / 8, "their own share they have"
-    rig.keep.close()
+    rig.backlog.close()
 
 
 def test_in_an_outage_stills_have_the_room_that_the_link_gave_them(tmp_path):
@@ -205,18 +207,18 @@ def test_in_an_outage_stills_have_the_room_that_the_link_gave_them(tmp_path):
     assert rig.sender.total_bps == 800_000
     rig.out.dark = True
     rig.play(21, 60)
-    assert rig.keep.away
-    assert rig.follower.pacer.rate_bps == 100_000
+    assert rig.backlog.offline
+    assert rig.link_control.pacer.rate_bps == 100_000
     assert rig.sender.total_bps == 800_000
     assert rig.sender.still_room_bytes(rig.now_ns, paced=False) > 5_000
     rig.out.dark = False
     rig.report()
     rig.play(60, 62)
-    assert not rig.keep.away
-    assert rig.sender.total_bps == rig.follower.pacer.rate_bps < 800_000, (
+    assert not rig.backlog.offline
+    assert rig.sender.total_bps == rig.link_control.pacer.rate_bps < 800_000, (
         "the link has to show first what it carries"
     )
-    rig.keep.close()
+    rig.backlog.close()
 
 
 def test_the_end_of_the_stores_thread_is_noticed_on_a_good_link(tmp_path):
@@ -227,11 +229,11 @@ def test_the_end_of_the_stores_thread_is_noticed_on_a_good_link(tmp_path):
 
     rig = Rig(tmp_path / "store", info=broken)
     rig.play(0, 7, reports=True)
-    rig.keep.still(STILL, utility=1.0, now_ns=rig.now_ns)
-    rig.keep._worker._thread.join(timeout=10)
+    rig.backlog.still(STILL, utility=1.0, now_ns=rig.now_ns)
+    rig.backlog._worker._thread.join(timeout=10)
     with pytest.raises(ZeroDivisionError):
         rig.play(7, 8, linked=True)
-    rig.keep.close()
+    rig.backlog.close()
 
 
 def test_stills_of_a_former_run_count_for_that_one(tmp_path):
@@ -242,9 +244,9 @@ def test_stills_of_a_former_run_count_for_that_one(tmp_path):
     rig.play(0, 21, reports=True)
     rig.finish()
     assert len([key for key in rig.out.ground.twice if key[1] == "still"]) == 2
-    assert rig.keep.numbers.sent_stills == 2
-    assert rig.fates == []
-    rig.keep.close()
+    assert rig.backlog.numbers.sent_stills == 2
+    assert rig.outcomes == []
+    rig.backlog.close()
 
 
 def test_what_goes_out_of_the_store_is_within_the_budget(tmp_path):
@@ -254,7 +256,7 @@ def test_what_goes_out_of_the_store_is_within_the_budget(tmp_path):
     rig.play(21, 110, linked=False)
     rig.linked = True
     rig.finish()
-    assert sum(row is Row.PAST for row, _, _ in rig.out.puts) > 10
-    assert rig.keep.numbers.empty
+    assert sum(row is Channel.BACKLOG for row, _, _ in rig.out.puts) > 10
+    assert rig.backlog.numbers.empty
     assert rig.ledger.worst_window_bps.total <= 800_000
-    rig.keep.close()
+    rig.backlog.close()

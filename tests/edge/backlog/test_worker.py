@@ -11,18 +11,18 @@ from pathlib import Path
 import pytest
 
 from clips import START_NS
-from hvt_common.protocol.channels import Row
-from hvt_common.protocol.messages import PastHave, PastKind
-from hvt_edge.backlog.backfill import Piece
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
+from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Folder
-from hvt_edge.backlog.intake import EndSegment, Intake, KeptUnit
+from hvt_edge.backlog.intake import EndSegment, Intake, IntakeUnit
 from hvt_edge.backlog.outgoing import Outgoing
 from hvt_edge.backlog.worker import StoreWorker
 from keeping import Rig
 from kept import INFO, UNITS, S, add_stills, add_units, opened, shifted
 from processes import eventually
 
-UNIT = KeptUnit(UNITS[0], UNITS[0].data)
+UNIT = IntakeUnit(UNITS[0], UNITS[0].data)
 
 
 class Link:
@@ -36,7 +36,7 @@ class Link:
         self.gone = 0
         """So many pieces find that their room is gone."""
         self.now_ns = START_NS
-        self.sent: list[tuple[int, Piece]] = []
+        self.sent: list[tuple[int, Chunk]] = []
         self.round_trip_ns, self.total_bps = S // 10, 800_000
 
     def may_send(self, now_ns: int) -> bool:
@@ -51,15 +51,15 @@ class Link:
         """Of a piece."""
         return 1400 if live_waits else 5000
 
-    def send(self, piece: Piece, *, now_ns: int) -> int:
+    def send(self, chunk: Chunk, *, now_ns: int) -> int:
         """Send it."""
         self.full.wait(timeout=20)
         if self.gone:
             self.gone -= 1
             return 0
-        self.sent.append((now_ns, piece))
+        self.sent.append((now_ns, chunk))
         self.now_ns += S // 1000
-        return len(piece.data) + 60
+        return len(chunk.data) + 60
 
 
 def worker_of(path: Path, link: Link, *, info=INFO.pack, close_s: float = 5.0) -> StoreWorker:
@@ -102,7 +102,7 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
 
     worker = worker_of(tmp_path / "store", link, info=slow)
     units = [shifted(unit, 4 * part) for part in range(10) for unit in UNITS]
-    taken = [unit.frame_index for unit in units if worker.offer(KeptUnit(unit, UNITS[0].data))]
+    taken = [unit.frame_index for unit in units if worker.offer(IntakeUnit(unit, UNITS[0].data))]
     worker.end_segment()
     worker.video_first()
     disk.set()
@@ -110,7 +110,7 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
         lambda: not worker.waiting and worker._folder.open_segments == 0, within_s=20, what="all is kept"
     )
     assert worker._backfill.video_first
-    assert not worker.offer(KeptUnit(UNITS[0], b"")) or worker.numbers.segments > 1
+    assert not worker.offer(IntakeUnit(UNITS[0], b"")) or worker.numbers.segments > 1
     worker.close()
     assert len(taken) < len(units)
     with opened(tmp_path / "store", session_id=8) as folder:
@@ -139,13 +139,17 @@ def test_the_words_of_a_full_line_are_few():
     for number in range(500):
         intake.end_segment()
         intake.interrupt()
-        have = PastHave(session_id=7, kind=PastKind.BASE, number=number, have_bytes=5)
-        intake.hear([have], receiver_id=3)
+        acknowledged_range = AcknowledgedRange(
+            session_id=7, kind=BacklogKind.BASE, number=number, acknowledged_bytes=5
+        )
+        intake.hear([acknowledged_range], receiver_id=3)
     assert len(intake) == 2
     news, first = intake.take(0.0)
     assert (news.interrupted, first) == (True, UNIT)
-    assert [have.number for _, have in news.haves] == list(range(436, 500)), "the newest"
-    assert [type(intake.take(0.0)[1]) for _ in range(3)] == [KeptUnit, EndSegment, type(None)]
+    assert [acknowledged_range.number for _, acknowledged_range in news.acknowledged_ranges] == list(
+        range(436, 500)
+    ), "the newest"
+    assert [type(intake.take(0.0)[1]) for _ in range(3)] == [IntakeUnit, EndSegment, type(None)]
     assert not intake.take(0.0)[0].interrupted
     intake.close()
     assert not intake.offer(UNIT)
@@ -161,7 +165,7 @@ def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
     worker = worker_of(tmp_path / "store", link)
     eventually(lambda: worker._outgoing.busy, within_s=10, what="a piece is being sent")
     for unit in UNITS[:10]:
-        worker.offer(KeptUnit(shifted(unit, 50), UNITS[0].data))
+        worker.offer(IntakeUnit(shifted(unit, 50), UNITS[0].data))
     eventually(lambda: worker.numbers.segments == 2 and not worker.waiting, within_s=10, what="it is kept")
     assert link.sent == []
     link.full.set()
@@ -180,7 +184,7 @@ def test_after_the_last_word_nothing_goes_out(tmp_path):
     worker.send_no_more()
     link.full.set()
     for unit in UNITS[:10]:
-        worker.offer(KeptUnit(shifted(unit, 50), UNITS[0].data))
+        worker.offer(IntakeUnit(shifted(unit, 50), UNITS[0].data))
     eventually(lambda: worker.numbers.segments == 2 and not worker.waiting, within_s=10, what="it is kept")
     worker.close()
     assert len(link.sent) == 1, "the one that was under way"
@@ -195,7 +199,7 @@ def test_a_piece_whose_room_is_gone_comes_next_and_no_hole_is_left(tmp_path):
     worker = worker_of(tmp_path / "store", link)
     eventually(lambda: len(link.sent) > 2, within_s=10, what="pieces go out")
     worker.close()
-    offsets = [(piece.offset, len(piece.data)) for _, piece in link.sent]
+    offsets = [(chunk.offset, len(chunk.data)) for _, chunk in link.sent]
     assert [offset for offset, _ in offsets] == [
         sum(size for _, size in offsets[:n]) for n in range(len(offsets))
     ]
@@ -213,14 +217,14 @@ def test_where_live_stills_always_wait_a_trickle_goes_on(tmp_path):
         link.now_ns += S // 10
         worker._intake.wake()
         eventually(
-            lambda: worker._intake._woken is False and not worker._outgoing._piece, within_s=5, what="a turn"
+            lambda: worker._intake._woken is False and not worker._outgoing._chunk, within_s=5, what="a turn"
         )
         assert len(link.sent) - before <= 1
     worker.close()
     times = [at_ns for at_ns, _ in link.sent]
     assert all(later - earlier >= S // 2 for earlier, later in pairwise(times))
     assert len(times) >= 3
-    assert {len(piece.data) for _, piece in link.sent} == {1400}
+    assert {len(chunk.data) for _, chunk in link.sent} == {1400}
 
 
 @pytest.mark.parametrize("then", ["end", "keep"])
@@ -230,13 +234,13 @@ def test_a_folder_that_vanishes_in_mid_flight_ends_nothing(tmp_path, caplog, the
     link.open = False
     worker = worker_of(store, link)
     for unit in UNITS[:10]:
-        worker.offer(KeptUnit(unit, UNITS[0].data))
+        worker.offer(IntakeUnit(unit, UNITS[0].data))
     eventually(lambda: worker.numbers.video_s > 0.5, within_s=10, what="they are written")
     shutil.rmtree(store)
     with caplog.at_level(logging.WARNING):
         if then == "end":
             worker.end_segment()
-        worker.offer(KeptUnit(shifted(UNITS[0], 60), UNITS[0].data))
+        worker.offer(IntakeUnit(shifted(UNITS[0], 60), UNITS[0].data))
         eventually(lambda: worker.failed, within_s=10, what="it is noticed")
         worker.close()
     assert worker.numbers.empty
@@ -261,12 +265,12 @@ def test_what_a_dying_run_had_kept_is_sent_by_the_next(tmp_path):
 def test_an_error_in_sending_ends_the_process_too():
     """Nothing would come back any more, and nobody would know."""
 
-    def broken(_piece: Piece) -> int:
+    def broken(_chunk: Chunk) -> int:
         raise ZeroDivisionError
 
     woken = threading.Event()
     outgoing = Outgoing(broken, on_done=woken.set)
-    outgoing.put(Piece(7, PastKind.STILL, 1, 0, 3, b"abc"))
+    outgoing.put(Chunk(7, BacklogKind.STILL, 1, 0, 3, b"abc"))
     assert woken.wait(timeout=10)
     with pytest.raises(ZeroDivisionError):
         outgoing.take()
@@ -277,12 +281,12 @@ def test_the_link_that_blocks_is_the_edges_own(tmp_path):
     """With the real sender a full link would hold up the disk all the same."""
     rig = Rig(tmp_path / "store")
     gate = threading.Event()
-    rig.out.before_put = lambda row: row is not Row.PAST or gate.wait(timeout=20)
+    rig.out.before_put = lambda row: row is not Channel.BACKLOG or gate.wait(timeout=20)
     rig.play(0, 21, reports=True)
     rig.play(21, 40, linked=False)
     rig.play(40, 90, linked=True, reports=True)
-    eventually(lambda: rig.keep._worker._outgoing.busy, within_s=10, what="a piece is being sent")
+    eventually(lambda: rig.backlog._worker._outgoing.busy, within_s=10, what="a piece is being sent")
     rig.play(90, 110, linked=False)
-    eventually(lambda: not rig.keep._worker.waiting, within_s=10, what="frames are kept")
+    eventually(lambda: not rig.backlog._worker.waiting, within_s=10, what="frames are kept")
     gate.set()
     assert {unit.frame_index for unit in rig.kept()} >= set(range(90, 110))

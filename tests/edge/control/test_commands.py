@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clips import START_NS
-from command_rig import SESSION, TICK_NS, VIEW, Rig, picture
+from command_rig import FRAME_NS, SESSION, VIEW, Rig, picture
 from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
@@ -32,7 +32,7 @@ def test_a_box_of_three_seconds_ago_is_cut_from_the_frame_of_then():
     assert (answer.accepted, answer.reason, answer.frame_index) == (True, "", 14)
     rig.run(3)
     ((header, data),) = rig.asked()
-    assert header.parameters == {"ask": answer.still_ask}
+    assert header.parameters == {"ask": answer.still_request}
     assert (header.frame_index, header.crop_source_px, header.track_id) == (14, (300, 200, 396, 264), -1)
     truth = picture(14)[200:264, 300:396]
     assert cv2.PSNR(shown(header, data), truth) > 30
@@ -64,7 +64,7 @@ def test_what_is_asked_for_goes_before_the_methods_own():
     rig.run(75, others=True)
     assert [header.reason for header, _ in rig.out.stills[before : before + 1]] == ["asked"]
     assert len(rig.out.stills) > before + 1, "and the others go on afterwards"
-    assert rig.fates["sent", "asked"] == 1
+    assert rig.outcomes["sent", "asked"] == 1
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "residual"])
@@ -97,7 +97,7 @@ def test_one_that_never_fits_comes_smaller_within_some_seconds():
     answer = rig.ask("still", quality=95)
     rig.run(75)
     ((header, data),) = rig.asked()
-    assert header.parameters["ask"] == answer.still_ask
+    assert header.parameters["ask"] == answer.still_request
     assert len(data) <= 15_000 / 8
     assert shown(header, data).shape[1] == header.parameters["w"] < 512
 
@@ -149,12 +149,12 @@ def test_whoever_waits_can_ask_what_became_of_it():
     rig.run(30)
     first, second = rig.ask("still", track=5), rig.ask("still", track=5)
     rig.run(4)
-    assert rig.ask("still-fate", ask=first.still_ask).accepted, "sent or waiting"
+    assert rig.ask("still-outcome", ask=first.still_request).accepted, "sent or waiting"
     rig.chooser.close()
     assert len(rig.asked()) in (1, 2)
     if len(rig.asked()) == 1:
-        assert "session ended" in rig.ask("still-fate", ask=second.still_ask).reason
-    assert "nothing is known" in rig.ask("still-fate", ask=99).reason
+        assert "session ended" in rig.ask("still-outcome", ask=second.still_request).reason
+    assert "nothing is known" in rig.ask("still-outcome", ask=99).reason
     assert "session is ending" in rig.ask("still").reason
 
 
@@ -177,12 +177,12 @@ def test_another_budget_counts_from_a_keyframe_that_comes_at_once():
     rig.keyframes.done(rig.now_ns)  # so fresh that a request for a picture would be answered by it
     assert rig.ask("set-budget", bps=500_000).accepted
     assert rig.keyframes.due(rig.now_ns)
-    encoder = rig.renewal(1, rig.now_ns)
+    encoder = rig.reconfiguration(1, rig.now_ns)
     assert encoder is not None
-    assert rig.renewal.base_bps == 375_000
+    assert rig.reconfiguration.base_bps == 375_000
     assert rig.budget.base_step_bytes == 375_000 / 8 / 15
     assert rig.commands.config.budget_bps == 500_000
-    assert rig.renewal(1, rig.now_ns) is None, "once"
+    assert rig.reconfiguration(1, rig.now_ns) is None, "once"
 
 
 def test_a_budget_that_x265_cannot_follow_is_refused_and_changes_nothing():
@@ -191,7 +191,7 @@ def test_a_budget_that_x265_cannot_follow_is_refused_and_changes_nothing():
     answer = rig.ask("set-budget", bps=20_000)
     assert "20 kbps would leave 15 kbps for video, and 640x360 at 15 fps takes at least" in answer.reason
     assert rig.commands.config.budget_bps == 800_000
-    assert rig.renewal(1, rig.now_ns) is None
+    assert rig.reconfiguration(1, rig.now_ns) is None
     assert not rig.ask("set-budget", bps=0).accepted
     assert not rig.ask("set-budget", bps=10**12).accepted
     assert not rig.ask("set-budget").accepted
@@ -212,8 +212,8 @@ def test_another_method_decides_from_then_on():
     rig.run(5)
     assert rig.ask("set-method", method="m1").accepted
     assert rig.commands.config.method == "M1"
-    rig.renewal(1, rig.now_ns)
-    assert rig.renewal.base_bps == 0.8125 * 400_000, "stills have their share again"
+    rig.reconfiguration(1, rig.now_ns)
+    assert rig.reconfiguration.base_bps == 0.8125 * 400_000, "stills have their share again"
     rig.run(60, others=True)
     assert rig.out.stills
     rig.request_ns += 2_000_000_000
@@ -258,7 +258,7 @@ def test_no_request_breaks_the_edge(command, arguments):
     HOSTILE.run(1)
     assert answer.accepted == (not answer.reason)
     assert HOSTILE.on_demand.waiting <= 4
-    assert HOSTILE.renewal.count == 0
+    assert HOSTILE.reconfiguration.count == 0
 
 
 @settings(max_examples=30, deadline=None)
@@ -273,7 +273,7 @@ def test_after_a_change_every_message_keeps_to_the_budget_of_its_own_time(seed, 
     sent: list[tuple[int, int]] = []
     for tick in range(45 * len(totals)):
         total, keyframe = totals[tick // 45], tick % 45 == 0
-        now_ns = START_NS + tick * TICK_NS
+        now_ns = START_NS + tick * FRAME_NS
         if keyframe and tick:
             budget.set_total(total, round(0.8 * total), 15.0, now_ns=now_ns)
         size = int(min(total / 8, 0.8 * total / 8 / 15 * rng.gamma(4, 0.25) * (4 if keyframe else 1)))

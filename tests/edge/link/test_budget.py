@@ -60,24 +60,24 @@ def total_bytes(one: BudgetSettings) -> float:
 
 
 def budgets(
-    *, windows: tuple[float, ...] = (0.5, 1.0, 2.3), lend: bool | None = None
+    *, windows: tuple[float, ...] = (0.5, 1.0, 2.3), borrow_unused: bool | None = None
 ) -> st.SearchStrategy[BudgetSettings]:
     """Plausible settings."""
     return st.builds(
-        lambda total, share, fps, window, metadata, lend: BudgetSettings(
+        lambda total, share, fps, window, metadata, borrow_unused: BudgetSettings(
             total_bps=total,
             base_bps=round(total * share),
             fps=fps,
             window_ns=round(window * SECOND_NS),
             metadata_bps=metadata,
-            lend=lend,
+            borrow_unused=borrow_unused,
         ),
         st.sampled_from([100_000, 800_000, 1_400_000]),
         st.floats(0.3, 1.0),
         st.sampled_from([3.0, 10.0, 15.0, 29.97]),
         st.sampled_from(windows),
         st.sampled_from([0, 8_000]),
-        st.booleans() if lend is None else st.just(lend),
+        st.booleans() if borrow_unused is None else st.just(borrow_unused),
     )
 
 
@@ -104,7 +104,7 @@ def test_no_rolling_window_exceeds_the_total(one, seed, burst, greed):
 
 
 @settings(max_examples=40, deadline=None)
-@given(one=budgets(lend=False), seed=st.integers(0, 2**32 - 1))
+@given(one=budgets(borrow_unused=False), seed=st.integers(0, 2**32 - 1))
 def test_stills_keep_to_their_share(one, seed):
     """Stills would live on what the base leaves, and the base's quality would be paid for twice."""
     rng = np.random.default_rng(seed)
@@ -293,7 +293,7 @@ def test_what_the_base_leaves_is_lent_and_no_more(every, use):
     """A quiet scene would leave a third of the link idle while tracks wait for their still."""
     plain = BudgetSettings(300_000, 240_000, fps=15 / every)
     alone = fly(plain, every=every, use=use)
-    lent = fly(replace(plain, lend=True), every=every, use=use)
+    lent = fly(replace(plain, borrow_unused=True), every=every, use=use)
     total = plain.total_bps / 8 * 20
     assert alone.still_bytes + alone.base_bytes < (use * 0.8 + 0.2 + 0.03) * total
     assert 0.96 * total < lent.still_bytes + lent.base_bytes <= 1.01 * total
@@ -304,7 +304,7 @@ def test_what_the_base_leaves_is_lent_and_no_more(every, use):
 def test_nothing_is_lent_where_the_base_takes_its_share():
     """Lending would take from the base what it needs itself."""
     plain = BudgetSettings(300_000, 240_000, fps=5)
-    assert fly(replace(plain, lend=True), every=3, use=1.05).still_bytes == pytest.approx(
+    assert fly(replace(plain, borrow_unused=True), every=3, use=1.05).still_bytes == pytest.approx(
         fly(plain, every=3, use=1.05).still_bytes, rel=0.15, abs=5_000
     )
 
@@ -313,7 +313,7 @@ def test_nothing_is_lent_where_the_base_takes_its_share():
 @pytest.mark.parametrize("use", [0.5, 0.8, 1.0])
 def test_a_loan_is_counted_and_what_is_kept_for_others_is_not_lent(every, use):
     """What the base left would be given twice, or the tracks channel would find its bytes spent."""
-    one = BudgetSettings(300_000, 140_000, fps=15 / every, metadata_bps=100_000, lend=True)
+    one = BudgetSettings(300_000, 140_000, fps=15 / every, metadata_bps=100_000, borrow_unused=True)
     flight = fly(one, every=every, use=use)
     rate_bps = flight.still_bytes * 8 / 20
     # The share, two seconds of it saved up at the start, and what was left; frames that differ by 20 % leave a little

@@ -17,9 +17,15 @@ from hvt_common.protocol.messages import Feedback
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Flight, Pacer
-from hvt_edge.link.rate_control import LeastDelay, Progress, RateController, RateSettings, Reopening
-from hvt_edge.video.frame_skip import Cadence
-from hvt_edge.video.reconfigure import HeldCadence
+from hvt_edge.link.rate_control import (
+    LeastDelay,
+    Progress,
+    RateController,
+    RateSettings,
+    ReconfigurationTrigger,
+)
+from hvt_edge.video.frame_skip import FrameSkip
+from hvt_edge.video.reconfigure import LimitedFrameSkip
 from messages import feedback
 
 MS = 1_000_000
@@ -32,7 +38,8 @@ FPS = 15
 class World:
     """An edge of base frames and stills, a FIFO bottleneck and a ground that reports; stepped in 5 ms.
 
-    The base stream is re-opened as `Reopening` says; each re-opening and each ten seconds bring a keyframe. Stills
+    The base stream is re-opened as `ReconfigurationTrigger` says; each re-opening and each ten seconds bring a
+    keyframe. Stills
     fill what is left of the rate. ``loss`` takes messages away without a queue; ``offset_ns`` is the ground's clock.
     """
 
@@ -59,7 +66,7 @@ class World:
     def __post_init__(self) -> None:
         self.controller = RateController(RateSettings(ceiling_bps=self.ceiling_bps, floor_bps=self.floor_bps))
         self.pacer = Pacer(self.controller)
-        self.reopening = Reopening()
+        self.trigger = ReconfigurationTrigger()
         self.base_bps = self.share * self.ceiling_bps
         self.random = random.Random(self.seed)
         self.start_ns = self.now_ns
@@ -113,7 +120,7 @@ class World:
     def _frame(self) -> None:
         rate = self.pacer.rate_bps
         wanted = min(self.share * self.pacer.steady_bps, rate)
-        if self.reopening.wants(wanted, self.base_bps, settled=self.pacer.settled, now_ns=self.now_ns):
+        if self.trigger.wants(wanted, self.base_bps, settled=self.pacer.settled, now_ns=self.now_ns):
             self.keyframe = True
         self.tokens = min(rate / 8, self.tokens + max(0.0, rate - self.base_bps) / 8 / FPS)
         self.window = [(at, size) for at, size in self.window if at > self.now_ns - S]
@@ -124,7 +131,7 @@ class World:
         if self.keyframe or self.now_ns - self.last_keyframe_ns > 10 * S:
             if self.keyframe and self.t > 0:
                 self.base_bps = wanted
-                self.reopening.done(self.now_ns)
+                self.trigger.done(self.now_ns)
                 self.reopened.append(self.t)
             self.keyframe, self.last_keyframe_ns = False, self.now_ns
             size = max(6_000, round(0.2 * self.base_bps / 8))
@@ -297,7 +304,7 @@ def test_what_was_never_sent_proves_nothing():
         now_ns = number * 150 * MS
         controller.on_progress(
             Progress(
-                now_ns=now_ns, sent_ns=now_ns - 40 * MS, arrived_ns=now_ns - 20 * MS, own_ns=5 * MS,
+                now_ns=now_ns, sent_ns=now_ns - 40 * MS, arrived_ns=now_ns - 20 * MS, serialization_ns=5 * MS,
                 arrived_bytes=number * 1_500,
             )
         )  # fmt: skip
@@ -503,18 +510,18 @@ def test_the_least_delay_forgets():
 
 def test_x265_is_opened_anew_only_where_it_is_worth_it():
     """A keyframe at each small step would cost more than the step."""
-    reopening = Reopening()
-    assert not reopening.wants(105, 100, settled=False, now_ns=0)
-    assert not reopening.wants(110, 100, settled=False, now_ns=1 * S)
-    assert reopening.wants(110, 100, settled=False, now_ns=4 * S)
-    assert reopening.wants(130, 100, settled=False, now_ns=4 * S)
-    assert reopening.wants(79, 100, settled=False, now_ns=4 * S)
-    reopening.done(4 * S)
-    assert not reopening.wants(50, 100, settled=False, now_ns=5 * S)
-    assert reopening.wants(50, 100, settled=False, now_ns=6 * S)
-    reopening.done(10 * S)
-    assert not reopening.wants(103, 100, settled=True, now_ns=11 * S)
-    assert reopening.wants(103, 100, settled=True, now_ns=15 * S)
+    trigger = ReconfigurationTrigger()
+    assert not trigger.wants(105, 100, settled=False, now_ns=0)
+    assert not trigger.wants(110, 100, settled=False, now_ns=1 * S)
+    assert trigger.wants(110, 100, settled=False, now_ns=4 * S)
+    assert trigger.wants(130, 100, settled=False, now_ns=4 * S)
+    assert trigger.wants(79, 100, settled=False, now_ns=4 * S)
+    trigger.done(4 * S)
+    assert not trigger.wants(50, 100, settled=False, now_ns=5 * S)
+    assert trigger.wants(50, 100, settled=False, now_ns=6 * S)
+    trigger.done(10 * S)
+    assert not trigger.wants(103, 100, settled=True, now_ns=11 * S)
+    assert trigger.wants(103, 100, settled=True, now_ns=15 * S)
 
 
 def test_the_same_reports_give_the_same_rates():
@@ -532,7 +539,7 @@ def test_one_report_cannot_do_more_than_its_share():
         controller.on_progress(
             Progress(
                 now_ns=now_ns, sent_ns=now_ns - 50 * MS, arrived_ns=now_ns - 50 * MS + delay_ns,
-                own_ns=50 * MS, arrived_bytes=number * 10_000,
+                serialization_ns=50 * MS, arrived_bytes=number * 10_000,
             )
         )  # fmt: skip
     assert controller.rate_bps == 800_000
@@ -557,15 +564,15 @@ def test_the_budget_takes_another_total_at_once():
 def test_few_frames_where_x265_can_do_no_more():
     """At a rate that x265 cannot follow the link would be overrun for good."""
     least = [1]
-    cadence = HeldCadence(Cadence(2), lambda: least[0])
-    assert cadence.at_keyframe(0) == 2
+    frame_skip = LimitedFrameSkip(FrameSkip(2), lambda: least[0])
+    assert frame_skip.at_keyframe(0) == 2
     least[0] = 5
-    assert cadence.every_n == 2  # at keyframes only
-    assert cadence.at_keyframe(10) == 5
-    cadence.coded(10, keyframe=True, mean_qp=30.0)
-    assert [tick for tick in range(11, 17) if cadence.codes(tick)] == [15, 16]
+    assert frame_skip.decimation == 2  # at keyframes only
+    assert frame_skip.at_keyframe(10) == 5
+    frame_skip.coded(10, keyframe=True, mean_qp=30.0)
+    assert [tick for tick in range(11, 17) if frame_skip.codes(tick)] == [15, 16]
     least[0] = 1
-    assert cadence.at_keyframe(20) == 2
+    assert frame_skip.at_keyframe(20) == 2
 
 
 def test_a_floor_above_the_ceiling_is_refused():

@@ -8,12 +8,14 @@ from clips import START_NS
 from hvt_common.protocol.messages import TrackStep, TrackStepDecoder
 from hvt_common.values import Frame, Tracks
 from hvt_edge.link.tracks_channel import TrackReporter, TrackReportSettings
-from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.analyzer import AnalyzedFrame
 
 PIXELS = np.zeros((8, 8, 3), np.uint8)
 
 
-def seen(index: int, *, ages=(0, 0), detected: bool = True, coded: bool = True, fps: float = 15) -> Seen:
+def seen(
+    index: int, *, ages=(0, 0), detected: bool = True, coded: bool = True, fps: float = 15
+) -> AnalyzedFrame:
     """Two tracks, last detected so many ticks ago."""
     frame = Frame(index, START_NS + round(index * 1e9 / fps), PIXELS, PIXELS)
     count = len(ages)
@@ -28,11 +30,11 @@ def seen(index: int, *, ages=(0, 0), detected: bool = True, coded: bool = True, 
         seen_frames=index - np.array(ages, np.int64),
         started=np.zeros(count, bool),
     )
-    return Seen(frame, PIXELS if coded else None, tracks, detected=detected)
+    return AnalyzedFrame(frame, PIXELS if coded else None, tracks, detected=detected)
 
 
 class Line:
-    """A sender whose budget has room 40 ms later; it makes each message twice, as `Sender.status` does."""
+    """A sender whose budget has room 40 ms later; it makes each message twice, as `Transmitter.status` does."""
 
     def __init__(self) -> None:
         self.steps: list[TrackStep] = []
@@ -43,7 +45,7 @@ class Line:
         self.steps.append(TrackStep.parse(make(now_ns + 40_000_000)))
 
 
-def told(shown: list[Seen], **settings) -> list[TrackStep]:
+def told(shown: list[AnalyzedFrame], **settings) -> list[TrackStep]:
     """What leaves the edge."""
     line = Line()
     reporter = TrackReporter(line, session_id=77, settings=TrackReportSettings(**settings))

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.protocol.channels import DELIVERIES, EdgeKeys, Row
-from hvt_common.protocol.ledger import Channel, Ledger, overhead_bytes
+from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
+from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, Flags, Health, RoiHeader, Status
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import (
     BASE_ATTACHMENT_BYTES,
     STATUS_BYTES,
-    Sender,
+    Transmitter,
     base_overhead_bps,
 )
 
@@ -32,9 +32,11 @@ class Out:
     """Keeps what was put, as a link would carry it."""
 
     def __init__(self) -> None:
-        self.puts: list[tuple[Row, bytes, bytes, str]] = []
+        self.puts: list[tuple[Channel, bytes, bytes, str]] = []
 
-    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+    def put(
+        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
         """Keep it."""
         self.puts.append((row, payload, attachment or b"", encoding))
 
@@ -54,7 +56,7 @@ class Rig:
     def __init__(self, *, total_bps: int = 800_000, lockstep: bool = False) -> None:
         self.out, self.ledger, self.waits = Out(), Ledger(), []
         self.budget = RollingBudget(BudgetSettings(total_bps, round(total_bps * 0.8), fps=15))
-        self.sender = Sender(
+        self.sender = Transmitter(
             self.out,
             ledger=self.ledger,
             budget=self.budget,
@@ -102,12 +104,12 @@ def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
         last_still_sequence=70_000,
         base_bytes=10**9,
         roi_bytes=10**9,
-        past_bytes=10**9,
+        backlog_bytes=10**9,
         meta_bytes=10**9,
         overhead_bytes=10**9,
         base_messages=10**6,
         roi_messages=10**6,
-        past_messages=10**6,
+        backlog_messages=10**6,
         meta_messages=10**6,
         worst_window_bps=(10**7, 10**7, 10**7),
         sent=counts,
@@ -163,7 +165,7 @@ def test_a_still_says_what_it_shows():
     rig.sender.still(sent, now_ns=NOW_NS + 50)
     ((row, payload, attachment, encoding),) = rig.out.puts
     header = RoiHeader.parse(attachment, payload)
-    assert (row, payload, encoding) == (Row.ROI, sent.data, JPEG)
+    assert (row, payload, encoding) == (Channel.ROI, sent.data, JPEG)
     for name in (
         "sequence",
         "frame_index",
@@ -195,9 +197,9 @@ def test_the_ledger_counts_the_very_bytes_that_were_put():
             rig.sender.status(lambda at_ns: status(at_ns, reasons=3), now_ns=now_ns)
     puts = rig.out.puts
     assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
-    assert rig.ledger.base_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Row.BASE)
-    assert rig.ledger.roi_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Row.ROI)
-    assert [rig.ledger.messages(one) for one in Channel] == [30, 10, 0, 2]
+    assert rig.ledger.base_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Channel.BASE)
+    assert rig.ledger.roi_bytes == sum(len(payload) for row, payload, _, _ in puts if row is Channel.ROI)
+    assert [rig.ledger.messages(one) for one in Account] == [30, 10, 0, 2]
     assert rig.ledger.line_bytes == sum(size for _, size in rig.budget._events)
 
 
@@ -290,13 +292,13 @@ def test_tracks_wait_for_the_window_and_are_counted_as_metadata():
     rig.sender.tracks(lambda at_ns: bytes([at_ns == NOW_NS + SECOND_NS] * 200), now_ns=NOW_NS + 100)
     (_, (row, payload, attachment, encoding)) = rig.out.puts
     assert (row, payload, attachment, encoding) == (
-        Row.TRACKS,
+        Channel.TRACKS,
         bytes([True] * 200),
         b"",
-        DELIVERIES[Row.TRACKS].encoding,
+        DELIVERIES[Channel.TRACKS].encoding,
     )
     assert rig.waits == [NOW_NS, NOW_NS + SECOND_NS]
-    assert rig.ledger.messages(Channel.META) == 1
+    assert rig.ledger.messages(Account.META) == 1
     assert rig.ledger.line_bytes == rig.out.line_bytes(EdgeKeys("uav-1"))
     assert rig.ledger.worst_window_bps.total <= 80_000
     assert rig.ledger.line_bytes == sum(size for _, size in rig.budget._events)
@@ -341,14 +343,14 @@ def test_two_threads_keep_one_account():
                 now_ns = NOW_NS + number * 1_000_000
                 if rig.sender.still_room_bytes(now_ns, still=still()) > 200:
                     rig.sender.still(still(200, sequence=number), now_ns=now_ns)
-                rig.sender.fate("sent", f"reason{number % 20}")
+                rig.sender.outcome("sent", f"reason{number % 20}")
         except BaseException as error:  # noqa: BLE001
             errors.append(error)
 
     def report(at_ns: int) -> Status:
         account = rig.ledger.summary(1.0)
         assert account.line_bytes == sum(size for size in (rig.ledger.line_bytes,))
-        return status(at_ns, reasons=len(rig.ledger.fates("sent")))
+        return status(at_ns, reasons=len(rig.ledger.outcomes("sent")))
 
     thread = threading.Thread(target=stills)
     thread.start()
@@ -363,10 +365,10 @@ def test_two_threads_keep_one_account():
     sequences = [
         BaseHeader.parse(attachment, payload).sequence
         for row, payload, attachment, _ in rig.out.puts
-        if row is Row.BASE
+        if row is Channel.BASE
     ]
     assert sequences == list(range(1_500))
-    assert sum(rig.ledger.fates("sent").values()) == 1_500
+    assert sum(rig.ledger.outcomes("sent").values()) == 1_500
 
 
 def test_attachments_are_messagepack_arrays():
@@ -374,7 +376,7 @@ def test_attachments_are_messagepack_arrays():
     rig = Rig()
     rig.sender.base(unit(0, keyframe=True), now_ns=NOW_NS)
     assert isinstance(msgpack.unpackb(rig.out.puts[0][2]), list)
-    assert DELIVERIES[Row.BASE].encoding == rig.out.puts[0][3]
+    assert DELIVERIES[Channel.BASE].encoding == rig.out.puts[0][3]
 
 
 @pytest.mark.parametrize("fits", [True, False])

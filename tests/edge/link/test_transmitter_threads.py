@@ -9,13 +9,13 @@ from itertools import count
 
 import pytest
 
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
-from hvt_common.protocol.messages import PastKind, RoiHeader
+from hvt_common.protocol.messages import BacklogKind, RoiHeader
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.backfill import Piece
+from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from keeping import STILL, Out
 
 S = 1_000_000_000
@@ -29,7 +29,7 @@ class Rig:
     def __init__(self) -> None:
         self.out, self.ledger, self.waits = Out(), Ledger(), []
         self.out.dark = True
-        self.sender = Sender(
+        self.sender = Transmitter(
             self.out,
             ledger=self.ledger,
             budget=RollingBudget(BudgetSettings(TOTAL, 400_000, fps=15)),
@@ -43,9 +43,9 @@ class Rig:
         """One of so many bytes."""
         self.sender.still(replace(STILL, sequence=number, data=b"\xff" * size), now_ns=now_ns)
 
-    def past(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:
+    def backlog(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:
         """A piece of so many bytes."""
-        return self.sender.past(Piece(7, PastKind.BASE, 0, offset, 10**6, bytes(size)), now_ns=now_ns)
+        return self.sender.backlog(Chunk(7, BacklogKind.BASE, 0, offset, 10**6, bytes(size)), now_ns=now_ns)
 
 
 def test_a_piece_that_lost_its_room_to_a_still_is_not_sent():
@@ -53,25 +53,25 @@ def test_a_piece_that_lost_its_room_to_a_still_is_not_sent():
     rig = Rig()
     for number in range(7):
         rig.still(number, 12_000)
-    room = rig.sender.past_room_bytes(NOW_NS, reserve=0.0)
+    room = rig.sender.backlog_allowance_bytes(NOW_NS, reserve=0.0)
     assert room == 5_000, "what the store's thread is told"
     rig.still(7, 12_000)  # by the stills' thread, meanwhile
-    assert rig.past(room) == 0
-    assert [row for row, _, _ in rig.out.puts if row is Row.PAST] == []
-    assert rig.past(rig.sender.past_room_bytes(NOW_NS, reserve=0.0)) in range(5_000)
+    assert rig.backlog(room) == 0
+    assert [row for row, _, _ in rig.out.puts if row is Channel.BACKLOG] == []
+    assert rig.backlog(rig.sender.backlog_allowance_bytes(NOW_NS, reserve=0.0)) in range(5_000)
     assert rig.ledger.worst_window_bps.total <= TOTAL
 
 
 def test_a_still_that_lost_its_room_waits_until_there_is_some():
     """A still and a piece that were both admitted would exceed the window together."""
     rig = Rig()
-    assert rig.past(40_000)
+    assert rig.backlog(40_000)
     room = rig.sender.still_room_bytes(NOW_NS)
     assert room > 7_000
-    assert rig.past(55_000, offset=40_000)  # by the store's thread, meanwhile
+    assert rig.backlog(55_000, offset=40_000)  # by the store's thread, meanwhile
     rig.still(0, room)
     row, payload, attachment = rig.out.puts[-1]
-    assert row is Row.ROI
+    assert row is Channel.ROI
     header = RoiHeader.parse(attachment, payload)
     assert header.capture_ns + header.send_delay_ns >= NOW_NS + S, "when the window has moved on"
     assert rig.waits[-1] == header.capture_ns + header.send_delay_ns
@@ -123,10 +123,10 @@ def kept(rig: Rig, clock: Clock) -> Iterator[None]:
     offset = 0
     while True:
         at_ns = clock()
-        room = rig.sender.past_room_bytes(at_ns, reserve=0.0)
+        room = rig.sender.backlog_allowance_bytes(at_ns, reserve=0.0)
         yield
         if room > 500:
-            offset += room if rig.past(room, now_ns=at_ns, offset=offset % 900_000) else 0
+            offset += room if rig.backlog(room, now_ns=at_ns, offset=offset % 900_000) else 0
         yield
 
 
@@ -140,18 +140,20 @@ def test_three_threads_keep_to_one_budget_in_whatever_order_they_run(seed):
         for _ in range(chance.randrange(1, 8)):
             next(chance.choice(threads))
     rows = [row for row, _, _ in rig.out.puts]
-    assert min(rows.count(row) for row in (Row.BASE, Row.ROI, Row.PAST)) > 10
+    assert min(rows.count(row) for row in (Channel.BASE, Channel.ROI, Channel.BACKLOG)) > 10
     assert rig.ledger.worst_window_bps.total <= TOTAL
 
 
 def test_room_for_what_was_kept_leaves_what_base_and_stills_will_want():
     """A piece would take the room of the next frame, or of a still that comes."""
     budget = RollingBudget(BudgetSettings(TOTAL, 400_000, fps=15))
-    assert budget.past_room(NOW_NS, reserve=0.0) == 100_000, "no base frame is expected where none goes out"
-    assert budget.past_room(NOW_NS, reserve=0.5) == 75_000
+    assert budget.backlog_allowance(NOW_NS, reserve=0.0) == 100_000, (
+        "no base frame is expected where none goes out"
+    )
+    assert budget.backlog_allowance(NOW_NS, reserve=0.5) == 75_000
     budget.record_base(3_000, now_ns=NOW_NS)
-    room = budget.past_room(NOW_NS, reserve=0.0)
+    room = budget.backlog_allowance(NOW_NS, reserve=0.0)
     assert 45_000 <= room <= 50_000, "the base's half of the coming window is not given away"
-    budget.record_past(20_000, now_ns=NOW_NS)
-    assert budget.past_room(NOW_NS, reserve=0.0) <= room
-    assert budget.past_room(NOW_NS + 3 * S, reserve=0.0) == 100_000
+    budget.record_backlog(20_000, now_ns=NOW_NS)
+    assert budget.backlog_allowance(NOW_NS, reserve=0.0) <= room
+    assert budget.backlog_allowance(NOW_NS + 3 * S, reserve=0.0) == 100_000

@@ -9,16 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hvt_common.protocol.channels import Row
-from hvt_common.protocol.ledger import Channel, Ledger
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.protocol.messages import Feedback, RoiHeader
 from hvt_common.values import AccessUnit, Frame, Still, Tracks, View
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.link.unacknowledged import UnackedSettings, Unacknowledged
-from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.policy.base import ranked
@@ -243,10 +243,10 @@ class Rig:
     """A real sender with budget, pacer and account, into a list; now and then a ground says what it has."""
 
     def __init__(self, *, total_bps: int = 800_000) -> None:
-        self.puts: list[tuple[Row, bytes, bytes]] = []
+        self.puts: list[tuple[Channel, bytes, bytes]] = []
         self.ledger, self.unacked = Ledger(), Unacknowledged()
         self.pacer = Pacer(RateController(RateSettings(ceiling_bps=total_bps, floor_bps=100_000)))
-        self.sender = Sender(
+        self.sender = Transmitter(
             self,
             ledger=self.ledger,
             budget=RollingBudget(BudgetSettings(total_bps, round(total_bps * 0.8), fps=15)),
@@ -265,7 +265,7 @@ class Rig:
     @property
     def stills(self) -> list[tuple[RoiHeader, bytes]]:
         """What went out on ``roi``."""
-        return [(RoiHeader.parse(extra, data), data) for row, data, extra in self.puts if row is Row.ROI]
+        return [(RoiHeader.parse(extra, data), data) for row, data, extra in self.puts if row is Channel.ROI]
 
 
 def test_a_second_copy_has_the_same_number_and_bytes_and_is_counted():
@@ -281,7 +281,7 @@ def test_a_second_copy_has_the_same_number_and_bytes_and_is_counted():
     assert copy == replace(header, send_delay_ns=copy.send_delay_ns)
     assert copy.send_ns == NOW + 2 * MS
     assert rig.sender.still_sequence == 2
-    assert rig.ledger.messages(Channel.ROI) == 4
+    assert rig.ledger.messages(Account.ROI) == 4
     assert rig.ledger.line_bytes - line_bytes > 400
     assert rig.sender.still_room_bytes(NOW + 2 * MS) < room - 400
 
@@ -317,7 +317,7 @@ class Choice:
 
     def __init__(self, *lost: tuple[Still, float]) -> None:
         self.lost = list(lost)
-        self.fates: Counter[tuple[str, str]] = Counter()
+        self.outcomes: Counter[tuple[str, str]] = Counter()
         size = (320, 192)
         self.chooser = Chooser(
             _Wants(),
@@ -327,7 +327,7 @@ class Choice:
             view=View.fitted(size, size, fit="letterbox"),
             class_names=("car",),
             settings=ChooserSettings(fps=3, most_bytes=50_000),
-            on_fate=lambda fate, reason: self.fates.update([(fate, reason)]),
+            on_outcome=lambda outcome, reason: self.outcomes.update([(outcome, reason)]),
             overdue=lambda _now_ns: tuple(self.lost),
         )
         self.picture = np.random.default_rng(1).integers(0, 255, (size[1], size[0], 3), np.uint8)
@@ -348,7 +348,7 @@ class Choice:
         )
         frame = Frame(0, NOW, self.picture, self.picture)
         flat = np.full_like(self.picture, 128)
-        self.chooser.consider(Seen(frame, flat, seen, detected=True), now_ns=NOW, room_bytes=1000)
+        self.chooser.consider(AnalyzedFrame(frame, flat, seen, detected=True), now_ns=NOW, room_bytes=1000)
 
     def stills(self, room: int = 100_000) -> list[tuple[int, float]]:
         """Send what fits: (track, utility) of each."""
@@ -366,7 +366,7 @@ def test_a_lost_still_goes_before_wishes_that_are_less_useful():
     choice = Choice((still(7, track=50), 2.5), (still(6, track=51), 0.5))
     choice.wish(1, 2, 3)
     assert choice.stills() == [(3, 3.0), (50, 2.5), (2, 2.0), (1, 1.0), (51, 0.5)]
-    assert choice.fates == {("sent", "test"): 3, ("sent", "again"): 2}
+    assert choice.outcomes == {("sent", "test"): 3, ("sent", "again"): 2}
     assert choice.chooser._sequence == 3, "a second copy takes no number"
 
 

@@ -7,16 +7,16 @@ import threading
 import pytest
 
 from clips import framed, smooth_pictures
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.operating.keyframes import KeyframePlan
-from hvt_edge.video.frame_skip import Cadence
+from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from messages import feedback
@@ -31,9 +31,11 @@ class Ground:
         self.inbox = FeedbackInbox()
         self.frames: list[int] = []
 
-    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+    def put(
+        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
         """Take one message."""
-        assert row is Row.BASE
+        assert row is Channel.BASE
         assert attachment is not None
         self.frames.append(BaseHeader.parse(attachment, payload).frame_index)
         report = feedback(
@@ -72,7 +74,7 @@ def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
     stage = BaseStage(
         BaseEncoder(EncoderSettings(size=SIZE, fps=5.0, bitrate_bps=100_000, preset="ultrafast")),
         keyframes=keyframes,
-        sender=Sender(
+        sender=Transmitter(
             ground,
             ledger=Ledger(),
             budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=5)),
@@ -83,7 +85,7 @@ def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
         ),
         recorder=None,
         first_keyframe_bytes=5000,
-        cadence=Cadence(3),
+        frame_skip=FrameSkip(3),
     )
     with LockstepPace(
         stage,

@@ -18,9 +18,9 @@ from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Frame, View
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan
-from hvt_edge.perception.analyzer import Sight, SightSettings
+from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills import stage as still_stage
 from hvt_edge.stills.maker import StillMaker
@@ -47,15 +47,15 @@ UNITS = [
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 
 
-def sight(*, detector=None, view: View = VIEW, **settings) -> Sight:
+def analyzer(*, detector=None, view: View = VIEW, **settings) -> Analyzer:
     """The edge's eyes."""
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15)
-    return Sight(detector or RedSquares(), tracker, view=view, settings=SightSettings(**settings))
+    return Analyzer(detector or RedSquares(), tracker, view=view, settings=AnalyzerSettings(**settings))
 
 
 def test_every_frame_is_decoded_and_each_nth_is_searched():
     """Candidates would be of other frames than the stills, or the processor would melt."""
-    eyes = sight(detect_every=5)
+    eyes = analyzer(detect_every=5)
     seen = [eyes.see(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
     assert [one.frame.index for one in seen if one.detected] == [0, 5, 10, 15, 20, 25]
     for one in seen[10:]:
@@ -68,7 +68,7 @@ def test_every_frame_is_decoded_and_each_nth_is_searched():
 
 def test_in_a_hurry_detection_is_put_off_and_made_up_for():
     """A slow detector would fall behind more and more; or a busy second would leave it blind for another."""
-    eyes = sight(detect_every=5)
+    eyes = analyzer(detect_every=5)
     hurried = {5, 6, 7, 15}
     seen = [
         eyes.see(frame, unit, hurry=frame.index in hurried) for frame, unit in zip(FRAMES, UNITS, strict=True)
@@ -80,7 +80,7 @@ def test_in_a_hurry_detection_is_put_off_and_made_up_for():
 def test_candidates_of_the_source_lie_in_base_pixels():
     """Stills would be cut at the wrong place where the detector looks at the camera's own frame."""
     view = View.fitted((640, 384), SIZE, fit="letterbox")
-    eyes = sight(view=view, candidates="source", detect_every=1)
+    eyes = analyzer(view=view, candidates="source", detect_every=1)
     for frame, unit in zip(FRAMES[:4], UNITS, strict=False):
         large = np.repeat(np.repeat(frame.base_bgr, 2, axis=0), 2, axis=1)
         seen = eyes.see(Frame(frame.index, frame.capture_ns, large, frame.base_bgr), unit)
@@ -97,7 +97,7 @@ def test_a_source_smaller_than_the_base_is_looked_at_enlarged():
             return super().detect(picture_bgr)
 
     view = View.fitted((160, 96), SIZE, fit="letterbox")
-    eyes = sight(detector=Noting(), view=view, candidates="source", detect_every=1)
+    eyes = analyzer(detector=Noting(), view=view, candidates="source", detect_every=1)
     for frame, unit in zip(FRAMES[:4], UNITS, strict=False):
         small = frame.base_bgr[::2, ::2]
         seen = eyes.see(Frame(frame.index, frame.capture_ns, small, frame.base_bgr), unit)
@@ -108,7 +108,7 @@ def test_a_source_smaller_than_the_base_is_looked_at_enlarged():
 def test_what_a_cropped_base_does_not_show_is_no_candidate():
     """The ground would get stills of objects that its picture does not have."""
     view = View.fitted((960, 192), SIZE, fit="crop")  # the base shows the middle third
-    eyes = sight(view=view, candidates="source", detect_every=1)
+    eyes = analyzer(view=view, candidates="source", detect_every=1)
     for frame, unit in zip(FRAMES[:3], UNITS, strict=False):
         wide = np.zeros((192, 960, 3), np.uint8)
         wide[:, :320] = frame.base_bgr
@@ -116,7 +116,7 @@ def test_what_a_cropped_base_does_not_show_is_no_candidate():
     assert len(seen.tracks) == 0
 
 
-def sparse(eyes: Sight, *, every: int, hurried: frozenset[int] = frozenset()) -> list:
+def sparse(eyes: Analyzer, *, every: int, hurried: frozenset[int] = frozenset()) -> list:
     """All ticks, of which only each n-th is coded, as with ``--fps auto``."""
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
     return [
@@ -144,7 +144,7 @@ def sparse(eyes: Sight, *, every: int, hurried: frozenset[int] = frozenset()) ->
 )
 def test_where_few_ticks_are_coded_each_of_them_has_its_own_detection(candidates, every, detected):
     """Stills could not be cut where the base has no picture, or would be chosen by what was seen before it."""
-    seen = sparse(sight(candidates=candidates), every=every)
+    seen = sparse(analyzer(candidates=candidates), every=every)
     assert [one.frame.index for one in seen if one.detected] == detected
     assert [one.frame.index for one in seen if one.coded] == list(range(0, 30, every))
     for one in seen:
@@ -156,7 +156,7 @@ def test_where_few_ticks_are_coded_each_of_them_has_its_own_detection(candidates
 
 def test_ticks_that_are_not_coded_still_move_the_tracks():
     """At a frame a second, tracks would jump, and the tracks channel have nothing to say between."""
-    seen = sparse(sight(candidates="source", detect_every=3), every=10)
+    seen = sparse(analyzer(candidates="source", detect_every=3), every=10)
     for one in seen[7:]:
         assert one.tracks.ids.tolist() == [1]
         np.testing.assert_allclose(one.tracks.boxes_xyxy_px[0], square_box(one.frame.index), atol=6)
@@ -164,7 +164,7 @@ def test_ticks_that_are_not_coded_still_move_the_tracks():
 
 def test_a_hurried_coded_tick_is_made_up_for():
     """With a slow detector and few coded ticks, detection would be put off until the next coded one."""
-    seen = sparse(sight(candidates="source"), every=15, hurried=frozenset({15}))
+    seen = sparse(analyzer(candidates="source"), every=15, hurried=frozenset({15}))
     assert [one.frame.index for one in seen if one.detected] == [0, 6, 11, 16, 21, 26]
 
 
@@ -177,11 +177,11 @@ def test_with_candidates_of_the_source_the_camera_is_followed_on_the_source():
             given.append(image_bgr is FRAMES[frame_index].base_bgr)
             return super().predict(frame_index=frame_index, image_bgr=image_bgr)
 
-    for candidates, followed in (("source", True), ("decoded", False)):
+    for candidates, primary in (("source", True), ("decoded", False)):
         tracker = Watched(TrackerSettings.starting_at(0.25, camera_motion="flow"), fps=15)
-        settings = SightSettings(candidates=candidates)
-        sparse(Sight(RedSquares(), tracker, view=VIEW, settings=settings), every=2)
-        assert set(given) == {followed}
+        settings = AnalyzerSettings(candidates=candidates)
+        sparse(Analyzer(RedSquares(), tracker, view=VIEW, settings=settings), every=2)
+        assert set(given) == {primary}
         given.clear()
 
 
@@ -200,9 +200,9 @@ class Rig:
     """A still stage with a real budget of 200 kbps for stills, and all that left it."""
 
     def __init__(self, *, detector=None) -> None:
-        self.out, self.fates = Out(), Counter()
+        self.out, self.outcomes = Out(), Counter()
         self.memory, self.keyframes = TrackMemory(), KeyframePlan()
-        sender = Sender(
+        sender = Transmitter(
             self.out,
             ledger=Ledger(),
             budget=RollingBudget(BudgetSettings(400_000, 200_000, fps=15)),
@@ -219,10 +219,10 @@ class Rig:
             view=VIEW,
             class_names=CLASSES,
             settings=ChooserSettings(fps=15, most_bytes=10_000),
-            on_fate=lambda *fate: self.fates.update([fate]),
+            on_outcome=lambda *outcome: self.outcomes.update([outcome]),
         )
         self.stage = StillStage(
-            sight(detector=detector),
+            analyzer(detector=detector),
             chooser,
             sender=sender,
             keyframes=self.keyframes,
@@ -243,9 +243,9 @@ def test_a_track_gets_its_stills_when_they_are_due():
     assert [one.frame_index for one in rig.out.stills] == [0, 15]
     for one in rig.out.stills:
         np.testing.assert_allclose(one.box_source_px, square_box(one.frame_index), atol=6)
-    assert rig.fates["sent", "due"] == len(rig.out.stills)
+    assert rig.outcomes["sent", "due"] == len(rig.out.stills)
     assert rig.stage.tracks == 1
-    assert rig.stage.sight_ms > 0
+    assert rig.stage.perception_ms > 0
 
 
 def test_while_a_keyframe_is_due_stills_are_held():
@@ -257,7 +257,7 @@ def test_while_a_keyframe_is_due_stills_are_held():
     rig.keyframes.done(FRAMES[-1].capture_ns)
     assert rig.stage.waiting == 1
     rig.stage.close()
-    assert rig.fates["dropped", "ended"] == 1
+    assert rig.outcomes["dropped", "ended"] == 1
 
 
 def test_what_the_ground_says_counts_and_no_opinion_does_not():
@@ -273,14 +273,14 @@ def test_what_the_ground_says_counts_and_no_opinion_does_not():
         "again": False,
     }
     rig.stage.hear([StillResult(class_name="", **answer)])
-    assert rig.memory._histories[1].belief is None
+    assert rig.memory._histories[1].class_posterior is None
     rig.stage.hear(
         [
             StillResult(class_name="bus", **answer),
             StillResult(class_name="bus", **(answer | {"track_id": 99})),
         ]
     )
-    assert rig.memory._histories[1].belief.class_name == "bus"
+    assert rig.memory._histories[1].class_posterior.class_name == "bus"
 
 
 def test_the_worker_takes_all_frames_in_order_and_finishes(monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.protocol.messages import AlsoShown, RoiHeader
 from hvt_common.video.base_crop import coded_size
@@ -148,7 +148,7 @@ def test_the_overhead_that_is_reckoned_with_is_the_real_one():
             ).pack(b"x" * 1000)
         )
 
-    framing = overhead_bytes(1000, header(0), key=EdgeKeys("edge-1").key(Row.ROI), encoding="image/jpeg")
+    framing = overhead_bytes(1000, header(0), key=EdgeKeys("edge-1").key(Channel.ROI), encoding="image/jpeg")
     assert header(0) + framing == pytest.approx(STILL_OVERHEAD_BYTES, abs=15)
     assert (header(8) - header(0)) / 8 == pytest.approx(ALSO_BYTES, abs=1)
 

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 from hvt_common.values import Still
 from hvt_edge.perception.candidates import Candidate
-from hvt_edge.stills.crop_job import Cut
-from hvt_edge.stills.outbox import QueueSettings, StillQueue, Waiting
+from hvt_edge.stills.crop_job import CropJob
+from hvt_edge.stills.outbox import PendingStill, QueueSettings, StillQueue
 from hvt_edge.stills.policy.base import Request
 
 DRAFT = Still(0, 0, 0, 1, (0, 0, 4, 4), (0, 0, 4, 4), "car", 0.5, "test", "jpeg", 65, b"")
-CUT = Cut(DRAFT, np.zeros((4, 4, 3), np.uint8), None, None)
+CUT = CropJob(DRAFT, np.zeros((4, 4, 3), np.uint8), None, None)
 
 
-def wish(track: int, score: float, *, since_ns: int = 0) -> Waiting:
+def wish(track: int, score: float, *, since_ns: int = 0) -> PendingStill:
     """A wish for a still."""
     candidate = Candidate(
         frame_index=0,
@@ -32,16 +32,16 @@ def wish(track: int, score: float, *, since_ns: int = 0) -> Waiting:
         crop_area_px=16,
         born_frame=0,
     )
-    return Waiting(Request(candidate, "test", score), CUT, since_ns)
+    return PendingStill(Request(candidate, "test", score), CUT, since_ns)
 
 
-def shared(lead: Waiting, *others: Waiting) -> Waiting:
+def shared(lead: PendingStill, *others: PendingStill) -> PendingStill:
     """One still for several."""
-    draft = replace(
-        lead.cut.draft, also=tuple((one.track_id, one.request.candidate.box_source_px) for one in others)
+    header = replace(
+        lead.cut.header, also=tuple((one.track_id, one.request.candidate.box_source_px) for one in others)
     )
     request = replace(lead.request, also=tuple(one.request.candidate for one in others))
-    return replace(lead, request=request, cut=replace(lead.cut, draft=draft))
+    return replace(lead, request=request, cut=replace(lead.cut, header=header))
 
 
 def tracks(queue: StillQueue) -> list[int]:
@@ -111,7 +111,7 @@ def test_a_shared_wish_keeps_every_track_to_one_wish():
     assert queue.offer(alone) == [], "it only gets off the shared one"
     (kept,) = (one for one in queue if one.track_id == 1)
     assert kept.track_ids == {1, 3}
-    assert [track for track, _ in kept.cut.draft.also] == [3]
+    assert [track for track, _ in kept.cut.header.also] == [3]
     other = shared(wish(4, 0.2), wish(1, 0.2), wish(3, 0.2))
     assert [(gone.track_id, why) for gone, why in queue.offer(other)] == [(1, "replaced")]
     assert sorted(map(tuple, (sorted(one.track_ids) for one in queue))) == [(1, 3, 4), (2,)]

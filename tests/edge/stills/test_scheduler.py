@@ -15,7 +15,7 @@ from base_coded import StandIn
 from clips import START_NS, hard_pictures
 from hvt_common.values import Frame, Still, Tracks, View
 from hvt_common.video.still_codecs import JpegCodec
-from hvt_edge.perception.analyzer import Seen
+from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.stills.gate import Gate
 from hvt_edge.stills.maker import StillMaker
@@ -61,7 +61,7 @@ class Rig:
         **settings,
     ) -> None:
         self.picture, self.memory = picture, TrackMemory()
-        self.fates: Counter[tuple[str, str]] = Counter()
+        self.outcomes: Counter[tuple[str, str]] = Counter()
         view = View.fitted(SIZE, SIZE, fit="letterbox")
         self.chooser = Chooser(
             method or ByScore(),
@@ -73,7 +73,7 @@ class Rig:
             settings=ChooserSettings(
                 fps=3, most_bytes=most_bytes, queue=QueueSettings(max_length=3), **settings
             ),
-            on_fate=lambda fate, reason: self.fates.update([(fate, reason)]),
+            on_outcome=lambda outcome, reason: self.outcomes.update([(outcome, reason)]),
         )
         self.number = -1
         self.sent: list[Still] = []
@@ -97,7 +97,7 @@ class Rig:
             np.full(count, self.number),
             np.zeros(count, np.bool_),
         )
-        seen = Seen(
+        seen = AnalyzedFrame(
             Frame(self.number, self.now_ns, self.picture, self.picture), base, tracks, detected=detected
         )
         self.chooser.consider(seen, now_ns=self.now_ns, room_bytes=1000)
@@ -127,7 +127,7 @@ def test_the_most_useful_is_sent_first_as_long_as_there_is_room():
     rig = Rig()
     rig.consider({1: box_at(1), 3: box_at(3), 2: box_at(2)})
     assert rig.stills(100_000) == [3, 2, 1]
-    assert rig.fates == {("sent", "test"): 3}
+    assert rig.outcomes == {("sent", "test"): 3}
     assert rig.chooser.waiting == 0
 
 
@@ -149,7 +149,7 @@ def test_one_that_never_fits_does_not_block_the_others_for_ever():
         sent += rig.stills(2_500)
     assert set(sent) == {1}
     assert len(sent) >= 3
-    assert rig.fates["dropped", "too_large"] >= 2
+    assert rig.outcomes["dropped", "too_large"] >= 2
 
 
 def test_one_that_waited_long_is_coded_to_the_room_there_is():
@@ -168,10 +168,10 @@ def test_what_the_base_shows_as_well_is_not_sent():
     rig = Rig()
     rig.consider({1: SMALL}, base=PICTURE)
     assert rig.stills(100_000) == []
-    assert rig.fates == {("dropped", "base_good"): 1}
+    assert rig.outcomes == {("dropped", "base_good"): 1}
     rig.consider({1: SMALL}, base=PICTURE)
     assert rig.stills(100_000) == []
-    assert rig.fates["deferred", "refused"] == 1, "it rests before it is tried again"
+    assert rig.outcomes["deferred", "refused"] == 1, "it rests before it is tried again"
 
 
 def test_between_detections_nothing_is_wished_for_but_what_waits_may_go():
@@ -202,7 +202,7 @@ def test_closing_says_what_becomes_of_those_that_wait():
     rig = Rig()
     rig.consider({1: SMALL, 2: box_at(5)})
     rig.chooser.close()
-    assert rig.fates == {("dropped", "ended"): 2}
+    assert rig.outcomes == {("dropped", "ended"): 2}
 
 
 # Neighbours, the gate, and stills that build on the base
@@ -221,10 +221,10 @@ def test_neighbours_share_a_still_and_all_of_them_count_as_sent():
     assert (alone.also, [track for track, _ in pair.also]) == ((), [1])
     assert pair.crop_source_px == (16, 17, 74, 45)
     assert all(rig.memory._histories[track].sent_count == 1 for track in (1, 2, 3))
-    assert rig.fates == {("sent", "test"): 2}, "one for each still"
+    assert rig.outcomes == {("sent", "test"): 2}, "one for each still"
     rig.consider(NEIGHBOURS)
     assert rig.stills(100_000) == []
-    assert rig.fates["deferred", "cooldown"] == 3
+    assert rig.outcomes["deferred", "cooldown"] == 3
 
 
 def test_without_the_setting_each_has_its_own():
@@ -253,10 +253,10 @@ def test_the_gate_holds_back_what_the_base_shows_well_before_the_method_chooses(
     boxes = {track: box_at(track) for track in (1, 2)} | {9: (450.0, 100.0, 500.0, 140.0)}
     rig = Rig(gate=Gate(psnr_y_db=36.0))
     rig.consider(boxes, base=good)
-    assert rig.fates == {("dropped", "base_good"): 1}
+    assert rig.outcomes == {("dropped", "base_good"): 1}
     assert rig.stills(100_000) == [2, 1]
     rig.consider(boxes, base=good)
-    assert rig.fates["deferred", "refused"] == 1
+    assert rig.outcomes["deferred", "refused"] == 1
     ungated = Rig(maker=BASE_CODED)
     ungated.consider(boxes, base=good)
     assert 9 in ungated.stills(100_000)
@@ -300,7 +300,7 @@ def test_a_still_without_its_base_is_sent_once_more_and_only_once():
         rig.chooser.ask_again(sequence)
     rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
     assert rig.stills(100_000) == []
-    assert rig.fates["sent", "again"] == 1
+    assert rig.outcomes["sent", "again"] == 1
 
 
 def test_the_newer_wish_of_a_track_makes_the_old_still_needless():
@@ -345,4 +345,4 @@ def test_every_candidate_of_a_step_has_exactly_one_fate(steps, cooldown, gate_db
         assert rig.chooser.waiting <= 3
         assert set(rig.chooser._held_up) <= {one.track_id for one in rig.chooser._queue}
     rig.chooser.close()
-    assert sum(rig.fates.values()) == candidates
+    assert sum(rig.outcomes.values()) == candidates

@@ -13,7 +13,7 @@ import numpy as np
 from base_coded import StandIn
 from clips import framed, smooth_pictures
 from flight import CLASSES, SIZE, RedSquares, square_box
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -22,9 +22,9 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan
-from hvt_edge.perception.analyzer import Sight, SightSettings
+from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.policy.registry import method
@@ -48,7 +48,7 @@ class Out:
     """Keeps what was put, in order."""
 
     def __init__(self) -> None:
-        self.puts: list[tuple[Row, bytes, bytes]] = []
+        self.puts: list[tuple[Channel, bytes, bytes]] = []
 
     def put(self, row, payload, *, attachment=None, encoding="") -> None:
         """Keep it."""
@@ -58,7 +58,9 @@ class Out:
     def stills(self) -> list[tuple[RoiHeader, bytes]]:
         """Headers and bytes."""
         return [
-            (RoiHeader.parse(extra, payload), payload) for row, payload, extra in self.puts if row is Row.ROI
+            (RoiHeader.parse(extra, payload), payload)
+            for row, payload, extra in self.puts
+            if row is Channel.ROI
         ]
 
 
@@ -66,8 +68,8 @@ class Rig:
     """A still stage whose stills build on the base, with a real budget of 200 kbps for them."""
 
     def __init__(self, *, reports: bool = False, sparse: bool = False) -> None:
-        self.out, self.fates, self.keyframes = Out(), Counter(), KeyframePlan()
-        self.sender = Sender(
+        self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframePlan()
+        self.sender = Transmitter(
             self.out,
             ledger=Ledger(),
             budget=RollingBudget(BudgetSettings(400_000, 200_000, fps=15)),
@@ -77,11 +79,11 @@ class Rig:
             wait_until=lambda _at: None,
         )
         self.stage = StillStage(
-            Sight(
+            Analyzer(
                 RedSquares(),
                 ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
                 view=VIEW,
-                settings=SightSettings(detect_every=5, candidates="source" if sparse else "decoded"),
+                settings=AnalyzerSettings(detect_every=5, candidates="source" if sparse else "decoded"),
             ),
             Chooser(
                 method("M1"),
@@ -91,7 +93,7 @@ class Rig:
                 view=VIEW,
                 class_names=CLASSES,
                 settings=ChooserSettings(fps=15, most_bytes=10_000),
-                on_fate=lambda *fate: self.fates.update([fate]),
+                on_outcome=lambda *outcome: self.outcomes.update([outcome]),
             ),
             sender=self.sender,
             keyframes=self.keyframes,
@@ -190,8 +192,8 @@ def test_the_tracks_of_a_step_go_before_its_stills():
     rig = Rig(reports=True)
     assert rig.stage.latest_tracks is None
     rig.run(11)
-    assert [row for row, _, _ in rig.out.puts[:2]] == [Row.TRACKS, Row.ROI]
-    assert [payload[0] for row, payload, _ in rig.out.puts if row is Row.TRACKS] == [0, 5, 10]
+    assert [row for row, _, _ in rig.out.puts[:2]] == [Channel.TRACKS, Channel.ROI]
+    assert [payload[0] for row, payload, _ in rig.out.puts if row is Channel.TRACKS] == [0, 5, 10]
     assert rig.stage.latest_tracks.frame_index == 10
 
 
@@ -206,13 +208,13 @@ def test_frames_that_wait_are_bounded_in_bytes():
 
     rig = Rig()
     frame_bytes = FRAMES[0].source_bgr.nbytes + FRAMES[0].base_bgr.nbytes
-    slow = Sight(
+    slow = Analyzer(
         Slow(),
         ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         view=VIEW,
-        settings=SightSettings(detect_every=1),
+        settings=AnalyzerSettings(detect_every=1),
     )
-    rig.stage._sight = slow
+    rig.stage._analyzer = slow
     worker = StillWorker(
         rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=4 * frame_bytes + 1
     )

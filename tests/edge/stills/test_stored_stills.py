@@ -9,14 +9,14 @@ import numpy as np
 
 from base_coded import StandIn
 from flight import CLASSES, RedSquares
-from hvt_common.protocol.channels import Row
-from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader, parse_past_still
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader, parse_backlog_still
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Frame, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.commands import Commands, Served
-from hvt_edge.perception.analyzer import Sight, SightSettings
+from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.policy.registry import method
@@ -46,28 +46,28 @@ class StillRig(Rig):
             view=VIEW,
             class_names=CLASSES,
             settings=ChooserSettings(fps=15, most_bytes=10_000),
-            on_fate=lambda *fate: self.chosen.update([fate]),
+            on_outcome=lambda *outcome: self.chosen.update([outcome]),
         )
         self.side = StillStage(
-            Sight(
+            Analyzer(
                 RedSquares(),
                 ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
                 view=VIEW,
-                settings=SightSettings(detect_every=5),
+                settings=AnalyzerSettings(detect_every=5),
             ),
             chooser,
             sender=self.sender,
             keyframes=self.keyframes,
-            keep=self.keep,
+            backlog=self.backlog,
         )
-        self.keep.attend(self.side)
+        self.backlog.attend(self.side)
 
     def fly(self, first: int, end: int, *, linked: bool = True) -> None:
         """Frames of that stretch; nobody reports."""
         self.linked = linked
         for frame in FRAMES[first:end]:
             self.now_ns = frame.capture_ns
-            self.follower.before_frame(self.now_ns)
+            self.link_control.before_frame(self.now_ns)
             unit = self.stage.encode(frame, now_ns=self.now_ns)
             self.stage.send(unit, now_ns=self.now_ns)
             source = np.clip(frame.base_bgr + _TEXTURE, 0, 255).astype(np.uint8)
@@ -77,13 +77,13 @@ class StillRig(Rig):
     @property
     def live(self) -> list[RoiHeader]:
         """Stills that went into the link."""
-        return [RoiHeader.parse(extra, data) for row, data, extra in self.out.puts if row is Row.ROI]
+        return [RoiHeader.parse(extra, data) for row, data, extra in self.out.puts if row is Channel.ROI]
 
     def stored(self) -> list[RoiHeader]:
         """Stills that another start of the edge finds, by number."""
-        self.keep.close()
+        self.backlog.close()
         with opened(self.path, session_id=8) as folder:
-            stills = [parse_past_still(folder.read(entry)) for entry in folder.best_stills()]
+            stills = [parse_backlog_still(folder.read(entry)) for entry in folder.best_stills()]
         return sorted(
             (RoiHeader.parse(one.attachment, one.payload) for one in stills), key=lambda one: one.sequence
         )
@@ -137,22 +137,28 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
 
     def ask() -> str:
         rig.now_ns += 100_000_000
-        request = ControlRequest(session_id=7, command=Command.SEND_PAST, arguments={})
+        request = ControlRequest(session_id=7, command=Command.SEND_BACKLOG, arguments={})
         answer = commands.answer(ControlRequest.parse(request.pack()))
         return "" if answer.accepted else answer.reason
 
-    commands.serve(Served(None, rig.follower._renewal, rig.side._chooser, base_size=SIZE, keep=rig.keep))
+    commands.serve(
+        Served(
+            None, rig.link_control._reconfiguration, rig.side._chooser, base_size=SIZE, backlog=rig.backlog
+        )
+    )
     assert "nothing is kept" in ask()
     rig.fly(0, 7)
     rig.report()
     rig.fly(7, 50, linked=False)
-    eventually(lambda: rig.keep.numbers.stills >= 2, within_s=10, what="stills are kept")
+    eventually(lambda: rig.backlog.numbers.stills >= 2, within_s=10, what="stills are kept")
     assert ask() == ""
     rig.linked = True
     rig.finish()
-    assert rig.keep.numbers.empty
-    kinds = [header.kind for header, _ in rig.out.past]
+    assert rig.backlog.numbers.empty
+    kinds = [header.kind for header, _ in rig.out.backlog]
     assert kinds.index("still") > max(n for n, kind in enumerate(kinds) if kind == "base")
-    rig.keep.close()
-    commands.serve(Served(None, rig.follower._renewal, rig.side._chooser, base_size=SIZE, keep=None))
+    rig.backlog.close()
+    commands.serve(
+        Served(None, rig.link_control._reconfiguration, rig.side._chooser, base_size=SIZE, backlog=None)
+    )
     assert "--store 0" in ask()

@@ -7,52 +7,52 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_edge.video.frame_skip import Cadence, MeasuredCadence
+from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 
 
-def coded(cadence: Cadence, ticks, *, keyframes=(), qp=40.0) -> list[int]:
+def coded(frame_skip: FrameSkip, ticks, *, keyframes=(), qp=40.0) -> list[int]:
     """The ticks that are coded; at keyframes the cadence may change."""
     taken = []
     for tick in ticks:
         keyframe = tick in keyframes
         if keyframe:
-            cadence.at_keyframe(tick)
-        if keyframe or cadence.codes(tick):
-            cadence.coded(tick, keyframe=keyframe, mean_qp=qp(tick) if callable(qp) else qp)
+            frame_skip.at_keyframe(tick)
+        if keyframe or frame_skip.codes(tick):
+            frame_skip.coded(tick, keyframe=keyframe, mean_qp=qp(tick) if callable(qp) else qp)
             taken.append(tick)
     return taken
 
 
 def test_each_nth_tick_is_coded():
     """The frame rate would be another than the one that was asked for."""
-    assert coded(Cadence(), range(5)) == [0, 1, 2, 3, 4]
-    assert coded(Cadence(3), range(10)) == [0, 3, 6, 9]
+    assert coded(FrameSkip(), range(5)) == [0, 1, 2, 3, 4]
+    assert coded(FrameSkip(3), range(10)) == [0, 3, 6, 9]
 
 
 def test_a_tick_that_was_missed_is_made_up_for_at_once():
     """A machine that drops one frame would show none for twice the time; and the rate must not creep up."""
-    assert coded(Cadence(3), [0, 1, 2, 4, 5, 6, 7, 8, 9, 17, 18, 19]) == [0, 4, 6, 9, 17, 18]
+    assert coded(FrameSkip(3), [0, 1, 2, 4, 5, 6, 7, 8, 9, 17, 18, 19]) == [0, 4, 6, 9, 17, 18]
 
 
 def test_a_keyframe_may_come_at_any_tick():
     """A ground that joins would wait for the next frame of a slow stream, a second or more."""
-    assert coded(Cadence(5), range(20), keyframes=(0, 7)) == [0, 5, 7, 12, 17]
+    assert coded(FrameSkip(5), range(20), keyframes=(0, 7)) == [0, 5, 7, 12, 17]
 
 
-@given(every_n=st.integers(1, 20), ticks=st.sets(st.integers(0, 300), min_size=1))
-def test_the_rate_is_kept_whatever_is_missed(every_n, ticks):
+@given(decimation=st.integers(1, 20), ticks=st.sets(st.integers(0, 300), min_size=1))
+def test_the_rate_is_kept_whatever_is_missed(decimation, ticks):
     """More frames than asked for would overspend the budget, fewer would show less than it could."""
-    taken = coded(Cadence(every_n), sorted(ticks))
-    slots = [(tick - taken[0]) // every_n for tick in taken]
+    taken = coded(FrameSkip(decimation), sorted(ticks))
+    slots = [(tick - taken[0]) // decimation for tick in taken]
     assert len(set(slots)) == len(slots), "never two frames for one turn"
-    assert set(slots) == {(tick - taken[0]) // every_n for tick in sorted(ticks)}, (
+    assert set(slots) == {(tick - taken[0]) // decimation for tick in sorted(ticks)}, (
         "never none where there was one"
     )
 
 
-def measured(every_n: int = 1) -> MeasuredCadence:
+def measured(decimation: int = 1) -> MeasuredFrameSkip:
     """As at 15 ticks a second."""
-    return MeasuredCadence(every_n, most_every_n=7, rest_ticks=150)
+    return MeasuredFrameSkip(decimation, most_decimation=7, rest_ticks=150)
 
 
 def test_a_starved_stream_gets_fewer_frames_and_a_rich_one_more():
@@ -60,47 +60,49 @@ def test_a_starved_stream_gets_fewer_frames_and_a_rich_one_more():
     starved, rich = measured(), measured(5)
     coded(starved, range(151), keyframes=(0, 150), qp=49.0)
     coded(rich, range(151), keyframes=(0, 150), qp=22.0)
-    assert starved.every_n > 1
-    assert rich.every_n < 5
+    assert starved.decimation > 1
+    assert rich.decimation < 5
 
 
 def test_it_changes_at_keyframes_and_not_too_often():
     """Grounds that ask for keyframes would make the frame rate flutter, with a new encoder each time."""
-    cadence = measured()
-    coded(cadence, range(149), keyframes=(0, 30, 60, 90, 120), qp=50.0)
-    assert cadence.every_n == 1
-    coded(cadence, range(149, 160), keyframes=(155,), qp=50.0)
-    assert cadence.every_n > 1
+    frame_skip = measured()
+    coded(frame_skip, range(149), keyframes=(0, 30, 60, 90, 120), qp=50.0)
+    assert frame_skip.decimation == 1
+    coded(frame_skip, range(149, 160), keyframes=(155,), qp=50.0)
+    assert frame_skip.decimation > 1
 
 
 def test_it_settles():
     """A scene that gives the same quality again and again would be shown at one rate and another in turn."""
     for start in (1, 2, 3, 5):
         for ease in (30.0, 36.0, 40.0, 44.0, 48.0, 52.0):
-            cadence = measured(start)
+            frame_skip = measured(start)
             seen = []
             for keyframe in range(0, 3000, 150):
-                qp = min(51.0, ease - 3 * math.log2(cadence.every_n))  # fewer frames, finer ones
-                coded(cadence, range(keyframe, keyframe + 150), keyframes=(keyframe,), qp=qp)
-                seen.append(cadence.every_n)
+                qp = min(51.0, ease - 3 * math.log2(frame_skip.decimation))  # fewer frames, finer ones
+                coded(frame_skip, range(keyframe, keyframe + 150), keyframes=(keyframe,), qp=qp)
+                seen.append(frame_skip.decimation)
             assert len(set(seen[8:])) == 1, (start, ease, seen)
 
 
 def test_keyframes_and_unknown_quantisers_do_not_count():
     """The first, coarse keyframe would decide for ten seconds."""
-    cadence = measured()
-    coded(cadence, range(150), keyframes=range(150), qp=51.0)
-    assert cadence.at_keyframe(150) == 1
-    cadence = measured()
-    coded(cadence, range(150), qp=math.nan)
-    assert cadence.at_keyframe(150) == 1
+    frame_skip = measured()
+    coded(frame_skip, range(150), keyframes=range(150), qp=51.0)
+    assert frame_skip.at_keyframe(150) == 1
+    frame_skip = measured()
+    coded(frame_skip, range(150), qp=math.nan)
+    assert frame_skip.at_keyframe(150) == 1
 
 
 def test_the_same_frames_give_the_same_rates():
     """In lockstep the same clip would give other bytes."""
     runs = []
     for _ in range(2):
-        cadence = measured()
-        runs.append(coded(cadence, range(900), keyframes=range(0, 900, 150), qp=lambda tick: 38 + tick / 60))
+        frame_skip = measured()
+        runs.append(
+            coded(frame_skip, range(900), keyframes=range(0, 900, 150), qp=lambda tick: 38 + tick / 60)
+        )
     assert runs[0] == runs[1]
     assert len(runs[0]) < 900

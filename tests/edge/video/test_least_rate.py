@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from clips import framed, hard_pictures, real_pictures
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_edge.link.transmitter import BASE_ATTACHMENT_BYTES, STATUS_BYTES
-from hvt_edge.video.least_rate import PULSE_VBV_S, encoder_settings, least_base_bps
+from hvt_edge.video.least_rate import REFRESH_VBV_S, encoder_settings, least_base_bps
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings, minimum_bps
 
 SIZE, FPS = (1280, 720), 15
@@ -30,9 +30,9 @@ def line_bits(pictures, settings: EncoderSettings, *, keyframes=KEYFRAMES) -> li
     for frame in framed(pictures):
         data = encoder.encode(frame, keyframe=frame.index in keyframes).data
         header = BASE_ATTACHMENT_BYTES - 8
-        around = header + overhead_bytes(len(data), header, key=key.key(Row.BASE), encoding="video/h265")
+        around = header + overhead_bytes(len(data), header, key=key.key(Channel.BASE), encoding="video/h265")
         if frame.index % FPS == 0:
-            around += STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=key.key(Row.STATUS))
+            around += STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=key.key(Channel.STATUS))
         bits.append(8 * (len(data) + around))
     return bits
 
@@ -96,16 +96,16 @@ def test_the_least_share_is_kept():
     )
 
 
-@pytest.mark.parametrize("every_n", [3, 5])
-def test_fewer_frames_leave_more_for_each_and_keep_the_share(every_n):
+@pytest.mark.parametrize("decimation", [3, 5])
+def test_fewer_frames_leave_more_for_each_and_keep_the_share(decimation):
     """With ``--fps auto`` the base would overspend, or waste what headers no longer take."""
-    fps = FPS / every_n
+    fps = FPS / decimation
     settings = encoder_settings(
         size=SIZE, fps=fps, preset="veryfast", total_bps=400_000, base_bps=320_000, edge_id="edge-1"
     )
     assert settings.bitrate_bps > asked(320_000, 400_000).bitrate_bps + 3_000
     assert settings.vbv_s * fps >= 0.999, "x265 takes no VBV that holds less than a frame"
-    pictures = hard_pictures(300, size=SIZE)[::every_n]
+    pictures = hard_pictures(300, size=SIZE)[::decimation]
     encoder = BaseEncoder(settings)
     payload = sum(len(encoder.encode(frame).data) for frame in framed(pictures, fps=fps))
     header = len(pictures) * 110
@@ -117,10 +117,16 @@ def test_whole_frame_pulses_get_the_buffer_they_need():
     """The pulse would be asked for and not happen."""
     both = [
         encoder_settings(
-            size=SIZE, fps=FPS, preset="veryfast", total_bps=400_000, base_bps=base, edge_id="a", pulses=True
+            size=SIZE,
+            fps=FPS,
+            preset="veryfast",
+            total_bps=400_000,
+            base_bps=base,
+            edge_id="a",
+            refreshes=True,
         )
         for base in (320_000, 400_000)
     ]
-    assert [one.vbv_s for one in both] == [PULSE_VBV_S] * 2
+    assert [one.vbv_s for one in both] == [REFRESH_VBV_S] * 2
     assert all(one.side_data for one in both)
     assert not asked(320_000, 400_000).side_data

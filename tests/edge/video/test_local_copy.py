@@ -124,9 +124,9 @@ def test_a_killed_process_leaves_a_file_that_plays(tmp_path):
     path = tmp_path / "base.mkv"
     program = f"""
         import sys, time
-        sys.path[:0] = [{str(TESTS)!r}, {str(TESTS / "edge")!r}]
+        sys.path[:0] = [{str(TESTS)!r}, {str(Path(__file__).parent)!r}]
         from pathlib import Path
-        from test_record_base import BaseRecorder, units
+        from test_local_copy import BaseRecorder, units
         recorder = BaseRecorder(Path({str(path)!r}))
         for unit in units(45):
             recorder.write(unit)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from clips import framed, hard_pictures
 from hvt_common.values import Tracks
-from hvt_edge.video.quality_refresh import PulsePlan, RollingPlan, TrackRegions, combined, grid_cells
+from hvt_edge.video.quality_refresh import RefreshPlan, RollingRefreshPlan, TrackRegions, combined, grid_cells
 from hvt_edge.video.regions import BLOCK_PX, MOST_REGIONS, Region
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 
@@ -33,29 +33,29 @@ def tracks(*boxes, confidences=None) -> Tracks:
     )
 
 
-def pulsed(plan, ticks, keyframes=()) -> list[int]:
+def refreshed(plan, ticks, keyframes=()) -> list[int]:
     """The ticks that get a pulse."""
     return [tick for tick in ticks if plan.regions(tick, None, keyframe=tick in keyframes)]
 
 
 def test_a_whole_frame_comes_once_a_period():
     """``--pulse 1s`` would do nothing, or with each frame."""
-    plan = PulsePlan(SIZE, period_ticks=15, depth=0.3)
-    assert pulsed(plan, range(50)) == [15, 30, 45]
-    plan = PulsePlan(SIZE, period_ticks=15, depth=0.3)
+    plan = RefreshPlan(SIZE, period_ticks=15, depth=0.3)
+    assert refreshed(plan, range(50)) == [15, 30, 45]
+    plan = RefreshPlan(SIZE, period_ticks=15, depth=0.3)
     plan.regions(0, None, keyframe=True)
     assert plan.regions(15, None) == [Region((0, 0, 640, 360), -0.3)]
 
 
 def test_pulses_keep_their_period_where_not_every_tick_is_coded():
     """With ``--fps auto`` the pulses would become rarer and rarer."""
-    assert pulsed(PulsePlan(SIZE, period_ticks=15, depth=0.3), range(0, 80, 4)) == [16, 32, 48, 60, 76]
+    assert refreshed(RefreshPlan(SIZE, period_ticks=15, depth=0.3), range(0, 80, 4)) == [16, 32, 48, 60, 76]
 
 
 def test_a_keyframe_takes_the_place_of_a_pulse():
     """Two large frames in a row would wait for each other."""
-    plan = PulsePlan(SIZE, period_ticks=15, depth=0.3)
-    assert pulsed(plan, range(60), keyframes=(0, 28, 30)) == [15, 45]
+    plan = RefreshPlan(SIZE, period_ticks=15, depth=0.3)
+    assert refreshed(plan, range(60), keyframes=(0, 28, 30)) == [15, 45]
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(5, 3), (1, 1), (8, 4), (3, 7)])
@@ -72,7 +72,7 @@ def test_the_cells_tile_the_picture(columns, rows):
 @pytest.mark.parametrize(("columns", "rows"), [(5, 3), (1, 1), (8, 4), (2, 1)])
 def test_without_tracks_each_cell_has_its_turn(columns, rows):
     """Parts of the picture would stay poor for ever."""
-    plan = RollingPlan(SIZE, columns=columns, rows=rows, depth=0.1)
+    plan = RollingRefreshPlan(SIZE, columns=columns, rows=rows, depth=0.1)
     boxes = [plan.regions(tick, None)[0].box_px for tick in range(3 * columns * rows)]
     count = columns * rows
     for start in (0, count, 2 * count):
@@ -82,7 +82,7 @@ def test_without_tracks_each_cell_has_its_turn(columns, rows):
 
 def test_cells_with_tracks_come_more_often_and_first():
     """The bits would go to empty ground as much as to the cars."""
-    plan = RollingPlan(SIZE, columns=4, rows=3, depth=0.1)
+    plan = RollingRefreshPlan(SIZE, columns=4, rows=3, depth=0.1)
     held = tracks((170, 130, 200, 160), (500, 300, 560, 340))
     boxes = [plan.regions(tick, held)[0].box_px for tick in range(120)]
     count = Counter(boxes)
@@ -95,7 +95,7 @@ def test_cells_with_tracks_come_more_often_and_first():
 
 def test_a_keyframe_takes_no_turn():
     """A cell would lose its turn to a frame that is coded whole anyway."""
-    plan, other = (RollingPlan(SIZE, columns=4, rows=3, depth=0.1) for _ in range(2))
+    plan, other = (RollingRefreshPlan(SIZE, columns=4, rows=3, depth=0.1) for _ in range(2))
     assert plan.regions(0, None, keyframe=True) == []
     assert plan.regions(1, None) == other.regions(0, None)
 
@@ -138,9 +138,9 @@ def test_the_surest_tracks_stay_where_there_are_too_many():
 def test_plans_add_up():
     """``--pulse`` and ``--roi-depth`` together would be one of them."""
     assert combined(None, None) is None
-    pulse = PulsePlan(SIZE, period_ticks=5, depth=0.3)
-    assert combined(None, pulse) is pulse
-    both = combined(pulse, TrackRegions(SIZE, depth=0.1))
+    refresh = RefreshPlan(SIZE, period_ticks=5, depth=0.3)
+    assert combined(None, refresh) is refresh
+    both = combined(refresh, TrackRegions(SIZE, depth=0.1))
     assert both is not None
     held = tracks((33, 20, 60, 40))
     assert [len(both.regions(tick, held)) for tick in range(6)] == [1, 1, 1, 1, 1, 2]
@@ -154,8 +154,8 @@ def test_no_box_of_a_tracker_breaks_a_plan(boxes):
     held = tracks(*boxes)
     for plan in (
         TrackRegions(SIZE, depth=0.1),
-        RollingPlan(SIZE, columns=4, rows=3, depth=0.1),
-        PulsePlan(SIZE, period_ticks=3, depth=0.1),
+        RollingRefreshPlan(SIZE, columns=4, rows=3, depth=0.1),
+        RefreshPlan(SIZE, period_ticks=3, depth=0.1),
     ):
         for region in plan.regions(1, held):
             x1, y1, x2, y2 = region.box_px
@@ -177,8 +177,8 @@ def frame_bytes(plan, *, vbv_s: float) -> list[int]:
 
 def test_a_rolling_pulse_keeps_its_frames_small():
     """The point of rolling: the gain without the frame that blocks the link for half a second."""
-    whole = frame_bytes(PulsePlan(SIZE, period_ticks=30, depth=0.15), vbv_s=0.5)
-    rolling = frame_bytes(RollingPlan(SIZE, columns=8, rows=4, depth=0.1), vbv_s=0.15)
-    assert max(rolling[1:]) < 0.6 * max(whole[1:])
+    whole = frame_bytes(RefreshPlan(SIZE, period_ticks=30, depth=0.15), vbv_s=0.5)
+    rolling_refresh = frame_bytes(RollingRefreshPlan(SIZE, columns=8, rows=4, depth=0.1), vbv_s=0.15)
+    assert max(rolling_refresh[1:]) < 0.6 * max(whole[1:])
     assert max(whole[1:]) > 5000, "a pulse is a large frame"
-    assert sum(rolling) * 8 / 5 <= 1.06 * 200_000
+    assert sum(rolling_refresh) * 8 / 5 <= 1.06 * 200_000

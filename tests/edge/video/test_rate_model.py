@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
-from hvt_edge.video.rate_model import better_every_n, choose_base, most_every_n, sizes_of
+from hvt_edge.video.rate_model import better_decimation, choose_base, most_decimation, sizes_of
 
 CAMERA = (1920, 1080)
 
@@ -49,12 +49,12 @@ def test_fewer_bits_never_mean_a_larger_picture():
 )
 def test_what_is_chosen_can_be_coded(payload_bps, source, most_fps, fps):
     """The edge would refuse, or distort, what it has chosen itself."""
-    (width, height), every_n = choose_base(payload_bps, source, size=None, fps=fps, most_fps=most_fps)
+    (width, height), decimation = choose_base(payload_bps, source, size=None, fps=fps, most_fps=most_fps)
     assert (width % 2, height % 2) == (0, 0)
     assert 64 <= width <= source[0]
     assert 64 <= height <= source[1]
     assert abs(width / height - source[0] / source[1]) < 0.04 * source[0] / source[1]
-    assert every_n == 1 or (fps is None and most_fps / every_n >= 2)
+    assert decimation == 1 or (fps is None and most_fps / decimation >= 2)
 
 
 def test_the_ladder_keeps_the_source_s_shape():
@@ -80,14 +80,14 @@ def test_a_source_too_small_is_one_sentence():
 
 def test_the_quantiser_moves_the_rate_the_right_way():
     """A starved scene would get more frames still."""
-    assert better_every_n(1, mean_qp=34.0, most_every_n=5) == 2
-    assert better_every_n(1, mean_qp=45.0, most_every_n=5) == 3
-    assert better_every_n(5, mean_qp=45.0, most_every_n=5) == 5
-    assert better_every_n(3, mean_qp=29.0, most_every_n=5) == 3
-    assert better_every_n(3, mean_qp=22.0, most_every_n=5) == 2
-    assert better_every_n(1, mean_qp=20.0, most_every_n=5) == 1
+    assert better_decimation(1, mean_qp=34.0, most_decimation=5) == 2
+    assert better_decimation(1, mean_qp=45.0, most_decimation=5) == 3
+    assert better_decimation(5, mean_qp=45.0, most_decimation=5) == 5
+    assert better_decimation(3, mean_qp=29.0, most_decimation=5) == 3
+    assert better_decimation(3, mean_qp=22.0, most_decimation=5) == 2
+    assert better_decimation(1, mean_qp=20.0, most_decimation=5) == 1
 
 
 def test_two_frames_a_second_are_left():
     """A budget's window of a second would be empty, or filled by a single frame."""
-    assert [most_every_n(fps) for fps in (15, 30, 4, 1)] == [5, 15, 2, 1]
+    assert [most_decimation(fps) for fps in (15, 30, 4, 1)] == [5, 15, 2, 1]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_edge.perception.base_loss import BaseLoss
-from hvt_edge.perception.candidates import Belief, Candidate
+from hvt_edge.perception.candidates import Candidate, ClassPosterior
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.stills.policy.cost import CostEstimate
 from hvt_edge.video.share import FIRST_SHARE, Split, SplitSettings
@@ -83,7 +83,7 @@ def test_settled_tracks_give_their_bits_back():
             sent_count=1,
             last_sent_ns=10 * SECOND,
             last_sent_area_px=track.area_px,
-            posterior=Belief("car", 0.97, 0.1),
+            posterior=ClassPosterior("car", 0.97, 0.1),
         )
         for track in crowd
     ]

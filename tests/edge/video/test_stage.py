@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from clips import START_NS, framed, hard_pictures, smooth_pictures
-from hvt_common.protocol.channels import Row
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
-from hvt_edge.link.transmitter import Sender
+from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
-from hvt_edge.video.frame_skip import Cadence, MeasuredCadence
+from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.local_copy import BaseRecorder
-from hvt_edge.video.quality_refresh import RollingPlan
+from hvt_edge.video.quality_refresh import RollingRefreshPlan
 from hvt_edge.video.regions import Region
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
@@ -34,24 +34,26 @@ class Kept:
     def __init__(self) -> None:
         self.units: list[bytes] = []
 
-    def put(self, row: Row, payload: bytes, *, attachment: bytes | None = None, encoding: str = "") -> None:
+    def put(
+        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
         """Keep the base stream's."""
-        if row is Row.BASE:
+        if row is Channel.BASE:
             self.units.append(payload)
 
 
 class Rig:
     """A base stage with all that it needs."""
 
-    def __init__(self, *, cadence=None, plan=None, recorder=None, interval_s=10.0) -> None:
+    def __init__(self, *, frame_skip=None, plan=None, recorder=None, interval_s=10.0) -> None:
         self.kept = Kept()
         self.opened: list[int] = []
-        self.cadence = cadence or Cadence()
+        self.frame_skip = frame_skip or FrameSkip()
         self.keyframes = KeyframePlan(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
         self.stage = BaseStage(
-            BaseEncoder(replace(SETTINGS, fps=15.0 / self.cadence.every_n)),
+            BaseEncoder(replace(SETTINGS, fps=15.0 / self.frame_skip.decimation)),
             keyframes=self.keyframes,
-            sender=Sender(
+            sender=Transmitter(
                 self.kept,
                 ledger=Ledger(),
                 budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=15)),
@@ -63,7 +65,7 @@ class Rig:
             recorder=recorder,
             first_keyframe_bytes=5000,
             plan=plan,
-            cadence=self.cadence,
+            frame_skip=self.frame_skip,
             renew=self._renew,
         )
 
@@ -80,12 +82,12 @@ class Rig:
                 coded.append(frame.index)
         return coded
 
-    def _renew(self, every_n: int, now_ns: int) -> BaseEncoder | None:
+    def _renew(self, decimation: int, now_ns: int) -> BaseEncoder | None:
         assert now_ns >= START_NS
-        if every_n == (self.opened or [1])[-1]:
+        if decimation == (self.opened or [1])[-1]:
             return None
-        self.opened.append(every_n)
-        return BaseEncoder(replace(SETTINGS, fps=15.0 / every_n))
+        self.opened.append(decimation)
+        return BaseEncoder(replace(SETTINGS, fps=15.0 / decimation))
 
 
 class Asked:
@@ -102,7 +104,7 @@ class Asked:
 
 def test_ticks_that_are_not_coded_cost_nothing():
     """``--fps auto`` would save no bit."""
-    rig = Rig(cadence=Cadence(3))
+    rig = Rig(frame_skip=FrameSkip(3))
     rig.opened.append(3)
     assert rig.play(smooth_pictures(10, size=SIZE)) == [0, 3, 6, 9]
     assert len(rig.kept.units) == 4
@@ -110,7 +112,7 @@ def test_ticks_that_are_not_coded_cost_nothing():
 
 def test_a_keyframe_on_demand_does_not_wait_for_its_tick():
     """At three frames a second a ground that joins would look at nothing for longer than promised."""
-    rig = Rig(cadence=Cadence(8))
+    rig = Rig(frame_skip=FrameSkip(8))
     rig.opened.append(8)
     assert rig.play(smooth_pictures(30, size=SIZE), asks=(10,)) == [0, 8, 10, 18, 26]
     assert BaseDecoder().decode(rig.kept.units[2]) is not None, "it is a keyframe"
@@ -120,7 +122,7 @@ def test_the_plan_is_asked_for_coded_ticks_and_told_the_tracks():
     """Pulses would fall on ticks that nobody sees, and R0 would know of no track."""
     plan = Asked()
     known = Tracks(0, **_no_tracks())
-    rig = Rig(cadence=Cadence(4), plan=plan)
+    rig = Rig(frame_skip=FrameSkip(4), plan=plan)
     rig.opened.append(4)
     rig.play(smooth_pictures(9, size=SIZE), tracks=known)
     assert [(tick, keyframe) for tick, _, keyframe in plan.calls] == [(0, True), (4, False), (8, False)]
@@ -141,18 +143,18 @@ def _no_tracks() -> dict[str, np.ndarray]:
     }
 
 
-def starving() -> MeasuredCadence:
+def starving() -> MeasuredFrameSkip:
     """Decides after a second; the clip below never reaches a fine quantiser."""
-    return MeasuredCadence(1, most_every_n=5, rest_ticks=15)
+    return MeasuredFrameSkip(1, most_decimation=5, rest_ticks=15)
 
 
 def test_the_rate_changes_with_a_keyframe_and_every_decoder_follows():
     """The picture would freeze, or turn to garbage, as soon as ``--fps auto`` decides."""
-    rig = Rig(cadence=starving(), interval_s=2.0)
+    rig = Rig(frame_skip=starving(), interval_s=2.0)
     pictures = hard_pictures(150, size=SIZE)
     coded = rig.play(pictures)
     assert rig.opened
-    assert rig.cadence.every_n > 1
+    assert rig.frame_skip.decimation > 1
     assert len(coded) < 150
     decoder = BaseDecoder()
     for index, data in zip(coded, rig.kept.units, strict=True):
@@ -169,7 +171,9 @@ def test_the_same_frames_give_the_same_bytes():
     """In lockstep no table could be repeated."""
     runs = []
     for _ in range(2):
-        rig = Rig(cadence=starving(), plan=RollingPlan(SIZE, columns=4, rows=3, depth=0.1), interval_s=2.0)
+        rig = Rig(
+            frame_skip=starving(), plan=RollingRefreshPlan(SIZE, columns=4, rows=3, depth=0.1), interval_s=2.0
+        )
         runs.append((rig.play(hard_pictures(100, size=SIZE), asks=(40,)), rig.kept.units))
     assert runs[0] == runs[1]
 
@@ -178,7 +182,7 @@ def test_a_recording_keeps_its_times_across_a_change(tmp_path):
     """The flight's video on the drone would run at the wrong speed after the first change."""
     path = tmp_path / "base.mkv"
     with BaseRecorder(path) as recorder:
-        rig = Rig(cadence=starving(), recorder=recorder, interval_s=2.0)
+        rig = Rig(frame_skip=starving(), recorder=recorder, interval_s=2.0)
         coded = rig.play(hard_pictures(90, size=SIZE))
     assert rig.opened
     with av.open(str(path)) as container:
@@ -190,7 +194,7 @@ def test_a_recording_keeps_its_times_across_a_change(tmp_path):
 
 def test_a_change_without_a_new_encoder_is_a_bug_that_shows():
     """x265 would go on as if all frames came, and spend a third of its bits."""
-    rig = Rig(cadence=starving(), interval_s=2.0)
+    rig = Rig(frame_skip=starving(), interval_s=2.0)
     rig.stage._renew = None
     with pytest.raises(AssertionError, match="another encoder"):
         rig.play(hard_pictures(120, size=SIZE))

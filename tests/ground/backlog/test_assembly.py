@@ -8,33 +8,35 @@ import pytest
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
+from backlog_chunks import info_object, still_object, video_object
 from flight import Flight
 from hvt_common.protocol.messages import (
-    MAX_PAST_BYTES,
+    MAX_BACKLOG_BYTES,
+    AcknowledgedRange,
+    BacklogHeader,
+    BacklogStill,
     Flags,
     Info,
-    PastHave,
-    PastHeader,
-    PastStill,
     WireError,
-    pack_past_still,
+    pack_backlog_still,
 )
-from hvt_ground.backlog import PastAssembly, StoredStill, past_content
-from hvt_ground.link.sequence_window import NumbersSeen
-from hvt_ground.sinks.rerun.backlog_stills import PastGallery, Shown
-from past_pieces import info_object, still_object, video_object
+from hvt_ground.backlog import BacklogAssembly, StoredStill, backlog_content
+from hvt_ground.link.sequence_window import SequenceWindow
+from hvt_ground.sinks.rerun.backlog_stills import BacklogGallery, Shown
 
 
-def header(offset: int = 0, total: int = 10, *, kind="still", number=3, session=7) -> PastHeader:
+def header(offset: int = 0, total: int = 10, *, kind="still", number=3, session=7) -> BacklogHeader:
     """Of a piece."""
-    return PastHeader(
+    return BacklogHeader(
         session_id=session, kind=kind, number=number, offset=offset, total_bytes=total, send_ns=0
     )
 
 
-def have(number: int, have_bytes: int, *, kind="still", session=7) -> PastHave:
+def acknowledged_range(number: int, acknowledged_bytes: int, *, kind="still", session=7) -> AcknowledgedRange:
     """What the edge hears."""
-    return PastHave(session_id=session, kind=kind, number=number, have_bytes=have_bytes)
+    return AcknowledgedRange(
+        session_id=session, kind=kind, number=number, acknowledged_bytes=acknowledged_bytes
+    )
 
 
 KEY = (7, "still", 3)
@@ -43,79 +45,85 @@ TEN = b"0123456789"
 
 def test_pieces_in_order_become_the_object():
     """Nothing of an outage would ever be seen, or the edge would send it for ever."""
-    assembly = PastAssembly()
-    assert assembly.piece(header(), TEN[:4]) is None
-    assert assembly.take_haves(16) == (have(3, 4),)
-    assert assembly.piece(header(4), TEN[4:]) == TEN
-    assert assembly.take_haves(16) == (have(3, 9),), "it is not where it belongs yet"
+    assembly = BacklogAssembly()
+    assert assembly.chunk(header(), TEN[:4]) is None
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 4),)
+    assert assembly.chunk(header(4), TEN[4:]) == TEN
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 9),), (
+        "it is not where it belongs yet"
+    )
     assembly.settle(KEY, usable=True)
-    assert assembly.take_haves(16) == (have(3, 10),)
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 10),)
     assert (assembly.in_progress, assembly.size_bytes) == (0, 0)
 
 
 def test_an_object_is_acknowledged_when_it_is_settled_however_long_that_takes():
     """The edge forgets what it hears of: on a slow ground, a still that nobody has read is lost with the session."""
-    assembly = PastAssembly()
-    assert assembly.piece(header(), TEN) == TEN
+    assembly = BacklogAssembly()
+    assert assembly.chunk(header(), TEN) == TEN
     for _ in range(100):  # the edge asks every two seconds, with the last byte
-        assert assembly.piece(header(9), TEN[9:]) is None
-        assert assembly.take_haves(16) == (have(3, 9),), "somebody is there, and has it all but finished"
-    assert assembly.piece(header(total=9), TEN[:9]) is None
-    assert assembly.take_haves(16) == (have(3, 0),), "another one of the same name has to wait"
+        assert assembly.chunk(header(9), TEN[9:]) is None
+        assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 9),), (
+            "somebody is there, and has it all but finished"
+        )
+    assert assembly.chunk(header(total=9), TEN[:9]) is None
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),), (
+        "another one of the same name has to wait"
+    )
     assembly.settle(KEY, usable=True)
-    assert assembly.take_haves(16) == (have(3, 10),)
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 10),)
 
 
 def test_what_is_in_progress_is_not_settled_by_a_word_too_late():
     """An object that begins again after a session has ended would lose what has come of it."""
-    assembly = PastAssembly()
-    assembly.piece(header(), TEN)
+    assembly = BacklogAssembly()
+    assembly.chunk(header(), TEN)
     assert assembly.drop_handed() == 1
-    assembly.piece(header(), TEN[:6])
+    assembly.chunk(header(), TEN[:6])
     assembly.settle(KEY, usable=True)
     assembly.drop(KEY)
-    assert assembly.piece(header(6), TEN[6:]) == TEN
+    assert assembly.chunk(header(6), TEN[6:]) == TEN
     assembly.drop(KEY)
-    assert (assembly.in_progress, assembly.take_haves(16)) == (0, ()), (
+    assert (assembly.in_progress, assembly.take_acknowledged_ranges(16)) == (0, ()), (
         "nobody can take it: nothing is said of it"
     )
 
 
 def test_only_the_run_without_a_hole_is_held():
     """An object with a hole in it would be taken for a whole one."""
-    assembly = PastAssembly()
-    assembly.piece(header(), TEN[:3])
-    assembly.piece(header(6), TEN[6:8])
-    assert assembly.take_haves(16) == (have(3, 3),)
-    assembly.piece(header(1), TEN[1:5])  # it overlaps and goes on
-    assembly.piece(header(0), TEN[:2])  # old
-    assert assembly.take_haves(16) == (have(3, 5),)
-    assert assembly.piece(header(2), TEN[2:]) == TEN
+    assembly = BacklogAssembly()
+    assembly.chunk(header(), TEN[:3])
+    assembly.chunk(header(6), TEN[6:8])
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 3),)
+    assembly.chunk(header(1), TEN[1:5])  # it overlaps and goes on
+    assembly.chunk(header(0), TEN[:2])  # old
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 5),)
+    assert assembly.chunk(header(2), TEN[2:]) == TEN
 
 
 def test_what_was_delivered_is_acknowledged_again_and_not_delivered_again():
     """Where a report is lost the still would be in the gallery twice, or sent until the store is full."""
-    assembly = PastAssembly(remember=3)
+    assembly = BacklogAssembly(remember=3)
     for number in range(5):
-        assert assembly.piece(header(number=number), TEN) == TEN
-        assert assembly.piece(header(number=number), TEN) is None, "it is being worked on"
+        assert assembly.chunk(header(number=number), TEN) == TEN
+        assert assembly.chunk(header(number=number), TEN) is None, "it is being worked on"
         assembly.settle((7, "still", number), usable=True)
-    assert len(assembly.take_haves(3)) == 3
-    assembly.take_haves(16)
-    assert assembly.piece(header(number=4), TEN) is None
-    assert assembly.piece(header(3, number=3), TEN[3:5]) is None
-    assert assembly.take_haves(16) == (have(4, 10), have(3, 10))
-    assert assembly.piece(header(total=9, number=4), TEN[:9]) == TEN[:9], "another one of the same name"
-    assert assembly.piece(header(number=0), TEN) == TEN, "what is known again is bounded"
+    assert len(assembly.take_acknowledged_ranges(3)) == 3
+    assembly.take_acknowledged_ranges(16)
+    assert assembly.chunk(header(number=4), TEN) is None
+    assert assembly.chunk(header(3, number=3), TEN[3:5]) is None
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(4, 10), acknowledged_range(3, 10))
+    assert assembly.chunk(header(total=9, number=4), TEN[:9]) == TEN[:9], "another one of the same name"
+    assert assembly.chunk(header(number=0), TEN) == TEN, "what is known again is bounded"
 
 
 def test_another_size_begins_anew():
     """Two halves of two objects would be one."""
-    assembly = PastAssembly()
-    assembly.piece(header(), TEN[:6])
-    assembly.piece(header(6, 12), b"xy")
-    assert assembly.take_haves(16) == (have(3, 0),)
-    assert assembly.piece(header(0, 12), TEN + b"xy") == TEN + b"xy"
+    assembly = BacklogAssembly()
+    assembly.chunk(header(), TEN[:6])
+    assembly.chunk(header(6, 12), b"xy")
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),)
+    assert assembly.chunk(header(0, 12), TEN + b"xy") == TEN + b"xy"
 
 
 @pytest.mark.parametrize(
@@ -129,69 +137,72 @@ def test_another_size_begins_anew():
 )
 def test_a_piece_that_cannot_be_one_is_refused(offset, total, payload, kind, number):
     """Memory would follow whatever a stranger sends."""
-    assembly = PastAssembly()
+    assembly = BacklogAssembly()
     with pytest.raises(WireError):
-        assembly.piece(header(offset, total, kind=kind, number=number), payload)
-    assert (assembly.in_progress, assembly.take_haves(16)) == (0, ())
+        assembly.chunk(header(offset, total, kind=kind, number=number), payload)
+    assert (assembly.in_progress, assembly.take_acknowledged_ranges(16)) == (0, ())
 
 
 def test_an_unusable_object_is_asked_for_again_but_not_for_ever():
     """One bad object would take the link for the rest of the flight."""
-    assembly = PastAssembly()
+    assembly = BacklogAssembly()
     for _ in range(2):
-        assert assembly.piece(header(), TEN) == TEN
+        assert assembly.chunk(header(), TEN) == TEN
         assembly.settle(KEY, usable=False)
-        assert assembly.take_haves(16) == (have(3, 0),)
-    assert assembly.piece(header(), TEN) == TEN
+        assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),)
+    assert assembly.chunk(header(), TEN) == TEN
     assembly.settle(KEY, usable=False)
-    assert assembly.take_haves(16) == (have(3, 10),)
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 10),)
     assert assembly.refused == 3
 
 
 def test_what_cannot_be_taken_now_comes_again():
     """While much waits, or a session is not known, an object would be acknowledged and lost."""
-    assembly = PastAssembly()
-    assembly.piece(header(), TEN[:4], may_finish=False)
-    assert assembly.piece(header(4), TEN[4:], may_finish=False) is None
+    assembly = BacklogAssembly()
+    assembly.chunk(header(), TEN[:4], may_finish=False)
+    assert assembly.chunk(header(4), TEN[4:], may_finish=False) is None
     assembly.want_info(7)
-    assert assembly.take_haves(16) == (have(3, 4), have(0, 0, kind="info"))
-    assert assembly.piece(header(4), TEN[4:]) == TEN
+    assert assembly.take_acknowledged_ranges(16) == (
+        acknowledged_range(3, 4),
+        acknowledged_range(0, 0, kind="info"),
+    )
+    assert assembly.chunk(header(4), TEN[4:]) == TEN
     assembly.drop_handed()  # the session that had it is gone
     assembly.settle(KEY, usable=True)
-    assert assembly.take_haves(16) == (have(3, 0),)
-    assembly.piece(header(4), TEN[4:])
-    assert assembly.take_haves(16) == (have(3, 0),)
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),)
+    assembly.chunk(header(4), TEN[4:])
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(3, 0),)
 
 
 def test_facts_of_a_session_are_delivered_as_often_as_they_come():
     """A ground that has forgotten them would ask for ever, and hear that it has them."""
-    assembly = PastAssembly()
+    assembly = BacklogAssembly()
     for _ in range(2):
-        assert assembly.piece(header(kind="info", number=0), TEN) == TEN
+        assert assembly.chunk(header(kind="info", number=0), TEN) == TEN
         assembly.settle((7, "info", 0), usable=True)
-        assert assembly.take_haves(16) == (have(0, 10, kind="info"),)
+        assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(0, 10, kind="info"),)
 
 
 def test_a_full_assembly_gives_up_what_has_waited_longest():
     """Objects that never end would fill the ground's memory, or keep out all others."""
-    assembly = PastAssembly(max_objects=3, max_bytes=MAX_PAST_BYTES)
+    assembly = BacklogAssembly(max_objects=3, max_bytes=MAX_BACKLOG_BYTES)
     for number in range(5):
-        assembly.piece(header(number=number), TEN[:2])
+        assembly.chunk(header(number=number), TEN[:2])
     assert assembly.in_progress == 3
-    assert len(assembly.take_haves(16)) == 5
-    assembly.piece(header(2, number=0), TEN[2:4])
-    assert assembly.take_haves(16) == (have(0, 0),)
-    assert assembly.piece(header(2, number=4), TEN[2:]) == TEN
-    big = bytes(MAX_PAST_BYTES)
-    assert assembly.piece(header(total=MAX_PAST_BYTES, number=9), big) is None, "one is being worked on"
+    assert len(assembly.take_acknowledged_ranges(16)) == 5
+    assembly.chunk(header(2, number=0), TEN[2:4])
+    assert assembly.take_acknowledged_ranges(16) == (acknowledged_range(0, 0),)
+    assert assembly.chunk(header(2, number=4), TEN[2:]) == TEN
+    big = bytes(MAX_BACKLOG_BYTES)
+    assert assembly.chunk(header(total=MAX_BACKLOG_BYTES, number=9), big) is None, "one is being worked on"
     assembly.settle((7, "still", 4), usable=True)
-    assert assembly.piece(header(total=MAX_PAST_BYTES, number=9), big) == big
-    assert assembly.size_bytes <= MAX_PAST_BYTES
+    assert assembly.chunk(header(total=MAX_BACKLOG_BYTES, number=9), big) == big
+    assert assembly.size_bytes <= MAX_BACKLOG_BYTES
 
 
-QUARTER = MAX_PAST_BYTES // 4
-ZEROS = bytes(MAX_PAST_BYTES)
-piece_of = st.tuples(
+QUARTER = MAX_BACKLOG_BYTES // 4
+ZEROS = bytes(MAX_BACKLOG_BYTES)
+chunk_of = st.tuples(
     st.integers(0, 5),  # number
     st.sampled_from([None, None, None, 0, 1, 2, 3]),  # where it begins, quarters; None goes on
     st.integers(0, 4),  # how long it is
@@ -201,26 +212,26 @@ piece_of = st.tuples(
 )
 
 
-@given(told=st.lists(piece_of, max_size=40))
+@given(told=st.lists(chunk_of, max_size=40))
 @settings(max_examples=60, deadline=None)
 def test_whatever_comes_it_stays_within_bounds(told):
     """A hostile sender would crash the ground or make it grow."""
-    assembly = PastAssembly(max_objects=3, max_bytes=MAX_PAST_BYTES + QUARTER, remember=2)
+    assembly = BacklogAssembly(max_objects=3, max_bytes=MAX_BACKLOG_BYTES + QUARTER, remember=2)
     fullest, heard = 0, {}
     for number, begins, length, total, may_finish, then in told:
         offset = heard.get(number, 0) if begins is None else begins * QUARTER
         try:
-            whole = assembly.piece(
+            whole = assembly.chunk(
                 header(offset, total * QUARTER, number=number),
                 ZEROS[: min(length * QUARTER, total * QUARTER - offset)],
                 may_finish=may_finish,
             )
         except WireError:
             continue
-        heard |= {said.number: said.have_bytes for said in assembly.take_haves(16)}
+        heard |= {said.number: said.acknowledged_bytes for said in assembly.take_acknowledged_ranges(16)}
         fullest = max(fullest, assembly.size_bytes)
         assert assembly.in_progress <= 3
-        assert assembly.size_bytes <= MAX_PAST_BYTES + QUARTER
+        assert assembly.size_bytes <= MAX_BACKLOG_BYTES + QUARTER
         if whole is None:
             continue
         assert len(whole) == total * QUARTER
@@ -228,16 +239,16 @@ def test_whatever_comes_it_stays_within_bounds(told):
             assembly.drop((7, "still", number))
         elif then != "keep":
             assembly.settle((7, "still", number), usable=then == "settle")
-    event("full" if fullest > MAX_PAST_BYTES else "not full")
+    event("full" if fullest > MAX_BACKLOG_BYTES else "not full")
 
 
 def test_acknowledgements_that_nobody_fetches_are_bounded():
     """While the way back is away, memory would follow what comes."""
-    assembly = PastAssembly()
+    assembly = BacklogAssembly()
     for number in range(2000):
-        assembly.piece(header(number=number), TEN[:3])
+        assembly.chunk(header(number=number), TEN[:3])
     said = 0
-    while taken := assembly.take_haves(16):
+    while taken := assembly.take_acknowledged_ranges(16):
         assert len(taken) <= 16
         said += len(taken)
     assert said == 512
@@ -245,16 +256,19 @@ def test_acknowledgements_that_nobody_fetches_are_bounded():
 
 def test_no_more_than_the_bound_is_held_to_the_byte():
     """The bound would be there, and one object more would go beyond it."""
-    assembly = PastAssembly(max_bytes=MAX_PAST_BYTES + 10)
-    half = MAX_PAST_BYTES // 2
-    assert len(assembly.piece(header(total=half), ZEROS[:half])) == half, (
+    assembly = BacklogAssembly(max_bytes=MAX_BACKLOG_BYTES + 10)
+    half = MAX_BACKLOG_BYTES // 2
+    assert len(assembly.chunk(header(total=half), ZEROS[:half])) == half, (
         "handed out: it takes its bytes still"
     )
-    assert assembly.piece(header(total=half + 20, number=4), ZEROS[: half + 10]) is None
-    assert assembly.size_bytes == MAX_PAST_BYTES + 10
-    assert assembly.piece(header(half + 10, half + 20, number=4), ZEROS[:1]) is None
-    assert assembly.take_haves(16) == (have(3, half - 1), have(4, half + 10)), "no byte more"
-    assembly.piece(header(number=5), TEN)  # what waits gives way, what is worked on does not
+    assert assembly.chunk(header(total=half + 20, number=4), ZEROS[: half + 10]) is None
+    assert assembly.size_bytes == MAX_BACKLOG_BYTES + 10
+    assert assembly.chunk(header(half + 10, half + 20, number=4), ZEROS[:1]) is None
+    assert assembly.take_acknowledged_ranges(16) == (
+        acknowledged_range(3, half - 1),
+        acknowledged_range(4, half + 10),
+    ), "no byte more"
+    assembly.chunk(header(number=5), TEN)  # what waits gives way, what is worked on does not
     assert assembly.size_bytes == half + 10
 
 
@@ -266,7 +280,7 @@ def test_no_more_than_the_bound_is_held_to_the_byte():
 @settings(max_examples=150, deadline=None)
 def test_an_edge_that_follows_the_acknowledgements_gets_everything_across(data, cuts, seed):
     """Lost, doubled or reordered pieces would leave an object unfinished for ever."""
-    assembly, chance = PastAssembly(), random.Random(seed)
+    assembly, chance = BacklogAssembly(), random.Random(seed)
     size = max(1, len(data) // (len(cuts) + 1))
     at, whole = 0, None
     for _ in range(2000):
@@ -275,11 +289,11 @@ def test_an_edge_that_follows_the_acknowledgements_gets_everything_across(data, 
         for offset in burst:
             if chance.random() < 0.3:
                 continue
-            whole = whole or assembly.piece(header(offset, len(data)), data[offset : offset + size])
+            whole = whole or assembly.chunk(header(offset, len(data)), data[offset : offset + size])
         if whole is not None:
             break
-        for said in assembly.take_haves(16):
-            at = said.have_bytes
+        for said in assembly.take_acknowledged_ranges(16):
+            at = said.acknowledged_bytes
     assert whole == data
 
 
@@ -295,14 +309,14 @@ def flight() -> Flight:
 def test_objects_are_read(flight):
     """Nothing of an outage could be shown."""
     sid = flight.session_id
-    still = past_content((sid, "still", 4), still_object(flight, 6, 4, flags=0), edge="uav-1")
+    still = backlog_content((sid, "still", 4), still_object(flight, 6, 4, flags=0), edge="uav-1")
     assert isinstance(still, StoredStill)
     assert (still.header.sequence, still.header.frame_index, still.encoding) == (4, 6, "image/jpeg")
     assert still.header.flags & Flags.STORED
     assert still.data.startswith(b"\xff\xd8")
-    units = past_content((sid, "base", 20), video_object(flight, range(20, 25)), edge="uav-1")
+    units = backlog_content((sid, "base", 20), video_object(flight, range(20, 25)), edge="uav-1")
     assert [unit.frame_index for unit in units] == list(range(20, 25))
-    info = past_content((sid, "info", 0), info_object(flight), edge="uav-1")
+    info = backlog_content((sid, "info", 0), info_object(flight), edge="uav-1")
     assert info.session_id == sid
 
 
@@ -311,7 +325,7 @@ def test_objects_that_are_another_inside_are_refused(flight):
     sid = flight.session_id
     still, video, info = still_object(flight, 6, 4), video_object(flight, [20]), info_object(flight)
     broken = flight.still(6, 4)
-    damaged = pack_past_still(PastStill(broken.attachment, broken.encoding, broken.payload + b"x"))
+    damaged = pack_backlog_still(BacklogStill(broken.attachment, broken.encoding, broken.payload + b"x"))
     for key, data, edge in (
         ((sid, "still", 5), still, "uav-1"),
         ((sid + 1, "still", 4), still, "uav-1"),
@@ -323,7 +337,7 @@ def test_objects_that_are_another_inside_are_refused(flight):
         ((sid, "info", 0), info, "uav-2"),
     ):
         with pytest.raises(WireError):
-            past_content(key, data, edge=edge)
+            backlog_content(key, data, edge=edge)
 
 
 @given(data=st.binary(max_size=400), kind=st.sampled_from(["info", "still", "base"]))
@@ -331,7 +345,7 @@ def test_objects_that_are_another_inside_are_refused(flight):
 def test_any_bytes_are_refused_or_read(data, kind):
     """One hostile object would end the ground."""
     with pytest.raises(WireError):
-        past_content((7, kind, 0), data, edge="uav-1")
+        backlog_content((7, kind, 0), data, edge="uav-1")
 
 
 # What has been
@@ -341,7 +355,7 @@ def test_any_bytes_are_refused_or_read(data, kind):
 @settings(max_examples=100, deadline=None)
 def test_numbers_are_known_again_in_any_order(numbers):
     """A still that was missed long ago would be taken for one that has been shown."""
-    seen, plain = NumbersSeen(), set()
+    seen, plain = SequenceWindow(), set()
     for number in numbers:
         assert (number in seen) == (number in plain)
         assert seen.add([number]) == (number not in plain)
@@ -351,7 +365,7 @@ def test_numbers_are_known_again_in_any_order(numbers):
 
 def test_forged_numbers_neither_fill_the_memory_nor_silence_those_that_come():
     """Somebody who makes up numbers would have every still that is sent afterwards taken for an old one."""
-    seen = NumbersSeen(pages=4)
+    seen = SequenceWindow(pages=4)
     for number in range(40):
         assert seen.add([number]) == 1, "it has not been, whatever else has"
         assert seen.add([(number + 1) << 20]) == 1
@@ -393,7 +407,7 @@ class Replay:
 @settings(max_examples=300, deadline=None)
 def test_pictures_and_captions_agree_at_every_moment(told):
     """The gallery would show a lorry under the words of a bus."""
-    gallery, replay = PastGallery(("",) * 3, hold_ns=2), Replay(3)
+    gallery, replay = BacklogGallery(("",) * 3, hold_ns=2), Replay(3)
     now, newest, taken = ("",) * 3, 0, set()
     for live, number, slot in told:
         # Stills of now come in their order, those of the past at any time between them.
@@ -416,7 +430,7 @@ def test_pictures_and_captions_agree_at_every_moment(told):
 
 def test_an_old_still_holds_its_slot_for_a_while_only_where_one_is_free():
     """Pairs would flicker by, or an old one would push out what is shown now."""
-    gallery = PastGallery(("", ""), hold_ns=10)
+    gallery = BacklogGallery(("", ""), hold_ns=10)
     gallery.note(0, Shown(0, 0, ("a", "")))
     gallery.note(0, Shown(100, 100, ("b", "")))
     put = gallery.put(50, 50, "x")

@@ -13,21 +13,21 @@ from typing import Self
 import av
 import pytest
 
-from flight import CLASSES, Flight, Port, RedSquares, SameAnswer, sight_of, square_box
+from backlog_chunks import chunks, info_object, still_object, video_object
+from flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from handled import WatchedInbox, end
-from hvt_common.protocol.ledger import Channel, overhead_bytes
-from hvt_common.protocol.messages import Feedback, Info, PastHave, PastUnit, pack_past_units
+from hvt_common.protocol.ledger import Account, overhead_bytes
+from hvt_common.protocol.messages import AcknowledgedRange, BacklogUnit, Feedback, Info, pack_backlog_units
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
-from hvt_ground.backlog.perception import FIRST_TRACK_ID, PastLook
-from hvt_ground.backlog.recordings import PastRecording, PastRecordings
-from hvt_ground.perception.worker import RealtimeEyes
+from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
+from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
+from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.session.receiver import EdgeReceiver
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.timing import SessionTiming, TimingTable
 from hvt_ground.status import summary, table
-from past_pieces import info_object, pieces, still_object, video_object
 from rrd import Recording
 
 
@@ -43,7 +43,7 @@ class Models:
     """Lends red-square detectors."""
 
     @contextmanager
-    def borrow(self):
+    def checkout(self):
         """One for each."""
         yield RedSquares(), None
 
@@ -60,9 +60,9 @@ def settings(info: Info, path: Path) -> RecorderSettings:
     )
 
 
-def look_of(info: Info, models=None) -> PastLook:
+def look_of(info: Info, models=None) -> BacklogPerception:
     """What looks at kept things."""
-    return PastLook(
+    return BacklogPerception(
         info,
         models=models or Models(),
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
@@ -74,19 +74,19 @@ def look_of(info: Info, models=None) -> PastLook:
 class Rig:
     """A receiver with a port; sessions and former sessions with recordings in a folder."""
 
-    def __init__(self, folder: Path, flight: Flight, *, sight=sight_of, models=None, timing=None):
+    def __init__(self, folder: Path, flight: Flight, *, pipeline=pipeline_of, models=None, timing=None):
         self.folder = folder
         self._models = models or Models()
-        self._sight = sight
+        self._pipeline = pipeline
         self._timing = timing
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
         self.port.flight = flight
         self.flight = flight
         self.opened: list[GroundSession] = []
-        self._past_numbers = itertools.count()
+        self._backlog_numbers = itertools.count()
         self.live: list[Received] = []
-        self.receiver = EdgeReceiver(self.port, open_session=self._open, open_past=self._open_past)
+        self.receiver = EdgeReceiver(self.port, open_session=self._open, open_backlog=self._open_backlog)
 
     def _open(self, info: Info, receiver: EdgeReceiver) -> GroundSession:
         path = self.folder / f"{len(self.opened)}.rrd"
@@ -94,12 +94,12 @@ class Rig:
             info,
             recorder=Recorder(settings(info, path)),
             recording=path,
-            sight_of=self._sight,
+            pipeline_of=self._pipeline,
             timing=None if self._timing is None else self._lines(self._timing, info),
             to_local_ns=receiver.clock_offset.to_local_ns,
             clock=time.time_ns,
             report=receiver.report_now,
-            past_look=look_of(info, self._models),
+            backlog_perception=look_of(info, self._models),
         )
         self.opened.append(session)
         return session
@@ -109,9 +109,9 @@ class Rig:
             table, edge=info.edge, session_id=info.session_id, clock=time.time_ns, offset_ns=lambda: 0
         )
 
-    def _open_past(self, info: Info) -> PastRecording:
-        path = self.folder / f"past-{next(self._past_numbers)}.rrd"
-        return PastRecording(info, path=path, recorder=Recorder(settings(info, path)), look=look_of(info))
+    def _open_backlog(self, info: Info) -> BacklogRecording:
+        path = self.folder / f"backlog-{next(self._backlog_numbers)}.rrd"
+        return BacklogRecording(info, path=path, recorder=Recorder(settings(info, path)), look=look_of(info))
 
     def put(self, *items: Received) -> None:
         """What Zenoh's callback does, and then all of it is handled and seen."""
@@ -119,7 +119,7 @@ class Rig:
         for item in items:
             self.inbox.put(item)
         self._wait_for(lambda: self.inbox.handled)
-        self._wait_for(lambda: self.receiver.past.idle)  # the receiving thread hands boxes on to the eyes
+        self._wait_for(lambda: self.receiver.backlog.idle)  # the receiving thread hands boxes on to the eyes
         for session in self.opened:
             self._wait_for(lambda one=session: one.idle)
 
@@ -132,10 +132,10 @@ class Rig:
         """Access units as they come."""
         self.put(*(self.flight.base(index) for index in indices))
 
-    def haves(self) -> list[PastHave]:
+    def acknowledged_ranges(self) -> list[AcknowledgedRange]:
         """All acknowledgements so far."""
         self.reported()
-        return [have for report in self.port.reports for have in report.past]
+        return [acknowledged_range for report in self.port.reports for acknowledged_range in report.backlog]
 
     def reported(self) -> Feedback:
         """A report that speaks of all that was put."""
@@ -163,9 +163,9 @@ def flight() -> Flight:
     return Flight(90, keyframes=(40, 65))
 
 
-def past(flight: Flight, kind: str, number: int, data: bytes, **cut) -> list[Received]:
+def backlog(flight: Flight, kind: str, number: int, data: bytes, **cut) -> list[Received]:
     """An object of the flight in pieces."""
-    return pieces(flight.session_id, kind, number, data, **cut)
+    return chunks(flight.session_id, kind, number, data, **cut)
 
 
 def decoded(recording: Recording) -> int:
@@ -175,9 +175,11 @@ def decoded(recording: Recording) -> int:
     return sum(len(decoder.decode(av.Packet(data))) for _, _, data in recording.video())
 
 
-def full(flight: Flight, kind: str, number: int, data: bytes) -> PastHave:
+def full(flight: Flight, kind: str, number: int, data: bytes) -> AcknowledgedRange:
     """It has arrived."""
-    return PastHave(session_id=flight.session_id, kind=kind, number=number, have_bytes=len(data))
+    return AcknowledgedRange(
+        session_id=flight.session_id, kind=kind, number=number, acknowledged_bytes=len(data)
+    )
 
 
 def test_the_hole_of_an_outage_is_filled(flight, tmp_path):
@@ -186,20 +188,22 @@ def test_the_hole_of_an_outage_is_filled(flight, tmp_path):
         rig.base(*range(25))
         for index in range(65, 75):
             rig.base(index)
-        tracks, detections = rig.session.sight.tracks, rig.session.sight.detections_run
+        tracks, detections = rig.session.pipeline.tracks, rig.session.pipeline.detections_run
         newest = video_object(flight, range(40, 65))
         # It begins in mid-GOP, with some that came, as an edge hands over what was not acknowledged.
         oldest = video_object(flight, range(22, 40))
-        rig.put(*past(flight, "base", 40, newest))
-        rig.put(*past(flight, "base", 22, oldest))
-        assert {full(flight, "base", 40, newest), full(flight, "base", 22, oldest)} <= set(rig.haves())
-        assert (rig.session.sight.tracks, rig.session.sight.detections_run) == (tracks, detections)
+        rig.put(*backlog(flight, "base", 40, newest))
+        rig.put(*backlog(flight, "base", 22, oldest))
+        assert {full(flight, "base", 40, newest), full(flight, "base", 22, oldest)} <= set(
+            rig.acknowledged_ranges()
+        )
+        assert (rig.session.pipeline.tracks, rig.session.pipeline.detections_run) == (tracks, detections)
         assert rig.session.last_frame_index == 74
         for index in range(75, 80):  # one by one: a burst would leave out detections
             rig.base(index)
-        assert rig.session.sight.tracks == tracks, "the tracker of now went on undisturbed"
-        assert rig.session.past.frames == 40
-        assert rig.session.past.left_out == 0, "what leads up to them is no frame of the outage"
+        assert rig.session.pipeline.tracks == tracks, "the tracker of now went on undisturbed"
+        assert rig.session.backlog.frames == 40
+        assert rig.session.backlog.left_out == 0, "what leads up to them is no frame of the outage"
         assert rig.session.frames_decoded == 40
     recording = Recording(tmp_path / "0.rrd")
     expected = [(u.frame_index, u.capture_ns, u.data) for u in flight.units[:80]]
@@ -208,7 +212,7 @@ def test_the_hole_of_an_outage_is_filled(flight, tmp_path):
     texts = [text for _, _, text in recording.events()]
     assert any(text.startswith("3 s of video from the outage at ") for text in texts)
     content = summary(rig.receiver.done[0], unusable=0)
-    assert content["past"]["frames"] == 40
+    assert content["backlog"]["frames"] == 40
     assert "s of video came afterwards" in dict(table(content))["outages"]
 
 
@@ -218,9 +222,9 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
         rig.base(*range(25))
         rig.base(*range(65, 75))
         before = Recording(tmp_path / "0.rrd")
-        rig.put(*past(flight, "base", 40, video_object(flight, range(40, 60))))
-        rig.put(*past(flight, "base", 25, video_object(flight, range(25, 40))))
-        assert rig.session.past.left_out == 0, "what leads up to a stretch is none of it"
+        rig.put(*backlog(flight, "base", 40, video_object(flight, range(40, 60))))
+        rig.put(*backlog(flight, "base", 25, video_object(flight, range(25, 40))))
+        assert rig.session.backlog.left_out == 0, "what leads up to a stretch is none of it"
         rig.base(*range(75, 90))
     after = Recording(tmp_path / "0.rrd")
     for frame in (3, 20, 24, 65, 66, 74):
@@ -236,17 +240,17 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
     assert len(after.boxes(74)) == 1
 
 
-@pytest.mark.parametrize("fold_bytes", [6_000, 1 << 30])
-def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, monkeypatch, fold_bytes):
+@pytest.mark.parametrize("compact_bytes", [6_000, 1 << 30])
+def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, monkeypatch, compact_bytes):
     """Rows that come late would be lost or doubled where the journal is written again, or when the file is closed."""
-    monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.FOLD_BYTES", fold_bytes)
+    monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.COMPACT_BYTES", compact_bytes)
     monkeypatch.setattr("hvt_ground.sinks.rerun.rrd.footer._MOST_GROWTH", 10)
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(25))
         rig.base(*range(65, 90))
-        rig.put(*past(flight, "base", 40, video_object(flight, range(40, 65))))
-        rig.put(*past(flight, "still", 0, still_object(flight, 50, 0)))
-        rig.put(*past(flight, "base", 24, video_object(flight, range(24, 40))))
+        rig.put(*backlog(flight, "base", 40, video_object(flight, range(40, 65))))
+        rig.put(*backlog(flight, "still", 0, still_object(flight, 50, 0)))
+        rig.put(*backlog(flight, "base", 24, video_object(flight, range(24, 40))))
     recording = Recording(tmp_path / "0.rrd")
     assert recording.video() == [(u.frame_index, u.capture_ns, u.data) for u in flight.units]
     assert decoded(recording) == 90
@@ -261,15 +265,17 @@ def test_stills_of_an_outage_are_shown_at_their_own_time(flight, tmp_path):
         rig.put(flight.still(10, 0))
         rig.base(*range(65, 90))
         kept = {sequence: still_object(flight, 26 + sequence, sequence) for sequence in range(1, 13)}
-        refined = rig.session.sight.refined
+        refined = rig.session.pipeline.refined
         for sequence in (5, 1, 12, 2, 3, 4, 6, 7, 8, 9, 10, 11):
-            rig.put(*past(flight, "still", sequence, kept[sequence], piece_bytes=300))
-        rig.put(*past(flight, "still", 5, kept[5]))  # its acknowledgement was lost
-        assert {full(flight, "still", one, data) for one, data in kept.items()} <= set(rig.haves())
+            rig.put(*backlog(flight, "still", sequence, kept[sequence], chunk_bytes=300))
+        rig.put(*backlog(flight, "still", 5, kept[5]))  # its acknowledgement was lost
+        assert {full(flight, "still", one, data) for one, data in kept.items()} <= set(
+            rig.acknowledged_ranges()
+        )
         results = [one.still_sequence for report in rig.port.reports for one in report.stills]
         assert sorted(results) == list(range(13)), "the edge hears of each once"
-        assert rig.session.sight.refined == refined
-        assert rig.session.sight.outcomes["frame lost"] == 12
+        assert rig.session.pipeline.refined == refined
+        assert rig.session.pipeline.outcomes["frame lost"] == 12
     recording = Recording(tmp_path / "0.rrd")
     shown = [frame for frame, _ in recording.stills()]
     assert [frame for frame in shown if 25 < frame < 65] == list(range(27, 39))
@@ -283,11 +289,11 @@ def test_a_still_on_both_ways_is_shown_once(flight, tmp_path):
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(25))
         rig.put(flight.still(10, 0), flight.still(12, 2))
-        rig.put(*past(flight, "still", 1, still_object(flight, 11, 1)))
-        rig.put(*past(flight, "still", 0, still_object(flight, 10, 0)))
+        rig.put(*backlog(flight, "still", 1, still_object(flight, 11, 1)))
+        rig.put(*backlog(flight, "still", 0, still_object(flight, 10, 0)))
         rig.put(flight.still(11, 1))
-        assert (rig.session.stills_received, rig.session.past.stills) == (2, 1)
-        assert rig.session.ledger.messages(Channel.ROI) == 3
+        assert (rig.session.stills_received, rig.session.backlog.stills) == (2, 1)
+        assert rig.session.ledger.messages(Account.ROI) == 3
         assert rig.reported().missing_stills == ()
     texts = [text for _, _, text in Recording(tmp_path / "0.rrd").events() if text.startswith("still #")]
     assert sorted(text[:8] for text in texts) == ["still #0", "still #1", "still #2"]
@@ -297,9 +303,9 @@ def test_a_still_at_a_frame_that_is_known_speaks_on_its_track(flight, tmp_path):
     """A still that a short outage held up would be lost on its track."""
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(25))
-        rig.put(*past(flight, "still", 0, still_object(flight, 15, 0)))
-        assert rig.session.sight.outcomes["matched"] == 1
-        assert rig.session.sight.refined == 1
+        rig.put(*backlog(flight, "still", 0, still_object(flight, 15, 0)))
+        assert rig.session.pipeline.outcomes["matched"] == 1
+        assert rig.session.pipeline.refined == 1
 
 
 def test_a_still_of_an_edge_track_that_is_known_now_speaks_on_it(flight, tmp_path):
@@ -309,9 +315,9 @@ def test_a_still_of_an_edge_track_that_is_known_now_speaks_on_it(flight, tmp_pat
         rig.base(*range(65, 70))
         rig.put(flight.step(69, {31: square_box(69)}))
         rig.base(*range(70, 80))
-        rig.put(*past(flight, "still", 0, still_object(flight, 30, 0, track_id=31)))
-        rig.put(*past(flight, "still", 1, still_object(flight, 31, 1, track_id=32)))
-        outcomes = rig.session.sight.outcomes
+        rig.put(*backlog(flight, "still", 0, still_object(flight, 30, 0, track_id=31)))
+        rig.put(*backlog(flight, "still", 1, still_object(flight, 31, 1, track_id=32)))
+        outcomes = rig.session.pipeline.outcomes
         assert (outcomes["matched"], outcomes["frame lost"] + outcomes["late"]) == (1, 1)
 
 
@@ -320,17 +326,17 @@ def test_pieces_are_in_the_account_to_the_byte(flight, tmp_path):
     other = Flight(3)
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(10))
-        kept = past(flight, "still", 3, still_object(flight, 4, 3), piece_bytes=200)
-        rig.put(*kept, *kept[:2], *pieces(other.session_id, "still", 0, still_object(other, 1, 0)))
-        assert rig.session.ledger.messages(Channel.PAST) == len(kept) + 3
+        kept = backlog(flight, "still", 3, still_object(flight, 4, 3), chunk_bytes=200)
+        rig.put(*kept, *kept[:2], *chunks(other.session_id, "still", 0, still_object(other, 1, 0)))
+        assert rig.session.ledger.messages(Account.BACKLOG) == len(kept) + 3
         assert rig.session.ledger.line_bytes == sum(
             len(one.payload)
             + len(one.attachment)
             + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
             for one in rig.live
         )
-        pressed = rig.session.ledger.summary(1.0).past_bytes
-        assert pressed == sum(len(one.payload) for one in rig.live if one.key.endswith("/past"))
+        pressed = rig.session.ledger.summary(1.0).backlog_bytes
+        assert pressed == sum(len(one.payload) for one in rig.live if one.key.endswith("/backlog"))
 
 
 def test_the_end_waits_for_the_last_piece(flight, tmp_path, monkeypatch):
@@ -339,13 +345,13 @@ def test_the_end_waits_for_the_last_piece(flight, tmp_path, monkeypatch):
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(5))
         data = still_object(flight, 2, 0)
-        one, two = past(flight, "still", 0, data, piece_bytes=(len(data) + 1) // 2)
-        report = flight.status(base=5, state="ended", past=2)
+        one, two = backlog(flight, "still", 0, data, chunk_bytes=(len(data) + 1) // 2)
+        report = flight.status(base=5, state="ended", backlog=2)
         rig.put(one, report)
         assert not rig.receiver.idle
         rig.put(two)
         wait_for(lambda: rig.receiver.done)
-        assert rig.receiver.done[0].past.stills == 1
+        assert rig.receiver.done[0].backlog.stills == 1
 
 
 def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path):
@@ -355,21 +361,21 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
     still, video = still_object(former, 7, 3), video_object(former, range(20, 45))
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(20))
-        rig.put(*pieces(sid, "still", 3, still, piece_bytes=200))
-        asked = rig.haves()
-        assert PastHave(session_id=sid, kind="info", number=0, have_bytes=0) in asked
-        assert not any(one.kind == "still" and one.have_bytes == len(still) for one in asked)
-        assert list(tmp_path.glob("past-*")) == []
-        rig.put(*pieces(sid, "info", 0, info_object(former)))
-        rig.put(*pieces(sid, "still", 3, still, piece_bytes=200))
-        rig.put(*pieces(sid, "base", 20, video), *pieces(sid, "still", 3, still))
-        said = set(rig.haves())
+        rig.put(*chunks(sid, "still", 3, still, chunk_bytes=200))
+        asked = rig.acknowledged_ranges()
+        assert AcknowledgedRange(session_id=sid, kind="info", number=0, acknowledged_bytes=0) in asked
+        assert not any(one.kind == "still" and one.acknowledged_bytes == len(still) for one in asked)
+        assert list(tmp_path.glob("backlog-*")) == []
+        rig.put(*chunks(sid, "info", 0, info_object(former)))
+        rig.put(*chunks(sid, "still", 3, still, chunk_bytes=200))
+        rig.put(*chunks(sid, "base", 20, video), *chunks(sid, "still", 3, still))
+        said = set(rig.acknowledged_ranges())
         for kind, number, data in (("info", 0, None), ("still", 3, still), ("base", 20, video)):
-            size = {one.have_bytes for one in said if (one.kind, one.number) == (kind, number)}
+            size = {one.acknowledged_bytes for one in said if (one.kind, one.number) == (kind, number)}
             assert size
             assert data is None or len(data) in size
-        assert rig.session.past.stills == 0
-    first, recording = Recording(tmp_path / "0.rrd"), Recording(tmp_path / "past-0.rrd")
+        assert rig.session.backlog.stills == 0
+    first, recording = Recording(tmp_path / "0.rrd"), Recording(tmp_path / "backlog-0.rrd")
     assert [frame for frame, _, _ in first.video()] == list(range(20))
     assert [frame for frame, _, _ in recording.video()] == list(range(20, 45))
     assert decoded(recording) == 25
@@ -377,11 +383,11 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
     assert len(recording.boxes(30)) == 1
     texts = [text for _, _, text in recording.events()]
     assert "1 still and 2 s of video of this session arrived after it had ended" in texts
-    assert f"uav-1-{sid:016x}".encode() in (tmp_path / "past-0.rrd").read_bytes(), (
+    assert f"uav-1-{sid:016x}".encode() in (tmp_path / "backlog-0.rrd").read_bytes(), (
         "the same recording to Rerun"
     )
-    content = summary(rig.receiver.done[0], unusable=0, past_recordings=rig.receiver.past.paths)
-    assert content["past"]["recordings"] == [str(tmp_path / "past-0.rrd")]
+    content = summary(rig.receiver.done[0], unusable=0, backlog_recordings=rig.receiver.backlog.paths)
+    assert content["backlog"]["recordings"] == [str(tmp_path / "backlog-0.rrd")]
 
 
 def test_recordings_of_former_sessions_are_bounded(flight, tmp_path):
@@ -390,11 +396,11 @@ def test_recordings_of_former_sessions_are_bounded(flight, tmp_path):
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(5))
         for former in formers:
-            rig.put(*pieces(former.session_id, "info", 0, info_object(former)))
-            rig.put(*pieces(former.session_id, "still", 0, still_object(former, 1, 0)))
-        assert len(rig.receiver.past._recordings._open) == 4
+            rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
+            rig.put(*chunks(former.session_id, "still", 0, still_object(former, 1, 0)))
+        assert len(rig.receiver.backlog._recordings._open) == 4
     for number in range(6):
-        assert [frame for frame, _ in Recording(tmp_path / f"past-{number}.rrd").stills()] == [1]
+        assert [frame for frame, _ in Recording(tmp_path / f"backlog-{number}.rrd").stills()] == [1]
 
 
 def test_no_more_files_are_made_than_the_bound(flight, tmp_path):
@@ -403,19 +409,19 @@ def test_no_more_files_are_made_than_the_bound(flight, tmp_path):
     stills = [still_object(former, 1, 0) for former in formers]
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(5))
-        rig.receiver.past._recordings._left = 2
+        rig.receiver.backlog._recordings._left = 2
         for former, still in zip(formers, stills, strict=True):
-            rig.put(*pieces(former.session_id, "info", 0, info_object(former)))
-            rig.put(*pieces(former.session_id, "still", 0, still))
-        said = {one.session_id for one in rig.haves()}
+            rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
+            rig.put(*chunks(former.session_id, "still", 0, still))
+        said = {one.session_id for one in rig.acknowledged_ranges()}
         assert said == {former.session_id for former in formers[:2]}, "of the third nothing is taken"
         assert rig.receiver.unusable >= 2
-        rig.put(*pieces(formers[0].session_id, "still", 1, still_object(formers[0], 0, 1)))
-    assert len(list(tmp_path.glob("past-*"))) == 2
-    assert len(Recording(tmp_path / "past-0.rrd").stills()) == 2, "what is open goes on"
+        rig.put(*chunks(formers[0].session_id, "still", 1, still_object(formers[0], 0, 1)))
+    assert len(list(tmp_path.glob("backlog-*"))) == 2
+    assert len(Recording(tmp_path / "backlog-0.rrd").stills()) == 2, "what is open goes on"
 
 
-class Slow(PastRecording):
+class Slow(BacklogRecording):
     """Closing it takes its time; knows who did it."""
 
     def __init__(self, *args, may_end: threading.Event, **kwargs) -> None:
@@ -439,7 +445,7 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
         made.append(Slow(info, path=path, recorder=recorder, look=look_of(info), may_end=may_end))
         return made[-1]
 
-    recordings = PastRecordings(open_one, most=2)
+    recordings = BacklogRecordings(open_one, most=2)
     still = flight.still(10, 0)
 
     def boxes():
@@ -461,14 +467,14 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
         assert last is made[4]
     assert list(recordings._open) == [formers[3].session_id, flight.session_id], "done with, it may go"
     recordings.close()
-    assert {one.closed_by.rpartition("_")[0] for one in made} == {"hvt-past-close"}
+    assert {one.closed_by.rpartition("_")[0] for one in made} == {"hvt-backlog-close"}
     assert "1 still of this session arrived after it had ended" in [
         text for _, _, text in Recording(tmp_path / "0.rrd").events()
     ]
     assert still.payload
     with recordings.using(flight.info()) as none:
         assert none is None
-    few = PastRecordings(open_one, most_files=1)
+    few = BacklogRecordings(open_one, most_files=1)
     with few.using(formers[0].info()) as one, few.using(formers[1].info()) as none:
         assert (one, none) == (made[5], None), (
             "so many came at once that the last could not be refused before"
@@ -479,26 +485,26 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
 def test_damaged_and_foreign_pieces_are_counted_and_skipped(flight, tmp_path):
     """One bad piece would end the ground."""
     with Rig(tmp_path, flight) as rig:
-        rig.put(*past(flight, "still", 0, still_object(flight, 1, 0)))  # no session is open yet
+        rig.put(*backlog(flight, "still", 0, still_object(flight, 1, 0)))  # no session is open yet
         assert rig.receiver.unusable == 1
         rig.base(*range(5))
-        item = past(flight, "still", 0, still_object(flight, 1, 0))[0]
+        item = backlog(flight, "still", 0, still_object(flight, 1, 0))[0]
         rig.put(Received(item.key, item.payload[:-1], item.attachment, item.encoding, 1))
         rig.put(Received(item.key, item.payload, b"\x93\x02", item.encoding, 1))
-        rig.put(*past(flight, "still", 9, still_object(flight, 1, 0)))
-        rig.put(*past(flight, "base", 2, b"no video"))
+        rig.put(*backlog(flight, "still", 9, still_object(flight, 1, 0)))
+        rig.put(*backlog(flight, "base", 2, b"no video"))
         assert rig.receiver.unusable == 5
-        assert {one.have_bytes for one in rig.haves()} == {0}
+        assert {one.acknowledged_bytes for one in rig.acknowledged_ranges()} == {0}
         garbage = video_object(flight, range(65, 70))
         noise = garbage.replace(flight.units[66].data, bytes(len(flight.units[66].data)))
-        rig.put(*past(flight, "base", 65, noise))
+        rig.put(*backlog(flight, "base", 65, noise))
         assert rig.receiver.error is None
-        assert rig.session.past.frames == 1, "what follows a broken frame is no picture"
-        assert rig.session.past.left_out == 4
+        assert rig.session.backlog.frames == 1, "what follows a broken frame is no picture"
+        assert rig.session.backlog.left_out == 4
         third = flight.units[3].data
         broken = video_object(flight, range(2, 5)).replace(third, bytes(len(third)))
-        rig.put(*past(flight, "base", 2, broken))
-        assert rig.session.past.left_out == 4, "they came at once, and are shown"
+        rig.put(*backlog(flight, "base", 2, broken))
+        assert rig.session.backlog.left_out == 4, "they came at once, and are shown"
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -507,23 +513,23 @@ def test_the_last_moment_there_is_can_be_shown(flight, tmp_path, own):
     last_ns, last = 2**63 - 1, 2**32 - 1
     sender = flight if own else Flight(45, keyframes=(40,))
     units = [
-        PastUnit(last - 1, last_ns - 1, keyframe=True, data=sender.units[40].data),
-        PastUnit(last, last_ns, keyframe=False, data=sender.units[41].data),
+        BacklogUnit(last - 1, last_ns - 1, keyframe=True, data=sender.units[40].data),
+        BacklogUnit(last, last_ns, keyframe=False, data=sender.units[41].data),
     ]
     latest = {"frame_index": last, "capture_ns": last_ns, "send_delay_ns": last_ns}
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(25))
         if not own:
-            rig.put(*pieces(sender.session_id, "info", 0, info_object(sender)))
-        rig.put(*pieces(sender.session_id, "base", last - 1, pack_past_units(units)))
+            rig.put(*chunks(sender.session_id, "info", 0, info_object(sender)))
+        rig.put(*chunks(sender.session_id, "base", last - 1, pack_backlog_units(units)))
         for sequence, changes in ((last, latest), (3, {"capture_ns": 0, "send_delay_ns": -last_ns})):
             kept = still_object(sender, 12, sequence, **changes)
-            rig.put(*pieces(sender.session_id, "still", sequence, kept))
+            rig.put(*chunks(sender.session_id, "still", sequence, kept))
         rig.base(*range(65, 75))
         assert rig.receiver.error is None
         assert rig.session.frames_decoded == 35
-        assert rig.receiver.past.refused == 0
-    recording = Recording(tmp_path / ("0.rrd" if own else "past-0.rrd"))
+        assert rig.receiver.backlog.refused == 0
+    recording = Recording(tmp_path / ("0.rrd" if own else "backlog-0.rrd"))
     assert [(frame, at_ns) for frame, at_ns, _ in recording.video()][-2:] == [
         (last - 1, last_ns - 1),
         (last, last_ns),
@@ -540,18 +546,18 @@ def test_a_still_is_acknowledged_when_it_was_read_and_not_before(flight, tmp_pat
             assert may_read.wait(20)
             return super().read(stills, base_bgr)
 
-    with Rig(tmp_path, flight, sight=lambda emit: sight_of(emit, reader=Busy())) as rig:
+    with Rig(tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Busy())) as rig:
         rig.base(*range(25))
-        for item in past(flight, "still", 4, still):
+        for item in backlog(flight, "still", 4, still):
             rig.inbox.put(item)
         for _ in range(3):  # two seconds, in which its last byte is sent again
-            rig.inbox.put(past(flight, "still", 4, still, piece_bytes=len(still) - 1)[-1])
-            assert {one.have_bytes for one in rig.haves()} == {len(still) - 1}
-        assert rig.session.past.stills == 0
+            rig.inbox.put(backlog(flight, "still", 4, still, chunk_bytes=len(still) - 1)[-1])
+            assert {one.acknowledged_bytes for one in rig.acknowledged_ranges()} == {len(still) - 1}
+        assert rig.session.backlog.stills == 0
         may_read.set()
-        wait_for(lambda: rig.receiver.past.idle)
-        assert rig.haves()[-1] == full(flight, "still", 4, still)
-        assert rig.session.past.stills == 1
+        wait_for(lambda: rig.receiver.backlog.idle)
+        assert rig.acknowledged_ranges()[-1] == full(flight, "still", 4, still)
+        assert rig.session.backlog.stills == 1
     assert [frame for frame, _ in Recording(tmp_path / "0.rrd").stills()] == [15]
 
 
@@ -564,26 +570,29 @@ def test_what_a_session_left_unread_comes_again_and_is_shown(flight, tmp_path):
             may_read.wait(20)
             return super().read(stills, base_bgr)
 
-    with Rig(tmp_path, flight, sight=lambda emit: sight_of(emit, reader=Busy())) as rig:
+    with Rig(tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Busy())) as rig:
         rig.base(*range(25))
         for item in (
-            *past(flight, "still", 3, still_object(flight, 14, 3)),
-            *past(flight, "still", 4, still),
+            *backlog(flight, "still", 3, still_object(flight, 14, 3)),
+            *backlog(flight, "still", 4, still),
         ):
             rig.inbox.put(item)
-        wait_for(lambda: rig.receiver.past._working == 2)
+        wait_for(lambda: rig.receiver.backlog._working == 2)
         rig.inbox.put(flight.status(base=25, state="ended"))
-        wait_for(lambda: rig.receiver.done and rig.receiver.past.idle, timeout_s=15)
-        told = [one for report in rig.port.reports for one in report.past]
+        wait_for(lambda: rig.receiver.done and rig.receiver.backlog.idle, timeout_s=15)
+        told = [one for report in rig.port.reports for one in report.backlog]
         assert full(flight, "still", 4, still) not in told
         may_read.set()
         second = Flight(10)
         rig.port.flight = rig.flight = second
         rig.base(*range(10))
-        assert PastHave(session_id=flight.session_id, kind="still", number=4, have_bytes=0) in rig.haves()
-        rig.put(*past(flight, "still", 4, still))
-        assert full(flight, "still", 4, still) in rig.haves()
-    assert [frame for frame, _ in Recording(tmp_path / "past-0.rrd").stills()] == [15]
+        assert (
+            AcknowledgedRange(session_id=flight.session_id, kind="still", number=4, acknowledged_bytes=0)
+            in rig.acknowledged_ranges()
+        )
+        rig.put(*backlog(flight, "still", 4, still))
+        assert full(flight, "still", 4, still) in rig.acknowledged_ranges()
+    assert [frame for frame, _ in Recording(tmp_path / "backlog-0.rrd").stills()] == [15]
 
 
 def test_a_still_of_which_a_part_came_is_missed_until_it_is_whole(flight, tmp_path):
@@ -591,7 +600,7 @@ def test_a_still_of_which_a_part_came_is_missed_until_it_is_whole(flight, tmp_pa
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(25))
         rig.put(flight.still(10, 0), flight.still(12, 2))
-        first, *others = past(flight, "still", 1, still_object(flight, 11, 1), piece_bytes=300)
+        first, *others = backlog(flight, "still", 1, still_object(flight, 11, 1), chunk_bytes=300)
         rig.put(first)
         assert rig.reported().missing_stills == (1,)
         rig.put(*others)
@@ -603,10 +612,10 @@ def test_timing_says_of_pieces_what_became_of_them(flight, tmp_path):
     with closing(TimingTable(tmp_path / "t.csv")) as lines, Rig(tmp_path, flight, timing=lines) as rig:
         rig.base(*range(5))
         good, bad = still_object(flight, 2, 0), still_object(flight, 3, 1)
-        rig.put(*past(flight, "still", 0, good, piece_bytes=len(good) // 2 + 1))
-        rig.put(*past(flight, "still", 9, bad, piece_bytes=len(bad) // 2 + 1))  # of another number inside
+        rig.put(*backlog(flight, "still", 0, good, chunk_bytes=len(good) // 2 + 1))
+        rig.put(*backlog(flight, "still", 9, bad, chunk_bytes=len(bad) // 2 + 1))  # of another number inside
     with (tmp_path / "t.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["kind"] == "past-still"]
+        rows = [row for row in csv.DictReader(file) if row["kind"] == "backlog-still"]
     assert [(row["sequence"], int(row["shown_ns"]) > 0) for row in rows] == [
         ("0", False),
         ("0", True),
@@ -632,17 +641,19 @@ def test_a_still_is_read_in_the_middle_of_a_stretch(flight, tmp_path):
 
     class Lent:
         @contextmanager
-        def borrow(self):
+        def checkout(self):
             yield Stepwise(), None
 
-    with Rig(tmp_path, flight, sight=lambda emit: sight_of(emit, reader=Reader()), models=Lent()) as rig:
+    with Rig(
+        tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), models=Lent()
+    ) as rig:
         rig.base(*range(25))
-        for item in past(flight, "base", 40, video_object(flight, range(40, 60))):
+        for item in backlog(flight, "base", 40, video_object(flight, range(40, 60))):
             rig.inbox.put(item)
-        wait_for(lambda: order and rig.receiver.past.idle)
-        for item in past(flight, "still", 4, still_object(flight, 45, 4)):
+        wait_for(lambda: order and rig.receiver.backlog.idle)
+        for item in backlog(flight, "still", 4, still_object(flight, 45, 4)):
             rig.inbox.put(item)
-        wait_for(lambda: rig.receiver.past._working == 1)
+        wait_for(lambda: rig.receiver.backlog._working == 1)
         steps.release()
         wait_for(lambda: "still" in order)
         assert order[:2] == ["boxes", "still"]
@@ -676,20 +687,20 @@ def test_stills_do_not_wait_for_boxes_in_kept_video():
         yield
         return True
 
-    eyes = RealtimeEyes(lambda *_: None, lambda *_: None, lambda _stills: None, name="stretch")
+    worker = RealtimeWorker(lambda *_: None, lambda *_: None, lambda _stills: None, name="stretch")
     try:
-        assert eyes.at_leisure(boxes())
+        assert worker.at_leisure(boxes())
         wait_for(lambda: order)
-        assert eyes.later(still())
+        assert worker.later(still())
         wait_for(lambda: "boxes ended" in order)
         assert order.index("still") < order.index("boxes ended")
         assert order[0] == "boxes", "it was in the middle of one"
-        waiting = [eyes.at_leisure(boxes()) for _ in range(9)]
+        waiting = [worker.at_leisure(boxes()) for _ in range(9)]
         assert (waiting.count(True), waiting[-1]) == (7, False), "each holds a stretch of video"
         assert held
     finally:
-        eyes.close()
-    eyes.raise_error()
+        worker.close()
+    worker.raise_error()
     assert not held, "the models that one in the middle has borrowed would never be given back"
 
 
@@ -701,17 +712,17 @@ def test_eyes_are_not_idle_while_they_see():
         began.set()
         assert may_end.wait(60)
 
-    eyes = RealtimeEyes(see, lambda *_: None, lambda _stills: None, name="idle")
+    worker = RealtimeWorker(see, lambda *_: None, lambda _stills: None, name="idle")
     try:
-        eyes.picture(None)
+        worker.picture(None)
         assert began.wait(30)
-        assert not eyes.idle
+        assert not worker.idle
         may_end.set()
-        wait_for(lambda: eyes.idle)
+        wait_for(lambda: worker.idle)
     finally:
         may_end.set()
-        eyes.close()
-    eyes.raise_error()
+        worker.close()
+    worker.raise_error()
 
 
 def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
@@ -721,23 +732,23 @@ def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
     def see(_picture, _hurry) -> None:
         time.sleep(0.03)
         if len(done) < 3:
-            eyes.picture(None)  # there is always another
+            worker.picture(None)  # there is always another
 
     def work():
         for step in range(3):
-            at_rest.append(eyes._pictures.empty())
+            at_rest.append(worker._pictures.empty())
             done.append(step)
             yield
         return True
 
-    eyes = RealtimeEyes(see, lambda *_: None, lambda _stills: None, name="busy")
+    worker = RealtimeWorker(see, lambda *_: None, lambda _stills: None, name="busy")
     try:
-        eyes.picture(None)
-        assert eyes.later(work())
+        worker.picture(None)
+        assert worker.later(work())
         wait_for(lambda: len(done) == 3, timeout_s=20)
     finally:
-        eyes.close()
-    eyes.raise_error()
+        worker.close()
+    worker.raise_error()
     assert not any(at_rest), "it was busy"
 
 
@@ -750,12 +761,12 @@ def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path, monkeypat
     rig = Rig(tmp_path, flight)
     rig.base(*range(25))
     rig.base(*range(65, 70))
-    for item in past(flight, "base", 40, video_object(flight, range(40, 65))):
+    for item in backlog(flight, "base", 40, video_object(flight, range(40, 65))):
         rig.inbox.put(item)
     rig.receiver.close()
     rig.receiver._thread.join(60)
     assert not rig.receiver._thread.is_alive()
     assert rig.receiver.error is None
     assert len(Recording(tmp_path / "0.rrd").video()) == 30 + 25
-    (last,) = [one for report in rig.port.reports for one in report.past if one.have_bytes][-1:]
+    (last,) = [one for report in rig.port.reports for one in report.backlog if one.acknowledged_bytes][-1:]
     assert last.kind == "base"

@@ -13,13 +13,13 @@ import pytest
 
 import messages
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeader
 from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_ground.cli import main
-from hvt_ground.control import AskedStill, EdgeClient, RefusedError
+from hvt_ground.control import EdgeClient, RefusedError, RequestedStill
 from hvt_ground.control.command import run
 
 KEYS = EdgeKeys("uav-1")
@@ -30,7 +30,7 @@ DATA = JpegCodec().encode(PICTURE, quality_pct=90).data
 INFO = replace(
     messages.INFO, source_size=(960, 540), base_size=(640, 360), view_scale=2 / 3, class_names=("car",)
 )
-YES = ControlAnswer(session_id=7, accepted=True, reason="", still_ask=3, frame_index=40, tracks=())
+YES = ControlAnswer(session_id=7, accepted=True, reason="", still_request=3, frame_index=40, tracks=())
 HEADER = RoiHeader(
     session_id=7,
     sequence=9,
@@ -56,7 +56,7 @@ class ScriptedEdge:
 
     def __init__(self, port: int) -> None:
         self.endpoint = f"tcp/127.0.0.1:{port}"
-        self.answer, self.fate = YES, YES
+        self.answer, self.outcome = YES, YES
         self.puts: list[tuple[bytes, bytes]] = [(DATA, HEADER.pack(DATA))]
         self.asked: list[ControlRequest] = []
         self._publisher = None
@@ -67,7 +67,7 @@ class ScriptedEdge:
         self.asked.append(request)
         if request.command == "still" and self.answer.accepted:
             threading.Timer(0.1, self._put).start()
-        return (self.fate if request.command == "still-fate" else self.answer).pack()
+        return (self.outcome if request.command == "still-outcome" else self.answer).pack()
 
     def _put(self) -> None:
         for payload, attachment in self.puts:
@@ -76,10 +76,10 @@ class ScriptedEdge:
     def fly(self, up: threading.Event, stop: threading.Event) -> None:
         """Listen, as an edge with --listen does."""
         with open_session(LinkSettings("edge", listen=(self.endpoint,))) as session:
-            self._publisher = declare_publisher(session, Row.ROI, keys=KEYS)
-            serve(session, Row.INFO, keys=KEYS, answer=lambda _question: INFO.pack())
-            serve(session, Row.CONTROL, keys=KEYS, answer=self.control)
-            token = session.liveliness().declare_token(KEYS.key(Row.ALIVE))
+            self._publisher = declare_publisher(session, Channel.ROI, keys=KEYS)
+            serve(session, Channel.INFO, keys=KEYS, answer=lambda _question: INFO.pack())
+            serve(session, Channel.CONTROL, keys=KEYS, answer=self.control)
+            token = session.liveliness().declare_token(KEYS.key(Channel.ALIVE))
             up.set()
             stop.wait(60)
             token.undeclare()
@@ -147,10 +147,10 @@ def test_refusals_are_the_edges_own_words(edge):
 def test_a_still_that_was_given_up_is_not_waited_for(edge):
     """The operator would look at nothing until the timeout, and then not know why."""
     edge.puts = []
-    edge.fate = replace(YES, accepted=False, reason="in 10 s the budget had no room for it")
+    edge.outcome = replace(YES, accepted=False, reason="in 10 s the budget had no room for it")
     with EdgeClient.connect(edge.endpoint) as edges, pytest.raises(RefusedError, match="no room for it"):
         edges["uav-1"].still(timeout_s=30)
-    assert [one.command for one in edge.asked] == ["still", "still-fate"]
+    assert [one.command for one in edge.asked] == ["still", "still-outcome"]
     assert edge.asked[1].arguments == {"ask": 3}
 
 
@@ -235,7 +235,7 @@ def test_an_asker_never_listens():
 
 def test_a_png_holds_the_very_pixels(tmp_path):
     """A program that measures on the file would measure another loss."""
-    still = AskedStill("uav-1", replace(HEADER, codec="h264-intra"), b"h264", PICTURE)
+    still = RequestedStill("uav-1", replace(HEADER, codec="h264-intra"), b"h264", PICTURE)
     still.save(tmp_path / "a.png")
     assert (cv2.imread(str(tmp_path / "a.png")) == PICTURE).all()
     still.save(tmp_path / "a.jpg")

@@ -41,8 +41,8 @@ def path():
 )
 def test_boxes_move_with_the_camera(path, start, end, moved):
     """The edge's boxes would lie beside their objects wherever the drone turns."""
-    carried = path.carry(BOX, start=start, end=end)
-    np.testing.assert_allclose(carried, BOX + np.tile(moved, 2), atol=1e-9)
+    wire_field = path.carry(BOX, start=start, end=end)
+    np.testing.assert_allclose(wire_field, BOX + np.tile(moved, 2), atol=1e-9)
 
 
 def test_a_climbing_camera_makes_boxes_smaller():

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import pytest
 
-from flight import Flight, sight_of
+from flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, TrackStep
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.perception.worker import RealtimeEyes
+from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.session.session import GroundSession
 
 BOX = {1: (30.0, 60.0, 62.0, 96.0)}
@@ -33,7 +33,7 @@ class Rig:
             flight.info(),
             recorder=None,
             recording=None,
-            sight_of=sight_of,
+            pipeline_of=pipeline_of,
             to_local_ns=int,
             clock=lambda: self.now_ns,
             report=lambda: None,
@@ -95,7 +95,7 @@ def test_broken_stills_are_not_all_looked_into(rig, flight):
     """Each costs a line in the recording and one on stderr; a few thousand a second would fill both."""
     notices = []
     rig.session._emit = notices.append
-    rig.session.sight._stills._emit = notices.append
+    rig.session.pipeline._stills._emit = notices.append
     for sequence in range(200):
         item = flight.still(1, sequence, data=b"no picture")
         rig.session.still(RoiHeader.parse(item.attachment, item.payload), item, media_type="image/jpeg")
@@ -111,16 +111,16 @@ def test_stills_that_wait_to_be_read_have_a_bound_in_bytes():
         begun.set()
         busy.wait(20)
 
-    eyes = RealtimeEyes(lambda *_: None, lambda *_: None, read, name="test")
+    worker = RealtimeWorker(lambda *_: None, lambda *_: None, read, name="test")
     flight = Flight(2)
     header = RoiHeader.parse(*((one := flight.still(1, 0)).attachment, one.payload))
     try:
-        eyes.still(ReceivedStill(header, b"x", "image/jpeg"))
+        worker.still(ReceivedStill(header, b"x", "image/jpeg"))
         assert begun.wait(10)
         for _ in range(64):
-            eyes.still(ReceivedStill(header, bytes(2**20), "image/jpeg"))
-        assert eyes.dropped["overflow"] == 32
+            worker.still(ReceivedStill(header, bytes(2**20), "image/jpeg"))
+        assert worker.dropped["overflow"] == 32
     finally:
         busy.set()
         time.sleep(0.05)
-        eyes.close()
+        worker.close()

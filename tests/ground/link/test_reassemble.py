@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from hvt_ground.link.reassemble import (
     ADOPTION_INTERVAL_NS,
+    DUPLICATE_AFTER_NS,
+    DUPLICATE_SILENCE_NS,
     REORDER_UNITS,
     REORDER_WAIT_NS,
     RESTART_SILENCE_NS,
-    RIVAL_AFTER_NS,
-    RIVAL_SILENCE_NS,
     SEQUENCE_SLACK,
     SILENCE_NS,
     Arrival,
@@ -48,9 +48,9 @@ class Ground:
         """Let one unit arrive ``after_ns`` later; (verdict, sequence) of all that is settled by it."""
         self.now_ns += after_ns
         header = Header(session, sequence, sequence * 2 if frame is None else frame, key)
-        settled = self.core.accept(header, b"%d/%d" % (session, sequence), now_ns=self.now_ns)
-        self.out += settled
-        return [(unit.verdict, unit.header.sequence) for unit in settled]
+        resolved = self.core.accept(header, b"%d/%d" % (session, sequence), now_ns=self.now_ns)
+        self.out += resolved
+        return [(unit.verdict, unit.header.sequence) for unit in resolved]
 
     def decoded(self):
         """The sequence numbers that went to the decoder."""
@@ -94,9 +94,9 @@ def assert_decodable(out):
 def assert_counted(core):
     """Every unit that came has exactly one verdict, or waits."""
     total = core.counters
-    settled = total.decodable + total.skipped + total.duplicates + total.replayed
-    settled += total.foreign + total.implausible
-    assert total.received == settled + len(core._held)
+    resolved = total.decodable + total.skipped + total.duplicates + total.replayed
+    resolved += total.foreign + total.implausible
+    assert total.received == resolved + len(core._held)
 
 
 def test_a_whole_stream_is_decoded_whole(running):
@@ -246,12 +246,14 @@ def beside(ground, count, *, interval_ns=FRAME_NS, first=4):
 def test_a_second_edge_of_one_id_is_noticed_and_waits_until_the_first_is_silent(running):
     """In each pause of the first the operator would look through another drone's eyes, and never be told."""
     end = beside(running, 40)
-    assert [unit.rival for unit in running.out if unit.header.session_id == 2][-20:] == [True] * 20
-    assert not any(unit.rival for unit in running.out if unit.header.session_id == 1)
-    assert running.send(end, session=2, key=True, after_ns=RIVAL_SILENCE_NS - 100 * MS) == [("foreign", end)]
+    assert [unit.duplicate for unit in running.out if unit.header.session_id == 2][-20:] == [True] * 20
+    assert not any(unit.duplicate for unit in running.out if unit.header.session_id == 1)
+    assert running.send(end, session=2, key=True, after_ns=DUPLICATE_SILENCE_NS - 100 * MS) == [
+        ("foreign", end)
+    ]
     assert not running.wants(), "nothing is missed while the first may go on"
     assert running.send(end) == [("decode", end)]
-    assert running.send(end + 1, session=2, after_ns=RIVAL_SILENCE_NS + MS) == [("foreign", end + 1)]
+    assert running.send(end + 1, session=2, after_ns=DUPLICATE_SILENCE_NS + MS) == [("foreign", end + 1)]
     assert running.wants()
     assert running.send(end + 2, session=2, key=True) == [("decode", end + 2)]
     assert running.out[-1].starts_session
@@ -259,7 +261,7 @@ def test_a_second_edge_of_one_id_is_noticed_and_waits_until_the_first_is_silent(
     for sequence in range(end + 3, end + 43):
         assert running.send(sequence, session=2) == [("decode", sequence)]
         assert running.send(sequence, key=True) == [("foreign", sequence)]
-    assert running.out[-1].rival
+    assert running.out[-1].duplicate
 
 
 def test_a_second_edge_does_not_get_in_at_a_low_frame_rate(ground):
@@ -279,8 +281,8 @@ def test_a_restart_is_not_taken_for_a_second_edge(running):
     running.send(1, session=2, after_ns=SILENCE_NS + ADOPTION_INTERVAL_NS)
     assert running.wants()
     assert running.send(2, key=True, session=2) == [("decode", 2)]
-    assert not any(unit.rival for unit in running.out)
-    assert RIVAL_AFTER_NS > FRAME_NS
+    assert not any(unit.duplicate for unit in running.out)
+    assert DUPLICATE_AFTER_NS > FRAME_NS
 
 
 def test_sessions_change_at_most_once_a_second(running):
@@ -388,7 +390,7 @@ def test_no_pattern_of_loss_and_reordering_reaches_the_decoder(pattern, copies_l
     end = len(pattern)
     ground.now_ns += RESTART_SILENCE_NS  # whatever was delayed has come
     tail = [ground.send(end + n, key=n == 0) for n in range(3)]
-    assert [settled[-1] for settled in tail] == [("decode", end + n) for n in range(3)]
+    assert [resolved[-1] for resolved in tail] == [("decode", end + n) for n in range(3)]
     assert_decodable(ground.out)
     assert_counted(ground.core)
     distinct = {sequence for _, sequence, _ in arrivals}

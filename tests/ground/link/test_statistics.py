@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
-from hvt_ground.link.statistics import REPORT_LINE_BYTES, Reception
+from hvt_ground.link.statistics import REPORT_LINE_BYTES, ReceptionStatistics
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -22,21 +22,21 @@ def header(sequence: int) -> BaseHeader:
 
 def test_the_newest_message_and_its_time_are_reported():
     """The edge would take the delay of one message for that of another."""
-    reception = Reception()
-    reception.base(header(4), size_bytes=5_000, arrived_ns=10 * MS, delay_ms=40.0)
-    reception.base(header(5), size_bytes=5_000, arrived_ns=70 * MS, delay_ms=60.0)
-    reception.base(header(3), size_bytes=5_000, arrived_ns=90 * MS, delay_ms=900.0)  # overtaken
-    reception.still(9, size_bytes=900, arrived_ns=95 * MS)
-    reception.still(8, size_bytes=900, arrived_ns=96 * MS)
-    measured = reception.take(100 * MS)
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.base(header(4), size_bytes=5_000, arrived_ns=10 * MS, delay_ms=40.0)
+    reception_statistics.base(header(5), size_bytes=5_000, arrived_ns=70 * MS, delay_ms=60.0)
+    reception_statistics.base(header(3), size_bytes=5_000, arrived_ns=90 * MS, delay_ms=900.0)  # overtaken
+    reception_statistics.still(9, size_bytes=900, arrived_ns=95 * MS)
+    reception_statistics.still(8, size_bytes=900, arrived_ns=96 * MS)
+    measured = reception_statistics.take(100 * MS)
     assert (measured.base_sequence, measured.base_held_us, measured.still_sequence) == (5, 30_000, 9)
     assert measured.delay_p50_ms == 60.0
-    assert reception.take(200 * MS).delay_p50_ms is None  # since the last report
+    assert reception_statistics.take(200 * MS).delay_p50_ms is None  # since the last report
 
 
 def test_before_anything_has_come():
     """A first report would acknowledge what never arrived."""
-    measured = Reception().take(5 * S)
+    measured = ReceptionStatistics().take(5 * S)
     assert (measured.base_sequence, measured.base_held_us, measured.still_sequence) == (-1, 0, -1)
 
 
@@ -45,14 +45,14 @@ def test_before_anything_has_come():
 )
 def test_reports_take_a_small_share_of_the_way_back(rate_bps, least_s, most_s):
     """On a thin radio, half duplex, the reports would take what the picture needs."""
-    reception, now_ns, reports = Reception(), 0, []
+    reception_statistics, now_ns, reports = ReceptionStatistics(), 0, []
     for sequence in range(150):
         now_ns += S // 15
-        reception.base(header(sequence), size_bytes=round(rate_bps / 8 / 15), arrived_ns=now_ns)
-        if reception.due(now_ns):
-            reception.take(now_ns)
+        reception_statistics.base(header(sequence), size_bytes=round(rate_bps / 8 / 15), arrived_ns=now_ns)
+        if reception_statistics.due(now_ns):
+            reception_statistics.take(now_ns)
             reports.append(now_ns)
-    assert least_s <= reception.interval_ns(now_ns) / S <= most_s
+    assert least_s <= reception_statistics.interval_ns(now_ns) / S <= most_s
     later = [at for at in reports if at > 3 * S]
     share = len(later) * REPORT_LINE_BYTES * 8 / 7 / rate_bps
     assert share < 0.1 if rate_bps < 1e5 else share < 0.035
@@ -61,104 +61,106 @@ def test_reports_take_a_small_share_of_the_way_back(rate_bps, least_s, most_s):
 
 def test_without_news_reports_are_rare():
     """A paused edge would hear ten reports a second that say nothing."""
-    reception = Reception()
-    reception.base(header(0), size_bytes=100_000, arrived_ns=0)
-    reception.take(0)
-    assert not reception.due(400 * MS)
-    assert reception.due(500 * MS)
-    reception.base(header(1), size_bytes=100_000, arrived_ns=100 * MS)
-    assert reception.due(101 * MS)
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.base(header(0), size_bytes=100_000, arrived_ns=0)
+    reception_statistics.take(0)
+    assert not reception_statistics.due(400 * MS)
+    assert reception_statistics.due(500 * MS)
+    reception_statistics.base(header(1), size_bytes=100_000, arrived_ns=100 * MS)
+    assert reception_statistics.due(101 * MS)
 
 
 def test_lockstep_reports_do_not_hang_on_the_clock_of_arrival():
     """More reports would be sent than an edge in lockstep has use for."""
-    reception = Reception(lockstep=True)
-    reception.take(0)
+    reception_statistics = ReceptionStatistics(lockstep=True)
+    reception_statistics.take(0)
     for sequence in range(6):
-        reception.base(header(sequence), size_bytes=50_000, arrived_ns=sequence * 10 * MS)
-    assert not reception.due(400 * MS)
-    assert reception.due(500 * MS)
+        reception_statistics.base(header(sequence), size_bytes=50_000, arrived_ns=sequence * 10 * MS)
+    assert not reception_statistics.due(400 * MS)
+    assert reception_statistics.due(500 * MS)
 
 
 def test_memory_is_bounded():
     """A flood would let the ground grow."""
-    reception = Reception()
+    reception_statistics = ReceptionStatistics()
     for sequence in range(20_000):
-        reception.base(header(sequence), size_bytes=10, arrived_ns=sequence, delay_ms=1.0)
-    assert len(reception._sizes) <= 4096
-    assert len(reception._delays_ms) <= 256
+        reception_statistics.base(header(sequence), size_bytes=10, arrived_ns=sequence, delay_ms=1.0)
+    assert len(reception_statistics._sizes) <= 4096
+    assert len(reception_statistics._delays_ms) <= 256
 
 
-def missing(reception: Reception, *, now_s: float = 1.0) -> tuple[int, ...]:
+def missing(reception_statistics: ReceptionStatistics, *, now_s: float = 1.0) -> tuple[int, ...]:
     """What a report would name."""
-    return reception.take(round(now_s * S)).missing_stills
+    return reception_statistics.take(round(now_s * S)).missing_stills
 
 
 def test_stills_that_never_came_are_named_until_they_come():
     """The edge would take them for received, and never send them again."""
-    reception = Reception()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
-    reception.still(1, size_bytes=900, arrived_ns=S // 2)
-    reception.still(4, size_bytes=900, arrived_ns=S)
-    assert missing(reception) == (0, 2, 3)
-    reception.still(2, size_bytes=900, arrived_ns=S)
-    reception.still(2, size_bytes=900, arrived_ns=S)
-    assert missing(reception) == (0, 3)
-    assert missing(reception, now_s=6.9) == (3,)
-    assert missing(reception, now_s=7.1) == ()
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.base(header(0), size_bytes=500, arrived_ns=0)
+    reception_statistics.still(1, size_bytes=900, arrived_ns=S // 2)
+    reception_statistics.still(4, size_bytes=900, arrived_ns=S)
+    assert missing(reception_statistics) == (0, 2, 3)
+    reception_statistics.still(2, size_bytes=900, arrived_ns=S)
+    reception_statistics.still(2, size_bytes=900, arrived_ns=S)
+    assert missing(reception_statistics) == (0, 3)
+    assert missing(reception_statistics, now_s=6.9) == (3,)
+    assert missing(reception_statistics, now_s=7.1) == ()
 
 
 def test_a_still_that_comes_with_what_was_kept_is_missed_no_more():
     """The edge would send it a second time, on the way that is for now."""
-    reception = Reception()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
-    reception.still(2, size_bytes=900, arrived_ns=0)
-    reception.stored_still(1)
-    reception.stored_still(7)
-    measured = reception.take(S)
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.base(header(0), size_bytes=500, arrived_ns=0)
+    reception_statistics.still(2, size_bytes=900, arrived_ns=0)
+    reception_statistics.stored_still(1)
+    reception_statistics.stored_still(7)
+    measured = reception_statistics.take(S)
     assert (measured.missing_stills, measured.still_sequence) == ((0,), 2)
 
 
 def test_pieces_of_the_past_are_reported_on_as_often_as_anything():
     """An edge that hears nothing of its pieces sends them again."""
-    reception = Reception()
-    reception.take(0)
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.take(0)
     for number in range(100):
-        reception.past(size_bytes=1_000, arrived_ns=number * 10 * MS)
-    assert reception.due(S)
-    assert reception.interval_ns(S) <= 150 * MS
+        reception_statistics.backlog(size_bytes=1_000, arrived_ns=number * 10 * MS)
+    assert reception_statistics.due(S)
+    assert reception_statistics.interval_ns(S) <= 150 * MS
 
 
 def test_a_ground_that_joins_late_misses_nothing_of_before():
     """It would ask for stills of a past that nobody there has seen, on the thin link."""
-    reception = Reception()
-    reception.base(header(700), size_bytes=500, arrived_ns=0)
-    reception.still(90, size_bytes=900, arrived_ns=0)
-    assert missing(reception) == ()
-    reception.still(92, size_bytes=900, arrived_ns=0)
-    assert missing(reception) == (91,)
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.base(header(700), size_bytes=500, arrived_ns=0)
+    reception_statistics.still(90, size_bytes=900, arrived_ns=0)
+    assert missing(reception_statistics) == ()
+    reception_statistics.still(92, size_bytes=900, arrived_ns=0)
+    assert missing(reception_statistics) == (91,)
 
 
 def test_what_is_missing_is_bounded():
     """A forged number would make reports too long to be sent, or the ground grow."""
-    reception = Reception()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
-    reception.still(2**32 - 2, size_bytes=900, arrived_ns=0)
-    assert missing(reception) == tuple(range(2**32 - 2 - MAX_MISSING_STILLS, 2**32 - 2))
-    reception.still(2**32 - 1, size_bytes=900, arrived_ns=0)
-    assert len(missing(reception)) == MAX_MISSING_STILLS
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.base(header(0), size_bytes=500, arrived_ns=0)
+    reception_statistics.still(2**32 - 2, size_bytes=900, arrived_ns=0)
+    assert missing(reception_statistics) == tuple(range(2**32 - 2 - MAX_MISSING_STILLS, 2**32 - 2))
+    reception_statistics.still(2**32 - 1, size_bytes=900, arrived_ns=0)
+    assert len(missing(reception_statistics)) == MAX_MISSING_STILLS
 
 
 class Moment(int):
     """A time that somebody reckons with just when a still comes in another thread."""
 
-    reception: Reception
+    reception_statistics: ReceptionStatistics
     threads: list[threading.Thread]
 
     def __sub__(self, other):
         sequence = 100 + 2 * len(self.threads)
         came = threading.Thread(
-            target=self.reception.still, args=(sequence,), kwargs={"size_bytes": 1, "arrived_ns": S}
+            target=self.reception_statistics.still,
+            args=(sequence,),
+            kwargs={"size_bytes": 1, "arrived_ns": S},
         )
         came.start()
         came.join(0.1)  # it has to wait its turn
@@ -168,13 +170,13 @@ class Moment(int):
 
 def test_a_still_may_come_while_a_report_is_made():
     """Stills are read in a thread of their own, which reports them at once: the ground would end with an error."""
-    reception = Reception()
-    reception.base(header(0), size_bytes=500, arrived_ns=0)
-    reception.still(4, size_bytes=900, arrived_ns=0)
+    reception_statistics = ReceptionStatistics()
+    reception_statistics.base(header(0), size_bytes=500, arrived_ns=0)
+    reception_statistics.still(4, size_bytes=900, arrived_ns=0)
     now = Moment(S)
-    now.reception, now.threads = reception, []
-    assert reception.take(now).missing_stills == (0, 1, 2, 3)
+    now.reception_statistics, now.threads = reception_statistics, []
+    assert reception_statistics.take(now).missing_stills == (0, 1, 2, 3)
     assert now.threads
     for came in now.threads:
         came.join()
-    assert reception.take(S).still_sequence == 100 + 2 * (len(now.threads) - 1)
+    assert reception_statistics.take(S).still_sequence == 100 + 2 * (len(now.threads) - 1)

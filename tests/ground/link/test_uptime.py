@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from hvt_ground.link.uptime import LivedTime
+from hvt_ground.link.uptime import Uptime
 
 MS = 1_000_000
 
 
 def test_gaps_count_as_far_as_both_arrival_and_handling_show_them():
     """While a recording is opened the edge would seem silent, and another be shown in its place."""
-    time, start = LivedTime(), 10**18
+    time, start = Uptime(), 10**18
 
     def handle(arrived_ms: int, now_ms: int) -> int:
         return (time.handle(arrived_ns=start + arrived_ms * MS, now_ns=start + now_ms * MS) - start) // MS
@@ -31,7 +31,7 @@ def test_gaps_count_as_far_as_both_arrival_and_handling_show_them():
 
 def test_it_never_goes_back():
     """Callbacks of two threads may come the wrong way round, and a keyframe would never be asked for again."""
-    time = LivedTime()
+    time = Uptime()
     shown = [
         time.handle(arrived_ns=arrived, now_ns=now)
         for arrived, now in ((50, 50), (40, 60), (90, 80), (85, 95))

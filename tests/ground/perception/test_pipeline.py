@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from flight import CLASSES, Flight, RedSquares, SameAnswer, sight_of, square_box, tracks_at
+from flight import CLASSES, Flight, RedSquares, SameAnswer, pipeline_of, square_box, tracks_at
 from hvt_common.protocol.messages import AlsoShown, RoiHeader
 from hvt_common.values import Detections, Posterior, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events.events import Notice, Overlay, Refinement
-from hvt_ground.perception.pipeline import GroundSight, Picture, ReceivedStill
+from hvt_ground.perception.pipeline import Picture, Pipeline, ReceivedStill
 from hvt_ground.perception.stills.classify import Reading, Readings
 
 
@@ -41,7 +41,7 @@ class Rig:
     def __init__(self, **options) -> None:
         self.events: list = []
         self.reader = options.pop("reader", SameAnswer())
-        self.sight: GroundSight = sight_of(self.events.append, reader=self.reader, **options)
+        self.pipeline: Pipeline = pipeline_of(self.events.append, reader=self.reader, **options)
 
     def of(self, kind) -> list:
         """Events of a kind."""
@@ -58,11 +58,11 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
     """Boxes would lag behind the picture or be missing from some frames."""
     rig = Rig(detect_every=3)
     for picture in pictures:
-        rig.sight.see(picture, hurry=False)
+        rig.pipeline.see(picture, hurry=False)
     overlays = rig.of(Overlay)
     assert [one.frame_index for one in overlays] == list(range(30))
-    assert rig.sight.detections_run == 10
-    assert rig.sight.tracks == 1
+    assert rig.pipeline.detections_run == 10
+    assert rig.pipeline.tracks == 1
     for one in overlays[6:]:
         assert one.track_ids.tolist() == [1]
         np.testing.assert_allclose(one.boxes_base_px[0], square_box(one.frame_index), atol=6)
@@ -73,8 +73,8 @@ def test_in_a_hurry_detection_waits_but_the_track_goes_on(pictures):
     """Boxes would vanish whenever the machine is busy."""
     rig = Rig()
     for picture in pictures:
-        rig.sight.see(picture, hurry=picture.frame_index % 4 != 0)
-    assert rig.sight.detections_run == 8
+        rig.pipeline.see(picture, hurry=picture.frame_index % 4 != 0)
+    assert rig.pipeline.detections_run == 8
     assert all(len(one.track_ids) == 1 for one in rig.of(Overlay)[8:])
 
 
@@ -82,9 +82,9 @@ def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
     """The whole point: the sharp still says bus, and the track would go on being called car."""
     rig = Rig()
     for picture in pictures[:12]:
-        rig.sight.see(picture, hurry=False)
-    rig.sight.read([received(flight, 8, 0)])
-    rig.sight.see(pictures[12], hurry=False)
+        rig.pipeline.see(picture, hurry=False)
+    rig.pipeline.read([received(flight, 8, 0)])
+    rig.pipeline.see(pictures[12], hurry=False)
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_before, refinement.class_after) == (1, "car", "bus")
     assert (refinement.still_sequence, refinement.edge_track_id, refinement.frame_index) == (0, 1, 11)
@@ -92,16 +92,22 @@ def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
     assert refinement.base_crop_bgr[16, 16, 2] > 150, "the base crop shows the square of frame 8"
     last = rig.of(Overlay)[-1]
     assert (last.base_classes, last.classes, last.refined.tolist()) == (("car",), ("bus",), [True])
-    assert (rig.sight.refined, rig.sight.class_changes, dict(rig.sight.outcomes)) == (1, 1, {"matched": 1})
+    assert (rig.pipeline.refined, rig.pipeline.class_changes, dict(rig.pipeline.outcomes)) == (
+        1,
+        1,
+        {"matched": 1},
+    )
 
 
 def test_the_edge_hears_of_every_still_once(flight, pictures):
     """A lockstep edge would wait in vain; M3 would count an answer twice."""
     rig = Rig()
     for picture in pictures[:10]:
-        rig.sight.see(picture, hurry=False)
-    rig.sight.read([received(flight, 8, 0), received(flight, 9, 1, data=b"broken"), received(flight, 9, 2)])
-    results = rig.sight.take_results()
+        rig.pipeline.see(picture, hurry=False)
+    rig.pipeline.read(
+        [received(flight, 8, 0), received(flight, 9, 1, data=b"broken"), received(flight, 9, 2)]
+    )
+    results = rig.pipeline.take_results()
     # Those of one frame are read together; one that cannot be decoded is answered as no opinion.
     assert sorted((one.still_sequence, one.class_name) for one in results) == [
         (0, "bus"),
@@ -110,8 +116,8 @@ def test_the_edge_hears_of_every_still_once(flight, pictures):
     ]
     (track_id,) = rig.of(Overlay)[-1].track_ids.tolist()
     assert {one.still_sequence: one.ground_track_id for one in results} == {0: track_id, 1: -1, 2: track_id}
-    assert rig.sight.take_results() == []
-    assert dict(rig.sight.stills_dropped) == {"undecodable": 1}
+    assert rig.pipeline.take_results() == []
+    assert dict(rig.pipeline.stills_dropped) == {"undecodable": 1}
     assert [one.level for one in rig.of(Notice)] == ["warning"]
 
 
@@ -126,9 +132,9 @@ def test_the_edge_hears_of_every_still_once(flight, pictures):
 def test_a_still_that_lies_about_itself_is_dropped(flight, pictures, changes):
     """One message could make the ground reserve gigabytes, or end it."""
     rig = Rig()
-    rig.sight.see(pictures[0], hurry=False)
-    rig.sight.read([received(flight, 0, 0, **changes)])
-    assert dict(rig.sight.stills_dropped) == {"undecodable": 1}
+    rig.pipeline.see(pictures[0], hurry=False)
+    rig.pipeline.read([received(flight, 0, 0, **changes)])
+    assert dict(rig.pipeline.stills_dropped) == {"undecodable": 1}
 
 
 def test_a_name_of_any_language_and_length_goes_back_to_the_edge(flight, pictures):
@@ -140,9 +146,9 @@ def test_a_name_of_any_language_and_length_goes_back_to_the_edge(flight, picture
             return Readings(((Reading(wordy),),) * len(stills))
 
     rig = Rig(reader=Wordy())
-    rig.sight.see(pictures[0], hurry=False)
-    rig.sight.read([received(flight, 0, 0)])
-    (result,) = rig.sight.take_results()
+    rig.pipeline.see(pictures[0], hurry=False)
+    rig.pipeline.read([received(flight, 0, 0)])
+    (result,) = rig.pipeline.take_results()
     assert len(result.class_name.encode()) <= 64
     assert result.class_name.startswith("乗用車?乗用車")
 
@@ -151,35 +157,35 @@ def test_a_still_that_nobody_can_read_is_shown_all_the_same(flight, pictures):
     """Without a classifier the operator would not even see the sharp picture."""
     rig = Rig(reader=SameAnswer(knows=False))
     for picture in pictures[:6]:
-        rig.sight.see(picture, hurry=False)
-    rig.sight.read([received(flight, 4, 0)])
+        rig.pipeline.see(picture, hurry=False)
+    rig.pipeline.read([received(flight, 4, 0)])
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_before, refinement.class_after) == (None, "car", "car")
     assert refinement.still[:2] == b"\xff\xd8"
-    assert (rig.sight.refined, dict(rig.sight.outcomes)) == (0, {"unread": 1})
+    assert (rig.pipeline.refined, dict(rig.pipeline.outcomes)) == (0, {"unread": 1})
 
 
 def test_what_still_waits_at_the_end_is_given_out(flight, pictures):
     """The last stills of a flight would be missing from its recording."""
     rig = Rig()
     for picture in pictures[:3]:
-        rig.sight.see(picture, hurry=False)
-    rig.sight.read([received(flight, 9, 0)])  # its frame will not come
+        rig.pipeline.see(picture, hurry=False)
+    rig.pipeline.read([received(flight, 9, 0)])  # its frame will not come
     assert rig.of(Refinement) == []
-    rig.sight.end()
+    rig.pipeline.end()
     (refinement,) = rig.of(Refinement)
     assert refinement.track_id is None
-    assert sum(rig.sight.outcomes.values()) == 1
+    assert sum(rig.pipeline.outcomes.values()) == 1
 
 
 def test_a_picture_without_objects_is_an_empty_overlay(flight):
     """An empty scene would crash the eyes, or show boxes of the past for ever."""
     grey = np.full((192, 320, 3), 120, np.uint8)
     rig = Rig(detector=RedSquares())
-    rig.sight.see(Picture(0, 0, 0, grey), hurry=False)
+    rig.pipeline.see(Picture(0, 0, 0, grey), hurry=False)
     (overlay,) = rig.of(Overlay)
     assert overlay.boxes_base_px.shape == (0, 4)
-    assert (overlay.classes, rig.sight.tracks) == ((), 0)
+    assert (overlay.classes, rig.pipeline.tracks) == ((), 0)
     assert flight.info().class_names == CLASSES
 
 
@@ -201,9 +207,9 @@ def test_a_residual_is_undone_on_the_frame_that_it_names(flight, pictures):
     """The still would be painted onto another moment: garbage that looks like a picture."""
     rig = Rig()
     for picture in pictures[:12]:
-        rig.sight.see(picture, hurry=False)
+        rig.pipeline.see(picture, hurry=False)
     still = residual(flight, pictures, 6, 0)
-    rig.sight.read([still])
+    rig.pipeline.read([still])
     (refinement,) = rig.of(Refinement)
     x1, y1, x2, y2 = (int(side) for side in square_box(6))
     sharp = flight.pictures[6][y1:y2, x1:x2].astype(float)
@@ -211,7 +217,7 @@ def test_a_residual_is_undone_on_the_frame_that_it_names(flight, pictures):
     assert np.square(refinement.still_bgr - sharp).mean() < 0.7 * np.square(base - sharp).mean()
     assert (refinement.track_id, refinement.class_after) == (1, "bus")
     assert refinement.crop_base_px == square_box(6)
-    (result,) = rig.sight.take_results()
+    (result,) = rig.pipeline.take_results()
     assert (result.class_name, result.again) == ("bus", False)
 
 
@@ -219,18 +225,18 @@ def test_a_residual_whose_frame_is_not_at_hand_is_asked_for_again_once(flight, p
     """The operator would never see the still; or the edge would send it for ever."""
     rig = Rig()
     for picture in [*pictures[:5], *pictures[7:12]]:
-        rig.sight.see(picture, hurry=False)
+        rig.pipeline.see(picture, hurry=False)
     lost = residual(flight, pictures, 6, 4)
     wrong = residual(flight, pictures, 8, 5, parameters={"b": 1}, data=lost.data)
-    rig.sight.read([lost, wrong])
-    rig.sight.see(pictures[12], hurry=False)
-    rig.sight.end()
-    results = rig.sight.take_results()
+    rig.pipeline.read([lost, wrong])
+    rig.pipeline.see(pictures[12], hurry=False)
+    rig.pipeline.end()
+    results = rig.pipeline.take_results()
     assert [(one.still_sequence, one.track_id, one.class_name, one.again) for one in results] == [
         (4, 1, "", True),
         (5, 1, "", True),
     ]
-    assert dict(rig.sight.stills_dropped) == {"base_missing": 2}
+    assert dict(rig.pipeline.stills_dropped) == {"base_missing": 2}
     assert [one.text.partition(":")[0] for one in rig.of(Notice)] == [
         "still 4 is asked for again",
         "still 5 is asked for again",
@@ -242,37 +248,37 @@ def test_a_residual_before_its_frame_waits_for_it(flight, pictures):
     """Each residual that overtakes its frame in the decoder's queue would cost an intra still more."""
     rig = Rig()
     for picture in pictures[:6]:
-        rig.sight.see(picture, hurry=False)
-    rig.sight.read([residual(flight, pictures, 7, 0), residual(flight, pictures, 8, 1)])
-    assert rig.sight.take_results() == []
-    rig.sight.see(pictures[6], hurry=False)
-    assert rig.sight.take_results() == []
-    rig.sight.see(pictures[7], hurry=False)
-    (result,) = rig.sight.take_results()
+        rig.pipeline.see(picture, hurry=False)
+    rig.pipeline.read([residual(flight, pictures, 7, 0), residual(flight, pictures, 8, 1)])
+    assert rig.pipeline.take_results() == []
+    rig.pipeline.see(pictures[6], hurry=False)
+    assert rig.pipeline.take_results() == []
+    rig.pipeline.see(pictures[7], hurry=False)
+    (result,) = rig.pipeline.take_results()
     assert (result.still_sequence, result.class_name, result.again) == (0, "bus", False)
-    rig.sight.see(pictures[9], hurry=False)  # frame 8 was lost
-    (result,) = rig.sight.take_results()
+    rig.pipeline.see(pictures[9], hurry=False)  # frame 8 was lost
+    (result,) = rig.pipeline.take_results()
     assert (result.still_sequence, result.again) == (1, True)
 
 
 def test_stills_that_wait_are_bounded(flight, pictures):
     """A peer that names frames of the future would fill the memory."""
     rig = Rig()
-    rig.sight.see(pictures[0], hurry=False)
+    rig.pipeline.see(pictures[0], hurry=False)
     one = residual(flight, pictures, 5, 0)
-    rig.sight.read([ReceivedStill(replace(one.header, sequence=i), one.data, "") for i in range(70)])
-    assert [result.still_sequence for result in rig.sight.take_results()] == list(range(6))
+    rig.pipeline.read([ReceivedStill(replace(one.header, sequence=i), one.data, "") for i in range(70)])
+    assert [result.still_sequence for result in rig.pipeline.take_results()] == list(range(6))
 
 
 def test_a_reader_that_wants_the_picture_gets_it(flight, pictures):
     """Re-detection would be given a still without surroundings, and say nothing."""
     rig = Rig(wants_base=True)
     for picture in pictures[:4]:
-        rig.sight.see(picture, hurry=False)
-    rig.sight.read([received(flight, 5, 0)])
+        rig.pipeline.see(picture, hurry=False)
+    rig.pipeline.read([received(flight, 5, 0)])
     assert rig.reader.had_base == []
-    rig.sight.see(pictures[4], hurry=False)
-    rig.sight.see(pictures[6], hurry=False)  # tick 5 has no picture: that of tick 4 serves
+    rig.pipeline.see(pictures[4], hurry=False)
+    rig.pipeline.see(pictures[6], hurry=False)  # tick 5 has no picture: that of tick 4 serves
     assert rig.reader.had_base == [True]
 
 
@@ -283,12 +289,12 @@ def test_each_object_in_a_still_gets_its_own_answer(flight, pictures):
     """The neighbours in a shared still would stay unrefined, and the edge would send them again."""
     rig = Rig()
     for picture in pictures[:10]:
-        rig.sight.see(picture, hurry=False)
+        rig.pipeline.see(picture, hurry=False)
     here = square_box(8)
-    rig.sight.edge_step(tracks_at(8, {1: here, 7: (200.0, 20.0, 240.0, 60.0)}))
+    rig.pipeline.edge_step(tracks_at(8, {1: here, 7: (200.0, 20.0, 240.0, 60.0)}))
     also = (AlsoShown(track_id=7, box_source_px=(200.0, 20.0, 240.0, 60.0)),)
-    rig.sight.read([received(flight, 8, 3, also=also)])
-    results = rig.sight.take_results()
+    rig.pipeline.read([received(flight, 8, 3, also=also)])
+    results = rig.pipeline.take_results()
     assert [(one.still_sequence, one.track_id, one.ground_track_id, one.class_name) for one in results] == [
         (3, 1, 1, "bus"),
         (3, 7, 2, "bus"),
@@ -296,9 +302,9 @@ def test_each_object_in_a_still_gets_its_own_answer(flight, pictures):
     shown = rig.of(Refinement)
     assert [(one.edge_track_id, one.track_id, one.still_sequence) for one in shown] == [(1, 1, 3), (7, 2, 3)]
     assert shown[1].box_base_px == (200.0, 20.0, 240.0, 60.0)
-    assert rig.sight.refined == 2
-    rig.sight.read([received(flight, 8, 4, also=also, data=b"broken")])
-    assert [(one.track_id, one.class_name) for one in rig.sight.take_results()] == [(1, ""), (7, "")]
+    assert rig.pipeline.refined == 2
+    rig.pipeline.read([received(flight, 8, 4, also=also, data=b"broken")])
+    assert [(one.track_id, one.class_name) for one in rig.pipeline.take_results()] == [(1, ""), (7, "")]
 
 
 def test_new_objects_and_boxes_of_a_still_enter_the_list(flight, pictures):
@@ -308,10 +314,10 @@ def test_new_objects_and_boxes_of_a_still_enter_the_list(flight, pictures):
     x1, y1, x2, y2 = square_box(8)
     rig = Rig(reader=SameAnswer(found=found, at=(x1 + 8, y1, x2 + 8, y2)))
     for picture in pictures[:9]:
-        rig.sight.see(picture, hurry=False)
-    before = rig.sight.list_at(9).boxes_base_px[0, 0]
-    rig.sight.read([received(flight, 8, 0)])
-    last = rig.sight.list_at(9)
+        rig.pipeline.see(picture, hurry=False)
+    before = rig.pipeline.list_at(9).boxes_base_px[0, 0]
+    rig.pipeline.read([received(flight, 8, 0)])
+    last = rig.pipeline.list_at(9)
     assert last.origins == ("base", "still")
     assert last.base_classes == ("car", "bus")
     np.testing.assert_allclose(last.boxes_base_px[1], new)
@@ -326,9 +332,9 @@ def test_the_edges_tracks_and_ours_are_one_list(pictures):
     rig = Rig()
     far = (220.0, 20.0, 250.0, 50.0)
     for picture in pictures[:12]:
-        rig.sight.see(picture, hurry=False)
+        rig.pipeline.see(picture, hurry=False)
         if picture.frame_index == 6:
-            rig.sight.edge_step(tracks_at(5, {31: square_box(5), 32: far}))
+            rig.pipeline.edge_step(tracks_at(5, {31: square_box(5), 32: far}))
     overlays = rig.of(Overlay)
     assert [one.frame_index for one in overlays] == list(range(12))
     assert overlays[6].origins == ("base",)
@@ -336,8 +342,8 @@ def test_the_edges_tracks_and_ours_are_one_list(pictures):
     assert overlays[7].track_ids.tolist() == [1, 2]
     np.testing.assert_allclose(overlays[7].boxes_base_px[1], far, atol=0.1)
     np.testing.assert_allclose(overlays[7].boxes_base_px[0], square_box(7), atol=8)
-    assert rig.sight.tracks == 2
-    assert rig.sight.steps_used == 1
+    assert rig.pipeline.tracks == 2
+    assert rig.pipeline.steps_used == 1
 
 
 def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures):
@@ -345,15 +351,15 @@ def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures)
     far = (220.0, 20.0, 250.0, 50.0)
     rig = Rig()
     for picture in pictures[:9]:
-        rig.sight.see(picture, hurry=False)
-    rig.sight.edge_step(tracks_at(6, {32: far}))
+        rig.pipeline.see(picture, hurry=False)
+    rig.pipeline.edge_step(tracks_at(6, {32: far}))
     crop = (216, 16, 254, 54)
     data = cv2.imencode(".jpg", flight.pictures[6][16:54, 216:254])[1].tobytes()
     still = received(flight, 6, 0, data=data, track_id=32, box_source_px=far, crop_source_px=crop)
-    rig.sight.read([still])
+    rig.pipeline.read([still])
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_after) == (2, "bus")
-    rig.sight.see(pictures[9], hurry=False)
+    rig.pipeline.see(pictures[9], hurry=False)
     last = rig.of(Overlay)[-1]
     assert (last.classes[1], last.refined.tolist(), last.origins[1]) == ("bus", [False, True], "edge")
 
@@ -361,14 +367,14 @@ def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures)
 def test_a_step_of_a_tick_without_a_picture_is_shown(pictures):
     """At one frame a second on the base the boxes would move once a second."""
     rig = Rig()
-    rig.sight.see(pictures[0], hurry=False)
-    rig.sight.see(pictures[5], hurry=False)
-    rig.sight.edge_step(tracks_at(8, {31: square_box(8)}), capture_ns=123)
-    rig.sight.edge_step(tracks_at(7, {31: square_box(7)}))  # older than the last
-    rig.sight.see(pictures[7], hurry=False)  # its picture was late
-    rig.sight.see(pictures[10], hurry=False)
-    rig.sight.edge_step(tracks_at(2**32 - 1, {31: square_box(10)}))  # nonsense: nothing could follow it
-    rig.sight.see(pictures[11], hurry=False)
+    rig.pipeline.see(pictures[0], hurry=False)
+    rig.pipeline.see(pictures[5], hurry=False)
+    rig.pipeline.edge_step(tracks_at(8, {31: square_box(8)}), capture_ns=123)
+    rig.pipeline.edge_step(tracks_at(7, {31: square_box(7)}))  # older than the last
+    rig.pipeline.see(pictures[7], hurry=False)  # its picture was late
+    rig.pipeline.see(pictures[10], hurry=False)
+    rig.pipeline.edge_step(tracks_at(2**32 - 1, {31: square_box(10)}))  # nonsense: nothing could follow it
+    rig.pipeline.see(pictures[11], hurry=False)
     overlays = rig.of(Overlay)
     assert [one.frame_index for one in overlays] == [0, 5, 8, 10, 11]
     assert overlays[2].capture_ns == 123
@@ -381,8 +387,8 @@ def test_a_still_of_a_tick_without_a_picture_finds_its_track(flight, pictures):
     """Where the base has few frames most stills would match nothing."""
     rig = Rig()
     for index in (0, 3, 6, 9, 12):
-        rig.sight.see(pictures[index], hurry=False)
-    rig.sight.read([received(flight, 8, 0)])
+        rig.pipeline.see(pictures[index], hurry=False)
+    rig.pipeline.read([received(flight, 8, 0)])
     (refinement,) = rig.of(Refinement)
     assert refinement.track_id == 1
 
@@ -391,20 +397,20 @@ def test_looking_ahead_tells_what_would_be_shown_and_changes_nothing(pictures):
     """A study that asks at every tick would measure another ground than the one that flies."""
     plain, asked = Rig(detect_every=5), Rig(detect_every=5)
     for rig in (plain, asked):
-        rig.sight.see(pictures[0], hurry=False)
+        rig.pipeline.see(pictures[0], hurry=False)
         for picture in pictures[1:20]:
             if rig is asked:
-                ahead = rig.sight.list_at(picture.frame_index + 3)
+                ahead = rig.pipeline.list_at(picture.frame_index + 3)
                 assert ahead.frame_index == picture.frame_index + 3
-            rig.sight.see(picture, hurry=False)
+            rig.pipeline.see(picture, hurry=False)
             if picture.frame_index % 6 == 0:
-                rig.sight.edge_step(tracks_at(picture.frame_index, {31: square_box(picture.frame_index)}))
+                rig.pipeline.edge_step(tracks_at(picture.frame_index, {31: square_box(picture.frame_index)}))
     for a, b in zip(plain.of(Overlay), asked.of(Overlay), strict=True):
         np.testing.assert_array_equal(a.boxes_base_px, b.boxes_base_px)
         np.testing.assert_array_equal(a.track_ids, b.track_ids)
-    now = asked.sight.list_at(19)
+    now = asked.pipeline.list_at(19)
     np.testing.assert_allclose(now.boxes_base_px, asked.of(Overlay)[-1].boxes_base_px)
-    np.testing.assert_allclose(asked.sight.list_at(22).boxes_base_px[0], square_box(22), atol=8)
+    np.testing.assert_allclose(asked.pipeline.list_at(22).boxes_base_px[0], square_box(22), atol=8)
     with pytest.raises(ValueError, match="tick 18 lies before"):
-        asked.sight.list_at(18)
-    assert len(Rig().sight.list_at(0).track_ids) == 0
+        asked.pipeline.list_at(18)
+    assert len(Rig().pipeline.list_at(0).track_ids) == 0

@@ -9,9 +9,9 @@ from typing import Self
 
 import pytest
 
-from flight import Flight, Port, RedSquares, SameAnswer, sight_of, square_box
+from flight import Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from handled import WatchedInbox, end
-from hvt_common.protocol.ledger import Channel, overhead_bytes
+from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_ground.session.receiver import EdgeReceiver
@@ -48,7 +48,7 @@ class Rig:
             info,
             recorder=None,
             recording=None,
-            sight_of=lambda emit: sight_of(emit, detector=self.detector, reader=self.reader),
+            pipeline_of=lambda emit: pipeline_of(emit, detector=self.detector, reader=self.reader),
             to_local_ns=receiver.clock_offset.to_local_ns,
             clock=time.time_ns,
             report=receiver.report_now,
@@ -110,7 +110,7 @@ def test_every_frame_is_decoded_tracked_and_accounted_for(flight):
             for one in items
         )
         assert session.ledger.line_bytes == expected
-        assert session.sight.tracks >= 1
+        assert session.pipeline.tracks >= 1
         wait_for(lambda: rig.port.reports and rig.port.reports[-1].last_frame_index == 29)
         last = rig.port.reports[-1]
         assert (last.base_messages, last.roi_messages, last.lost, last.corrupt) == (30, 2, 0, 0)
@@ -137,16 +137,16 @@ def test_the_edges_tracks_are_counted_and_shown(pace):
             rig.put(item)
             rig.settle()
         session = rig.receiver.session
-        assert (session.steps_received, session.ledger.messages(Channel.META)) == (3, 3)
+        assert (session.steps_received, session.ledger.messages(Account.META)) == (3, 3)
         assert session.ledger.line_bytes == sum(
             len(one.payload)
             + len(one.attachment)
             + overhead_bytes(len(one.payload), len(one.attachment), key=one.key, encoding=one.encoding)
             for one in items
         )
-        assert session.sight.tracks == 2
-        assert session.sight.steps_used == 3
-        assert session.sight.list_at(19).origins == ("edge+base", "edge")
+        assert session.pipeline.tracks == 2
+        assert session.pipeline.steps_used == 3
+        assert session.pipeline.list_at(19).origins == ("edge+base", "edge")
 
 
 def test_tracks_that_make_no_sense_are_counted_and_skipped():
@@ -160,7 +160,7 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         rig.put(stranger.step(0, {1: square_box(0)}), Received(good[1].key, b"\x93\x02", b"", "", 1))
         rig.settle()
         session = rig.receiver.session
-        assert (session.steps_received, session.sight.steps_used) == (2, 1)
+        assert (session.steps_received, session.pipeline.steps_used) == (2, 1)
         assert rig.receiver.unusable == 3
         rig.put(*bases(flight, *range(4, 10)), flight.status(base=10))
         rig.settle()
@@ -180,7 +180,7 @@ def test_the_end_waits_for_the_last_tracks(monkeypatch):
         wait_for(lambda: rig.receiver.done)
         rig.settle()
         (session,) = rig.receiver.done
-        assert (session.steps_received, session.sight.steps_used) == (1, 1)
+        assert (session.steps_received, session.pipeline.steps_used) == (1, 1)
 
 
 def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
@@ -220,7 +220,7 @@ def test_damaged_replayed_and_foreign_messages_are_skipped(flight):
         rig.settle()
         session = rig.receiver.session
         assert (session.frames_received, session.frames_decoded, session.stills_received) == (3, 3, 1)
-        assert session.ledger.messages(Channel.META) == 1
+        assert session.ledger.messages(Account.META) == 1
         assert rig.receiver.unusable == 3
         rig.put(broken)
         rig.settle()
@@ -252,10 +252,10 @@ def test_a_still_that_came_twice_is_shown_once_and_counted_twice(flight):
         ):  # repeated, somebody else's, not the edge's
             rig.put(one)
             rig.settle()
-            assert session.ledger.messages(Channel.ROI) == copies
+            assert session.ledger.messages(Account.ROI) == copies
             assert session.ledger.line_bytes - before == pytest.approx(copies * once, abs=8)
         assert session.stills_received == 1
-        assert session.ledger.fates("received") == {"utility": 1}
+        assert session.ledger.outcomes("received") == {"utility": 1}
         results = [one for report in rig.port.reports for one in report.stills]
         assert [one.still_sequence for one in results] == [0]
 
@@ -382,7 +382,7 @@ def test_a_still_that_comes_before_its_session_is_open_is_taken(flight):
         rig.settle()
         session = rig.receiver.session
         assert (session.stills_received, session.frames_received) == (1, 6)
-        assert session.ledger.messages(Channel.ROI) == 1
+        assert session.ledger.messages(Account.ROI) == 1
         assert rig.receiver.unusable == 1, "the other one's"
 
 
@@ -428,11 +428,11 @@ def test_slow_detection_never_holds_up_decoding(flight):
         began = time.monotonic()
         rig.put(*bases(flight, *range(30)))
         wait_for(lambda: rig.opened and rig.opened[0].frames_decoded == 30)
-        assert rig.opened[0].sight.detections_run <= 2 + (time.monotonic() - began) / 0.3
+        assert rig.opened[0].pipeline.detections_run <= 2 + (time.monotonic() - began) / 0.3
         rig.settle()
     (session,) = rig.receiver.done
     assert session.last_frame_index == 29, "the newest is tracked, whatever is left out"
-    assert session.frames_untracked + session.sight.detections_run < 30
+    assert session.frames_untracked + session.pipeline.detections_run < 30
 
 
 def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
@@ -444,7 +444,7 @@ def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
         rig.settle()
         wait_for(lambda: len(rig.reader.had_base) == 20)
         assert all(rig.reader.had_base)
-        assert rig.receiver.session.sight.refined >= 1  # a busy machine may lose the track between
+        assert rig.receiver.session.pipeline.refined >= 1  # a busy machine may lose the track between
 
 
 def test_a_still_before_its_frame_waits_for_its_track(flight):
@@ -453,10 +453,10 @@ def test_a_still_before_its_frame_waits_for_its_track(flight):
         rig.port.flight = flight
         rig.put(*bases(flight, 0, 1, 2), flight.still(6, 0))
         rig.settle()
-        assert rig.receiver.session.sight.refined == 0
+        assert rig.receiver.session.pipeline.refined == 0
         rig.put(*bases(flight, *range(3, 12)))
         rig.settle()
-        wait_for(lambda: rig.receiver.session.sight.refined == 1)
+        wait_for(lambda: rig.receiver.session.pipeline.refined == 1)
 
 
 def test_lockstep_sees_every_frame_and_answers_every_still():
@@ -472,7 +472,7 @@ def test_lockstep_sees_every_frame_and_answers_every_still():
                 )
             rig.settle()
             session = rig.receiver.session
-            assert session.sight.detections_run == 20
+            assert session.pipeline.detections_run == 20
             answered = [one.still_sequence for report in rig.port.reports for one in report.stills]
             assert answered == list(range(20))
             frames = [report.last_frame_index for report in rig.port.reports]

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from flight import Flight, sight_of
+from flight import Flight, pipeline_of
 from hvt_common.protocol.messages import Info
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.config import GroundConfig, check
-from hvt_ground.perception.pipeline import GroundSight, Picture
-from hvt_ground.wiring import Models, make_sight
+from hvt_ground.perception.pipeline import Picture, Pipeline
+from hvt_ground.wiring import Models, make_pipeline
 
 
 def test_pictures_are_let_go_of():
     """A ground whose edges come and go would grow by a hundred megabytes each time."""
-    flight, decoder, sight = Flight(6), BaseDecoder(), sight_of(lambda _event: None)
+    flight, decoder, pipeline = Flight(6), BaseDecoder(), pipeline_of(lambda _event: None)
     for unit in flight.units:
         image = decoder.decode(unit.data)
-        sight.see(Picture(unit.frame_index, unit.capture_ns, unit.capture_ns, image), hurry=False)
-    assert sight._history.size_bytes > 0
-    sight.end()
-    assert sight._history.size_bytes == 0
-    assert sight.tracks == 1
+        pipeline.see(Picture(unit.frame_index, unit.capture_ns, unit.capture_ns, image), hurry=False)
+    assert pipeline._history.size_bytes > 0
+    pipeline.end()
+    assert pipeline._history.size_bytes == 0
+    assert pipeline.tracks == 1
 
 
 def test_the_next_session_gets_the_same_models():
@@ -33,32 +33,32 @@ def test_the_next_session_gets_the_same_models():
     assert again[1] is first[1]
 
 
-def eyes_of(config: GroundConfig) -> tuple[Models, GroundSight, Info]:
+def eyes_of(config: GroundConfig) -> tuple[Models, Pipeline, Info]:
     """The eyes of a session of an edge."""
     models, info = Models(config), Flight(1).info()
-    return models, make_sight(config, models, info=info, emit=lambda _event: None), info
+    return models, make_pipeline(config, models, info=info, emit=lambda _event: None), info
 
 
 def test_what_looks_at_the_past_uses_the_models_of_now():
     """The first still of an outage would stop the picture for as long as it takes to load a network."""
-    models, sight, info = eyes_of(check(GroundConfig()))
+    models, pipeline, info = eyes_of(check(GroundConfig()))
     for _ in range(2):  # twice at a time: a stretch of video waits while a still is read
-        with models.lender(info.edge).borrow() as (detector, classifier):
-            assert detector is sight._parts.detector
-            with models.lender(info.edge).borrow() as again:
+        with models.pool(info.edge).checkout() as (detector, classifier):
+            assert detector is pipeline._parts.detector
+            with models.pool(info.edge).checkout() as again:
                 assert again == (detector, classifier)
-    with models.lender("uav-9").borrow() as other:
+    with models.pool("uav-9").checkout() as other:
         assert other[0] is not detector, "another edge's is used by another thread"
-    sight.end()
+    pipeline.end()
     assert {id(models.take()[0]), id(models.take()[0])} == {id(detector), id(other[0])}
 
 
 def test_a_detector_of_motion_does_not_see_the_past():
     """The picture of now would be compared with one of an hour ago: all of it moves."""
-    models, sight, info = eyes_of(check(GroundConfig(detector="motion", classifier="none")))
-    with models.lender(info.edge).borrow() as (detector, classifier):
-        assert isinstance(detector, type(sight._parts.detector))
-        assert detector is not sight._parts.detector
+    models, pipeline, info = eyes_of(check(GroundConfig(detector="motion", classifier="none")))
+    with models.pool(info.edge).checkout() as (detector, classifier):
+        assert isinstance(detector, type(pipeline._parts.detector))
+        assert detector is not pipeline._parts.detector
         assert classifier is None
 
 

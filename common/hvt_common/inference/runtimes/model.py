@@ -25,7 +25,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.external_weights import external_weights, read_varint
 from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
-from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, Choice, choose_provider
+from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
 
 __all__ = ["MAX_MODEL_BYTES", "ModelSettings", "OnnxModel", "Port", "open_model", "opset_versions"]
 
@@ -109,7 +109,7 @@ class OnnxModel:
     """
 
     def __init__(
-        self, path: Path, session: ort.InferenceSession, *, runner: _Runner, provider: Choice
+        self, path: Path, session: ort.InferenceSession, *, runner: _Runner, provider: ProviderChoice
     ) -> None:
         self.path = path
         self.inputs = tuple(_port(value) for value in session.get_inputs())
@@ -168,14 +168,14 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     except UserError as error:
         if choice.asked or choice.provider == "cpu":
             raise
-        model = _open(path, settings, Choice("cpu", str(error), asked=False))
+        model = _open(path, settings, ProviderChoice("cpu", str(error), asked=False))
     except UnicodeDecodeError as error:  # a name in the file, or the runtime's message that quotes it
         raise UserError(f"model {path} cannot be opened: a name in it is not text") from error
     _log.info("%s runs on %s: %s", path.name, model.provider.provider, model.provider.why)
     return model
 
 
-def _open(path: Path, settings: ModelSettings, choice: Choice) -> OnnxModel:
+def _open(path: Path, settings: ModelSettings, choice: ProviderChoice) -> OnnxModel:
     if choice.provider == "openvino":
         described = _session(path, settings, ("CPUExecutionProvider",), optimised=False)
         found = find_openvino()

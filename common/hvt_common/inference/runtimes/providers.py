@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 from hvt_common.errors import UserError
 
-__all__ = ["ONNXRUNTIME_PROVIDERS", "PROVIDERS", "Choice", "OpenVinoCpu", "choose_provider"]
+__all__ = ["ONNXRUNTIME_PROVIDERS", "PROVIDERS", "OpenVinoCpu", "ProviderChoice", "choose_provider"]
 
 PROVIDERS = ("auto", "cpu", "cuda", "tensorrt", "openvino", "coreml")
 
@@ -50,7 +50,7 @@ class OpenVinoCpu:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class ProviderChoice:
     """The provider that is taken."""
 
     provider: str
@@ -63,7 +63,7 @@ class Choice:
 
 def choose_provider(
     wanted: str, *, onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]
-) -> Choice:
+) -> ProviderChoice:
     """Settle ``wanted`` to a provider that is installed here.
 
     Args:
@@ -81,24 +81,24 @@ def choose_provider(
     if wanted == "openvino":
         found = openvino()
         if found is not None:
-            return Choice(wanted, _openvino_text(found), asked=True)
+            return ProviderChoice(wanted, _openvino_text(found), asked=True)
     elif ONNXRUNTIME_PROVIDERS[wanted][0] in onnxruntime:
-        return Choice(wanted, "as asked", asked=True)
+        return ProviderChoice(wanted, "as asked", asked=True)
     raise UserError(
         f"--provider {wanted} is not installed here ({_HOW_TO_GET[wanted]}): choose auto or cpu, or install it"
     )
 
 
-def _best(onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]) -> Choice:
+def _best(onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]) -> ProviderChoice:
     if ONNXRUNTIME_PROVIDERS["cuda"][0] in onnxruntime:
-        return Choice("cuda", "onnxruntime-gpu is installed", asked=False)
+        return ProviderChoice("cuda", "onnxruntime-gpu is installed", asked=False)
     found = openvino()
     if found is None:
-        return Choice("cpu", f"OpenVINO is not installed ({_HOW_TO_GET['openvino']})", asked=False)
+        return ProviderChoice("cpu", f"OpenVINO is not installed ({_HOW_TO_GET['openvino']})", asked=False)
     if not found.bf16:
         why = f"this processor has no bf16, without which OpenVINO {found.version} is no faster"
-        return Choice("cpu", why, asked=False)
-    return Choice("openvino", _openvino_text(found), asked=False)
+        return ProviderChoice("cpu", why, asked=False)
+    return ProviderChoice("openvino", _openvino_text(found), asked=False)
 
 
 def _openvino_text(found: OpenVinoCpu) -> str:

@@ -1,7 +1,7 @@
-"""What an edge kept while its link was away, and sends afterwards: objects on ``past``, in pieces, acknowledged.
+"""What an edge kept while its link was away, and sends afterwards: objects on ``backlog``, in pieces, acknowledged.
 
 An object is a still, a stretch of the base stream, or the facts of the session that both belong to. Each is bytes; it
-crosses in pieces that the budget has room for, in order, and the ground says in `Feedback.past` how much of it it
+crosses in pieces that the budget has room for, in order, and the ground says in `Feedback.backlog` how much of it it
 holds. So neither a restart of either side nor a second outage costs more than the piece on its way.
 """
 
@@ -16,77 +16,77 @@ from typing import Any, ClassVar
 import msgpack
 
 from hvt_common.protocol.messages.envelope import MAX_PAYLOAD_BYTES, Message
-from hvt_common.protocol.messages.fields import I63, U32, U64, Choice, Int, WireError, carried
+from hvt_common.protocol.messages.fields import I63, U32, U64, Choice, Int, WireError, wire_field
 
 __all__ = [
-    "MAX_PAST_BYTES",
-    "MAX_PAST_HAVES",
-    "PastHave",
-    "PastHeader",
-    "PastKind",
-    "PastStill",
-    "PastUnit",
-    "pack_past_still",
-    "pack_past_units",
-    "parse_past_still",
-    "parse_past_units",
+    "MAX_ACKNOWLEDGED_RANGES",
+    "MAX_BACKLOG_BYTES",
+    "AcknowledgedRange",
+    "BacklogHeader",
+    "BacklogKind",
+    "BacklogStill",
+    "BacklogUnit",
+    "pack_backlog_still",
+    "pack_backlog_units",
+    "parse_backlog_still",
+    "parse_backlog_units",
 ]
 
-MAX_PAST_BYTES = MAX_PAYLOAD_BYTES
+MAX_BACKLOG_BYTES = MAX_PAYLOAD_BYTES
 """Of one object: ten seconds of video at 3 Mbps."""
-MAX_PAST_HAVES = 16
+MAX_ACKNOWLEDGED_RANGES = 16
 _MAX_UNITS = 2400
 _MAX_HEADER_BYTES = 1024
 _MAX_ENCODING_BYTES = 64
-_SIZE = Int(1, MAX_PAST_BYTES)
+_SIZE = Int(1, MAX_BACKLOG_BYTES)
 
 
-class PastKind(StrEnum):
+class BacklogKind(StrEnum):
     """What an object is."""
 
     INFO = "info"
     """`Info` of the session, as its edge would have answered; number 0."""
     STILL = "still"
-    """`PastStill`; its number is the still's sequence."""
+    """`BacklogStill`; its number is the still's sequence."""
     BASE = "base"
-    """A run of `PastUnit`; its number is the frame index of the first."""
+    """A run of `BacklogUnit`; its number is the frame index of the first."""
 
 
-_KIND = Choice(tuple(PastKind))
+_KIND = Choice(tuple(BacklogKind))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PastHeader(Message):
-    """Attachment of ``past``; the payload is one piece of the object."""
+class BacklogHeader(Message):
+    """Attachment of ``backlog``; the payload is one piece of the object."""
 
     MAX_BYTES: ClassVar[int] = 80
 
-    session_id: int = carried(Int(0, U64))
+    session_id: int = wire_field(Int(0, U64))
     """In which it was captured: this one, or one before the edge was started again."""
-    kind: str = carried(_KIND)
-    """A `PastKind`."""
-    number: int = carried(Int(0, U32))
-    offset: int = carried(Int(0, MAX_PAST_BYTES))
+    kind: str = wire_field(_KIND)
+    """A `BacklogKind`."""
+    number: int = wire_field(Int(0, U32))
+    offset: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
     """Where the piece lies in the object, bytes."""
-    total_bytes: int = carried(_SIZE)
+    total_bytes: int = wire_field(_SIZE)
     """Of the object."""
-    send_ns: int = carried(Int(0, I63))
+    send_ns: int = wire_field(Int(0, I63))
     """When the piece was handed to Zenoh, the edge's clock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PastHave:
+class AcknowledgedRange:
     """How much of an object a ground holds, without a hole from its beginning."""
 
-    session_id: int = carried(Int(0, U64))
-    kind: str = carried(_KIND)
-    number: int = carried(Int(0, U32))
-    have_bytes: int = carried(Int(0, MAX_PAST_BYTES))
+    session_id: int = wire_field(Int(0, U64))
+    kind: str = wire_field(_KIND)
+    number: int = wire_field(Int(0, U32))
+    acknowledged_bytes: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
     """All of it: the edge may forget it. Less than was said before: begin again there."""
 
 
 @dataclass(frozen=True, slots=True)
-class PastStill:
+class BacklogStill:
     """A still that was kept: what would have crossed on ``roi``."""
 
     attachment: bytes
@@ -97,7 +97,7 @@ class PastStill:
 
 
 @dataclass(frozen=True, slots=True)
-class PastUnit:
+class BacklogUnit:
     """One access unit that was kept."""
 
     frame_index: int
@@ -107,13 +107,13 @@ class PastUnit:
     """HEVC, Annex B."""
 
 
-def pack_past_still(still: PastStill) -> bytes:
+def pack_backlog_still(still: BacklogStill) -> bytes:
     """The object's bytes."""
     packed: bytes = msgpack.packb([still.attachment, still.encoding, still.payload])
     return packed
 
 
-def parse_past_still(data: bytes) -> PastStill:
+def parse_backlog_still(data: bytes) -> BacklogStill:
     """Back; raises `WireError` and nothing else, for any bytes whatever. The attachment is not looked into."""
     values = _unpack(data, "a past still")
     if len(values) != 3 or [type(value) for value in values] != [bytes, str, bytes]:
@@ -121,10 +121,10 @@ def parse_past_still(data: bytes) -> PastStill:
     attachment, encoding, payload = values
     if len(attachment) > _MAX_HEADER_BYTES or len(encoding) > _MAX_ENCODING_BYTES or not payload:
         raise WireError("a past still has an attachment or encoding that is too long, or no payload")
-    return PastStill(attachment, encoding, payload)
+    return BacklogStill(attachment, encoding, payload)
 
 
-def pack_past_units(units: Sequence[PastUnit]) -> bytes:
+def pack_backlog_units(units: Sequence[BacklogUnit]) -> bytes:
     """The object's bytes; ``units`` are in the order of capture."""
     packed: bytes = msgpack.packb(
         [[unit.frame_index, unit.capture_ns, unit.keyframe, unit.data] for unit in units]
@@ -132,7 +132,7 @@ def pack_past_units(units: Sequence[PastUnit]) -> bytes:
     return packed
 
 
-def parse_past_units(data: bytes) -> tuple[PastUnit, ...]:
+def parse_backlog_units(data: bytes) -> tuple[BacklogUnit, ...]:
     """Back, in the order of capture; raises `WireError` and nothing else, for any bytes whatever."""
     rows = _unpack(data, "past video")
     if not 1 <= len(rows) <= _MAX_UNITS:
@@ -144,18 +144,18 @@ def parse_past_units(data: bytes) -> tuple[PastUnit, ...]:
     return units
 
 
-def _unit(row: Any) -> PastUnit:
+def _unit(row: Any) -> BacklogUnit:
     if type(row) is not list or [type(value) for value in row] != [int, int, bool, bytes]:
         raise WireError("past video with a frame that is not an index, a time, a flag and bytes")
     frame_index, capture_ns, keyframe, data = row
     if not (0 <= frame_index <= U32 and 0 <= capture_ns <= I63 and data):
         raise WireError("past video with an index or a time out of bounds, or an empty frame")
-    return PastUnit(frame_index, capture_ns, keyframe, data)
+    return BacklogUnit(frame_index, capture_ns, keyframe, data)
 
 
 def _unpack(data: bytes, name: str) -> list[Any]:
-    if len(data) > MAX_PAST_BYTES:
-        raise WireError(f"{name} of {len(data)} bytes is longer than {MAX_PAST_BYTES}")
+    if len(data) > MAX_BACKLOG_BYTES:
+        raise WireError(f"{name} of {len(data)} bytes is longer than {MAX_BACKLOG_BYTES}")
     try:
         values = msgpack.unpackb(data, raw=False, strict_map_key=True, use_list=True, max_ext_len=0)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:

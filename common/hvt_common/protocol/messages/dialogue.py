@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
-from hvt_common.protocol.messages.backlog import MAX_PAST_HAVES, PastHave
+from hvt_common.protocol.messages.backlog import MAX_ACKNOWLEDGED_RANGES, AcknowledgedRange
 from hvt_common.protocol.messages.envelope import Message, Nested
 from hvt_common.protocol.messages.fields import (
     I63,
@@ -21,7 +21,7 @@ from hvt_common.protocol.messages.fields import (
     Scaled,
     Text,
     TupleOf,
-    carried,
+    wire_field,
 )
 
 __all__ = [
@@ -50,13 +50,13 @@ class Command(StrEnum):
 
     KEYFRAME = "keyframe"
     STILL = "still"
-    STILL_FATE = "still-fate"
+    STILL_OUTCOME = "still-outcome"
     """What became of a still that was accepted."""
     TRACKS = "tracks"
     """What the edge tracks now, by its own ids."""
     SET_BUDGET = "set-budget"
     SET_METHOD = "set-method"
-    SEND_PAST = "send-past"
+    SEND_BACKLOG = "send-backlog"
     """Send what was kept of the base stream too, before what is left of the stills."""
 
 
@@ -64,22 +64,22 @@ class Command(StrEnum):
 class ControlRequest(Message):
     """Payload of a question on ``control``."""
 
-    session_id: int = carried(Int(0, U64))
+    session_id: int = wire_field(Int(0, U64))
     """The session it is meant for; 0 for whichever runs."""
-    command: str = carried(Text(24))
+    command: str = wire_field(Text(24))
     """A `Command`, or a word of some later version."""
-    arguments: Mapping[str, int | float | str] = carried(MapOf(Scalar(), 8, key_bytes=16))
+    arguments: Mapping[str, int | float | str] = wire_field(MapOf(Scalar(), 8, key_bytes=16))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackNow:
     """A track of the edge, as an answer lists it."""
 
-    track_id: int = carried(Int(0, U32))
-    class_id: int = carried(Int(0, 2047))
+    track_id: int = wire_field(Int(0, U32))
+    class_id: int = wire_field(Int(0, 2047))
     """Index into `Info.class_names`."""
-    confidence: float = carried(Scaled(0, 1, 1000))
-    box_source_px: tuple[float, float, float, float] = carried(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    confidence: float = wire_field(Scaled(0, 1, 1000))
+    box_source_px: tuple[float, float, float, float] = wire_field(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
     """x1, y1, x2, y2 in eighths of a pixel."""
 
 
@@ -89,16 +89,16 @@ class ControlAnswer(Message):
 
     MAX_BYTES: ClassVar[int] = 4096
 
-    session_id: int = carried(Int(0, U64))
-    accepted: bool = carried(Flag())
-    reason: str = carried(Text(200))
+    session_id: int = wire_field(Int(0, U64))
+    accepted: bool = wire_field(Flag())
+    reason: str = wire_field(Text(200))
     """One sentence; empty where accepted."""
-    still_ask: int = carried(Int(-1, U32))
+    still_request: int = wire_field(Int(-1, U32))
     """The number of the still that was accepted: it comes on ``roi`` with the parameter ``ask`` of this value; -1
     for any other command."""
-    frame_index: int = carried(Int(-1, U32))
+    frame_index: int = wire_field(Int(-1, U32))
     """The frame that the still shows, or whose tracks these are; -1 where neither."""
-    tracks: tuple[TrackNow, ...] = carried(ListOf(Nested(TrackNow), MAX_TRACKS_NOW))
+    tracks: tuple[TrackNow, ...] = wire_field(ListOf(Nested(TrackNow), MAX_TRACKS_NOW))
     """For the command ``tracks``; else empty."""
 
 
@@ -106,15 +106,15 @@ class ControlAnswer(Message):
 class StillResult:
     """What the ground made of one still."""
 
-    still_sequence: int = carried(Int(0, U32))
-    track_id: int = carried(Int(-1, U32))
+    still_sequence: int = wire_field(Int(0, U32))
+    track_id: int = wire_field(Int(-1, U32))
     """The edge's track, as the still said."""
-    class_name: str = carried(Text(64))
-    confidence: float = carried(Scaled(0, 1, 1000))
-    entropy_nats: float = carried(Scaled(0, 20, 1000))
-    ground_track_id: int = carried(Int(-1, U32))
+    class_name: str = wire_field(Text(64))
+    confidence: float = wire_field(Scaled(0, 1, 1000))
+    entropy_nats: float = wire_field(Scaled(0, 20, 1000))
+    ground_track_id: int = wire_field(Int(-1, U32))
     """The ground's track that it refined; -1 where it matched none, or none yet."""
-    again: bool = carried(Flag())
+    again: bool = wire_field(Flag())
     """The still names a base frame that this ground does not have: please send it once more, without the base."""
 
 
@@ -124,37 +124,39 @@ class Feedback(Message):
 
     MAX_BYTES: ClassVar[int] = 6144
 
-    session_id: int = carried(Int(0, U64))
-    receiver_id: int = carried(Int(0, U64))
+    session_id: int = wire_field(Int(0, U64))
+    receiver_id: int = wire_field(Int(0, U64))
     """Random, new at each start of the ground: several grounds may report on one edge."""
-    sequence: int = carried(Int(0, U32))
-    send_ns: int = carried(Int(0, I63))
+    sequence: int = wire_field(Int(0, U32))
+    send_ns: int = wire_field(Int(0, I63))
     """The ground's clock as it was at its start, carried on without steps."""
-    last_frame_index: int = carried(Int(-1, U32))
+    last_frame_index: int = wire_field(Int(-1, U32))
     """The last frame that the ground is done with; -1 before the first. A lockstep edge waits for it."""
-    base_messages: int = carried(_COUNT)
-    base_bytes: int = carried(_COUNT)
-    roi_messages: int = carried(_COUNT)
-    roi_bytes: int = carried(_COUNT)
-    lost: int = carried(_COUNT)
+    base_messages: int = wire_field(_COUNT)
+    base_bytes: int = wire_field(_COUNT)
+    roi_messages: int = wire_field(_COUNT)
+    roi_bytes: int = wire_field(_COUNT)
+    lost: int = wire_field(_COUNT)
     """Messages of base and roi that never came."""
-    corrupt: int = carried(_COUNT)
+    corrupt: int = wire_field(_COUNT)
     """Messages that came and could not be used."""
-    base_sequence: int = carried(Int(-1, U32))
+    base_sequence: int = wire_field(Int(-1, U32))
     """The highest of ``base`` that has come; -1 for none. With what follows, the edge follows the link's rate."""
-    base_held_us: int = carried(Int(0, U32))
+    base_held_us: int = wire_field(Int(0, U32))
     """How long before ``send_ns`` it came: ``send_ns`` minus this is its time of arrival."""
-    still_sequence: int = carried(Int(-1, U32))
+    still_sequence: int = wire_field(Int(-1, U32))
     """The highest of ``roi`` that has come; -1 for none."""
-    missing_stills: tuple[int, ...] = carried(ListOf(Int(0, U32), MAX_MISSING_STILLS))
+    missing_stills: tuple[int, ...] = wire_field(ListOf(Int(0, U32), MAX_MISSING_STILLS))
     """Sequences of ``roi`` below it that have not come; the edge sends them again while they are worth it."""
-    delay_p50_ms: float = carried(Scaled(-1, 3_600_000, 10))
+    delay_p50_ms: float = wire_field(Scaled(-1, 3_600_000, 10))
     """Median capture to receive since the last report, clocks reconciled; -1 where unknown."""
-    clock_offset_ns: int = carried(Int(-I63, I63))
+    clock_offset_ns: int = wire_field(Int(-I63, I63))
     """Edge clock minus ground clock, as the ground estimates it."""
-    clock_error_ns: int = carried(Int(-1, I63))
+    clock_error_ns: int = wire_field(Int(-1, I63))
     """The estimate is right within this; -1 where there is none."""
-    stills: tuple[StillResult, ...] = carried(ListOf(Nested(StillResult), MAX_STILL_RESULTS))
+    stills: tuple[StillResult, ...] = wire_field(ListOf(Nested(StillResult), MAX_STILL_RESULTS))
     """New since the last report."""
-    past: tuple[PastHave, ...] = carried(ListOf(Nested(PastHave), MAX_PAST_HAVES))
+    backlog: tuple[AcknowledgedRange, ...] = wire_field(
+        ListOf(Nested(AcknowledgedRange), MAX_ACKNOWLEDGED_RANGES)
+    )
     """Objects of which pieces came since the last report."""

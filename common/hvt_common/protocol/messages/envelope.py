@@ -26,7 +26,7 @@ __all__ = [
     "kinds",
 ]
 
-WIRE_VERSION = 2
+WIRE_VERSION = 3
 MAX_PAYLOAD_BYTES = 4 * 2**20
 """No access unit and no still is larger; a larger one is not looked at."""
 
@@ -50,7 +50,7 @@ def kinds(message: type) -> tuple[tuple[str, Kind], ...]:
 
 
 class Message:
-    """Base of every message: a frozen dataclass whose fields are all `carried`."""
+    """Base of every message: a frozen dataclass whose fields are all `wire_field`."""
 
     __slots__ = ()
     MAX_BYTES: ClassVar[int] = 1024
@@ -90,7 +90,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Nested(Kind):
-    """A field that holds another dataclass of `carried` fields, as an array without version and checksum."""
+    """A field that holds another dataclass of `wire_field` fields, as an array without version and checksum."""
 
     of: type
 

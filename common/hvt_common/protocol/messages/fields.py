@@ -28,8 +28,8 @@ __all__ = [
     "Text",
     "TupleOf",
     "WireError",
-    "carried",
     "fitted_text",
+    "wire_field",
 ]
 
 U32 = 2**32 - 1
@@ -73,7 +73,7 @@ class Kind(ABC):
     def _describe(self) -> str: ...
 
 
-def carried(kind: Kind) -> Any:
+def wire_field(kind: Kind) -> Any:
     """A dataclass field that crosses the wire as ``kind``; fields are sent in the order they are declared."""
     return field(metadata={"wire": kind})
 

@@ -19,8 +19,8 @@ from hvt_common.protocol.messages.fields import (
     Scaled,
     Text,
     TupleOf,
-    carried,
     fitted_text,
+    wire_field,
 )
 from hvt_common.values import View
 
@@ -55,31 +55,31 @@ class Info(Message):
 
     MAX_BYTES: ClassVar[int] = 65536
 
-    session_id: int = carried(Int(0, U64))
-    edge: str = carried(Text(32))
-    software: str = carried(Text(32))
+    session_id: int = wire_field(Int(0, U64))
+    edge: str = wire_field(Text(32))
+    software: str = wire_field(Text(32))
     """Version of HVT on the edge."""
-    started_ns: int = carried(_TIME)
-    source_size: tuple[int, int] = carried(TupleOf(_SIDE, 2))
+    started_ns: int = wire_field(_TIME)
+    source_size: tuple[int, int] = wire_field(TupleOf(_SIDE, 2))
     """(width, height) in pixels."""
-    base_size: tuple[int, int] = carried(TupleOf(_SIDE, 2))
-    view_scale: float = carried(Real(1e-4, 1e4))
-    view_offset_px: tuple[float, float] = carried(TupleOf(Real(-32767, 32767), 2))
+    base_size: tuple[int, int] = wire_field(TupleOf(_SIDE, 2))
+    view_scale: float = wire_field(Real(1e-4, 1e4))
+    view_offset_px: tuple[float, float] = wire_field(TupleOf(Real(-32767, 32767), 2))
     """base = source x scale + offset, in base pixels."""
-    fps: float = carried(Real(0.01, 1000))
-    codec: str = carried(Text(24))
-    pace: str = carried(Choice(("realtime", "lockstep")))
-    method: str = carried(Text(48))
-    budget_bps: int = carried(_BPS)
-    base_bps: int = carried(_BPS)
+    fps: float = wire_field(Real(0.01, 1000))
+    codec: str = wire_field(Text(24))
+    pace: str = wire_field(Choice(("realtime", "lockstep")))
+    method: str = wire_field(Text(48))
+    budget_bps: int = wire_field(_BPS)
+    base_bps: int = wire_field(_BPS)
     """The part of the budget that the base stream may use."""
-    window_ns: int = carried(Int(1, 3_600_000_000_000))
+    window_ns: int = wire_field(Int(1, 3_600_000_000_000))
     """Length of the rolling window that the budget holds over."""
-    class_names: tuple[str, ...] = carried(ListOf(Text(_CLASS_NAME_BYTES), _CLASS_NAMES))
+    class_names: tuple[str, ...] = wire_field(ListOf(Text(_CLASS_NAME_BYTES), _CLASS_NAMES))
     """Of the edge's detector."""
-    received_ns: int = carried(_TIME)
+    received_ns: int = wire_field(_TIME)
     """When the edge received the question, its clock (t1)."""
-    answered_ns: int = carried(_TIME)
+    answered_ns: int = wire_field(_TIME)
     """When it answered (t2)."""
 
     @property
@@ -92,20 +92,20 @@ class Info(Message):
 class Health:
     """How the edge is doing; counts are since its start."""
 
-    frames_captured: int = carried(_COUNT)
-    frames_encoded: int = carried(_COUNT)
-    frames_dropped: int = carried(_COUNT)
+    frames_captured: int = wire_field(_COUNT)
+    frames_encoded: int = wire_field(_COUNT)
+    frames_dropped: int = wire_field(_COUNT)
     """Dropped before encoding."""
-    keyframes: int = carried(_COUNT)
-    tracks: int = carried(_COUNT)
+    keyframes: int = wire_field(_COUNT)
+    tracks: int = wire_field(_COUNT)
     """Distinct tracks seen."""
-    base_queue: int = carried(Int(0, U32))
+    base_queue: int = wire_field(Int(0, U32))
     """Access units that wait to be sent."""
-    still_queue: int = carried(Int(0, U32))
-    encode_ms: float = carried(Scaled(0, 60_000, 10))
+    still_queue: int = wire_field(Int(0, U32))
+    encode_ms: float = wire_field(Scaled(0, 60_000, 10))
     """Mean since the last status."""
-    detect_ms: float = carried(Scaled(0, 60_000, 10))
-    feedback_age_ms: int = carried(Int(-1, U32))
+    detect_ms: float = wire_field(Scaled(0, 60_000, 10))
+    feedback_age_ms: int = wire_field(Int(-1, U32))
     """Since the last feedback from any ground; -1 for none yet."""
 
 
@@ -115,29 +115,29 @@ class Status(Message):
 
     MAX_BYTES: ClassVar[int] = 2048
 
-    session_id: int = carried(Int(0, U64))
-    sequence: int = carried(Int(0, U32))
-    state: str = carried(Choice(("running", "ended")))
-    send_ns: int = carried(_TIME)
-    media_ns: int = carried(_TIME)
+    session_id: int = wire_field(Int(0, U64))
+    sequence: int = wire_field(Int(0, U32))
+    state: str = wire_field(Choice(("running", "ended")))
+    send_ns: int = wire_field(_TIME)
+    media_ns: int = wire_field(_TIME)
     """Length of the stream so far: frames of the source rate, dropped ones included, in nanoseconds."""
-    last_base_sequence: int = carried(_LAST)
+    last_base_sequence: int = wire_field(_LAST)
     """Of the last access unit sent before this message; -1 for none."""
-    last_still_sequence: int = carried(_LAST)
-    base_bytes: int = carried(_COUNT)
-    roi_bytes: int = carried(_COUNT)
-    past_bytes: int = carried(_COUNT)
+    last_still_sequence: int = wire_field(_LAST)
+    base_bytes: int = wire_field(_COUNT)
+    roi_bytes: int = wire_field(_COUNT)
+    backlog_bytes: int = wire_field(_COUNT)
     """Pieces of what was kept while the link was away."""
-    meta_bytes: int = carried(_COUNT)
-    overhead_bytes: int = carried(_COUNT)
-    base_messages: int = carried(_COUNT)
-    roi_messages: int = carried(_COUNT)
-    past_messages: int = carried(_COUNT)
-    meta_messages: int = carried(_COUNT)
-    worst_window_bps: tuple[int, int, int] = carried(TupleOf(_BPS, 3))
+    meta_bytes: int = wire_field(_COUNT)
+    overhead_bytes: int = wire_field(_COUNT)
+    base_messages: int = wire_field(_COUNT)
+    roi_messages: int = wire_field(_COUNT)
+    backlog_messages: int = wire_field(_COUNT)
+    meta_messages: int = wire_field(_COUNT)
+    worst_window_bps: tuple[int, int, int] = wire_field(TupleOf(_BPS, 3))
     """Base, roi, total: the fullest rolling window of the run."""
-    sent: Mapping[str, int] = carried(_REASONS)
+    sent: Mapping[str, int] = wire_field(_REASONS)
     """Stills sent, by reason."""
-    deferred: Mapping[str, int] = carried(_REASONS)
-    dropped: Mapping[str, int] = carried(_REASONS)
-    health: Health = carried(Nested(Health))  # noqa: RUF009 - a dataclass field, not a default
+    deferred: Mapping[str, int] = wire_field(_REASONS)
+    dropped: Mapping[str, int] = wire_field(_REASONS)
+    health: Health = wire_field(Nested(Health))  # noqa: RUF009 - a dataclass field, not a default

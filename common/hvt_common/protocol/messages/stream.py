@@ -19,7 +19,7 @@ from hvt_common.protocol.messages.fields import (
     Scaled,
     Text,
     TupleOf,
-    carried,
+    wire_field,
 )
 
 __all__ = ["MAX_ALSO", "AlsoShown", "BaseHeader", "Flags", "RoiHeader"]
@@ -51,17 +51,17 @@ class BaseHeader(Message):
 
     MAX_BYTES: ClassVar[int] = 80
 
-    session_id: int = carried(Int(0, U64))
+    session_id: int = wire_field(Int(0, U64))
     """Random, new at each start of the edge."""
-    sequence: int = carried(Int(0, U32))
+    sequence: int = wire_field(Int(0, U32))
     """0, 1, 2 … for each message sent; a hole means that messages were lost."""
-    frame_index: int = carried(Int(0, U32))
+    frame_index: int = wire_field(Int(0, U32))
     """Index of the frame at the source rate; a frame dropped before encoding leaves a hole here only."""
-    capture_ns: int = carried(_TIME)
+    capture_ns: int = wire_field(_TIME)
     """Unix time at the source, nanoseconds of the edge's clock."""
-    send_delay_ns: int = carried(_DELAY)
+    send_delay_ns: int = wire_field(_DELAY)
     """Send time minus ``capture_ns``."""
-    flags: int = carried(Int(0, 255))
+    flags: int = wire_field(Int(0, 255))
 
     @property
     def keyframe(self) -> bool:
@@ -78,9 +78,9 @@ class BaseHeader(Message):
 class AlsoShown:
     """A further track that a still shows."""
 
-    track_id: int = carried(Int(0, U32))
+    track_id: int = wire_field(Int(0, U32))
     """The edge's."""
-    box_source_px: tuple[float, float, float, float] = carried(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    box_source_px: tuple[float, float, float, float] = wire_field(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
     """x1, y1, x2, y2 in eighths of a pixel."""
 
     def __post_init__(self) -> None:
@@ -97,29 +97,29 @@ class RoiHeader(Message):
     MAX_PAYLOAD: ClassVar[int] = 2**20
     """The largest still, 512x512 pixels, has 768 KiB before it is coded; a ground keeps hundreds in its queues."""
 
-    session_id: int = carried(Int(0, U64))
-    sequence: int = carried(Int(0, U32))
+    session_id: int = wire_field(Int(0, U64))
+    sequence: int = wire_field(Int(0, U32))
     """Of stills: 0, 1, 2 … apart from that of ``base``."""
-    frame_index: int = carried(Int(0, U32))
-    capture_ns: int = carried(_TIME)
-    send_delay_ns: int = carried(_DELAY)
-    flags: int = carried(Int(0, 255))
-    track_id: int = carried(Int(-1, U32))
+    frame_index: int = wire_field(Int(0, U32))
+    capture_ns: int = wire_field(_TIME)
+    send_delay_ns: int = wire_field(_DELAY)
+    flags: int = wire_field(Int(0, 255))
+    track_id: int = wire_field(Int(-1, U32))
     """The edge's track; -1 where the still belongs to none."""
-    box_source_px: tuple[float, float, float, float] = carried(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
+    box_source_px: tuple[float, float, float, float] = wire_field(TupleOf(Scaled(-_FAR_PX, _FAR_PX, 8), 4))
     """The track's box at that frame, in eighths of a pixel; may reach beyond the frame."""
-    crop_source_px: tuple[int, int, int, int] = carried(TupleOf(Int(0, _FAR_PX), 4))
+    crop_source_px: tuple[int, int, int, int] = wire_field(TupleOf(Int(0, _FAR_PX), 4))
     """What the still shows."""
-    class_name: str = carried(Text(64))
-    confidence: float = carried(Scaled(0, 1, 1000))
-    reason: str = carried(Text(48))
+    class_name: str = wire_field(Text(64))
+    confidence: float = wire_field(Scaled(0, 1, 1000))
+    reason: str = wire_field(Text(48))
     """Why the method sent it."""
-    codec: str = carried(Text(24))
-    quality_pct: int = carried(Int(0, 100))
-    parameters: Mapping[str, int | float | str] = carried(MapOf(Scalar(), 8, key_bytes=16))
+    codec: str = wire_field(Text(24))
+    quality_pct: int = wire_field(Int(0, 100))
+    parameters: Mapping[str, int | float | str] = wire_field(MapOf(Scalar(), 8, key_bytes=16))
     """What else the codec needs to be undone; empty for JPEG. ``w`` and ``h`` are the coded size where that is not
     the size of the crop."""
-    also: tuple[AlsoShown, ...] = carried(ListOf(Nested(AlsoShown), MAX_ALSO))
+    also: tuple[AlsoShown, ...] = wire_field(ListOf(Nested(AlsoShown), MAX_ALSO))
     """Further tracks that the same crop shows."""
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from hvt_common.protocol.messages.envelope import Message
-from hvt_common.protocol.messages.fields import I63, U32, U64, Blob, Int, WireError, carried
+from hvt_common.protocol.messages.fields import I63, U32, U64, Blob, Int, WireError, wire_field
 from hvt_common.protocol.messages.track_boxes import (
     CONFIDENCE_STEPS,
     MOST_BOXES,
@@ -42,17 +42,17 @@ class TrackStep(Message):
 
     MAX_BYTES: ClassVar[int] = 16_384
 
-    session_id: int = carried(Int(0, U64))
-    sequence: int = carried(Int(0, U32))
+    session_id: int = wire_field(Int(0, U64))
+    sequence: int = wire_field(Int(0, U32))
     """Of track steps: 0, 1, 2 …; a hole means that messages were lost."""
-    frame_index: int = carried(Int(0, U32))
+    frame_index: int = wire_field(Int(0, U32))
     """The frame whose tracks these are."""
-    capture_ns: int = carried(Int(0, I63))
-    send_delay_ns: int = carried(Int(-I63, I63))
+    capture_ns: int = wire_field(Int(0, I63))
+    send_delay_ns: int = wire_field(Int(-I63, I63))
     """Send time minus ``capture_ns``."""
-    reference: int = carried(Int(-1, U32))
+    reference: int = wire_field(Int(-1, U32))
     """Sequence of the step that the boxes are coded against; -1 where they stand by themselves."""
-    boxes: bytes = carried(Blob(_MOST_BOX_BYTES))
+    boxes: bytes = wire_field(Blob(_MOST_BOX_BYTES))
     """Range-coded; see docs/wire.md, *Coded tracks*."""
 
     @property

@@ -20,7 +20,7 @@ from typing import Self
 import zenoh
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.doctor.certificate import TlsFiles
 from hvt_common.transport.doctor.probe import why_no_link
 from hvt_common.transport.rights import Rights
@@ -104,7 +104,7 @@ class LinkWatch:
     def may_command(self, edge: str) -> bool:
         """Whether our own configuration lets questions on ``control`` of this edge out at all."""
         return self._rights.allow_somebody(
-            flow="egress", message="query", key=EdgeKeys(edge).key(Row.CONTROL)
+            flow="egress", message="query", key=EdgeKeys(edge).key(Channel.CONTROL)
         )
 
     def __enter__(self) -> Self:
@@ -212,7 +212,7 @@ class LinkWatch:
     def _writes(self, name: str) -> bool:
         """Whether an edge of that name may send here under its own id."""
         try:
-            key = EdgeKeys(name).key(Row.STATUS)
+            key = EdgeKeys(name).key(Channel.STATUS)
         except UserError:
             return False
         return self._rights.allow(name, flow="ingress", message="put", key=key)

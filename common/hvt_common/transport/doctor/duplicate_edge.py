@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import Info, WireError
 from hvt_common.transport.session import ask
 from hvt_common.transport.zenoh_config import LinkSettings, configure
@@ -88,10 +88,10 @@ def _look_within(settings: LinkSettings, keys: EdgeKeys) -> Info | None:
 def _look(config: zenoh.Config, keys: EdgeKeys) -> Info | None:
     try:
         with zenoh.open(config) as session:
-            tokens = session.liveliness().get(keys.key(Row.ALIVE), timeout=_ANSWER_S)
+            tokens = session.liveliness().get(keys.key(Channel.ALIVE), timeout=_ANSWER_S)
             if not any(reply.ok is not None for reply in tokens):
                 return None
-            answer = ask(session, Row.INFO, keys=keys, question=b"", timeout_s=_ANSWER_S)
+            answer = ask(session, Channel.INFO, keys=keys, question=b"", timeout_s=_ANSWER_S)
             return None if answer is None else Info.parse(answer)
     except (zenoh.ZError, WireError) as error:
         _log.debug("no edge of this id was found: %s", error)

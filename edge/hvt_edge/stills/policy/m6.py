@@ -126,12 +126,12 @@ class ExpectedGain:
 
     def _doubt_left(self, candidate: Candidate) -> float:
         """P(wrong after the last still): ``1 - exp(-H)`` of the ground's entropy, more where the two disagree."""
-        belief = candidate.posterior
-        if belief is None:
+        class_posterior = candidate.posterior
+        if class_posterior is None:
             return min(1.0, self.unanswered)
-        doubt = 1 - math.exp(-max(0.0, belief.entropy_nats))
-        known = MOVING not in (belief.class_name, candidate.class_name)
-        if known and not same_kind(belief.class_name, candidate.class_name):
+        doubt = 1 - math.exp(-max(0.0, class_posterior.entropy_nats))
+        known = MOVING not in (class_posterior.class_name, candidate.class_name)
+        if known and not same_kind(class_posterior.class_name, candidate.class_name):
             doubt = max(doubt, min(1.0, self.disagreement))
         return doubt
 

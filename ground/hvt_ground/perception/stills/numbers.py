@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from hvt_ground.link.sequence_window import NumbersSeen
+from hvt_ground.link.sequence_window import SequenceWindow
 
-__all__ = ["StillNumbers"]
+__all__ = ["StillSequenceWindow"]
 
 _MOST_SENT = 512
 """Stills whose second copy is still known for one: those of the last seconds."""
@@ -12,11 +12,11 @@ _NEVER_NS = -(2**64)
 """When a still was sent that has come with what was kept only."""
 
 
-class StillNumbers:
+class StillSequenceWindow:
     """For the receiving thread."""
 
     def __init__(self) -> None:
-        self._seen = NumbersSeen()
+        self._seen = SequenceWindow()
         self._sent_ns: dict[int, int] = {}
         """Sequence → when a still was sent of which no second copy has come."""
 

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from hvt_common.values import Posterior
 
-__all__ = ["BASE_WEIGHT", "PROBABILITY_FLOOR", "Belief", "Labels", "Reading"]
+__all__ = ["BASE_WEIGHT", "PROBABILITY_FLOOR", "Labels", "Reading", "TrackPosterior"]
 
 PROBABILITY_FLOOR = 1e-4
 BASE_WEIGHT = 1.0
@@ -61,7 +61,7 @@ class Labels:
         return vote
 
 
-class Belief:
+class TrackPosterior:
     """What is known of one track of the ground."""
 
     __slots__ = ("_log_sum", "_newest", "_order", "last_frame")

@@ -6,7 +6,7 @@ base packet must not refine the wrong object. What cannot be decided yet is held
 when it never will be.
 
 ``replace`` is the paper's rule: the newest still's prediction is the class. ``fuse`` multiplies what all
-stills of the track say (see `Belief`). Frames are the only clock here; `History` satisfies `TrackLog`.
+stills of the track say (see `TrackPosterior`). Frames are the only clock here; `History` satisfies `TrackLog`.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ import numpy as np
 
 from hvt_common.values import Tracks
 from hvt_ground.perception.stills.match import Candidate, Matcher, Wanted
-from hvt_ground.perception.stills.posterior import Belief, Labels, Reading
-from hvt_ground.perception.stills.resolved import Outcome, Settled, Shown, StillSeen
+from hvt_ground.perception.stills.posterior import Labels, Reading, TrackPosterior
+from hvt_ground.perception.stills.resolved import Outcome, ResolvedStill, Shown, StillSeen
 
-__all__ = ["Counters", "Mode", "Outcome", "Refiner", "Settled", "Shown", "StillSeen", "TrackLog"]
+__all__ = ["Counters", "Mode", "Outcome", "Refiner", "ResolvedStill", "Shown", "StillSeen", "TrackLog"]
 
 Mode = Literal["replace", "fuse"]
 
 MAX_HELD = 256
-MAX_BELIEFS = 1024
+MAX_TRACK_POSTERIORS = 1024
 _REMEMBERED_STILLS = 4096
 
 P = TypeVar("P")
@@ -115,9 +115,11 @@ class Refiner(Generic[P]):
         self._matcher = Matcher(iou=iou, owned_frames=self._forget_frames)
         self._held: dict[tuple[int, int], _Held[P]] = {}  # by still sequence and part, oldest offer first
         self._seen: OrderedDict[tuple[int, int], None] = OrderedDict()
-        self._beliefs: OrderedDict[int, Belief] = OrderedDict()  # by ground track id, longest unseen first
+        self._track_posteriors: OrderedDict[int, TrackPosterior] = (
+            OrderedDict()
+        )  # by ground track id, longest unseen first
 
-    def offer(self, still: StillSeen[P], *, now_frame: int) -> list[Settled[P]]:
+    def offer(self, still: StillSeen[P], *, now_frame: int) -> list[ResolvedStill[P]]:
         """Take a still; returns what had to make room for it (almost always nothing).
 
         ``now_frame`` is the newest frame that was decoded. A part of a still that was here before is ignored.
@@ -137,7 +139,7 @@ class Refiner(Generic[P]):
 
     def settle(
         self, log: TrackLog, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
-    ) -> list[Settled[P]]:
+    ) -> list[ResolvedStill[P]]:
         """Match what can be matched and give up what never will be, oldest frame first.
 
         Call it after each frame was tracked, with the newest frame that was decoded. ``known_as`` gives the ground's
@@ -146,14 +148,14 @@ class Refiner(Generic[P]):
         by_frame: dict[int, list[_Held[P]]] = {}
         for held in self._held.values():
             by_frame.setdefault(held.still.frame_index, []).append(held)
-        settled: list[Settled[P]] = []
+        resolved: list[ResolvedStill[P]] = []
         for frame_index in sorted(by_frame):
-            settled += self._settle_frame(by_frame[frame_index], log, now_frame, known_as)
-        for done in settled:
+            resolved += self._settle_frame(by_frame[frame_index], log, now_frame, known_as)
+        for done in resolved:
             del self._held[done.still.key]
-        return settled
+        return resolved
 
-    def end(self) -> list[Settled[P]]:
+    def end(self) -> list[ResolvedStill[P]]:
         """Give out all that still waits, as unmatched: the stream or its session is over."""
         ended = [self._unmatched(held.still, "ended") for held in self._held.values()]
         self._held.clear()
@@ -164,17 +166,17 @@ class Refiner(Generic[P]):
 
         Where both were refined, the track that stays keeps its own belief.
         """
-        belief = self._beliefs.pop(gone_id, None)
-        if belief is not None:
-            self._beliefs.setdefault(kept_id, belief)
+        class_posterior = self._track_posteriors.pop(gone_id, None)
+        if class_posterior is not None:
+            self._track_posteriors.setdefault(kept_id, class_posterior)
         self._matcher.merge(kept_id, gone_id)
 
     def shown(self, tracks: Tracks) -> Shown:
         """The classes to show for the tracks of one frame; frames must not go back."""
         for track_id in tracks.ids.tolist():
-            belief = self._beliefs.get(track_id)
-            if belief is not None:
-                self._touch(track_id, belief, tracks.frame_index)
+            class_posterior = self._track_posteriors.get(track_id)
+            if class_posterior is not None:
+                self._touch(track_id, class_posterior, tracks.frame_index)
         self._forget(tracks.frame_index)
         return self.preview(tracks)
 
@@ -185,10 +187,10 @@ class Refiner(Generic[P]):
         confidences = tracks.confidences.astype(np.float32)  # a copy
         refined = np.zeros(len(tracks), np.bool_)
         for row, track_id in enumerate(tracks.ids.tolist()):
-            belief = self._beliefs.get(track_id)
-            if belief is None:
+            class_posterior = self._track_posteriors.get(track_id)
+            if class_posterior is None:
                 continue
-            reading = self._read(belief, tracks, row)
+            reading = self._read(class_posterior, tracks, row)
             classes[row], confidences[row], refined[row] = reading.class_name, reading.confidence, True
         return Shown(base_classes, tuple(classes), confidences, refined)
 
@@ -196,24 +198,24 @@ class Refiner(Generic[P]):
 
     def _settle_frame(
         self, held: list[_Held[P]], log: TrackLog, now_frame: int, known_as: Callable[[int], int | None]
-    ) -> list[Settled[P]]:
+    ) -> list[ResolvedStill[P]]:
         frame_index = held[0].still.frame_index
         tracks = log.tracks(frame_index)
         if tracks is None:
             return self._settle_untracked(held, log, now_frame, known_as)
         found = self._match(held, tracks, log)
         newest = log.newest_tracked
-        settled: list[Settled[P]] = []
+        resolved: list[ResolvedStill[P]] = []
         for waiting in sorted(held, key=lambda waiting: waiting.still.key):
             candidate = found[waiting.still.key]
             if candidate.tracks is not None:
-                settled.append(self._speak(waiting.still, candidate.tracks, candidate.row))
+                resolved.append(self._speak(waiting.still, candidate.tracks, candidate.row))
             elif now_frame > waiting.last_frame or (
                 newest is not None and newest >= frame_index + self._confirm_frames
             ):
                 outcome: Outcome = "ambiguous" if candidate.ambiguous else "no track"
-                settled.append(self._unmatched(waiting.still, outcome))
-        return settled
+                resolved.append(self._unmatched(waiting.still, outcome))
+        return resolved
 
     def _settle_untracked(
         self,
@@ -221,9 +223,9 @@ class Refiner(Generic[P]):
         log: TrackLog,
         now_frame: int,
         known_as: Callable[[int], int | None],
-    ) -> list[Settled[P]]:
+    ) -> list[ResolvedStill[P]]:
         """Tracks come in the order of frames: once a later frame is there, an absent one never will be."""
-        settled: list[Settled[P]] = []
+        resolved: list[ResolvedStill[P]] = []
         for waiting in held:
             oldest, newest, frame_index = log.oldest_tracked, log.newest_tracked, waiting.still.frame_index
             outcome: Outcome | None = None
@@ -235,12 +237,12 @@ class Refiner(Generic[P]):
                 outcome = "late"
             if outcome is not None:
                 named = self._by_name(waiting.still, log, known_as) if waiting.still.stored else None
-                settled.append(named or self._unmatched(waiting.still, outcome))
-        return settled
+                resolved.append(named or self._unmatched(waiting.still, outcome))
+        return resolved
 
     def _by_name(
         self, still: StillSeen[P], log: TrackLog, known_as: Callable[[int], int | None]
-    ) -> Settled[P] | None:
+    ) -> ResolvedStill[P] | None:
         """Let a still of long ago speak on the track that its edge track is known as now; None where it is not."""
         edge_id = still.edge_track_id
         if edge_id < 0 or log.newest_tracked is None:
@@ -269,26 +271,26 @@ class Refiner(Generic[P]):
             wanted, tracks, later=(t for t in later if t is not None), class_names=self._labels.detector
         )
 
-    def _speak(self, still: StillSeen[P], tracks: Tracks, row: int) -> Settled[P]:
+    def _speak(self, still: StillSeen[P], tracks: Tracks, row: int) -> ResolvedStill[P]:
         """Let a still speak on the class of a track."""
         track_id = int(tracks.ids[row])
-        belief = self._beliefs.get(track_id)
-        if belief is None:
+        class_posterior = self._track_posteriors.get(track_id)
+        if class_posterior is None:
             before = self._labels.detector[tracks.class_ids[row]]
-            belief = self._beliefs[track_id] = Belief(tracks.frame_index)
+            class_posterior = self._track_posteriors[track_id] = TrackPosterior(tracks.frame_index)
             self.counters.tracks_refined += 1
-            if len(self._beliefs) > MAX_BELIEFS:
-                self._beliefs.popitem(last=False)
+            if len(self._track_posteriors) > MAX_TRACK_POSTERIORS:
+                self._track_posteriors.popitem(last=False)
         else:
-            before = self._read(belief, tracks, row).class_name
-        newest = belief.hear(
+            before = self._read(class_posterior, tracks, row).class_name
+        newest = class_posterior.hear(
             still.posterior, self._labels, order=(still.frame_index, still.sequence), news=still.news
         )
-        self._touch(track_id, belief, still.frame_index)
-        after = self._read(belief, tracks, row)
+        self._touch(track_id, class_posterior, still.frame_index)
+        after = self._read(class_posterior, tracks, row)
         self.counters.matched += 1
         self.counters.class_changes += after.class_name != before
-        return Settled(
+        return ResolvedStill(
             still=still,
             outcome="matched" if newest or self._mode == "fuse" else "superseded",
             track_id=track_id,
@@ -298,11 +300,11 @@ class Refiner(Generic[P]):
             entropy_nats=after.entropy_nats,
         )
 
-    def _unmatched(self, still: StillSeen[P], outcome: Outcome) -> Settled[P]:
+    def _unmatched(self, still: StillSeen[P], outcome: Outcome) -> ResolvedStill[P]:
         self.counters.unmatched += 1
         self.counters.late += outcome == "late"
         said = still.posterior
-        return Settled(
+        return ResolvedStill(
             still=still,
             outcome=outcome,
             track_id=None,
@@ -314,21 +316,21 @@ class Refiner(Generic[P]):
 
     # What is believed of each track.
 
-    def _read(self, belief: Belief, tracks: Tracks, row: int) -> Reading:
+    def _read(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> Reading:
         if self._mode == "replace":
-            return belief.newest()
-        return belief.fused(
+            return class_posterior.newest()
+        return class_posterior.fused(
             self._labels, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
         )
 
-    def _touch(self, track_id: int, belief: Belief, frame_index: int) -> None:
-        belief.last_frame = max(belief.last_frame, frame_index)
-        self._beliefs.move_to_end(track_id)
+    def _touch(self, track_id: int, class_posterior: TrackPosterior, frame_index: int) -> None:
+        class_posterior.last_frame = max(class_posterior.last_frame, frame_index)
+        self._track_posteriors.move_to_end(track_id)
 
     def _forget(self, now_frame: int) -> None:
         """Drop what is believed of tracks that ended; the longest unseen stand first."""
-        while self._beliefs:
-            track_id, belief = next(iter(self._beliefs.items()))
-            if now_frame - belief.last_frame <= self._forget_frames:
+        while self._track_posteriors:
+            track_id, class_posterior = next(iter(self._track_posteriors.items()))
+            if now_frame - class_posterior.last_frame <= self._forget_frames:
                 return
-            del self._beliefs[track_id]
+            del self._track_posteriors[track_id]

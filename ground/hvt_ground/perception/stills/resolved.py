@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from hvt_common.values import Posterior
 
-__all__ = ["Outcome", "Settled", "Shown", "StillSeen"]
+__all__ = ["Outcome", "ResolvedStill", "Shown", "StillSeen"]
 
 Outcome = Literal["matched", "superseded", "no track", "ambiguous", "frame lost", "late", "overflow", "ended"]
 """What became of a still:
@@ -51,7 +51,7 @@ class StillSeen(Generic[P]):
     """What the edge's detector called it."""
     posterior: Posterior
     """Of the classifier, over the `Refiner`'s ``classifier_classes``."""
-    carried: P
+    wire_field: P
     """Whatever the caller wants back with it (the coded still, its header)."""
     news: float = 1.0
     """How much the still shows that the base did not, 0…1; see `news`."""
@@ -68,7 +68,7 @@ class StillSeen(Generic[P]):
 
 
 @dataclass(frozen=True, slots=True)
-class Settled(Generic[P]):
+class ResolvedStill(Generic[P]):
     """A still and what it did."""
 
     still: StillSeen[P]

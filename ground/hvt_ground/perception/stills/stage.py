@@ -17,7 +17,7 @@ from hvt_ground.events.history import FilledLog, History
 from hvt_ground.perception.fusion.fuse import Fusion
 from hvt_ground.perception.stills.classify import Box, Decoded, Reading, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
-from hvt_ground.perception.stills.refine import Refiner, Settled, StillSeen
+from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillSeen
 
 __all__ = ["Carried", "Moment", "StillStage"]
 
@@ -25,7 +25,7 @@ SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
 _MOST_SPOILT, _SPOILT_TICKS = 32, 150
 """After so many undecodable stills in so many ticks the next are dropped unseen until the time is over."""
-MAX_WAITING = 64
+MAX_PENDING = 64
 """Stills that wait for their base frame; beyond, the oldest is read without it."""
 
 
@@ -108,21 +108,21 @@ class StillStage:
         ready = [still for still in self._waiting if not self._may_wait(still.header, now)]
         if ready:
             self._waiting = [still for still in self._waiting if self._may_wait(still.header, now)]
-        surplus = len(self._waiting) - MAX_WAITING
+        surplus = len(self._waiting) - MAX_PENDING
         if surplus > 0:
             ready, self._waiting = ready + self._waiting[:surplus], self._waiting[surplus:]
         self._read(ready, now)
-        for settled in self._refiner.settle(
+        for resolved in self._refiner.settle(
             self._log, now_frame=now.frame_index, known_as=self._fusion.known_as
         ):
-            self._settled(settled, now)
+            self._resolved(resolved, now)
 
     def end(self, now: Moment) -> None:
         """The session is over: what still waits is given out as it is."""
         ready, self._waiting = self._waiting, []
         self._read(ready, now)
-        for settled in self._refiner.end():
-            self._settled(settled, now)
+        for resolved in self._refiner.end():
+            self._resolved(resolved, now)
 
     def take_results(self) -> list[StillResult]:
         """Return and forget what the edge wants to hear of its stills."""
@@ -202,12 +202,12 @@ class StillStage:
         news = self._news(decoded)
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
-            carried = Carried(still, decoded, track_id, box, reading.box_base_px, crop)
+            wire_field = Carried(still, decoded, track_id, box, reading.box_base_px, crop)
             self._answer(header, track_id, reading.posterior)
             if reading.posterior is None:
                 self.outcomes["unread"] += 1
                 name = header.class_name
-                self._emit(self._refinement(carried, now, None, name, name, header.confidence))
+                self._emit(self._refinement(wire_field, now, None, name, name, header.confidence))
                 continue
             seen = StillSeen(
                 sequence=header.sequence,
@@ -217,13 +217,13 @@ class StillStage:
                 box_base_px=box,
                 class_name=header.class_name,
                 posterior=reading.posterior,
-                carried=carried,
+                wire_field=wire_field,
                 news=news,
                 part=part,
                 stored=bool(header.flags & Flags.STORED),
             )
-            for settled in self._refiner.offer(seen, now_frame=now.frame_index):
-                self._settled(settled, now)
+            for resolved in self._refiner.offer(seen, now_frame=now.frame_index):
+                self._resolved(resolved, now)
 
     def _news(self, decoded: Decoded) -> float:
         """How much a still shows that the base did not, 0…1.
@@ -241,21 +241,27 @@ class StillStage:
         nearness_db = psnr_y_db(seen, decoded.image_bgr)
         return float(np.clip((SAME_DB - nearness_db) / (SAME_DB - OTHER_DB), 0.0, 1.0))
 
-    def _settled(self, settled: Settled[Carried], now: Moment) -> None:
-        self.outcomes[settled.outcome] += 1
-        carried, track_id = settled.still.carried, settled.track_id
+    def _resolved(self, resolved: ResolvedStill[Carried], now: Moment) -> None:
+        self.outcomes[resolved.outcome] += 1
+        wire_field, track_id = resolved.still.wire_field, resolved.track_id
         if track_id is not None:
-            self._name_track(settled.still, track_id)
-            if carried.found_base_px is not None and not settled.still.stored:
-                frame_index = settled.still.frame_index
-                self._fusion.take_box(track_id, carried.found_base_px, frame_index=frame_index)
-        before, after = settled.class_before, settled.class_after
-        self._emit(self._refinement(carried, now, track_id, before, after, settled.confidence))
+            self._name_track(resolved.still, track_id)
+            if wire_field.found_base_px is not None and not resolved.still.stored:
+                frame_index = resolved.still.frame_index
+                self._fusion.take_box(track_id, wire_field.found_base_px, frame_index=frame_index)
+        before, after = resolved.class_before, resolved.class_after
+        self._emit(self._refinement(wire_field, now, track_id, before, after, resolved.confidence))
 
     def _refinement(
-        self, carried: Carried, now: Moment, track_id: int | None, before: str, after: str, confidence: float
+        self,
+        wire_field: Carried,
+        now: Moment,
+        track_id: int | None,
+        before: str,
+        after: str,
+        confidence: float,
     ) -> Refinement:
-        header = carried.received.header
+        header = wire_field.received.header
         stored = bool(header.flags & Flags.STORED)
         # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. What
         # was kept while the link was away tells of then, and nobody looked on.
@@ -264,17 +270,17 @@ class StillStage:
             capture_ns=header.capture_ns if stored else now.capture_ns,
             still_sequence=header.sequence,
             track_id=track_id,
-            edge_track_id=carried.track_id,
-            box_base_px=carried.box_base_px,
-            still=carried.received.data,
+            edge_track_id=wire_field.track_id,
+            box_base_px=wire_field.box_base_px,
+            still=wire_field.received.data,
             media_type=still_codec(header.codec).media_type,  # not what Zenoh said: that is nobody's word
-            base_crop_bgr=carried.base_crop_bgr,
+            base_crop_bgr=wire_field.base_crop_bgr,
             class_before=before,
             class_after=after,
             confidence=confidence,
             reason=header.reason,
             quality_pct=header.quality_pct,
-            still_bgr=carried.decoded.image_bgr,
+            still_bgr=wire_field.decoded.image_bgr,
             crop_base_px=self._to_base(header.crop_source_px),
             stored=stored,
         )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from hvt_ground.events.events import Overlay
 from hvt_ground.sinks.rerun.overlay_encoding import LayerUpdate, OverlayEncoder
 
-__all__ = ["PastOverlays", "Timed"]
+__all__ = ["BacklogOverlays", "Timed"]
 
 Timed = tuple[int, int, LayerUpdate]
 """Frame index, capture time, and what to write there."""
@@ -33,7 +33,7 @@ class _Hole:
     said: bool = False
 
 
-class PastOverlays:
+class BacklogOverlays:
     """Of one recording. Not safe for threads.
 
     Args:

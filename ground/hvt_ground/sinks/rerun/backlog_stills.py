@@ -10,7 +10,7 @@ from bisect import bisect_right, insort
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-__all__ = ["PastGallery", "Put", "Shown"]
+__all__ = ["BacklogGallery", "Put", "Shown"]
 
 T = TypeVar("T")
 
@@ -38,7 +38,7 @@ class Put(Generic[T]):
     """Nothing came into the slot later: it is what is shown there now."""
 
 
-class PastGallery(Generic[T]):
+class BacklogGallery(Generic[T]):
     """What each slot held when. Not safe for threads.
 
     Args:

@@ -20,14 +20,14 @@ from rerun.chunk import Chunk
 from hvt_common.units import bitrate_text
 from hvt_ground.events.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.backlog_overlays import PastOverlays
+from hvt_ground.sinks.rerun.backlog_overlays import BacklogOverlays
 from hvt_ground.sinks.rerun.blueprint import Front
 from hvt_ground.sinks.rerun.live_view import LiveSink
 from hvt_ground.sinks.rerun.overlay_encoding import LAYERS, Identity, Layer, LayerUpdate, OverlayEncoder
 from hvt_ground.sinks.rerun.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun.rrd.file import RrdEncoder, RrdFile
 from hvt_ground.sinks.rerun.rrd.footer import add_footer
-from hvt_ground.sinks.rerun.rrd.size_limit import TABLE_BYTES, Room
+from hvt_ground.sinks.rerun.rrd.size_limit import TABLE_BYTES, SizeLimit
 from hvt_ground.sinks.rerun.rrd.tables import (
     CodedIdentity,
     Table,
@@ -43,15 +43,15 @@ from hvt_ground.sinks.rerun.rrd.tables import (
     told_identity_columns,
     video_columns,
 )
-from hvt_ground.sinks.rerun.static_data import class_chunk, unchanging_chunks
-from hvt_ground.sinks.rerun.stills import At, Row, StillRows
+from hvt_ground.sinks.rerun.static_data import class_chunk, static_chunks
+from hvt_ground.sinks.rerun.stills import At, EventRow, StillRows
 
-__all__ = ["APPLICATION_ID", "FOLD_BYTES", "Recorder", "RecorderSettings"]
+__all__ = ["APPLICATION_ID", "COMPACT_BYTES", "Recorder", "RecorderSettings"]
 
 log = logging.getLogger(__name__)
 
 APPLICATION_ID = "hvt"
-FOLD_BYTES = 3 << 19
+COMPACT_BYTES = 3 << 19
 """Payload of the journal at which it is folded; a fold costs some 50 kB, and this much is held in memory."""
 
 DIMMED = 0.75
@@ -101,8 +101,8 @@ class Recorder:
         self._settings = settings
         self._lock = threading.Lock()
         self._overlays = OverlayEncoder()
-        self._past_overlays = PastOverlays(fps=settings.fps)
-        self._room = Room()
+        self._backlog_overlays = BacklogOverlays(fps=settings.fps)
+        self._room = SizeLimit()
         self._stills = StillRows(self._room)
         self._class_ids: dict[str, int] = {}
         self._classes_written: dict[Layer, int] = dict.fromkeys(LAYERS, 0)
@@ -160,7 +160,7 @@ class Recorder:
                 return
             self._closed = True
             try:
-                self._fold()
+                self._compact()
             finally:
                 if self._file is not None:
                     self._file.close()
@@ -182,7 +182,7 @@ class Recorder:
 
     def _open(self) -> None:
         settings = self._settings
-        chunks = unchanging_chunks(title=settings.title or settings.edge_id, facts=_facts(settings))
+        chunks = static_chunks(title=settings.title or settings.edge_id, facts=_facts(settings))
         for sink in (self._encoder, self._live):
             if sink is None:
                 continue
@@ -196,7 +196,7 @@ class Recorder:
             )
             data = sink.blueprint(screen) + sink.chunks(chunks)
             if sink is self._encoder and self._file is not None:
-                self._file.fold(self._encoder.header + data)
+                self._file.compact(self._encoder.header + data)
 
     def _write(self, chunks: list[Chunk]) -> None:
         if not chunks:
@@ -206,16 +206,16 @@ class Recorder:
         if self._file is None:
             return
         self._file.append(self._encoder.chunks(chunks))
-        if self._pending_bytes >= FOLD_BYTES:
-            self._fold()
+        if self._pending_bytes >= COMPACT_BYTES:
+            self._compact()
 
-    def _fold(self) -> None:
+    def _compact(self) -> None:
         chunks = [*self._contexts.values()]
         chunks += [chunk for table in self._tables.values() if (chunk := table.take()) is not None]
         self._contexts.clear()
         self._pending_bytes = 0
         if chunks and self._file is not None:
-            self._file.fold(self._encoder.chunks(chunks))
+            self._file.compact(self._encoder.chunks(chunks))
 
     def _row(self, path: str, columns: Any, event: Event | At, value: Any, *, size_bytes: int = 64) -> Chunk:
         """Add a row to the table of this entity and these columns; ``size_bytes``: its cost once folded, about."""
@@ -229,7 +229,7 @@ class Recorder:
         self._room.logged_bytes += size_bytes
         return table.add(event.frame_index, event.capture_ns, value)
 
-    def _rows(self, rows: Sequence[Row], event: Event) -> list[Chunk]:
+    def _rows(self, rows: Sequence[EventRow], event: Event) -> list[Chunk]:
         return [
             self._row(row.path, row.columns, row.at or event, row.value, size_bytes=row.size_bytes)
             for row in rows
@@ -244,7 +244,7 @@ class Recorder:
         size = len(sample.data)
         self._room.received_bytes += size
         if sample.stored:
-            self._past_overlays.earn(size)
+            self._backlog_overlays.earn(size)
         else:
             self._last_sample = sample.frame_index
             self._overlays.earn(size)
@@ -258,17 +258,17 @@ class Recorder:
 
     def _overlay(self, overlay: Overlay) -> list[Chunk]:
         if overlay.stored:
-            return self._past_overlay(overlay)
+            return self._backlog_overlay(overlay)
         chunks = self._rows(self._stills.overlay(overlay), overlay)
         for update in self._overlays.encode(overlay):
             chunks += self._layer(overlay, update)
-        self._past_overlays.note(overlay, self._overlays)
+        self._backlog_overlays.note(overlay, self._overlays)
         return chunks
 
-    def _past_overlay(self, overlay: Overlay) -> list[Chunk]:
+    def _backlog_overlay(self, overlay: Overlay) -> list[Chunk]:
         """Patches stay away: they ride on tracks of now."""
         chunks = []
-        timed = self._past_overlays.encode(overlay, with_origins=self._overlays.told_of)
+        timed = self._backlog_overlays.encode(overlay, with_origins=self._overlays.told_of)
         for frame_index, capture_ns, update in timed:
             chunks += self._layer(replace(overlay, frame_index=frame_index, capture_ns=capture_ns), update)
         return chunks

@@ -22,7 +22,7 @@ from hvt_ground.sinks.rerun.palette import (
 )
 from hvt_ground.sinks.rerun.rrd.tables import static_chunk
 
-__all__ = ["class_chunk", "unchanging_chunks"]
+__all__ = ["class_chunk", "static_chunks"]
 
 _BITRATE = (
     ("total", TOTAL_LINE, 1.5),
@@ -36,7 +36,7 @@ _TRACKS = (("tracks", GREY, 2.0), ("refined", STILL_LINE, 2.5))
 _LEGEND = f"□ seen on the base  ·  {TOLD_MARK} told by edge or still only  ·  **thick** a still spoke  ·  ✓ it agreed"
 
 
-def unchanging_chunks(*, title: str, facts: Mapping[str, str]) -> list[Chunk]:
+def static_chunks(*, title: str, facts: Mapping[str, str]) -> list[Chunk]:
     """All static chunks of a recording whose session panel shows ``title`` and ``facts``."""
     return [
         static_chunk(names.VIDEO, rr.VideoStream.from_fields(codec=rr.VideoCodec.H265)),

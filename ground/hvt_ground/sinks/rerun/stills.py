@@ -11,11 +11,11 @@ import rerun as rr
 
 from hvt_ground.events.events import Overlay, Refinement
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.backlog_stills import PastGallery, Put, Shown
+from hvt_ground.sinks.rerun.backlog_stills import BacklogGallery, Put, Shown
 from hvt_ground.sinks.rerun.gallery import HOLD_S, SLOTS, Gallery, placed
 from hvt_ground.sinks.rerun.palette import GREY, Rgb, class_colour
 from hvt_ground.sinks.rerun.patches import Patches
-from hvt_ground.sinks.rerun.rrd.size_limit import Room
+from hvt_ground.sinks.rerun.rrd.size_limit import SizeLimit
 from hvt_ground.sinks.rerun.rrd.tables import (
     Captions,
     Picture,
@@ -29,7 +29,7 @@ from hvt_ground.sinks.rerun.rrd.tables import (
 )
 from hvt_ground.sinks.rerun.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
 
-__all__ = ["At", "Row", "StillRows"]
+__all__ = ["At", "EventRow", "StillRows"]
 
 HIDDEN_CROP_RATIO = 1.15
 """A still that is not shown keeps its base crop while the recording is smaller than this times the bytes received."""
@@ -54,7 +54,7 @@ class At:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class EventRow:
     """A row for the table of an entity with these columns."""
 
     path: str
@@ -69,20 +69,20 @@ class Row:
 class StillRows:
     """Decides what of each still is worth writing. Not safe for threads."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: SizeLimit) -> None:
         self._room = room
         self._gallery = Gallery()
         self._captions: Captions = (("", GREY),) * SLOTS
-        self._past = PastGallery(self._captions, hold_ns=round(HOLD_S * 1e9))
+        self._backlog = BacklogGallery(self._captions, hold_ns=round(HOLD_S * 1e9))
         self._patches = Patches()
         self._pictured: OrderedDict[int, None] = OrderedDict()
 
-    def refinement(self, refinement: Refinement) -> list[Row]:
+    def refinement(self, refinement: Refinement) -> list[EventRow]:
         """The rows of a still; its pictures are written once, however many objects it shows."""
         changed = refinement.class_before != refinement.class_after
         text = event_text(refinement)
         colour = class_colour(refinement.class_after) if changed else GREY
-        rows = [Row(names.EVENTS, text_columns, Text(text, "INFO", colour), len(text))]
+        rows = [EventRow(names.EVENTS, text_columns, Text(text, "INFO", colour), len(text))]
         still = still_picture(refinement) if self._is_new(refinement.still_sequence) else None
         if still is None:
             return rows
@@ -100,15 +100,15 @@ class StillRows:
             shown += self._patch(refinement, still)
         return rows + (shown or self._hidden(refinement, base, still))
 
-    def overlay(self, overlay: Overlay) -> list[Row]:
+    def overlay(self, overlay: Overlay) -> list[EventRow]:
         """The patches that move with their tracks, or go."""
         rows = []
         for moved in self._patches.follow(overlay):
             path = f"{names.PATCHES}/{moved.slot}"
             if moved.place is None:
-                rows.append(Row(path, patch_columns, None, _MOVE_BYTES))
+                rows.append(EventRow(path, patch_columns, None, _MOVE_BYTES))
             elif self._room.has(_MOVE_BYTES, ratio=PATCH_RATIO):
-                rows.append(Row(path, place_columns, moved.place, _MOVE_BYTES))
+                rows.append(EventRow(path, place_columns, moved.place, _MOVE_BYTES))
         return rows
 
     def _is_new(self, still_sequence: int) -> bool:
@@ -119,7 +119,9 @@ class StillRows:
             self._pictured.popitem(last=False)
         return True
 
-    def _pair(self, refinement: Refinement, base: Coded | None, still: Coded, *, changed: bool) -> list[Row]:
+    def _pair(
+        self, refinement: Refinement, base: Coded | None, still: Coded, *, changed: bool
+    ) -> list[EventRow]:
         """Base crop and still in the gallery; nothing where all slots are held, or for lack of room."""
         # A slot's old base crop must not stand beside a new still: the frame's absence is shown as a blank.
         pictures = (("base", base or BLANK), ("still", still))
@@ -132,10 +134,10 @@ class StillRows:
         rows = []
         for name, (data, size) in pictures:
             picture = Picture(data, placed(put.slot, size, right=name == "still"))
-            rows.append(Row(f"{names.STILLS}/{put.slot}/{name}", picture_columns, picture, len(data)))
+            rows.append(EventRow(f"{names.STILLS}/{put.slot}/{name}", picture_columns, picture, len(data)))
         for shown in put.rows:
             at = At(shown.frame_index, shown.capture_ns)
-            rows.append(Row(names.CAPTIONS, caption_columns, shown.captions, 160, at))
+            rows.append(EventRow(names.CAPTIONS, caption_columns, shown.captions, 160, at))
         return rows
 
     def _slot(self, refinement: Refinement, *, changed: bool) -> Put[tuple[str, Rgb]] | None:
@@ -143,7 +145,7 @@ class StillRows:
         words = (caption(refinement), class_colour(refinement.class_after))
         at = refinement.frame_index, refinement.capture_ns
         if refinement.stored:
-            put = self._past.put(*at, words)
+            put = self._backlog.put(*at, words)
             if put is not None and put.stays:
                 self._captions = _with(self._captions, put.slot, words)
             return put
@@ -152,19 +154,19 @@ class StillRows:
             return None
         self._captions = _with(self._captions, slot, words)
         row = Shown(*at, self._captions)
-        self._past.note(slot, row)
+        self._backlog.note(slot, row)
         return Put(slot, (row,), stays=True)
 
-    def _patch(self, refinement: Refinement, still: Coded) -> list[Row]:
+    def _patch(self, refinement: Refinement, still: Coded) -> list[EventRow]:
         """The still on the enhanced picture; nothing where its object is not on the screen."""
         data, size = still
         put = self._patches.put(refinement, size=size)
         if put is None or put.place is None:
             return []
         path = f"{names.PATCHES}/{put.slot}"
-        return [Row(path, patch_columns, Picture(data, put.place), len(data) + _MOVE_BYTES)]
+        return [EventRow(path, patch_columns, Picture(data, put.place), len(data) + _MOVE_BYTES)]
 
-    def _hidden(self, refinement: Refinement, base: Coded | None, still: Coded) -> list[Row]:
+    def _hidden(self, refinement: Refinement, base: Coded | None, still: Coded) -> list[EventRow]:
         """Kept where it can be found but not seen, as far as bytes allow; a still as received always is."""
         path, rows = names.OVERFLOW, []
         for name, picture in (("still", still), ("base", base)):
@@ -172,7 +174,7 @@ class StillRows:
                 continue
             data = picture[0]
             if data is refinement.still or self._room.has(len(data), ratio=HIDDEN_CROP_RATIO):
-                rows.append(Row(f"{path}/{name}", hidden_picture_columns, data, len(data)))
+                rows.append(EventRow(f"{path}/{name}", hidden_picture_columns, data, len(data)))
         return rows
 
 

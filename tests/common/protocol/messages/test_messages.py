@@ -17,7 +17,11 @@ from hypothesis.strategies import SearchStrategy
 from hvt_common.protocol.messages import (
     MAX_PAYLOAD_BYTES,
     MAX_STILL_RESULTS,
+    AcknowledgedRange,
     AlsoShown,
+    BacklogHeader,
+    BacklogStill,
+    BacklogUnit,
     BaseHeader,
     ControlAnswer,
     ControlRequest,
@@ -26,10 +30,6 @@ from hvt_common.protocol.messages import (
     Health,
     Info,
     Message,
-    PastHave,
-    PastHeader,
-    PastStill,
-    PastUnit,
     RoiHeader,
     Status,
     StillResult,
@@ -38,10 +38,10 @@ from hvt_common.protocol.messages import (
     UnknownVersionError,
     WireError,
     kinds,
-    pack_past_still,
-    pack_past_units,
-    parse_past_still,
-    parse_past_units,
+    pack_backlog_still,
+    pack_backlog_units,
+    parse_backlog_still,
+    parse_backlog_units,
 )
 from hvt_common.protocol.messages.envelope import WIRE_VERSION, Nested
 from hvt_common.protocol.messages.fields import (
@@ -74,7 +74,7 @@ MESSAGES: tuple[type[Message], ...] = (
     ControlRequest,
     ControlAnswer,
     Feedback,
-    PastHeader,
+    BacklogHeader,
 )
 
 
@@ -294,8 +294,8 @@ def test_an_empty_crop_or_inverted_box_is_refused(name, bad):
 
 def test_another_version_is_told_apart():
     """A newer edge would be reported as corrupt instead of as newer."""
-    with pytest.raises(UnknownVersionError, match="schema version 3, only 2 is known"):
-        BaseHeader.parse(sealed([3, "anything"]))
+    with pytest.raises(UnknownVersionError, match="schema version 4, only 3 is known"):
+        BaseHeader.parse(sealed([4, "anything"]))
     with pytest.raises(WireError, match=r"begins with a version"):
         BaseHeader.parse(sealed([True, 1, 2, 3, 4, 5, 6]))
 
@@ -344,7 +344,7 @@ def test_info_gives_the_view():
 # What an edge kept while its link was away
 
 stored_still = st.builds(
-    PastStill, st.binary(max_size=1024), st.text(max_size=16), st.binary(min_size=1, max_size=300)
+    BacklogStill, st.binary(max_size=1024), st.text(max_size=16), st.binary(min_size=1, max_size=300)
 )
 stored_units = st.lists(
     st.tuples(st.integers(0, U32), st.integers(0, I63), st.booleans(), st.binary(min_size=1, max_size=40)),
@@ -353,7 +353,7 @@ stored_units = st.lists(
     unique_by=(lambda row: row[0], lambda row: row[1]),
 ).map(
     lambda rows: tuple(
-        PastUnit(frame, at, keyframe, data)
+        BacklogUnit(frame, at, keyframe, data)
         for frame, at, (_, _, keyframe, data) in zip(
             sorted(row[0] for row in rows), sorted(row[1] for row in rows), rows, strict=True
         )
@@ -365,8 +365,8 @@ stored_units = st.lists(
 @settings(max_examples=200, deadline=None)
 def test_what_was_kept_survives_the_wire(still, units):
     """What an operator sees of an outage would not be what the edge saw."""
-    assert parse_past_still(pack_past_still(still)) == still
-    assert parse_past_units(pack_past_units(units)) == units
+    assert parse_backlog_still(pack_backlog_still(still)) == still
+    assert parse_backlog_units(pack_backlog_units(units)) == units
 
 
 nonsense = st.recursive(
@@ -392,11 +392,11 @@ nonsense = st.recursive(
 def test_any_bytes_of_a_kept_object_are_refused_or_within_bounds(data):
     """One hostile or damaged object would end the ground."""
     with contextlib.suppress(WireError):
-        still = parse_past_still(data)
+        still = parse_backlog_still(data)
         assert len(still.attachment) <= 1024
         assert still.payload
     with contextlib.suppress(WireError):
-        units = parse_past_units(data)
+        units = parse_backlog_units(data)
         assert 1 <= len(units) <= 2400
         assert all(
             0 <= unit.frame_index <= U32 and 0 <= unit.capture_ns <= I63 and unit.data for unit in units
@@ -422,7 +422,7 @@ def test_any_bytes_of_a_kept_object_are_refused_or_within_bounds(data):
 def test_kept_video_that_cannot_be_one_is_refused(rows):
     """Frames out of order would freeze the viewer that plays the hole."""
     with pytest.raises(WireError):
-        parse_past_units(msgpack.packb(rows))
+        parse_backlog_units(msgpack.packb(rows))
 
 
 @pytest.mark.parametrize(
@@ -431,12 +431,12 @@ def test_kept_video_that_cannot_be_one_is_refused(rows):
 def test_a_kept_still_that_cannot_be_one_is_refused(values):
     """Its header would be taken for something else."""
     with pytest.raises(WireError):
-        parse_past_still(msgpack.packb(values))
+        parse_backlog_still(msgpack.packb(values))
 
 
 @pytest.mark.parametrize(
     "message",
-    [*MESSAGES, AlsoShown, Health, PastHave, StillResult, TrackNow],
+    [*MESSAGES, AlsoShown, Health, AcknowledgedRange, StillResult, TrackNow],
     ids=lambda message: message.__name__,
 )
 def test_the_document_lists_every_field_with_its_bounds(message):

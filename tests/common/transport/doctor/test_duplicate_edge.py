@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from flight import Flight
-from hvt_common.protocol.channels import EdgeKeys, Row
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.doctor import duplicate_edge as same_id
 from hvt_common.transport.doctor.duplicate_edge import living_edge
 from hvt_common.transport.session import open_session, serve
@@ -62,9 +62,9 @@ def edge(
                 left.set()
             return info
 
-        serve(session, Row.INFO, keys=KEYS, answer=answer)
-        token = session.liveliness().declare_token(KEYS.key(Row.ALIVE))
-        while not list(ground.liveliness().get(KEYS.key(Row.ALIVE), timeout=20.0)):
+        serve(session, Channel.INFO, keys=KEYS, answer=answer)
+        token = session.liveliness().declare_token(KEYS.key(Channel.ALIVE))
+        while not list(ground.liveliness().get(KEYS.key(Channel.ALIVE), timeout=20.0)):
             time.sleep(0.02)
         leaver = threading.Thread(target=lambda: left.wait(60) and token.undeclare(), daemon=True)
         leaver.start()

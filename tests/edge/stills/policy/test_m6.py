@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_edge.perception.base_loss import BaseLoss
-from hvt_edge.perception.candidates import Belief, Candidate
+from hvt_edge.perception.candidates import Candidate, ClassPosterior
 from hvt_edge.stills.policy import METHODS, CostEstimate, Step, method
 from hvt_edge.stills.policy.m6 import ExpectedGain
 
@@ -57,7 +57,7 @@ def sent(one: Candidate, *, seconds: float, **changes) -> Candidate:
         "sent_count": 1,
         "last_sent_ns": round(NOW - seconds * 1e9),
         "last_sent_area_px": one.area_px,
-        "posterior": Belief("car", 0.95, 0.1),
+        "posterior": ClassPosterior("car", 0.95, 0.1),
     }
     return replace(one, **{**plain, **changes})
 
@@ -114,7 +114,7 @@ def test_gain_is_a_chance_and_monotone_in_every_term(lost, confidence, area, cov
     assert M6.gain(known, moment) <= max(gain, M6.again) + slack
     if gain > 0.1:
         assert M6.gain(known, moment) <= M6.gain(sent(one, seconds=since + 20), moment) + slack
-    doubtful = replace(known, posterior=Belief("car", 0.3, 3.0))
+    doubtful = replace(known, posterior=ClassPosterior("car", 0.3, 3.0))
     assert M6.gain(doubtful, moment) >= M6.gain(known, moment) - slack
 
 
@@ -122,11 +122,11 @@ def test_the_ground_s_answer_decides_whether_another_still_is_worth_it():
     """The same settled cars would be sent again and again, or one that the ground could not name never again."""
     one = car(lost=0.8)
     assert M6.requests([sent(one, seconds=2)], step()) == []
-    unsure = sent(one, seconds=2, posterior=Belief("car", 0.2, 3.0))
+    unsure = sent(one, seconds=2, posterior=ClassPosterior("car", 0.2, 3.0))
     assert M6.gain(unsure, step()) > 3 * M6.gain(sent(one, seconds=2), step())
-    odd = sent(one, seconds=2, posterior=Belief("bus", 0.95, 0.1))
+    odd = sent(one, seconds=2, posterior=ClassPosterior("bus", 0.95, 0.1))
     assert M6.gain(odd, step()) > M6.gain(
-        sent(one, seconds=2, posterior=Belief("minivan", 0.95, 0.1)), step()
+        sent(one, seconds=2, posterior=ClassPosterior("minivan", 0.95, 0.1)), step()
     )
     moving = sent(replace(one, class_name="moving"), seconds=2)
     assert M6.gain(moving, step()) == M6.gain(sent(one, seconds=2), step())

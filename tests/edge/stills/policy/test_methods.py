@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
-from hvt_edge.perception.candidates import Belief, Candidate
+from hvt_edge.perception.candidates import Candidate, ClassPosterior
 from hvt_edge.stills.policy import METHODS, CostEstimate, CostModel, Step, method, tuning
 
 SECOND = 1_000_000_000
@@ -74,7 +74,7 @@ def candidates(draw):
                 last_sent_frame=sent,
                 last_sent_ns=None if sent is None else round(sent / FPS * SECOND),
                 posterior=draw(
-                    st.one_of(st.none(), st.builds(Belief, NAMES, st.floats(0, 1), st.floats(0, 7)))
+                    st.one_of(st.none(), st.builds(ClassPosterior, NAMES, st.floats(0, 1), st.floats(0, 7)))
                 ),
             )
         )
@@ -161,7 +161,7 @@ def test_m3_follows_the_classifier_once_it_has_spoken():
     policy = method("M3")
     assert len(policy.requests([candidate(confidence=0.49)], step())) == 1
     assert policy.requests([candidate(confidence=0.5)], step()) == []
-    sure, unsure = Belief("minivan", 0.9, 0.4), Belief("minivan", 0.2, 3.0)
+    sure, unsure = ClassPosterior("minivan", 0.9, 0.4), ClassPosterior("minivan", 0.2, 3.0)
     assert policy.requests([candidate(confidence=0.1, posterior=sure)], step()) == []
     assert len(policy.requests([candidate(confidence=0.95, posterior=unsure)], step())) == 1
     order = [candidate(1, confidence=0.4), candidate(2, confidence=0.2), candidate(3, posterior=unsure)]
@@ -187,7 +187,7 @@ def test_m5_known_answer():
     expected = (0.5 * 0.4 + 0.3 * 0.6 + 0.2 * (1 - exp(-1))) / (3000 / 1500)
     (request,) = method("M5").requests([one], moment)
     assert request.score == pytest.approx(expected)
-    known = replace(one, posterior=Belief("minivan", 0.5, 1.0), last_sent_ns=None)
+    known = replace(one, posterior=ClassPosterior("minivan", 0.5, 1.0), last_sent_ns=None)
     expected = (0.5 * (1 - exp(-1)) + 0.3 * 0.6 + 0.2) / 2
     assert method("M5").requests([known], moment)[0].score == pytest.approx(expected)
 
@@ -230,7 +230,7 @@ def test_m5_leaves_the_settled_alone():
     """Bytes would be spent on an object that is large, certain and just refined."""
     now = round(300 / FPS * SECOND)
     settled = candidate(
-        area_share=0.02, crop_area_px=31_000, last_sent_ns=now, posterior=Belief("bus", 0.99, 0.02)
+        area_share=0.02, crop_area_px=31_000, last_sent_ns=now, posterior=ClassPosterior("bus", 0.99, 0.02)
     )
     assert method("M5").requests([settled], step()) == []
     assert len(method("M5", min_score=0).requests([settled], step())) == 1

@@ -51,13 +51,13 @@ _SESSION = """
 import pickle, resource, sys, time
 sys.path[:0] = sys.argv[1:]
 from dataclasses import replace
-from flight import Flight, sight_of
+from flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader
 from hvt_ground.session.session import GroundSession
 (bomb,) = pickle.load(sys.stdin.buffer)
 flight = Flight(2)
 session = GroundSession(
-    flight.info(), recorder=None, recording=None, sight_of=sight_of, to_local_ns=int, clock=time.time_ns,
+    flight.info(), recorder=None, recording=None, pipeline_of=pipeline_of, to_local_ns=int, clock=time.time_ns,
     report=lambda: None,
 )
 first = flight.base(0)
@@ -73,11 +73,11 @@ print((peak() - before) // 1024, shown)
 
 _PAST = """
 import pickle, resource, sys
-from hvt_common.protocol.messages import PastUnit
-from hvt_ground.backlog.video import PastVideo
+from hvt_common.protocol.messages import BacklogUnit
+from hvt_ground.backlog.video import BacklogVideo
 size, good, bombs = pickle.load(sys.stdin.buffer)
-video = PastVideo(base_size=size)
-unit = lambda number, data: PastUnit(number, number, True, data)
+video = BacklogVideo(base_size=size)
+unit = lambda number, data: BacklogUnit(number, number, True, data)
 shown = lambda units: sum(one is not None and one[1] is not None for one in video.pictures(units))
 assert shown([unit(0, good)]) == 1
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hvt_common.values import Posterior, Tracks
 from hvt_ground.events.history import History
 from hvt_ground.perception.stills.match import Matcher, Wanted, iou_matrix
-from hvt_ground.perception.stills.refine import MAX_BELIEFS, MAX_HELD, Refiner, StillSeen
+from hvt_ground.perception.stills.refine import MAX_HELD, MAX_TRACK_POSTERIORS, Refiner, StillSeen
 
 DETECTOR = ("car", "van", "person")
 CLASSIFIER = ("Person", "car", "truck")
@@ -62,7 +62,7 @@ def still(sequence, frame_index, box=A, *, edge=70, posterior=TRUCK, class_name=
         box_base_px=box,
         class_name=class_name,
         posterior=posterior,
-        carried=f"still {sequence}",
+        wire_field=f"still {sequence}",
     )
 
 
@@ -97,9 +97,9 @@ class Ground:
         return [done for frame_index in range(start, stop) for done in self.track(frame_index, boxes)]
 
 
-def brief(settled):
+def brief(resolved):
     """(sequence, outcome, track) of each."""
-    return [(done.still.sequence, done.outcome, done.track_id) for done in settled]
+    return [(done.still.sequence, done.outcome, done.track_id) for done in resolved]
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_a_still_replaces_the_class_of_its_track(ground):
     assert (done.track_id, done.class_before, done.class_after) == (1, "car", "truck")
     assert done.confidence == pytest.approx(0.7)
     assert done.entropy_nats == pytest.approx(0.8018, abs=1e-4)
-    assert done.still.carried == "still 0"
+    assert done.still.wire_field == "still 0"
     shown = ground.refiner.shown(tracks(6, {1: A, 2: B}, classes={2: 1}, confidences={2: 0.25}))
     assert shown.base_classes == ("car", "van")
     assert shown.classes == ("truck", "van")
@@ -356,7 +356,7 @@ def test_a_flood_of_stills_is_bounded_and_given_out():
         ground.offer(still(sequence, sequence, edge=sequence))
         ground.refiner.shown(tracks(sequence, dict.fromkeys(range(10000, sequence + 1), A)))
         if sequence % 500 == 499:
-            assert len(ground.refiner._beliefs) <= MAX_BELIEFS
+            assert len(ground.refiner._track_posteriors) <= MAX_TRACK_POSTERIORS
     matcher = ground.refiner._matcher
     sizes = [len(known) for known in (matcher._ground_of, matcher._edge_of, matcher._claims)]
     assert sizes == [1024, 1024, 256]
@@ -467,16 +467,16 @@ def test_objects_that_stand_apart_are_never_confused(script):
     """Whatever is lost, late or missing, an object would get the class of another."""
     spots = {n: (n * 60.0, 0.0, n * 60.0 + 40.0, 30.0) for n in range(1, 5)}
     ground = Ground()
-    settled, sent = [], 0
+    resolved, sent = [], 0
     for frame_index, (missing, lost, about, late) in enumerate(script):
         boxes = None if lost else {n: box for n, box in spots.items() if n != missing}
-        settled += ground.track(frame_index, boxes)
+        resolved += ground.track(frame_index, boxes)
         edge = about + 1
-        settled += ground.offer(still(frame_index, max(0, frame_index - late), spots[edge], edge=edge))
+        resolved += ground.offer(still(frame_index, max(0, frame_index - late), spots[edge], edge=edge))
         sent += 1
-    settled += ground.refiner.end()
-    assert sorted(done.still.sequence for done in settled) == list(range(sent)), "each still comes out once"
-    for done in settled:
+    resolved += ground.refiner.end()
+    assert sorted(done.still.sequence for done in resolved) == list(range(sent)), "each still comes out once"
+    for done in resolved:
         assert done.track_id in (None, done.still.edge_track_id)
         if done.track_id is not None:
             at_its_frame = ground.history.tracks(done.still.frame_index)

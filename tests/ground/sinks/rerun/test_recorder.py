@@ -217,16 +217,16 @@ def test_folding_changes_nothing_but_the_size(
     events: list[Event], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The journal is rewritten while recording; a row lost or doubled there would be lost for good."""
-    plain, folded = tmp_path / "plain.rrd", tmp_path / "folded.rrd"
+    plain, compacted = tmp_path / "plain.rrd", tmp_path / "folded.rrd"
     sizes: list[int] = []
-    for path, limit in ((plain, 1 << 40), (folded, 20_000)):
-        monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.FOLD_BYTES", limit)
+    for path, limit in ((plain, 1 << 40), (compacted, 20_000)):
+        monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.COMPACT_BYTES", limit)
         with Recorder(settings(path)) as recorder:
             for event in events:
                 recorder.log(event)
             assert recorder.size_bytes == path.stat().st_size
             sizes.append(recorder.size_bytes)
-    one, other = Recording(plain), Recording(folded)
+    one, other = Recording(plain), Recording(compacted)
     assert one.video() == other.video()
     assert one.events() == other.events()
     assert one.stills() == other.stills()

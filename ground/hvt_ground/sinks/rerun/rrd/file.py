@@ -4,7 +4,7 @@ Rerun stores chunks: a table of rows of one entity. A chunk costs about 1.3 kB b
 of a kB for each further column, as much as half an access unit at 300 kbps; so rows must be gathered. A recording
 that gathers in memory loses what it gathered when the process is killed. `RrdFile` does both: each row is
 appended at once as a chunk of its own (the *journal*, at the end of the file), and when the journal's rows have
-become `FOLD_BYTES`, the same rows are written again as one chunk a table, over the journal (*folding*).
+become `COMPACT_BYTES`, the same rows are written again as one chunk a table, over the journal (*folding*).
 
 What is on disk is a plain RRD stream without a footer: the SDK keeps a footer's manifest in memory for as long as
 it records (a footer costs 1.6 kB a chunk, too). `rrd_footer` adds one at the end.
@@ -85,17 +85,17 @@ class RrdFile:
         """Create or overwrite ``path``; `UserError` where that cannot be."""
         self.path = path
         self._file = _created(path)
-        self._folded_bytes = 0
+        self._compacted_bytes = 0
         self.size_bytes = 0
 
     def append(self, data: bytes) -> None:
         """Add to the journal; `UserError` when the disk refuses."""
         self._write(data, at=self.size_bytes)
 
-    def fold(self, data: bytes) -> None:
+    def compact(self, data: bytes) -> None:
         """Replace the journal by ``data``, which says the same in fewer bytes, and begin a new journal."""
-        self._write(data, at=self._folded_bytes)
-        self._folded_bytes = self.size_bytes
+        self._write(data, at=self._compacted_bytes)
+        self._compacted_bytes = self.size_bytes
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["FIXED_BYTES", "TABLE_BYTES", "Room"]
+__all__ = ["FIXED_BYTES", "TABLE_BYTES", "SizeLimit"]
 
 FIXED_BYTES = 77_000
 """About what the blueprint and the static values cost."""
@@ -14,7 +14,7 @@ _HEAD_START_BYTES = 30_000
 """Beyond the ratio, so that the first pictures of a flight are shown."""
 
 
-class Room:
+class SizeLimit:
     """Counts what came over the link and what was written for it."""
 
     def __init__(self) -> None:

@@ -15,6 +15,7 @@ from filelock import FileLock
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
+from hvt_study.compare_clip import Clip, stage_clip
 from hvt_study.datasets.classes import ClassMap
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.labels import FrameLabels
@@ -22,15 +23,14 @@ from hvt_study.datasets.reference import ReferenceLabels, reference_labels, with
 from hvt_study.matrix.cache import CacheError, ResultCache, content_key
 from hvt_study.matrix.materials import Materials, open_materials
 from hvt_study.matrix.spec import RunSpec
-from hvt_study.sight_clip import Clip, stage_clip
 
-__all__ = ["Workshop", "open_workshop"]
+__all__ = ["RunContext", "open_run_context"]
 
 _OPEN_FILES = Path("/proc/self/fd")
 
 
 @dataclass(frozen=True, slots=True)
-class Workshop:
+class RunContext:
     """Open for one process; flights take turns."""
 
     sequence: Sequence
@@ -48,7 +48,7 @@ class Workshop:
     """Hashes of all that the runs are made from."""
 
 
-def open_workshop(spec: RunSpec, *, cache: Path) -> Workshop:
+def open_run_context(spec: RunSpec, *, cache: Path) -> RunContext:
     """The workshop for this run; the one before is kept, so that runs over one sequence open it once.
 
     Raises:
@@ -59,7 +59,7 @@ def open_workshop(spec: RunSpec, *, cache: Path) -> Workshop:
 
 
 @lru_cache(maxsize=1)
-def _open(spec: RunSpec, cache: Path) -> Workshop:
+def _open(spec: RunSpec, cache: Path) -> RunContext:
     cv2.setNumThreads(1)  # there are as many processes as cores to use
     found = open_materials(spec, cache=cache)
     clip, pictures = _staged(found.sequence.clip)
@@ -67,7 +67,7 @@ def _open(spec: RunSpec, cache: Path) -> Workshop:
     if spec.labels == "reference":
         sequence = _with_reference(sequence, found, cache, base_size=spec.size)
     truth = (sequence.labels_at_tick(tick) for tick in range(sequence.ticks))
-    return Workshop(
+    return RunContext(
         sequence=sequence,
         labels=tuple(one for one in truth if one is not None),
         classes=found.classes,

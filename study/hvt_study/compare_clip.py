@@ -28,16 +28,16 @@ from hvt_study.virtual_camera import SCHEME, open_camera
 
 __all__ = [
     "DEMO_LEAST_VISIBLE",
-    "TICK_FPS",
+    "NOMINAL_FPS",
     "Clip",
-    "TickSource",
+    "FrameSource",
     "clip_name",
     "share_clip",
     "stage_clip",
     "staged_bytes",
 ]
 
-TICK_FPS = 15.0
+NOMINAL_FPS = 15.0
 """At so many ticks a second the list of the ground is judged, whatever is coded."""
 _ANY_SIZE = (64, 64)  # of base frames, which are made for each flight anew
 DEMO_LEAST_VISIBLE = 0.5
@@ -47,7 +47,7 @@ _MOST_SHARED_BYTES = 4 << 30
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Pictures at `TICK_FPS`, in a file that processes share, or read again from the source where that is large."""
+    """Pictures at `NOMINAL_FPS`, in a file that processes share, or read again from a large source."""
 
     spec: str
     """What ``--source`` takes, if it ends by itself: a video, a folder of images, ``demo``; or ``still:PICTURE``."""
@@ -82,7 +82,7 @@ class Clip:
                 yield image
 
 
-class TickSource(Source):
+class FrameSource(Source):
     """A clip as a source of the edge that gives only some of the ticks; ``frame.index`` counts ticks all the same."""
 
     live = False
@@ -90,13 +90,13 @@ class TickSource(Source):
     def __init__(self, clip: Clip, resizer: Resizer, *, ticks: frozenset[int]) -> None:
         self._clip, self._resizer, self._ticks = clip, resizer, ticks
         self.view: View = resizer.view
-        self.fps = TICK_FPS
+        self.fps = NOMINAL_FPS
         self.frame_count = len(ticks)
         self.class_names = clip.class_names
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """The chosen ticks from the beginning."""
-        rate = exact_rate(TICK_FPS)
+        rate = exact_rate(NOMINAL_FPS)
         for index, image in enumerate(self._clip.images()):
             if index in self._ticks:
                 capture_ns = capture_time_ns(index, fps=rate, start_ns=start_ns)
@@ -182,13 +182,13 @@ def _open(
     annotated: bool = True,
 ) -> _Reel:
     if spec.startswith(SCHEME):
-        camera = open_camera(spec, fps=TICK_FPS, seed=seed, annotated=annotated)
+        camera = open_camera(spec, fps=NOMINAL_FPS, seed=seed, annotated=annotated)
         return _Reel(
             lambda: islice(camera.images(), most),
             lambda index: None if (seen := camera.truth(index)) is None else Listed(*seen),
         )
     source = open_source(
-        spec, size=_ANY_SIZE, fps=TICK_FPS, max_frames=most, source_fps=source_fps, seed=seed
+        spec, size=_ANY_SIZE, fps=NOMINAL_FPS, max_frames=most, source_fps=source_fps, seed=seed
     )
     if source.live:
         source.close()
@@ -201,7 +201,7 @@ def _open(
 
 def _demo_truth(source: DemoSource, index: int) -> Listed:
     scene = cast(Scene, source.scene)
-    truth, names = scene.truth(index / TICK_FPS), scene.class_names
+    truth, names = scene.truth(index / NOMINAL_FPS), scene.class_names
     asked = truth.visible >= DEMO_LEAST_VISIBLE
     kinds = tuple(names[kind] for kind in truth.class_ids[asked].tolist())
     return Listed(truth.boxes_source_px[asked], kinds, truth.boxes_source_px[~asked])

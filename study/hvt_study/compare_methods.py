@@ -62,7 +62,7 @@ METHODS: Mapping[str, MethodRow] = MappingProxyType(
                 "M6",
                 (
                     *("--method", "M6", "--still-codec", "residual", *_SOURCE),
-                    *("--fps", "auto", "--video-share", "auto", "--lend", "--group-stills"),
+                    *("--fps", "auto", "--video-share", "auto", "--borrow-unused", "--group-stills"),
                     *("--gate", "32", "--fidelity", "36", "--roi-depth", "0.1"),
                 ),
                 "all of it, as the rate and the scene allow",

@@ -8,8 +8,8 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hvt_study.sight import SightResult, SightRow
-from hvt_study.sight_methods import METHODS
+from hvt_study.compare_methods import METHODS
+from hvt_study.sight import CompareResult, CompareRow
 
 __all__ = ["plot"]
 
@@ -30,7 +30,7 @@ _HALVES = {1: "first", 2: "second"}
 _DPI = 200
 
 
-def plot(result: SightResult, path: Path, *, half: int = 2) -> None:
+def plot(result: CompareResult, path: Path, *, half: int = 2) -> None:
     """Write a PNG: F1 and class agreement of one half of the clip over kbps in all, a line a method."""
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True)
@@ -48,7 +48,7 @@ def plot(result: SightResult, path: Path, *, half: int = 2) -> None:
     figure.savefig(path, dpi=_DPI, metadata={"Software": None})
 
 
-def _draw(axes: Axes, rows: Sequence[SightRow], *, measure: str) -> None:
+def _draw(axes: Axes, rows: Sequence[CompareRow], *, measure: str) -> None:
     axes.set_xscale("log")
     for name in METHODS:
         points = sorted((row.total_bps / 1e3, getattr(row, measure)) for row in rows if row.method == name)

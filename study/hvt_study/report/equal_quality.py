@@ -15,11 +15,11 @@ from statistics import median_low
 
 from hvt_study.report.runs import Arm, Setting, values
 
-__all__ = ["EqualSight", "equal_sight", "needed_bps"]
+__all__ = ["EqualQuality", "equal_quality", "needed_bps"]
 
 
 @dataclass(frozen=True, slots=True)
-class EqualSight:
+class EqualQuality:
     """Of one arm against one video-only method."""
 
     arm: Arm
@@ -66,7 +66,7 @@ def needed_bps(points: Iterable[tuple[float, float]], *, level: float) -> float:
     return math.inf
 
 
-def equal_sight(setting: Setting, arm: Arm, *, reference: str, column: str) -> EqualSight:
+def equal_quality(setting: Setting, arm: Arm, *, reference: str, column: str) -> EqualQuality:
     """Read every sequence's curve at what the arm shows there."""
     video = setting.video(reference)
     runs = setting.runs(arm)
@@ -77,4 +77,4 @@ def equal_sight(setting: Setting, arm: Arm, *, reference: str, column: str) -> E
         points = [(float(row["total_bps"]), float(row[column])) for row in rows]
         ratios.append(needed_bps(points, level=level) / spent[name])
     known = sorted(ratio for ratio in ratios if not math.isnan(ratio))
-    return EqualSight(arm, reference, tuple(known), len(ratios) - len(known))
+    return EqualQuality(arm, reference, tuple(known), len(ratios) - len(known))

@@ -8,29 +8,29 @@ from collections.abc import Sequence
 from flight import Flight
 from hvt_common.protocol.channels import MSGPACK_ENCODING
 from hvt_common.protocol.messages import (
+    BacklogHeader,
+    BacklogStill,
+    BacklogUnit,
     Flags,
-    PastHeader,
-    PastStill,
-    PastUnit,
-    pack_past_still,
-    pack_past_units,
+    pack_backlog_still,
+    pack_backlog_units,
 )
 from hvt_common.transport.inbox import Received
 
-__all__ = ["info_object", "pieces", "still_object", "video_object"]
+__all__ = ["chunks", "info_object", "still_object", "video_object"]
 
 
 def still_object(flight: Flight, index: int, sequence: int, **changes) -> bytes:
     """A still of the red square in a frame."""
     changes = {"flags": int(Flags.STORED)} | changes
     item = flight.still(index, sequence, **changes)
-    return pack_past_still(PastStill(item.attachment, item.encoding, item.payload))
+    return pack_backlog_still(BacklogStill(item.attachment, item.encoding, item.payload))
 
 
 def video_object(flight: Flight, indices: Sequence[int]) -> bytes:
     """A stretch of the base stream."""
     units = [flight.units[index] for index in indices]
-    return pack_past_units([PastUnit(u.frame_index, u.capture_ns, u.keyframe, u.data) for u in units])
+    return pack_backlog_units([BacklogUnit(u.frame_index, u.capture_ns, u.keyframe, u.data) for u in units])
 
 
 def info_object(flight: Flight) -> bytes:
@@ -38,14 +38,14 @@ def info_object(flight: Flight) -> bytes:
     return flight.info().pack()
 
 
-def pieces(
-    session_id: int, kind: str, number: int, data: bytes, *, piece_bytes: int = 1400
+def chunks(
+    session_id: int, kind: str, number: int, data: bytes, *, chunk_bytes: int = 1400
 ) -> list[Received]:
     """The object in pieces, in order."""
     items = []
-    for offset in range(0, len(data), piece_bytes):
-        payload = data[offset : offset + piece_bytes]
-        header = PastHeader(
+    for offset in range(0, len(data), chunk_bytes):
+        payload = data[offset : offset + chunk_bytes]
+        header = BacklogHeader(
             session_id=session_id,
             kind=kind,
             number=number,
@@ -54,6 +54,6 @@ def pieces(
             send_ns=time.time_ns(),
         )
         items.append(
-            Received("hvt/uav-1/past", payload, header.pack(payload), MSGPACK_ENCODING, time.time_ns())
+            Received("hvt/uav-1/backlog", payload, header.pack(payload), MSGPACK_ENCODING, time.time_ns())
         )
     return items

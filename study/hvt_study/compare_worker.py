@@ -20,19 +20,19 @@ from hvt_edge.source.resample import Resizer
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_study.cached_detector import CachedDetector
+from hvt_study.compare_clip import Clip
 from hvt_study.flight import FlightPlan, FlightReport, fly
 from hvt_study.flight_ground import SharedModels
 from hvt_study.list_score import Listed
-from hvt_study.sight_clip import Clip
 
-__all__ = ["Job", "Refused", "Workshop", "class_names", "fly_job", "label_job", "prepare"]
+__all__ = ["Job", "Refused", "RunContext", "class_names", "fly_job", "label_job", "prepare"]
 
 _CONFIDENCE = 0.25
 """From which a detection counts, at the edge, at the ground and as a reference label."""
 
 
 @dataclass(frozen=True, slots=True)
-class Workshop:
+class RunContext:
     """What all jobs share."""
 
     clip: Clip
@@ -66,12 +66,12 @@ def prepare() -> None:
     cv2.setNumThreads(1)
 
 
-def class_names(shop: Workshop) -> tuple[str, ...]:
+def class_names(shop: RunContext) -> tuple[str, ...]:
     """Those of the ground's detector."""
     return _ground_detector(shop).class_names
 
 
-def label_job(shop: Workshop, first: int, count: int) -> tuple[Listed, ...]:
+def label_job(shop: RunContext, first: int, count: int) -> tuple[Listed, ...]:
     """Reference labels of some ticks, source pixels."""
     detector = _ground_detector(shop)
     resizer = Resizer(shop.clip.source_size, shop.size, fit="letterbox")
@@ -84,7 +84,7 @@ def label_job(shop: Workshop, first: int, count: int) -> tuple[Listed, ...]:
     return tuple(labels)
 
 
-def fly_job(shop: Workshop, job: Job) -> FlightReport | Refused:
+def fly_job(shop: RunContext, job: Job) -> FlightReport | Refused:
     """Fly; what the edge cannot do is an answer, too."""
     try:
         plan = FlightPlan(
@@ -95,7 +95,7 @@ def fly_job(shop: Workshop, job: Job) -> FlightReport | Refused:
         return Refused(str(error))
 
 
-def edge_config(shop: Workshop, job: Job) -> EdgeConfig:
+def edge_config(shop: RunContext, job: Job) -> EdgeConfig:
     """The settings that a user of ``hvt-edge`` would give."""
     width, height = shop.size
     flags = ["--source", shop.clip.spec, "--pace", "lockstep", "--detector", shop.edge_detector]
@@ -108,7 +108,7 @@ def edge_config(shop: Workshop, job: Job) -> EdgeConfig:
     return check_edge(config)
 
 
-def ground_config(shop: Workshop) -> GroundConfig:
+def ground_config(shop: RunContext) -> GroundConfig:
     """The ground of every flight: re-detection reads the stills, which are weighed with the votes of the base."""
     classifier = "none" if shop.detector == MOTION else "detector"
     return check_ground(
@@ -124,11 +124,11 @@ def ground_config(shop: Workshop) -> GroundConfig:
     )
 
 
-def _ground_detector(shop: Workshop) -> Detector:
+def _ground_detector(shop: RunContext) -> Detector:
     return _open(shop.detector, shop.provider, shop.cache, "ground")
 
 
-def _edge_detector(shop: Workshop) -> Detector:
+def _edge_detector(shop: RunContext) -> Detector:
     return _open(shop.edge_detector, shop.provider, shop.cache, "edge")
 
 
