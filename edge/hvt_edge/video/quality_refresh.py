@@ -3,8 +3,7 @@
 What a frame shows well stays well shown for a while, because the frames after it are predicted from it. So bits are
 worth more where they come in pulses: a whole frame once a period (`RefreshPlan`), or one cell of a grid in
 each
-frame,
-in rotation (`RollingRefreshPlan`), which keeps the frames small. `TrackRegions` (R0) spends them on the tracks instead.
+frame, in rotation (`RollingRefreshPlan`), which keeps the frames small. `TrackRegions` (R0) spends them on tracks.
 
 A plan is asked once for each coded frame, in order, with the tracks that are known by then.
 """

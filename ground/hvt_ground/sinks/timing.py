@@ -2,7 +2,7 @@
 
 The columns, in this order (times are Unix nanoseconds, 0 where there is none):
 
-- ``kind``: base, roi, tracks, status; backlog-still, backlog-base, backlog-info for a piece of what the edge kept in an outage
+- ``kind``: base, roi, tracks, status; backlog-still, backlog-base, backlog-info for a chunk of the backlog
 - ``sequence``: the message's own number; ``frame_index``: of the frame it is about, -1 where it is about none
 - ``capture_ns``, ``send_ns``: by the edge's clock; ``received_ns``, ``shown_ns``: by this one
 - ``shown_ns``: when it was decoded and recorded (base), read by the classifier (roi), or taken in; 0: never, or
