@@ -31,6 +31,7 @@ from hvt_common.protocol.messages.envelope import (
     WIRE_VERSION,
     CorruptError,
     Message,
+    PackedMessage,
     UnknownVersionError,
     kinds,
 )
@@ -64,6 +65,7 @@ __all__ = [
     "Health",
     "Info",
     "Message",
+    "PackedMessage",
     "RoiHeader",
     "Status",
     "StillResult",

@@ -9,7 +9,8 @@ bit in either is always noticed.
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self, TypeVar
 
 import msgpack
@@ -22,6 +23,7 @@ __all__ = [
     "CorruptError",
     "Message",
     "Nested",
+    "PackedMessage",
     "UnknownVersionError",
     "kinds",
 ]
@@ -62,12 +64,7 @@ class Message:
 
         Raises ValueError when a field is out of its bounds or the whole longer than ``MAX_BYTES``.
         """
-        values = [kind.encode(getattr(self, name)) for name, kind in kinds(type(self))]
-        packed: bytes = msgpack.packb([WIRE_VERSION, *values, 2**32 - 1])
-        body = packed[:-_CRC_BYTES]
-        if len(packed) > self.MAX_BYTES or len(payload) > self.MAX_PAYLOAD:
-            raise ValueError(f"{type(self).__name__} of {len(packed)} bytes or its payload is too long")
-        return body + bytes((_CRC_TAG,)) + _checksum(body, payload).to_bytes(4, "big")
+        return PackedMessage.of(self).pack(payload)
 
     @classmethod
     def parse(cls, data: bytes, payload: bytes = b"") -> Self:
@@ -89,6 +86,47 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
+class PackedMessage:
+    """A message whose fields are packed once, for sending at any time: `with_fields` packs only what differs."""
+
+    message: type[Message]
+    fields: Mapping[str, bytes]
+    """By name, in the order of the wire."""
+
+    @classmethod
+    def of(cls, message: Message) -> PackedMessage:
+        """Raises ValueError when a field is out of its bounds."""
+        table = kinds(type(message))
+        return cls(
+            type(message), {name: _packed(kind.encode(getattr(message, name))) for name, kind in table}
+        )
+
+    def with_fields(self, **values: Any) -> PackedMessage:
+        """The same message with other values of these fields; what two fields promise together is not checked."""
+        table = dict(kinds(self.message))
+        changed = {name: _packed(table[name].encode(value)) for name, value in values.items()}
+        return replace(self, fields={**self.fields, **changed})
+
+    @property
+    def size_bytes(self) -> int:
+        """What `pack` returns, whatever the payload."""
+        return len(self._body()) + _CRC_BYTES
+
+    def pack(self, payload: bytes = b"") -> bytes:
+        """As `Message.pack`."""
+        body, message = self._body(), self.message
+        if len(body) + _CRC_BYTES > message.MAX_BYTES or len(payload) > message.MAX_PAYLOAD:
+            raise ValueError(
+                f"{message.__name__} of {len(body) + _CRC_BYTES} bytes or its payload is too long"
+            )
+        return body + bytes((_CRC_TAG,)) + _checksum(body, payload).to_bytes(4, "big")
+
+    def _body(self) -> bytes:
+        head: bytes = msgpack.Packer().pack_array_header(len(self.fields) + 2)
+        return b"".join((head, _packed(WIRE_VERSION), *self.fields.values()))
+
+
+@dataclass(frozen=True, slots=True)
 class Nested(Kind):
     """A field that holds another dataclass of `wire_field` fields, as an array without version and checksum."""
 
@@ -104,6 +142,11 @@ class Nested(Kind):
 
     def _describe(self) -> str:
         return self.of.__name__
+
+
+def _packed(value: Any) -> bytes:
+    packed: bytes = msgpack.packb(value)
+    return packed
 
 
 def _unpack(data: bytes, name: str) -> list[Any]:

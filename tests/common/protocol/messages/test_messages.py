@@ -6,6 +6,7 @@ import contextlib
 import re
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import msgpack
@@ -30,6 +31,7 @@ from hvt_common.protocol.messages import (
     Health,
     Info,
     Message,
+    PackedMessage,
     RoiHeader,
     Status,
     StillResult,
@@ -448,3 +450,21 @@ def test_the_document_lists_every_field_with_its_bounds(message):
         (str(number), name, kind.describe()) for number, (name, kind) in enumerate(kinds(message), first)
     ]
     assert [(number, name, bounds.strip()) for number, name, bounds in rows] == expected
+
+
+@given(st.integers(-I63, I63), st.integers(0, 255), st.integers(0, U32), st.binary(max_size=40))
+def test_a_header_packed_once_has_the_bytes_of_one_packed_anew(delay_ns, flags, sequence, payload):
+    """A still that is sent late, or again, would be refused by every ground; or the budget would count other bytes."""
+    packed = PackedMessage.of(ROI).with_fields(send_delay_ns=delay_ns, flags=flags, sequence=sequence)
+    anew = replace(ROI, send_delay_ns=delay_ns, flags=flags, sequence=sequence).pack(payload)
+    assert packed.pack(payload) == anew
+    assert packed.size_bytes == len(anew)
+
+
+def test_a_header_packed_once_keeps_the_bounds_of_its_fields():
+    """Bytes that no ground parses would cross the link."""
+    packed = PackedMessage.of(ROI)
+    with pytest.raises(ValueError, match="256"):
+        packed.with_fields(flags=256)
+    with pytest.raises(ValueError, match="too long"):
+        packed.pack(bytes(RoiHeader.MAX_PAYLOAD + 1))
