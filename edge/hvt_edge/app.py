@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from hvt_common.inference.detect import Detector
-from hvt_common.protocol.channels import EdgeKeys
+from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.protocol.messages import Feedback, Status
 from hvt_common.runtime.clock import SteadyClock
@@ -19,6 +19,7 @@ from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.doctor.duplicate_edge import refuse_same_id
 from hvt_common.transport.session import open_session
 from hvt_common.values import Fit
+from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.commands import Commands, Served
 from hvt_edge.control.link_control import LinkControl, wait_for_ground
@@ -26,7 +27,6 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.link.unacknowledged import Unacknowledged
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
@@ -34,6 +34,8 @@ from hvt_edge.source.closing import closing_on
 from hvt_edge.source.demo import check_truth, write_truth_of
 from hvt_edge.source.opening import Source, open_source
 from hvt_edge.status import make_info, make_status, status_text
+from hvt_edge.stills.outbox import Outbox
+from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.summary import EdgeRun, summary
 from hvt_edge.video.local_copy import BaseRecorder
@@ -57,6 +59,7 @@ from hvt_edge.wiring import (
     make_pacer,
     make_regions,
     make_split,
+    make_still_maker,
     warm_up_for,
 )
 
@@ -93,8 +96,11 @@ class Edge:
         self._ledger = Ledger(window_ns=round(config.window * SECOND_NS))
         self._keyframes = make_keyframes(config)
         self._inbox = FeedbackInbox()
-        unacked = None if self._lockstep else Unacknowledged()
-        self._link_control = LinkControl(make_pacer(config), unacked, keyframes=self._keyframes)
+        self._outbox = Outbox(reports=not self._lockstep)
+        self._in_flight = BaseInFlight()
+        self._link_control = LinkControl(
+            make_pacer(config), self._in_flight, self._outbox, keyframes=self._keyframes
+        )
         self._commands = Commands(
             config,
             session_id=self._session_id,
@@ -153,7 +159,7 @@ class Edge:
             lockstep=self._lockstep,
             wait_until=self._wait_until,
             pacer=link_control.pacer,
-            unacked=link_control.unacked,
+            in_flight=None if self._lockstep else self._in_flight,
         )
         reconfiguration = EncoderReconfiguration(
             config,
@@ -167,8 +173,10 @@ class Edge:
             config,
             session_id=self._session_id,
             live=source.live,
-            link=link,
+            has_subscriber=lambda: link.listens(Channel.BACKLOG),
             sender=sender,
+            in_flight=self._in_flight,
+            outbox=self._outbox,
             keyframes=self._keyframes,
             clock=self._clock,
             info=lambda: self._info(source, detector.class_names, self._clock()),
@@ -190,32 +198,45 @@ class Edge:
             backlog=backlog,
         )
         on_demand = make_on_demand(
-            config, view=view, class_names=detector.class_names, most_bytes=sender.most_still_bytes
+            config,
+            outbox=self._outbox,
+            view=view,
+            class_names=detector.class_names,
+            most_bytes=sender.most_still_bytes,
         )
         chooser = make_chooser(
             config,
+            outbox=self._outbox,
             view=view,
             class_names=detector.class_names,
             most_bytes=sender.most_still_bytes(),
             on_outcome=sender.outcome,
             observe=reconfiguration.observe,
-            asked=on_demand,
-            overdue=link_control.overdue_stills,
+            on_demand=on_demand,
         )
         reconfiguration.on_change = lambda: chooser.set_most_bytes(sender.most_still_bytes())
         self._commands.serve(
             Served(on_demand, reconfiguration, chooser, base_size=view.base_size, backlog=backlog)
         )
+        still_sender = StillSender(
+            self._outbox, maker=make_still_maker(config), transmitter=sender, backlog=backlog
+        )
+        stack.callback(lambda: still_sender.close(self._clock()))
         stills = StillStage(
             make_analyzer(config, detector=detector, view=view),
             chooser,
-            sender=sender,
+            outbox=self._outbox,
+            sender=still_sender,
+            transmitter=sender,
             keyframes=self._keyframes,
             reporter=TrackReporter(sender, session_id=self._session_id) if config.send_tracks else None,
-            backlog=backlog,
         )
         link_control.attach(
-            linked=link.heard, sender=sender, reconfiguration=reconfiguration, stills=stills, backlog=backlog
+            linked=link.heard,
+            sender=sender,
+            reconfiguration=reconfiguration,
+            stills=still_sender,
+            backlog=backlog,
         )
         return _Flow(base, stills, sender, link, reconfiguration)
 

@@ -102,7 +102,7 @@ def make_status(
             keyframes=keyframes.sent,
             tracks=stills.tracks,
             base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
-            still_queue=stills.waiting,
+            still_queue=stills.pending,
             encode_ms=counts.encode_ms if measured else 0.0,
             detect_ms=stills.perception_ms if measured else 0.0,
             feedback_age_ms=feedback_age_ms if measured else -1,
@@ -125,6 +125,6 @@ def status_text(
     sent = sum(ledger.outcomes("sent").values())
     return (
         f"{config.edge_id} {counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "
-        f"{bitrate_text(allowed_bps)}  {config.method}  stills {sent}, {stills.waiting} waiting  "
+        f"{bitrate_text(allowed_bps)}  {config.method}  stills {sent}, {stills.pending} waiting  "
         f"tracks {stills.tracks}  {link}"
     )

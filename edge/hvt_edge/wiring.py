@@ -12,10 +12,11 @@ from hvt_common.inference.tiles import tiled, warm_up_source
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.transport.zenoh_config import LinkSettings
-from hvt_common.values import Still, View
+from hvt_common.values import View
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.backlog.disk import Folder, check_folder, default_folder
-from hvt_edge.backlog.stage import BacklogStage, Link
+from hvt_edge.backlog.outage import BaseInFlight
+from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, parse_grid
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
@@ -26,13 +27,13 @@ from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.source.resample import BaseSize
-from hvt_edge.stills.gate import Gate
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
+from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.stills.policy.registry import method, tuning
-from hvt_edge.stills.scheduler import Asked, Chooser, ChooserSettings
-from hvt_edge.stills.suppression import Suppression
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.suppression import Gate, Suppression
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.least_rate import encoder_settings, least_base_bps, payload_bps
 from hvt_edge.video.quality_refresh import RefreshPlan, RegionPlan, RollingRefreshPlan, TrackRegions, combined
@@ -58,6 +59,7 @@ __all__ = [
     "make_pacer",
     "make_regions",
     "make_split",
+    "make_still_maker",
     "make_suppression",
     "warm_up_for",
 ]
@@ -147,19 +149,20 @@ def make_suppression(config: EdgeConfig) -> Suppression:
 def make_chooser(
     config: EdgeConfig,
     *,
+    outbox: Outbox,
     view: View,
     class_names: tuple[str, ...],
     most_bytes: int,
     on_outcome: Callable[[str, str], None],
     observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
-    asked: Asked | None = None,
-    overdue: Callable[[int], Sequence[tuple[Still, float]]] = lambda _now_ns: (),
+    on_demand: OnDemand | None = None,
 ) -> Chooser:
     """Method, suppression, queue and still stage; ``most_bytes`` is the largest payload the budget ever admits."""
     return Chooser(
         method(config.method, **tuning(config.tune)),
         suppression=make_suppression(config),
-        maker=_still_maker(config),
+        outbox=outbox,
+        maker=make_still_maker(config),
         memory=TrackMemory(padding=config.padding),
         view=view,
         class_names=class_names,
@@ -172,22 +175,32 @@ def make_chooser(
         ),
         on_outcome=on_outcome,
         observe=observe,
-        asked=asked,
-        overdue=overdue,
+        on_demand=on_demand,
     )
 
 
 def make_on_demand(
-    config: EdgeConfig, *, view: View, class_names: tuple[str, ...], most_bytes: Callable[[], int]
+    config: EdgeConfig,
+    *,
+    outbox: Outbox,
+    view: View,
+    class_names: tuple[str, ...],
+    most_bytes: Callable[[], int],
 ) -> OnDemand:
     """The ring of source frames, and who serves stills from it."""
     ring = FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS)))
     return OnDemand(
-        ring, maker=_still_maker(config), view=view, class_names=class_names, most_bytes=most_bytes
+        ring,
+        outbox=outbox,
+        maker=make_still_maker(config),
+        view=view,
+        class_names=class_names,
+        most_bytes=most_bytes,
     )
 
 
-def _still_maker(config: EdgeConfig) -> StillMaker:
+def make_still_maker(config: EdgeConfig) -> StillMaker:
+    """Codec, quality and fallback of stills."""
     codec = still_codec(config.still_codec)
     return StillMaker(
         codec=codec,
@@ -323,8 +336,10 @@ def make_backlog(
     *,
     session_id: int,
     live: bool,
-    link: Link,
+    has_subscriber: Callable[[], bool],
     sender: Transmitter,
+    in_flight: BaseInFlight,
+    outbox: Outbox,
     keyframes: KeyframePlan,
     clock: Callable[[], int],
     info: Callable[[], bytes],
@@ -338,8 +353,16 @@ def make_backlog(
         lambda: Folder(path, max_bytes=config.store, session_id=session_id, info=info, oldest_ns=oldest_ns),
         session_id=session_id,
         live=live,
-        link=link,
-        sender=sender,
+        link=BacklogLink(
+            has_subscriber=has_subscriber,
+            allowance_bytes=lambda now_ns, reserve: sender.backlog_allowance_bytes(now_ns, reserve=reserve),
+            send=lambda chunk, now_ns: sender.backlog(chunk, now_ns=now_ns),
+            round_trip_ns=lambda: sender.round_trip_ns,
+            total_bps=lambda: sender.total_bps,
+            stills_pending=lambda: outbox.any_pending,
+            stills_in_flight=lambda: outbox.unacknowledged,
+        ),
+        in_flight=in_flight,
         keyframes=keyframes,
         clock=clock,
         on_outcome=sender.outcome,

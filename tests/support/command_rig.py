@@ -26,8 +26,10 @@ from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
+from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.suppression import Suppression
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 
@@ -74,8 +76,11 @@ class Rig:
             wait_until=lambda _at: None,
         )
         maker = StillMaker(codec=StandIn(), fallback=JpegCodec()) if codec == "residual" else StillMaker()
+        self.outbox = Outbox()
+        self.maker = maker
         self.on_demand = OnDemand(
             FrameRing(RingSettings(max_age_ns=round(ring_s * 1e9))),
+            outbox=self.outbox,
             maker=maker,
             view=VIEW,
             class_names=("car",),
@@ -83,6 +88,7 @@ class Rig:
         )
         self.chooser = Chooser(
             method(name),
+            outbox=self.outbox,
             suppression=Suppression.for_cooldown(0),
             maker=maker,
             memory=TrackMemory(),
@@ -90,7 +96,7 @@ class Rig:
             class_names=("car",),
             settings=ChooserSettings(fps=15, most_bytes=self.sender.most_still_bytes()),
             on_outcome=lambda *outcome: self.outcomes.update([outcome]),
-            asked=self.on_demand,
+            on_demand=self.on_demand,
         )
         self.reconfiguration = EncoderReconfiguration(
             self.config, size=BASE, decimation=1, sender=self.sender, split=None
@@ -124,11 +130,12 @@ class Rig:
             tracks = tracks_at(self.tick, {5: self.box(self.tick)})
             seen = AnalyzedFrame(Frame(self.tick, self.now_ns, pixels, base), base, tracks, detected=others)
             self.budget.record_base(int(self.budget.base_step_bytes), now_ns=self.now_ns)
-            self.chooser.consider(seen, now_ns=self.now_ns, room_bytes=1000)
-            for still in self.chooser.stills(
-                now_ns=self.now_ns, room=lambda one: self.sender.still_room_bytes(self.now_ns, still=one)
+            self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)
+            sender = StillSender(self.outbox, maker=self.maker, transmitter=self.sender)
+            for coded in self.chooser.stills(
+                now_ns=self.now_ns, allowance=sender.allowance(self.now_ns, paced=True)
             ):
-                self.sender.still(still, now_ns=self.now_ns)
+                sender.put(coded, now_ns=self.now_ns, store=False)
 
     def ask(self, command: str, **arguments) -> ControlAnswer:
         """One request, a tenth of a second after the last, through the wire and back."""

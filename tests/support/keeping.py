@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from clips import START_NS, framed, smooth_pictures
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
@@ -22,15 +24,19 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.values import Still
 from hvt_edge.backlog.disk import Folder
-from hvt_edge.backlog.stage import BacklogStage
+from hvt_edge.backlog.outage import BaseInFlight
+from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.link_control import LinkControl
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.link.unacknowledged import Unacknowledged
 from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
+from hvt_edge.stills.crop_job import CropJob
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.outbox import Outbox, OutboxStill
+from hvt_edge.stills.sending import StillSender
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
@@ -38,7 +44,7 @@ from hvt_ground.backlog import BacklogAssembly
 from kept import INFO, S, opened
 from messages import feedback
 
-__all__ = ["FRAMES", "SIZE", "STILL", "Ground", "NoStills", "Out", "Rig"]
+__all__ = ["FRAMES", "SIZE", "STILL", "Ground", "Out", "Rig", "link_of"]
 
 SIZE = (320, 192)
 FRAMES = framed(smooth_pictures(150, size=SIZE))
@@ -128,10 +134,6 @@ class Out:
         if not self.dark:
             self.ground.take(row, payload, attachment or b"")
 
-    def listens(self, row) -> bool:
-        """Somebody does."""
-        return True
-
     @property
     def base(self) -> list[BaseHeader]:
         """Headers of the base stream."""
@@ -147,17 +149,6 @@ class Out:
         ]
 
 
-class NoStills:
-    """An edge that makes none; ``live_waits`` is what it says."""
-
-    def __init__(self, *, live_waits: bool = False) -> None:
-        self.live_waits = live_waits
-
-    def without_base(self, still: Still, *, now_ns: int) -> Still:
-        """It is."""
-        return still
-
-
 class Rig:
     """The frame loop's stages with a store. The clock stands still but for frames, and for `finish`."""
 
@@ -171,13 +162,14 @@ class Rig:
         info: Callable[[], bytes] = INFO.pack,
         session_id: int = 7,
         budget: tuple[int, int] = (800_000, 400_000),
+        maker: StillMaker | None = None,
     ) -> None:
         self.path, self.out, self.now_ns = folder, Out(), START_NS
         self.linked = True
         self.keyframes = KeyframePlan(KeyframeSettings(interval_ns=60 * S))
-        self.unacked, self.ledger = Unacknowledged(), Ledger()
+        self.in_flight, self.outbox, self.ledger = BaseInFlight(), Outbox(), Ledger()
         pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))) if adapt else None
-        self.link_control = LinkControl(pacer, self.unacked, keyframes=self.keyframes)
+        self.link_control = LinkControl(pacer, self.in_flight, self.outbox, keyframes=self.keyframes)
         self.sender = Transmitter(
             self.out,
             ledger=self.ledger,
@@ -187,21 +179,23 @@ class Rig:
             lockstep=False,
             wait_until=lambda _at_ns: None,
             pacer=pacer,
-            unacked=self.unacked,
+            in_flight=self.in_flight,
         )
         self.outcomes: list[tuple[str, str]] = []
         self.backlog = BacklogStage(
             lambda: Folder(folder, max_bytes=50_000_000, session_id=session_id, info=info),
             session_id=session_id,
             live=live,
-            link=self.out,
-            sender=self.sender,
+            link=link_of(self.sender, self.outbox),
+            in_flight=self.in_flight,
             keyframes=self.keyframes,
             clock=lambda: self.now_ns,
             on_outcome=lambda *outcome: self.outcomes.append(outcome),
         )
         config = check(EdgeConfig(source="demo", size=SIZE, budget=budget[0], preset="ultrafast"))
-        self.stills = NoStills()
+        self.stills = StillSender(
+            self.outbox, maker=maker or StillMaker(), transmitter=self.sender, backlog=self.backlog
+        )
         self.link_control.attach(
             linked=lambda: self.linked,
             sender=self.sender,
@@ -249,9 +243,20 @@ class Rig:
 
     def still(self, sequence: int, *, utility: float = 1.0) -> None:
         """One goes out."""
-        still = _numbered(STILL, sequence)
-        self.sender.still(still, now_ns=self.now_ns, utility=utility)
-        self.backlog.note_utility(still, utility)
+        one = _pending(utility, self.now_ns)
+        self.outbox.sent(one, replace(STILL, sequence=sequence), now_ns=self.now_ns)
+        self.stills.put(one, now_ns=self.now_ns, store=False)
+
+    def store(self, *, utility: float = 1.0) -> None:
+        """One is coded while the link is away, or as if it were."""
+        one = _pending(utility, self.now_ns)
+        self.outbox.stored(one, STILL)
+        self.stills.put(one, now_ns=self.now_ns, store=True)
+
+    def close(self) -> None:
+        """The run ends."""
+        self.stills.close(self.now_ns)
+        self.backlog.close()
 
     def finish(self, *, reports: bool = True) -> list[str]:
         """After the last frame, in a tenth of a second a turn; what the user is told."""
@@ -272,7 +277,7 @@ class Rig:
 
     def kept(self) -> list:
         """What another start of the edge finds."""
-        self.backlog.close()
+        self.close()
         with opened(self.path, session_id=8) as folder:
             return [
                 unit
@@ -282,11 +287,25 @@ class Rig:
 
     def stored_stills(self) -> dict[int, str]:
         """Numbers and file names of the stills that another start of the edge finds."""
-        self.backlog.close()
+        self.close()
         with opened(self.path, session_id=8) as folder:
             return {entry.number: entry.path.name for entry in folder.best_stills()}
 
 
-def _numbered(still: Still, sequence: int) -> Still:
-    """The same of another number."""
-    return replace(still, sequence=sequence)
+def link_of(sender: Transmitter, outbox: Outbox) -> BacklogLink:
+    """As `hvt_edge.wiring` gives it to the backlog, with a ground that subscribes."""
+    return BacklogLink(
+        has_subscriber=lambda: True,
+        allowance_bytes=lambda now_ns, reserve: sender.backlog_allowance_bytes(now_ns, reserve=reserve),
+        send=lambda chunk, now_ns: sender.backlog(chunk, now_ns=now_ns),
+        round_trip_ns=lambda: sender.round_trip_ns,
+        total_bps=lambda: sender.total_bps,
+        stills_pending=lambda: outbox.any_pending,
+        stills_in_flight=lambda: outbox.unacknowledged,
+    )
+
+
+def _pending(utility: float, now_ns: int) -> OutboxStill:
+    """A still about to be coded."""
+    job = CropJob(STILL, np.zeros((4, 4, 3), np.uint8), None, None)
+    return OutboxStill(job, None, utility, now_ns)

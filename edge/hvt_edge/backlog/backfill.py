@@ -74,14 +74,14 @@ class Backfill:
         self._data: tuple[Key, bytes] | None = None
         self._informed: set[int] = set()
         """Sessions whose facts the ground has."""
-        self._asked: set[int] = set()
+        self._requested: set[int] = set()
         """Sessions whose facts it asked for."""
-        self._aside: set[Key] = set()
+        self._refused: set[Key] = set()
         """What the present ground does not take; another is asked again, and so is any after the next start."""
         self._acknowledged: dict[Key, int] = {}
         """What the present ground has said it has of objects that are not done."""
         self._receiver_id: int | None = None
-        self._heard_ns = 0
+        self._reported_ns = 0
         self.video_first = False
         """Somebody asked for the video."""
         self.acknowledged_bytes = 0
@@ -96,18 +96,18 @@ class Backfill:
 
     # What comes back
 
-    def hear(
+    def on_acknowledged(
         self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int, now_ns: int
     ) -> None:
         """Take in what a ground says it has. One ground counts, until it says nothing of it for a while."""
         if receiver_id != self._receiver_id:
-            if self._receiver_id is not None and now_ns - self._heard_ns < _OTHER_RECEIVER_NS:
+            if self._receiver_id is not None and now_ns - self._reported_ns < _OTHER_RECEIVER_NS:
                 return
             self._receiver_id = receiver_id
             self._informed.clear()
-            self._aside.clear()
+            self._refused.clear()
             self._acknowledged.clear()
-        self._heard_ns = now_ns
+        self._reported_ns = now_ns
         for acknowledged_range in acknowledged_ranges:
             key = (
                 acknowledged_range.session_id,
@@ -117,7 +117,7 @@ class Backfill:
             transfer = self._line.get(key)
             if transfer is not None:
                 self._advance(transfer, acknowledged_range.acknowledged_bytes, now_ns)
-            elif key in self._aside:
+            elif key in self._refused:
                 self._late(key, acknowledged_range.acknowledged_bytes)
             elif (
                 key[1:] == (BacklogKind.INFO, 0)
@@ -125,14 +125,14 @@ class Backfill:
                 and self._folder.find(key) is not None
             ):
                 self._informed.discard(acknowledged_range.session_id)
-                self._asked.add(acknowledged_range.session_id)
+                self._requested.add(acknowledged_range.session_id)
 
     def _late(self, key: Key, acknowledged_bytes: int) -> None:
         """The ground had it after all when it was put aside."""
         entry = self._folder.find(key)
         data = None if entry is None else self._folder.read(entry)
         if entry is not None and data is not None and acknowledged_bytes == len(data):
-            self._aside.discard(key)
+            self._refused.discard(key)
             self._folder.remove(entry)
             self._on_done(entry)
 
@@ -144,7 +144,7 @@ class Backfill:
 
     def _forget(self) -> None:
         """Keep nothing of objects that are not here any more."""
-        self._aside = {key for key in self._aside if self._folder.find(key) is not None}
+        self._refused = {key for key in self._refused if self._folder.find(key) is not None}
         here = {
             key: acknowledged_range
             for key, acknowledged_range in self._acknowledged.items()
@@ -234,11 +234,11 @@ class Backfill:
                 self.given_up,
             )
         if transfer.entry.kind is BacklogKind.INFO:
-            self._asked.discard(transfer.entry.session_id)
+            self._requested.discard(transfer.entry.session_id)
             self._informed.add(transfer.entry.session_id)  # what follows shows whether it was needed
         else:  # only a ground that has it, age or want of room may cost an object its place
             self._forget()
-            self._aside.add(transfer.entry.key)
+            self._refused.add(transfer.entry.key)
 
     def _current(self, now_ns: int) -> _Transfer | None:
         """The object of which pieces are cut now: one that is not all on its way, or the next one."""
@@ -258,17 +258,17 @@ class Backfill:
 
     def _open_entries(self) -> Iterator[Entry]:
         """Those that may begin now, in their order."""
-        for session_id in sorted(self._asked - self._informed):
+        for session_id in sorted(self._requested - self._informed):
             info = self._folder.info_of(session_id)
             if info is None:
-                self._asked.discard(session_id)
+                self._requested.discard(session_id)
             elif info.key not in self._line:
                 yield info
         stills, video = self._folder.best_stills(), self._folder.newest_segments()
         if self.video_first and not self._folder.segments:
             self.video_first = False
         for entry in chain(video, stills) if self.video_first else chain(stills, video):
-            if entry.key in self._line or entry.key in self._aside:
+            if entry.key in self._line or entry.key in self._refused:
                 continue
             info = self._folder.info_of(entry.session_id)
             if entry.session_id == self._session_id or entry.session_id in self._informed or info is None:

@@ -37,7 +37,6 @@ from hvt_edge.backlog.entry import (
     Key,
     base_entry,
     base_name,
-    blocks,
     found,
     info_entry,
     object_of,
@@ -46,8 +45,7 @@ from hvt_edge.backlog.entry import (
     unlink,
     write_whole,
 )
-from hvt_edge.backlog.open_segment import SEGMENT_NS, OpenSegment
-from hvt_edge.backlog.segment import DamagedError
+from hvt_edge.backlog.segment import SEGMENT_NS, DamagedError, OpenSegment, blocks
 
 __all__ = ["SEGMENT_NS", "Folder", "check_folder", "default_folder"]
 

@@ -21,16 +21,14 @@ from hvt_common.protocol.messages import (
     pack_backlog_units,
     parse_backlog_still,
 )
-from hvt_edge.backlog.segment import DamagedError, index_of, last_ns, read_segment
+from hvt_edge.backlog.segment import DamagedError, blocks, index_of, last_ns, read_segment
 
 __all__ = [
-    "BLOCK_BYTES",
     "FIRST_STORED",
     "Entry",
     "Key",
     "base_entry",
     "base_name",
-    "blocks",
     "found",
     "info_entry",
     "object_of",
@@ -42,8 +40,6 @@ __all__ = [
 
 FIRST_STORED = 2**31
 """Stills that are kept for later have numbers of their own: those that are sent have no holes then."""
-BLOCK_BYTES = 4096
-"""Files take whole blocks, as on most disks."""
 _SECOND_NS = 1_000_000_000
 _HALF_LIFE_NS = 600 * _SECOND_NS
 _LEAST_STRENGTH = -60.0
@@ -142,11 +138,6 @@ def base_entry(path: Path, session_id: int, first_frame: int, capture_ns: int) -
     return Entry(
         session_id, BacklogKind.BASE, first_frame, capture_ns, path, size, max(0, last_ns(path) - capture_ns)
     )
-
-
-def blocks(size_bytes: int) -> int:
-    """The room that a file of so many bytes takes."""
-    return -(-size_bytes // BLOCK_BYTES) * BLOCK_BYTES
 
 
 def write_whole(path: Path, data: bytes) -> None:

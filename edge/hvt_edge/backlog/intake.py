@@ -64,13 +64,13 @@ class Intake:
         self._most = most
         self._changed = threading.Condition()
         self._items: deque[IntakeUnit | IntakeStill | EndSegment] = deque()
-        self._waiting = 0
+        self._queued = 0
         self._interrupted = self._video_first = self._woken = self._closed = False
         self._acknowledged_ranges: OrderedDict[tuple[int, Key], AcknowledgedRange] = OrderedDict()
 
     def __len__(self) -> int:
         """Frames and stills that wait."""
-        return self._waiting
+        return self._queued
 
     @property
     def ended(self) -> bool:
@@ -83,10 +83,10 @@ class Intake:
     def offer(self, item: IntakeUnit | IntakeStill) -> bool:
         """Hand over something to be kept; False where there is no room for it."""
         with self._changed:
-            if self._closed or self._waiting >= self._most:
+            if self._closed or self._queued >= self._most:
                 return False
             self._items.append(item)
-            self._waiting += 1
+            self._queued += 1
             self._changed.notify()
         return True
 
@@ -103,13 +103,13 @@ class Intake:
             self._interrupted = True
             self._wake()
 
-    def ask_for_video(self) -> None:
+    def request_video(self) -> None:
         """Somebody wants the video first."""
         with self._changed:
             self._video_first = True
             self._wake()
 
-    def hear(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
+    def on_acknowledged(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
         """A ground says what it has; the newest counts, and one that is lost comes again."""
         with self._changed:
             for acknowledged_range in acknowledged_ranges:
@@ -159,5 +159,5 @@ class Intake:
             self._interrupted = self._video_first = self._woken = False
             self._acknowledged_ranges.clear()
             item = self._items.popleft() if self._items else None
-            self._waiting -= item is not None and not isinstance(item, EndSegment)
+            self._queued -= item is not None and not isinstance(item, EndSegment)
             return news, item

@@ -1,20 +1,26 @@
-"""Whether the link is away, so that what the camera sees is kept instead of sent. Pure: time is an argument.
+"""Whether the link is away, and which frames it took with it. Time is an argument.
 
-Two signs: nobody listens any more (Zenoh says so some seconds after the link broke), or a ground that used to report
-is silent (it reports twice a second whatever it hears, so this is noticed much sooner).
+Two signs that it is away: nobody subscribes any more (Zenoh notices that some seconds after the link broke), or a
+ground that used to report is silent (it reports twice a second whatever it receives, so this is noticed much sooner).
 """
 
 from __future__ import annotations
 
-__all__ = ["SILENCE_NS", "Outage"]
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+from hvt_common.values import AccessUnit
+
+__all__ = ["SILENCE_NS", "BaseInFlight", "InFlightSettings", "Outage"]
 
 _MS = 1_000_000
 _SECOND_NS = 1_000_000_000
 SILENCE_NS = 1_500 * _MS
 """Three reports in a row that did not come."""
 _LEFT_NS = 15 * _SECOND_NS
-"""Who is silent for so long on a link that Zenoh still has, has left; others may listen that never report. The same
-as in `hvt_edge.link.pacer`."""
+"""Who is silent for so long on a link that Zenoh still has, has left; others may subscribe
+that never report. The same as in `hvt_edge.link.pacer`."""
 
 
 class Outage:
@@ -22,34 +28,91 @@ class Outage:
 
     def __init__(self, *, live: bool) -> None:
         self._live = live
-        self._listened = False
+        self._subscribed = False
         self._linked = False
         self._reported_ns: int | None = None
-        self.heard = False
+        self.reports = False
         """Whether a ground ever reported on this session: of who never does nobody knows what has arrived."""
 
     def reported(self, now_ns: int) -> None:
         """A ground has reported on this session (any thread)."""
         self._reported_ns = now_ns
-        self.heard = True
+        self.reports = True
 
-    def hears(self, now_ns: int) -> bool:
+    def reports_now(self, now_ns: int) -> bool:
         """Whether a ground reports now."""
         reported_ns = self._reported_ns
         return reported_ns is not None and now_ns - reported_ns <= SILENCE_NS
 
     def offline(self, now_ns: int, *, linked: bool) -> bool:
-        """Whether the link is away; asked before each frame. ``linked``: somebody listens, by what Zenoh knows.
+        """Whether the link is away; asked before each frame. ``linked``: somebody subscribes, by what Zenoh knows.
 
-        Before anybody ever listened, only a live source is kept: a clip plays again.
+        Before anybody ever subscribed, only a live source is kept: a clip plays again.
         """
         if not linked:
             self._linked = False
-            return self._listened or self._live
+            return self._subscribed or self._live
         if not self._linked:  # a new path: the silence of before says nothing about it
-            self._linked = self._listened = True
+            self._linked = self._subscribed = True
             self._reported_ns = None
         reported_ns = self._reported_ns
         if reported_ns is not None and now_ns - reported_ns > _LEFT_NS:
             self._reported_ns = reported_ns = None
         return reported_ns is not None and now_ns - reported_ns > SILENCE_NS
+
+
+@dataclass(frozen=True, slots=True)
+class InFlightSettings:
+    """Bounds of what is held for an outage that may come."""
+
+    max_age_ns: int = 4 * _SECOND_NS
+    max_bytes: int = 2 * 2**20
+
+
+class BaseInFlight:
+    """Access units that were sent and that no report has named; the oldest leaves first. Thread-safe."""
+
+    def __init__(self, settings: InFlightSettings = InFlightSettings()) -> None:
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._units: deque[tuple[int, int, AccessUnit]] = deque()
+        """(sequence, time of sending, unit)."""
+        self._size_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._units)
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the access units."""
+        return self._size_bytes
+
+    def sent(self, sequence: int, unit: AccessUnit, *, now_ns: int) -> None:
+        """An access unit goes out."""
+        settings = self._settings
+        with self._lock:
+            self._units.append((sequence, now_ns, unit))
+            self._size_bytes += len(unit.data)
+            while self._units and (
+                self._size_bytes > settings.max_bytes or now_ns - self._units[0][1] > settings.max_age_ns
+            ):
+                self._forget()
+
+    def on_report(self, base_sequence: int) -> bool:
+        """The primary receiver has come as far as this; return whether that is news."""
+        with self._lock:
+            before = len(self._units)
+            while self._units and self._units[0][0] <= base_sequence:
+                self._forget()
+            return len(self._units) < before
+
+    def take(self) -> list[AccessUnit]:
+        """Return and forget all that may be lost, in order."""
+        with self._lock:
+            units = [unit for _, _, unit in self._units]
+            self._units.clear()
+            self._size_bytes = 0
+        return units
+
+    def _forget(self) -> None:
+        self._size_bytes -= len(self._units.popleft()[2].data)

@@ -18,16 +18,32 @@ from typing import BinaryIO
 import av
 import av.error
 
-from hvt_common.protocol.messages import BacklogUnit
+from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogUnit
 from hvt_common.values import AccessUnit
 
-__all__ = ["DamagedError", "SegmentWriter", "index_of", "last_ns", "read_segment"]
+__all__ = [
+    "BLOCK_BYTES",
+    "SEGMENT_NS",
+    "DamagedError",
+    "OpenSegment",
+    "SegmentWriter",
+    "blocks",
+    "index_of",
+    "last_ns",
+    "read_segment",
+]
 
 _RECORD = struct.Struct("<IQIIB")
 """Frame index, capture time (ns), CRC-32 and size of the frame with start codes of four bytes, keyframe."""
 _LONG, _SHORT = b"\0\0\0\1", b"\0\0\1"
 _PARAMETER_SETS = (32, 33, 34)
 """NAL unit types of HEVC: VPS, SPS, PPS. x265 puts the long start code before these and the first NAL of a frame."""
+SEGMENT_NS = 10_000_000_000
+"""A keyframe is wanted when a segment is so long: eviction and sending go by segments."""
+_MOST_SEGMENT_BYTES = MAX_BACKLOG_BYTES - 512 * 1024
+_MOST_SEGMENT_UNITS = 2400
+BLOCK_BYTES = 4096
+"""Files take whole blocks, as on most disks."""
 
 
 class DamagedError(Exception):
@@ -86,6 +102,50 @@ class SegmentWriter:
             self._index.close()
 
 
+class OpenSegment:
+    """The segment that is being written, and which unit begins the next.
+
+    Raises OSError or FFmpegError where the disk takes no more.
+    """
+
+    def __init__(self, path: Path, first: AccessUnit, parameter_sets: bytes) -> None:
+        self.path = path
+        self.first = first
+        self._last = (first.frame_index - 1, first.capture_ns - 1)
+        self._size_bytes = self._units = 0
+        self._writer = SegmentWriter(path, parameter_sets=parameter_sets)
+
+    @property
+    def span_ns(self) -> int:
+        """From its first frame to its last."""
+        return max(0, self._last[1] - self.first.capture_ns)
+
+    @property
+    def disk_bytes(self) -> int:
+        """About."""
+        return 2 * BLOCK_BYTES + blocks(self._size_bytes)
+
+    def ends_before(self, unit: AccessUnit) -> bool:
+        """Whether this unit begins another segment."""
+        if unit.frame_index <= self._last[0] or unit.capture_ns <= self._last[1]:
+            return True
+        if self._units >= _MOST_SEGMENT_UNITS or self._size_bytes + len(unit.data) > _MOST_SEGMENT_BYTES:
+            return True
+        long = unit.capture_ns - self.first.capture_ns >= SEGMENT_NS // 2
+        return unit.keyframe and (long or not self.first.keyframe)
+
+    def write(self, unit: AccessUnit) -> None:
+        """Append."""
+        self._writer.write(unit)
+        self._last = (unit.frame_index, unit.capture_ns)
+        self._size_bytes += len(unit.data) + 64  # with what Matroska and the index add
+        self._units += 1
+
+    def close(self) -> None:
+        """End it."""
+        self._writer.close()
+
+
 def read_segment(video: Path) -> tuple[BacklogUnit, ...]:
     """The frames of a segment, bytes as x265 made them, up to the first that is missing or damaged.
 
@@ -122,6 +182,11 @@ def last_ns(video: Path) -> int:
         index.seek((count - 1) * _RECORD.size)
         capture_ns: int = _RECORD.unpack(index.read(_RECORD.size))[1]
         return capture_ns
+
+
+def blocks(size_bytes: int) -> int:
+    """The disk space that a file of so many bytes takes."""
+    return -(-size_bytes // BLOCK_BYTES) * BLOCK_BYTES
 
 
 def _nals(data: bytes) -> list[bytes]:

@@ -11,7 +11,6 @@ import logging
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, pack_backlog_still
 from hvt_common.runtime.priority import lower_priority
@@ -19,14 +18,13 @@ from hvt_edge.backlog.backfill import Backfill, Chunk
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.entry import Entry
 from hvt_edge.backlog.intake import EndSegment, Intake, IntakeStill, IntakeUnit, News
-from hvt_edge.backlog.outgoing import Outgoing
 
-__all__ = ["ChunkSender", "IntakeStill", "IntakeUnit", "StoreNumbers", "StoreWorker"]
+__all__ = ["ChunkAllowance", "ChunkThread", "IntakeStill", "IntakeUnit", "StoreNumbers", "StoreWorker"]
 
 _log = logging.getLogger(__name__)
 
 _QUEUE = 512
-_TICK_S = 0.02
+_BUSY_S = 0.02
 _IDLE_S = 0.25
 _CLOSE_S = 5.0
 _LAST_CHUNK_S = 1.0
@@ -36,34 +34,13 @@ _TRICKLE_SHARE = 1 / 40
 _SECOND_NS = 1_000_000_000
 
 
-class ChunkSender(Protocol):
-    """How pieces leave the edge."""
+@dataclass(frozen=True, slots=True)
+class ChunkAllowance:
+    """What a chunk may have now."""
 
-    def may_send(self, now_ns: int) -> bool:
-        """Whether the link is there and steady."""
-        ...
-
-    def live_waits(self) -> bool:
-        """Whether a live still waits for room."""
-        ...
-
-    def room_bytes(self, now_ns: int, *, live_waits: bool) -> int:
-        """Payload that a piece may have now."""
-        ...
-
-    def send(self, chunk: Chunk, *, now_ns: int) -> int:
-        """Send it; return its line bytes, 0 where its room is gone. May block while the link is full."""
-        ...
-
-    @property
-    def round_trip_ns(self) -> int:
-        """Of the link."""
-        ...
-
-    @property
-    def total_bps(self) -> int:
-        """What may be sent in all."""
-        ...
+    limit_bytes: int
+    trickle: bool = False
+    """Live stills are pending: a little goes all the same, with pauses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,21 +76,26 @@ class StoreWorker:
     def __init__(
         self,
         open_folder: Callable[[], Folder],
-        sends: ChunkSender,
         *,
         session_id: int,
         clock: Callable[[], int],
+        allowance: Callable[[int], ChunkAllowance | None],
+        send: Callable[[Chunk], int],
+        round_trip_ns: Callable[[], int],
+        total_bps: Callable[[], int],
         on_sent: Callable[[Entry], None] = lambda _entry: None,
         close_s: float = _CLOSE_S,
     ) -> None:
         self._open_folder = open_folder
-        self._sends = sends
+        self._allowance = allowance
+        self._round_trip_ns = round_trip_ns
+        self._total_bps = total_bps
         self._session_id = session_id
         self._clock = clock
         self._on_sent = on_sent
         self._close_s = close_s
         self._intake = Intake(_QUEUE)
-        self._outgoing = Outgoing(lambda chunk: sends.send(chunk, now_ns=clock()), on_done=self._intake.wake)
+        self._sending = ChunkThread(send, on_done=self._intake.wake)
         self._folder: Folder | None = None
         self._backfill: Backfill | None = None
         self._sent_stills = 0
@@ -146,9 +128,9 @@ class StoreWorker:
             return False
         return True
 
-    def hear(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
+    def on_acknowledged(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
         """A ground says what it has. One that is not heard comes again."""
-        self._intake.hear(acknowledged_ranges, receiver_id=receiver_id)
+        self._intake.on_acknowledged(acknowledged_ranges, receiver_id=receiver_id)
 
     def end_segment(self) -> None:
         """The link is back: what was kept may be sent."""
@@ -160,10 +142,10 @@ class StoreWorker:
 
     def video_first(self) -> None:
         """Somebody asked for the video."""
-        self._intake.ask_for_video()
+        self._intake.request_video()
 
     @property
-    def waiting(self) -> int:
+    def queued(self) -> int:
         """Frames and stills that are not on disk yet."""
         return len(self._intake)
 
@@ -189,7 +171,7 @@ class StoreWorker:
 
     def send_no_more(self) -> None:
         """Let nothing go out from now on, so that an account can be closed; what comes is kept all the same."""
-        self._outgoing.close(_LAST_CHUNK_S)
+        self._sending.close(_LAST_CHUNK_S)
 
     def close(self) -> None:
         """Write what waits, end the files, join the thread. A disk that hangs costs what waits, and a warning."""
@@ -200,9 +182,9 @@ class StoreWorker:
                 "the disk of --store-folder takes longer than %g s: %d frames and stills that wait for it are not "
                 "kept",
                 self._close_s,
-                self.waiting,
+                self.queued,
             )
-        self._outgoing.close(self._close_s)
+        self._sending.close(self._close_s)
         self.check()
 
     # In the thread
@@ -245,7 +227,7 @@ class StoreWorker:
 
     def _patience_s(self) -> float:
         busy = self._folder is not None and (self._folder.stills or self._folder.segments)
-        return _TICK_S if busy else _IDLE_S
+        return _BUSY_S if busy else _IDLE_S
 
     def _note(self, news: News, backfill: Backfill) -> None:
         if news.interrupted:
@@ -253,7 +235,7 @@ class StoreWorker:
         if news.video_first:
             backfill.video_first = True
         for receiver_id, acknowledged_range in news.acknowledged_ranges:
-            backfill.hear([acknowledged_range], receiver_id=receiver_id, now_ns=self._clock())
+            backfill.on_acknowledged([acknowledged_range], receiver_id=receiver_id, now_ns=self._clock())
 
     def _backlog(self, folder: Folder, item: IntakeUnit | IntakeStill) -> None:
         if self.failed:
@@ -291,26 +273,92 @@ class StoreWorker:
         )
 
     def _send_chunk(self, backfill: Backfill) -> None:
-        done = self._outgoing.take()
+        done = self._sending.take()
         if done is not None and not done[1]:
             backfill.take_back(done[0])  # and wait a moment: others send
             return
         now_ns = self._clock()
         if done is not None:
-            pause_ns = 8 * _SECOND_NS * done[1] / (_TRICKLE_SHARE * self._sends.total_bps)
+            pause_ns = 8 * _SECOND_NS * done[1] / (_TRICKLE_SHARE * self._total_bps())
             self._trickle_ns = now_ns + round(pause_ns)
-        if self._outgoing.busy or not self._sends.may_send(now_ns):
+        allowance = None if self._sending.busy else self._allowance(now_ns)
+        if allowance is None or (allowance.trickle and now_ns < self._trickle_ns):
             return
-        live_waits = self._sends.live_waits()
-        if live_waits and now_ns < self._trickle_ns:
-            return
-        room_bytes = self._sends.room_bytes(now_ns, live_waits=live_waits)
-        chunk = backfill.next_chunk(room_bytes, now_ns=now_ns, round_trip_ns=self._sends.round_trip_ns)
+        chunk = backfill.next_chunk(allowance.limit_bytes, now_ns=now_ns, round_trip_ns=self._round_trip_ns())
         if chunk is not None:
-            self._outgoing.put(chunk)
+            self._sending.put(chunk)
 
     def _note_done(self, entry: Entry) -> None:
         if entry.kind is BacklogKind.STILL:
             self._sent_stills += 1
         self._sent_ns += entry.span_ns
         self._on_sent(entry)
+
+
+class ChunkThread:
+    """Sends one chunk at a time in a thread of its own: a link that is full for seconds must not hold up the disk.
+
+     `put` and `take` from one thread; ``on_done()`` is called in its own after each chunk.
+
+    ``send(chunk)`` returns the line bytes, 0 where it was not sent; it may block.
+    """
+
+    def __init__(self, send: Callable[[Chunk], int], *, on_done: Callable[[], None]) -> None:
+        self._send = send
+        self._on_done = on_done
+        self._changed = threading.Condition()
+        self._chunk: Chunk | None = None
+        self._done: tuple[Chunk, int] | None = None
+        self._closed = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="hvt-backlog", daemon=True)
+        self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a chunk is being sent, or was sent and not taken note of."""
+        return self._chunk is not None or self._done is not None
+
+    def put(self, chunk: Chunk) -> None:
+        """Send this; only where it is not `busy`."""
+        assert not self.busy, "one at a time"
+        with self._changed:
+            self._chunk = chunk
+            self._changed.notify()
+
+    def take(self) -> tuple[Chunk, int] | None:
+        """Return the chunk that was sent last and its line bytes, once; None while there is none.
+
+        Raises whatever ``send`` has raised.
+        """
+        with self._changed:
+            if self._error is not None:
+                raise self._error
+            done, self._done = self._done, None
+        return done
+
+    def close(self, timeout_s: float) -> None:
+        """Send no more; what is being sent has so long to go."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join(timeout=timeout_s)
+
+    def _run(self) -> None:
+        lower_priority()
+        while (chunk := self._next()) is not None:
+            try:
+                line_bytes = self._send(chunk)
+            except BaseException as error:  # noqa: BLE001 - handed to the disk thread, which hands it on
+                with self._changed:
+                    self._error = error
+                self._on_done()
+                return
+            with self._changed:
+                self._done, self._chunk = (chunk, line_bytes), None
+            self._on_done()
+
+    def _next(self) -> Chunk | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._chunk is not None or self._closed)
+            return None if self._closed else self._chunk

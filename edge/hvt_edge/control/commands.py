@@ -20,7 +20,7 @@ from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import LEAST_FPS, REGIMES, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframePlan
 from hvt_edge.stills.on_demand import OnDemand
-from hvt_edge.stills.on_demand_crop import Ask, RefusedError
+from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser
 from hvt_edge.video.least_rate import least_base_bps
@@ -158,7 +158,7 @@ class Commands:
         return _Said()
 
     def _still(self, arguments: Arguments) -> _Said:
-        number, frame_index = self._parts().on_demand.ask(_ask(arguments))
+        number, frame_index = self._parts().on_demand.request(_on_demand_request(arguments))
         return _Said(still_request=number, frame_index=frame_index)
 
     def _still_outcome(self, arguments: Arguments) -> _Said:
@@ -246,7 +246,7 @@ def _check_base(config: EdgeConfig, size: tuple[int, int]) -> None:
         )
 
 
-def _ask(arguments: Arguments) -> Ask:
+def _on_demand_request(arguments: Arguments) -> OnDemandRequest:
     reader = _Reader("still", arguments)
     track = reader.optional("track", 0, _U32)
     box = [reader.optional(name, -_FAR_PX, _FAR_PX) for name in ("x", "y", "w", "h")]
@@ -261,7 +261,7 @@ def _ask(arguments: Arguments) -> Ask:
         raise RefusedError("a still is of a track or of a box, not of both")
     if at_ms is not None and frame is not None:
         raise RefusedError("a still is of a frame or of a time, not of both")
-    return Ask(
+    return OnDemandRequest(
         track_id=track,
         box_xywh_px=(given[0], given[1], given[2], given[3]) if given else None,
         frame_index=frame,

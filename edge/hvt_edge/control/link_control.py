@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from hvt_common.protocol.messages import Feedback
-from hvt_common.values import Still
-from hvt_edge.backlog.stage import BacklogStage, Stills
+from hvt_edge.backlog.outage import BaseInFlight
+from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.link.unacknowledged import Unacknowledged
 from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.stills.outbox import Outbox
+from hvt_edge.stills.sending import StillSender
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 
 __all__ = ["LinkControl", "wait_for_ground"]
@@ -23,23 +25,25 @@ _MOST_WAIT_NS = 100_000_000
 
 
 class LinkControl:
-    """One for each run: `hear` in the link's thread, `overdue_stills` in the stills', all else in the frame loop.
+    """One for each run: `hear` in the link's thread, all else in the frame loop.
 
-    ``pacer`` is None without ``--adapt``, ``unacked`` in lockstep: when reports come must not decide there on what is
-    sent. `attach` before the first frame; reports may come before that.
+    ``pacer`` is None without ``--adapt``. `attach` before the first frame; reports may come before that.
     """
 
     def __init__(
-        self, pacer: Pacer | None, unacked: Unacknowledged | None, *, keyframes: KeyframePlan
+        self, pacer: Pacer | None, in_flight: BaseInFlight, outbox: Outbox, *, keyframes: KeyframePlan
     ) -> None:
         self.pacer = pacer
-        self.unacked = unacked
+        self.in_flight = in_flight
+        self.outbox = outbox
+        self._primary = PrimaryReceiver()
         self.backlog: BacklogStage | None = None
         """Who keeps what the link cannot carry away; None where nobody does."""
         self._keyframes = keyframes
         self._linked: Callable[[], bool] = lambda: False
         self._sender: Transmitter | None = None
         self._reconfiguration: EncoderReconfiguration | None = None
+        self._stills: StillSender | None = None
 
     def attach(
         self,
@@ -47,7 +51,7 @@ class LinkControl:
         linked: Callable[[], bool],
         sender: Transmitter,
         reconfiguration: EncoderReconfiguration,
-        stills: Stills,
+        stills: StillSender,
         backlog: BacklogStage | None,
     ) -> None:
         """What it decides for. ``linked()`` tells whether a ground listens."""
@@ -57,13 +61,12 @@ class LinkControl:
             reconfiguration,
             backlog,
         )
-        if backlog is not None:
-            backlog.attend(stills)
+        self._stills = stills
 
     def before_frame(self, now_ns: int) -> None:
         """What the link carries decides on budget, base rate, keyframe, and on whether anything is sent at all."""
         linked = self._linked()
-        offline = self.backlog is not None and self.backlog.follow(now_ns, linked=linked)
+        offline = self.backlog is not None and self.backlog.before_frame(now_ns, linked=linked)
         if self.pacer is None:
             return
         back = self.pacer.link(linked, now_ns=now_ns)
@@ -89,9 +92,11 @@ class LinkControl:
     def finish(self, *, stop: threading.Event, note: Callable[[str], None]) -> None:
         """After the last frame of a recorded source: send what was kept."""
         if self.backlog is not None:
-            self.backlog.finish(follow=self._after_last, stop=stop, note=note)
+            self.backlog.finish(before_frame=self._after_last, stop=stop, note=note)
 
     def _after_last(self, now_ns: int) -> None:
+        assert self._stills is not None, "attached before the first frame"
+        self._stills.store_lost(now_ns)
         self.before_frame(now_ns)
         self.admits(now_ns)  # which gives up what is lost: nothing else would, without frames
 
@@ -100,17 +105,28 @@ class LinkControl:
         self._keyframes.note_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)
         if self.pacer is not None:
             self.pacer.hear(feedback, now_ns=now_ns)
-        if self.unacked is not None:
-            self.unacked.hear(feedback, now_ns=now_ns)
+        self._acknowledge(feedback, now_ns)
         if self.backlog is not None:
-            self.backlog.hear(feedback, now_ns=now_ns)
+            self.backlog.on_feedback(feedback, now_ns=now_ns)
 
-    def overdue_stills(self, now_ns: int) -> Sequence[tuple[Still, float]]:
-        """Stills that seem to be lost, with their utility, most useful first."""
-        if self.unacked is None:
-            return ()
-        round_trip_ns = 0 if self.pacer is None else self.pacer.round_trip_ns
-        return self.unacked.overdue_stills(now_ns, round_trip_ns=round_trip_ns)
+    def _acknowledge(self, feedback: Feedback, now_ns: int) -> None:
+        # Numbers that were never sent mean nothing, and who names them does not become the primary receiver.
+        sender = self._sender
+        if sender is None or feedback.base_sequence > sender.base_sequence:
+            return
+        if feedback.still_sequence > sender.still_sequence:
+            return
+        if self._primary.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns) is None:
+            return
+        progress = self.in_flight.on_report(feedback.base_sequence)
+        progress |= self.outbox.on_report(
+            feedback.still_sequence,
+            feedback.missing_stills,
+            now_ns=now_ns,
+            round_trip_ns=0 if self.pacer is None else self.pacer.round_trip_ns,
+        )
+        if progress:
+            self._primary.note_progress(now_ns)
 
 
 def wait_for_ground(

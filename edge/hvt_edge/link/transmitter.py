@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
@@ -19,15 +20,16 @@ from hvt_common.protocol.messages import (
     BacklogStill,
     BaseHeader,
     Flags,
+    PackedMessage,
     RoiHeader,
     Status,
     fitted_text,
 )
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.backlog.backfill import Chunk
+from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.link.pacer import Pacer
-from hvt_edge.link.unacknowledged import Unacknowledged
 
 __all__ = [
     "BASE_ATTACHMENT_BYTES",
@@ -35,6 +37,7 @@ __all__ = [
     "STATUS_BYTES",
     "STILL_ATTACHMENT_BYTES",
     "Outlet",
+    "StillEnvelope",
     "Transmitter",
     "base_overhead_bps",
 ]
@@ -43,14 +46,14 @@ BASE_ATTACHMENT_BYTES = 48
 """What a `BaseHeader` takes at most."""
 STILL_ATTACHMENT_BYTES = 100
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
-`Transmitter.still_room_bytes` of one that is counts its own header."""
+`Transmitter.still_allowance_bytes` of one that is counts its own header."""
 STATUS_BYTES = 320
 """What a `Status` takes."""
 BACKLOG_ATTACHMENT_BYTES = 48
 """What a `BacklogHeader` takes at most."""
 _LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
 _CHUNK_S = 0.05
-"""So long the link is busy with a piece at most, so that a frame or a live still need not wait for it."""
+"""So long the link is busy with a chunk at most, so that a frame or a live still need not wait for it."""
 _SECOND_NS = 1_000_000_000
 _GROWTH_BYTES = 16
 """By how much metadata may grow when it is made for a later moment: its two times."""
@@ -91,11 +94,24 @@ def _encoding(still: Still) -> str:
     return PLAIN_ENCODING if still.media_type.startswith(_OWN_TYPES) else still.media_type
 
 
+@dataclass(frozen=True, slots=True)
+class StillEnvelope:
+    """A still with its header packed once; send delay, flags and checksum are packed when it goes out."""
+
+    still: Still
+    header: PackedMessage
+    encoding: str
+
+    def header_at(self, send_ns: int, *, flags: int) -> PackedMessage:
+        """The header of a still that goes out at this time."""
+        return self.header.with_fields(send_delay_ns=send_ns - self.still.capture_ns, flags=int(flags))
+
+
 class Transmitter:
     """Sends access units, stills, tracks and status, and accounts for each.
 
     ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` is told of all
-    that goes out, and holds stills while the link is busy. ``unacked`` keeps what no report has named yet.
+    that goes out, and holds stills while the link is busy. ``in_flight`` holds access units until they are reported.
     """
 
     def __init__(
@@ -109,11 +125,11 @@ class Transmitter:
         lockstep: bool,
         wait_until: Callable[[int], None],
         pacer: Pacer | None = None,
-        unacked: Unacknowledged | None = None,
+        in_flight: BaseInFlight | None = None,
     ) -> None:
         self._outlet = outlet
         self._pacer = pacer
-        self._unacked = unacked
+        self._in_flight = in_flight
         self._ledger = ledger
         self._budget = budget
         self._keys = EdgeKeys(edge_id)
@@ -124,6 +140,7 @@ class Transmitter:
         self.base_sequence = -1
         """Of the last access unit sent; -1 before the first."""
         self.still_sequence = -1
+        self._newest: StillEnvelope | None = None
 
     def base(self, unit: AccessUnit, *, now_ns: int, after_hole: bool = False) -> int:
         """Send one access unit as soon as the budget's window has room for it; return its line bytes.
@@ -147,29 +164,38 @@ class Transmitter:
             self._budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
             if self._pacer is not None:
                 self._pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
-            if self._unacked is not None:
-                self._unacked.sent_base(self.base_sequence, unit, now_ns=at_ns)
+            if self._in_flight is not None:
+                self._in_flight.sent(self.base_sequence, unit, now_ns=at_ns)
         self._wait_until(at_ns)
         self._outlet.put(
             Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
         )
         return line_bytes
 
-    def still_room_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
+    def envelope(self, still: Still) -> StillEnvelope:
+        """The still with its header. The one asked for last is at hand: what was measured is what is sent."""
+        newest = self._newest
+        if newest is None or newest.still is not still:
+            header = PackedMessage.of(self._still_header(still))
+            self._newest = newest = StillEnvelope(still, header, _encoding(still))
+        return newest
+
+    def still_allowance_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
         """Payload that a still with the header of this one may take now, whatever data it holds itself.
 
         True to the byte: all that differs between still and still is counted (names, parameters, further tracks,
         media type). Without a still it is an estimate for one with the usual names. Not ``paced`` it is what the
-        budget has room for, whether or not the link is free at this moment.
+        budget allows, whether or not the link is free at this moment.
         """
         with self._lock:
-            room = self._budget.still_room(now_ns)
+            line_bytes = self._budget.still_room(now_ns)
         if paced and self._pacer is not None and not self._pacer.admits_still(now_ns):
             return 0
         if still is None:
-            return self._payload_bytes(room, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
-        attachment_bytes = len(self._still_header(still, send_ns=now_ns).pack())
-        return self._payload_bytes(room, attachment_bytes, _encoding(still))
+            return self._payload_bytes(line_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
+        envelope = self.envelope(still)
+        header_bytes = envelope.header_at(now_ns, flags=self._flags).size_bytes
+        return self._payload_bytes(line_bytes, header_bytes, envelope.encoding)
 
     def most_still_bytes(self) -> int:
         """About the payload of the largest still that the budget ever admits."""
@@ -177,50 +203,42 @@ class Transmitter:
             self._budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding
         )
 
-    def still(self, still: Still, *, now_ns: int, utility: float = 0.0) -> None:
-        """Send one still that `still_room_bytes` admitted at this very time; of one sent before, a second copy.
+    def still(self, envelope: StillEnvelope, *, now_ns: int, copy: bool = False) -> None:
+        """Send one still that `still_allowance_bytes` admitted at this very time; ``copy``: it was sent before.
 
-        Where another thread has taken the room since, it waits until there is room again, as everything does.
+        Where another thread has taken the allowance since, it waits until there is one again, as everything does.
         """
-        encoding = _encoding(still)
+        still, encoding = envelope.still, envelope.encoding
         with self._lock:
-            again = still.sequence <= self.still_sequence
             self.still_sequence = max(self.still_sequence, still.sequence)
-            at_ns = self._still_at_ns(still, encoding, now_ns)
-            attachment = self._still_header(still, send_ns=at_ns).pack(still.data)
+            at_ns = self._still_at_ns(envelope, now_ns)
+            attachment = envelope.header_at(at_ns, flags=self._flags).pack(still.data)
             line_bytes = self._count(
                 Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
             )
             self._budget.record_still(line_bytes, now_ns=at_ns)
-            if self._pacer is not None and again:  # its number stands for the first copy, or for later stills
+            if self._pacer is not None and copy:  # its number stands for the first copy, or for later stills
                 self._pacer.sent_other(line_bytes, now_ns=at_ns)
             elif self._pacer is not None:
                 self._pacer.sent_still(still.sequence, line_bytes, now_ns=at_ns)
-            if self._unacked is not None:
-                self._unacked.sent_still(still, utility=utility, now_ns=at_ns)
         self._wait_until(at_ns)
         self._outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=encoding)
 
     def store_base(self, unit: AccessUnit, *, now_ns: int) -> None:
-        """An access unit is kept for later: it has used up its share, and left nothing of it to a still."""
+        """An access unit is stored: it has used up its share, and left nothing of it to a still."""
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
             self._budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, kept=True)
 
-    def store_still(self, still: Still, *, now_ns: int, counted: bool = True) -> BacklogStill:
-        """The still as it would have gone out, for the store; ``counted``: its share of the budget is taken."""
-        header = self._still_header(still, send_ns=now_ns, stored=True)
-        attachment, encoding = header.pack(still.data), _encoding(still)
+    def store_still(self, envelope: StillEnvelope, *, now_ns: int, counted: bool = True) -> BacklogStill:
+        """The still as it would have gone out, for the backlog; ``counted``: its share of the budget is taken."""
+        still, encoding = envelope.still, envelope.encoding
+        attachment = envelope.header_at(now_ns, flags=self._flags | Flags.STORED).pack(still.data)
         if counted:
             line_bytes = self._line_bytes(Channel.ROI, still.data, len(attachment), encoding=encoding)
             with self._lock:
                 self._budget.record_still(line_bytes, now_ns=now_ns)
         return BacklogStill(attachment, encoding, still.data)
-
-    @property
-    def unacked(self) -> Unacknowledged | None:
-        """What no report has named yet."""
-        return self._unacked
 
     @property
     def round_trip_ns(self) -> int:
@@ -233,24 +251,24 @@ class Transmitter:
         return self._budget.total_bps
 
     def backlog_allowance_bytes(self, now_ns: int, *, reserve: float) -> int:
-        """Payload that a piece of what was kept may have now; ``reserve``: see `RollingBudget.backlog_allowance`."""
+        """Payload that a chunk of the backlog may have now; ``reserve``: see `RollingBudget.backlog_allowance`."""
         with self._lock:
-            room = self._budget.backlog_allowance(now_ns, reserve=reserve)
+            line_bytes = self._budget.backlog_allowance(now_ns, reserve=reserve)
         if self._pacer is not None and not self._pacer.admits_still(now_ns):
             return 0
         around = BACKLOG_ATTACHMENT_BYTES + overhead_bytes(
-            room,
+            line_bytes,
             BACKLOG_ATTACHMENT_BYTES,
             key=self._keys.key(Channel.BACKLOG),
             encoding=DELIVERIES[Channel.BACKLOG].encoding,
         )
         most = min(_MOST_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, round(_CHUNK_S * self.total_bps / 8)))
-        return min(most, max(0, room - around))
+        return min(most, max(0, line_bytes - around))
 
     def backlog(self, chunk: Chunk, *, now_ns: int) -> int:
-        """Send a piece that `backlog_allowance_bytes` admitted at this very time; return its line bytes.
+        """Send a chunk that `backlog_allowance_bytes` admitted at this very time; return its line bytes.
 
-        0: another thread has taken the room since, and it was not sent.
+        0: another thread has taken the allowance since, and it was not sent.
         """
         header = BacklogHeader(
             session_id=chunk.session_id,
@@ -262,8 +280,8 @@ class Transmitter:
         )
         attachment = header.pack(chunk.data)
         with self._lock:
-            wanted_bytes = self._line_bytes(Channel.BACKLOG, chunk.data, len(attachment))
-            if wanted_bytes > self._budget.backlog_allowance(now_ns, reserve=0.0):
+            needed_bytes = self._line_bytes(Channel.BACKLOG, chunk.data, len(attachment))
+            if needed_bytes > self._budget.backlog_allowance(now_ns, reserve=0.0):
                 return 0
             line_bytes = self._count(Channel.BACKLOG, Account.BACKLOG, chunk.data, attachment, at_ns=now_ns)
             self._budget.record_backlog(line_bytes, now_ns=now_ns)
@@ -330,14 +348,15 @@ class Transmitter:
         self._wait_until(at_ns)
         self._outlet.put(row, payload, encoding=DELIVERIES[row].encoding)
 
-    def _still_header(self, still: Still, *, send_ns: int, stored: bool = False) -> RoiHeader:
+    def _still_header(self, still: Still) -> RoiHeader:
+        """All of it but send delay and flags."""
         return RoiHeader(
             session_id=self._session_id,
             sequence=still.sequence,
             frame_index=still.frame_index,
             capture_ns=still.capture_ns,
-            send_delay_ns=send_ns - still.capture_ns,
-            flags=int(self._flags | Flags.STORED if stored else self._flags),
+            send_delay_ns=0,
+            flags=0,
             track_id=still.track_id,
             box_source_px=still.box_source_px,
             crop_source_px=still.crop_source_px,
@@ -350,20 +369,22 @@ class Transmitter:
             also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in still.also),
         )
 
-    def _still_at_ns(self, still: Still, encoding: str, now_ns: int) -> int:
-        """When it may go: now, unless its room is gone."""
-        attachment_bytes = len(self._still_header(still, send_ns=now_ns).pack())
-        line_bytes = self._line_bytes(Channel.ROI, still.data, attachment_bytes, encoding=encoding)
+    def _still_at_ns(self, envelope: StillEnvelope, now_ns: int) -> int:
+        """When it may go: now, unless its allowance is gone."""
+        header_bytes = envelope.header_at(now_ns, flags=self._flags).size_bytes
+        line_bytes = self._line_bytes(
+            Channel.ROI, envelope.still.data, header_bytes, encoding=envelope.encoding
+        )
         if self._budget.has_room(line_bytes, now_ns=now_ns):
             return now_ns
         return self._budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
 
-    def _payload_bytes(self, room_bytes: int, attachment_bytes: int, media_type: str) -> int:
+    def _payload_bytes(self, line_bytes: int, attachment_bytes: int, media_type: str) -> int:
         """What of so many line bytes is left for a still's payload."""
         around = attachment_bytes + overhead_bytes(
-            room_bytes, attachment_bytes, key=self._keys.key(Channel.ROI), encoding=media_type
+            line_bytes, attachment_bytes, key=self._keys.key(Channel.ROI), encoding=media_type
         )
-        return max(0, room_bytes - around)
+        return max(0, line_bytes - around)
 
     def _count(
         self,

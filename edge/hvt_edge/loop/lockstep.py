@@ -84,7 +84,7 @@ class LockstepPace:
             self._coded_index = frame.index
             self._base.send(unit, now_ns=frame.capture_ns)
         held = self._keyframes.due(frame.capture_ns)
-        seen = self._eyes.submit(self._stills.see, frame, unit)
+        seen = self._eyes.submit(self._stills.analyze, frame, unit)
         self._seeing = (frame, self._coded_index, held, seen)
 
     def __enter__(self) -> Self:
@@ -119,7 +119,7 @@ class LockstepPace:
             if self._follows:
                 self._follows = self._answered(coded_index, sent)
             self._newest_answered = max([self._newest_answered, *sent])
-        self._stills.hear(self._inbox.take_up_to(self._newest_answered))
+        self._stills.on_results(self._inbox.take_up_to(self._newest_answered))
 
     def _answered(self, index: int, sent: set[int]) -> bool:
         """Wait for the ground's answer to a frame and its stills; False where it is gone or never answers."""

@@ -13,7 +13,8 @@ from hvt_common.values import Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.source.pacing import realtime_admits
-from hvt_edge.stills.stage import StillStage, StillWorker
+from hvt_edge.stills.stage import StillStage
+from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.stage import BaseStage
 
 __all__ = ["RealtimePace"]
@@ -46,7 +47,7 @@ class RealtimePace:
         self._counts = counts
         self._stop = stop
         self._follow = follow
-        self._worker = StillWorker(stills, hear=inbox.take, clock=clock)
+        self._worker = StillWorker(stills, results=inbox.take, clock=clock)
         self.now_ns = clock()
         """The time that windows go by, of the newest frame."""
 

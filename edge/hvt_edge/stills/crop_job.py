@@ -69,7 +69,7 @@ class CropJob:
     crop_bgr: Image
     """Of the source, at the size at which it is coded."""
     base_crop_bgr: Image | None
-    """What the decoded base frame of the same tick shows of it, at that size; None where there is none."""
+    """What the decoded base frame of the same source frame shows of it, at that size; None where there is none."""
     alternative: Alternative | None
     """None where the base was not at hand."""
 

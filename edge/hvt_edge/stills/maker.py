@@ -5,8 +5,8 @@ base frame is at hand, it is closer to the source than what the base shows of th
 over the padded crop and over each box alone (mean squared error, hence PSNR). Where both promises cannot be kept
 there is no still, and the reason is said.
 
-A codec that builds on the base (``residual``) is used where the base frame of the same tick is at hand. The fallback
-codec takes its place where there is none, and where the base is so far off that it comes out smaller for the
+A codec that builds on the base (``residual``) is used where the decoded base of the same source frame is at hand. The
+fallback codec takes its place where there is none, and where the base is so far off that it comes out smaller for the
 same picture.
 """
 
@@ -24,9 +24,9 @@ from hvt_edge.stills.fidelity import Fitted, Fitter, NoStill
 from hvt_edge.stills.merging import union_crop
 from hvt_edge.stills.policy.base import Request
 
-__all__ = ["NoStill", "Room", "StillMaker"]
+__all__ = ["Allowance", "NoStill", "StillMaker"]
 
-Room = Callable[[Still], int]
+Allowance = Callable[[Still], int]
 """How many payload bytes a still with this header may take now; what it holds as data does not count."""
 
 _TRIES = 3
@@ -68,7 +68,7 @@ class StillMaker:
         assert self.fallback is not None, "checked at the start"
         return self.fallback
 
-    def cut(
+    def crop(
         self, frame: Frame, request: Request, *, view: View, base_bgr: Image | None = None
     ) -> CropJob | NoStill:
         """Take the request's crop out of ``frame``, which is the frame the request was made at.
@@ -112,17 +112,17 @@ class StillMaker:
         )
         return CropJob(header=header, crop_bgr=crop, base_crop_bgr=seen, alternative=alternative)
 
-    def code(self, cut: CropJob, *, sequence: int, room: Room) -> Still | NoStill:
-        """Code a crop so that ``room``, asked of the very still that comes out, holds its data."""
-        header = replace(cut.header, sequence=sequence)
-        if cut.base_crop_bgr is None or not self.codec.needs_base:
-            made = self._fitted(self.without_base, cut, header, room)
+    def code(self, job: CropJob, *, sequence: int, allowance: Allowance) -> Still | NoStill:
+        """Code a crop so that ``allowance``, asked of the very still that comes out, holds its data."""
+        header = replace(job.header, sequence=sequence)
+        if job.base_crop_bgr is None or not self.codec.needs_base:
+            made = self._fitted(self.without_base, job, header, allowance)
             return made if isinstance(made, NoStill) else made[0]
-        built = self._fitted(self.codec, cut, header, room)
+        built = self._fitted(self.codec, job, header, allowance)
         if isinstance(built, NoStill):
-            made = self._fitted(self.without_base, cut, header, room) if cut.base_far_off else built
+            made = self._fitted(self.without_base, job, header, allowance) if job.base_far_off else built
             return made if isinstance(made, NoStill) else made[0]
-        return (self._cheaper(*built, cut, header) if cut.base_far_off else None) or built[0]
+        return (self._cheaper(*built, job, header) if job.base_far_off else None) or built[0]
 
     def make(
         self,
@@ -134,35 +134,35 @@ class StillMaker:
         limit_bytes: int,
         base_bgr: Image | None = None,
     ) -> Still | NoStill:
-        """`cut` and `code` in one; ``limit_bytes`` bounds the payload alone."""
-        cut = self.cut(frame, request, view=view, base_bgr=base_bgr)
-        if isinstance(cut, NoStill):
-            return cut
-        return self.code(cut, sequence=sequence, room=lambda _: limit_bytes)
+        """`crop` and `code` in one; ``limit_bytes`` bounds the payload alone."""
+        job = self.crop(frame, request, view=view, base_bgr=base_bgr)
+        if isinstance(job, NoStill):
+            return job
+        return self.code(job, sequence=sequence, allowance=lambda _: limit_bytes)
 
     def _fitted(
-        self, codec: StillCodec, cut: CropJob, header: Still, room: Room
+        self, codec: StillCodec, job: CropJob, header: Still, allowance: Allowance
     ) -> tuple[Still, Fitted] | NoStill:
-        """As asked, with this codec, or the best below that for which there is room."""
+        """As asked, with this codec, or the best below that for which there is allowance."""
         fitter = self._fitter(codec)
         header = _of_codec(header, codec)
-        limit_bytes = room(header)
+        limit_bytes = allowance(header)
         for _ in range(_TRIES):
-            fitted = fitter.best(cut, limit_bytes=limit_bytes)
+            fitted = fitter.best(job, limit_bytes=limit_bytes)
             if isinstance(fitted, NoStill):
                 return fitted
             still = _filled(header, fitted)
-            excess_bytes = len(still.data) - room(still)  # the codec's parameters have taken their part
+            excess_bytes = len(still.data) - allowance(still)  # the codec's parameters have taken their part
             if excess_bytes <= 0:
                 return still, fitted
             limit_bytes = min(limit_bytes, len(still.data)) - excess_bytes
         return NoStill("too_large")
 
-    def _cheaper(self, built: Still, fitted: Fitted, cut: CropJob, header: Still) -> Still | None:
+    def _cheaper(self, built: Still, fitted: Fitted, job: CropJob, header: Still) -> Still | None:
         """The fallback's still, where it shows no less than the one built on the base, in fewer bytes."""
         codec = self.without_base
-        psnr_db = psnr_y_db(fitted.shown_bgr, cut.crop_bgr)
-        smaller = self._fitter(codec).smallest(cut, psnr_db=psnr_db, limit_bytes=len(built.data))
+        psnr_db = psnr_y_db(fitted.shown_bgr, job.crop_bgr)
+        smaller = self._fitter(codec).smallest(job, psnr_db=psnr_db, limit_bytes=len(built.data))
         return None if smaller is None else _filled(_of_codec(header, codec), smaller)
 
     def _fitter(self, codec: StillCodec) -> Fitter:

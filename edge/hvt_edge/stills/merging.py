@@ -24,8 +24,8 @@ __all__ = ["ALSO_BYTES", "MOST_ALSO", "expected_bytes", "group", "union_crop"]
 ALSO_BYTES = 17.0
 """What the header takes for each further track: its id and its box in eighths of a pixel."""
 MOST_ALSO = 15
-_MOST_WEIGHED = 96
-"""Of more wishes than that only the most wanted are weighed against each other: the time it takes stays bounded."""
+_MOST_COMPARED = 96
+"""Of more requests than that only the most wanted are compared with each other: the time it takes stays bounded."""
 _LEAST_SAVING_BYTES = 1.0
 
 Crop = tuple[int, int, int, int]
@@ -60,7 +60,7 @@ def group(
     most: int = MOST_ALSO,
     max_side_px: int = MAX_SIDE_PX,
 ) -> list[tuple[Request, list[Request]]]:
-    """Join the wishes of one step into stills: each with its lead and the others that the same still shows.
+    """Join the requests of one step into stills: each with its lead and the others that the same still shows.
 
     The two stills that save most by becoming one are joined, and again, until no two save a byte; no still
     shows more than ``most`` tracks beside its lead, nor a side of more than ``max_side_px`` where it shows several.
@@ -70,26 +70,27 @@ def group(
     gain over what the one still costs, if scores are gains per byte; never less than its score alone. Most wanted
     first, ties by the lead's track id. Each request is in exactly one group.
     """
-    weighed = list(requests[:_MOST_WEIGHED])
+    compared = list(requests[:_MOST_COMPARED])
     board = _Board.of(
-        weighed,
+        compared,
         cost=cost,
         overhead_bytes=overhead_bytes,
         crops=[
-            crop_box(one.candidate.box_source_px, padding=padding, source_size=source_size) for one in weighed
+            crop_box(one.candidate.box_source_px, padding=padding, source_size=source_size)
+            for one in compared
         ],
         most=most,
         max_side_px=max_side_px,
     )
     board.join()
-    joined = [board.request(members, weighed) for members in board.groups()]
-    joined += [(one, []) for one in requests[_MOST_WEIGHED:]]
+    joined = [board.request(members, compared) for members in board.groups()]
+    joined += [(one, []) for one in requests[_MOST_COMPARED:]]
     return sorted(joined, key=lambda one: (-one[0].score, one[0].candidate.track_id))
 
 
 @dataclass(slots=True)
 class _Board:
-    """Stills under way: row ``i`` is the still that wish ``i`` leads, until another takes it in."""
+    """Stills under way: row ``i`` is the still that request ``i`` leads, until another takes it in."""
 
     cost: CostEstimate
     overhead_bytes: float
@@ -133,7 +134,7 @@ class _Board:
         for row in range(count):
             savings[row, row + 1 :] = self._savings(row)[row + 1 :]
         while count:
-            # Of equal savings the first: the same wishes give the same stills in every run.
+            # Of equal savings the first: the same requests give the same stills in every run.
             lead, other = divmod(int(savings.argmax()), count)
             if savings[lead, other] < _LEAST_SAVING_BYTES:
                 return
@@ -144,11 +145,11 @@ class _Board:
             savings[:lead, lead] = fresh[:lead]
 
     def groups(self) -> list[list[int]]:
-        """The wishes of each still, most wanted first."""
+        """The requests of each still, most wanted first."""
         return [sorted(members) for members in self.members if members]
 
     def request(self, members: list[int], requests: Sequence[Request]) -> tuple[Request, list[Request]]:
-        """One still's wish, and those that ride with it."""
+        """One still's request, and those that ride with it."""
         lead, others = requests[members[0]], [requests[index] for index in members[1:]]
         if not others:
             return lead, []

@@ -14,9 +14,9 @@ from hvt_edge.perception.frame_ring import FrameRing, RingFrame
 from hvt_edge.stills.crop_job import CropJob, crop_of
 from hvt_edge.stills.maker import StillMaker
 
-__all__ = ["ASKED", "Ask", "RefusedError", "box_of", "crop_job_for", "frame_for", "shrunk"]
+__all__ = ["ON_DEMAND", "OnDemandRequest", "RefusedError", "box_of", "crop_job_for", "frame_for", "shrunk"]
 
-ASKED = "asked"
+ON_DEMAND = "asked"
 """The reason that such a still carries on the wire and in the ledger."""
 
 Box = tuple[float, float, float, float]
@@ -28,7 +28,7 @@ class RefusedError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
+class OnDemandRequest:
     """A track or a box, or neither for the whole frame; at a frame or so long ago, or neither for the newest."""
 
     track_id: int | None = None
@@ -42,86 +42,90 @@ class Ask:
     """At most so good; None for the quality of all stills."""
 
 
-def frame_for(ask: Ask, ring: FrameRing) -> RingFrame:
+def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
     """The frame that is asked for, or the nearest that is kept; raises `RefusedError` where it is gone or to come."""
     newest = ring.newest
     if newest is None:
         raise RefusedError("there is no frame yet, or none is kept (--ring)")
-    if ask.frame_index is not None:
-        if ask.frame_index > newest.frame_index:
-            raise RefusedError(f"frame {ask.frame_index} is yet to come: the newest is {newest.frame_index}")
-        kept, wanted = ring.near_index(ask.frame_index), f"frame {ask.frame_index}"
+    if request.frame_index is not None:
+        if request.frame_index > newest.frame_index:
+            raise RefusedError(
+                f"frame {request.frame_index} is yet to come: the newest is {newest.frame_index}"
+            )
+        frame, wanted = ring.near_index(request.frame_index), f"frame {request.frame_index}"
     else:
-        ago_ms = ask.ago_ms or 0
-        kept = ring.near_time(newest.capture_ns - ago_ms * 1_000_000)
+        ago_ms = request.ago_ms or 0
+        frame = ring.near_time(newest.capture_ns - ago_ms * 1_000_000)
         wanted = f"the frame of {ago_ms / 1000:g} s ago"
-    if kept is None:
+    if frame is None:
         raise RefusedError(f"{wanted} is not held: frames go back {ring.reach_s():.1f} s")
-    return kept
+    return frame
 
 
 def crop_job_for(
-    ask: Ask, kept: RingFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]
+    request: OnDemandRequest, frame: RingFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]
 ) -> CropJob:
     """Take what is asked for out of that frame; raises `RefusedError` where it is not in it."""
-    height, width = kept.source_bgr.shape[:2]
+    height, width = frame.source_bgr.shape[:2]
     box: Box
-    if ask.track_id is not None:
-        row = _row(kept, ask.track_id)
+    if request.track_id is not None:
+        row = _row(frame, request.track_id)
         box = box_of(
-            np.clip(view.to_source(kept.tracks.boxes_xyxy_px), 0, (width, height, width, height)), row
+            np.clip(view.to_source(frame.tracks.boxes_xyxy_px), 0, (width, height, width, height)), row
         )
         crop = crop_box(box, padding=maker.padding, source_size=(width, height))
         if box[2] - box[0] < 1 or box[3] - box[1] < 1:
-            raise RefusedError(f"track {ask.track_id} is outside the picture at frame {kept.frame_index}")
-        class_id = int(kept.tracks.class_ids[row])
-        name, confidence = class_names[class_id], float(kept.tracks.confidences[row])
+            raise RefusedError(
+                f"track {request.track_id} is outside the picture at frame {frame.frame_index}"
+            )
+        class_id = int(frame.tracks.class_ids[row])
+        name, confidence = class_names[class_id], float(frame.tracks.confidences[row])
     else:
-        crop = _inside(ask.box_xywh_px or (0, 0, width, height), (width, height))
+        crop = _inside(request.box_xywh_px or (0, 0, width, height), (width, height))
         box, name, confidence = (*map(float, crop),), "", 0.0  # type: ignore[assignment]
     size = coded_size(crop, max_side_px=maker.max_side_px)
     codec = maker.codec
     header = Still(
         sequence=0,
-        frame_index=kept.frame_index,
-        capture_ns=kept.capture_ns,
-        track_id=-1 if ask.track_id is None else ask.track_id,
+        frame_index=frame.frame_index,
+        capture_ns=frame.capture_ns,
+        track_id=-1 if request.track_id is None else request.track_id,
         box_source_px=box,
         crop_source_px=crop,
         class_name=name,
         confidence=confidence,
-        reason=ASKED,
+        reason=ON_DEMAND,
         codec=codec.name,
         quality_pct=maker.quality_pct,
         data=b"",
         media_type=codec.media_type,
         parameters=_size_parameters(crop, size),
     )
-    pixels = crop_of(kept.source_bgr, crop, size)
+    pixels = crop_of(frame.source_bgr, crop, size)
     return CropJob(header=header, crop_bgr=pixels, base_crop_bgr=None, alternative=None)
 
 
-def _row(kept: RingFrame, track_id: int) -> int:
-    rows = np.flatnonzero(kept.tracks.ids == track_id)
+def _row(frame: RingFrame, track_id: int) -> int:
+    rows = np.flatnonzero(frame.tracks.ids == track_id)
     if len(rows):
         return int(rows[0])
-    known = kept.tracks.ids.tolist()
+    known = frame.tracks.ids.tolist()
     listed = ", ".join(map(str, known[:12])) + (" and more" if len(known) > 12 else "")
     raise RefusedError(
-        f"there is no track {track_id} at frame {kept.frame_index}: the edge's own tracks there are "
+        f"there is no track {track_id} at frame {frame.frame_index}: the edge's own tracks there are "
         f"{listed or 'none'}"
     )
 
 
-def shrunk(cut: CropJob, shrink: float) -> CropJob:
+def shrunk(job: CropJob, shrink: float) -> CropJob:
     """The same crop, coded with its sides so much shorter."""
-    height, width = cut.crop_bgr.shape[:2]
+    height, width = job.crop_bgr.shape[:2]
     size = max(1, round(width * shrink)), max(1, round(height * shrink))
     if size == (width, height):
-        return cut
-    pixels = np.asarray(cv2.resize(cut.crop_bgr, size, interpolation=cv2.INTER_AREA), np.uint8)
-    parameters = {**cut.header.parameters, **_size_parameters(cut.header.crop_source_px, size)}
-    return replace(cut, header=replace(cut.header, parameters=parameters), crop_bgr=pixels)
+        return job
+    pixels = np.asarray(cv2.resize(job.crop_bgr, size, interpolation=cv2.INTER_AREA), np.uint8)
+    parameters = {**job.header.parameters, **_size_parameters(job.header.crop_source_px, size)}
+    return replace(job, header=replace(job.header, parameters=parameters), crop_bgr=pixels)
 
 
 def _size_parameters(crop: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:

@@ -1,121 +1,414 @@
-"""Stills that wait for room: a small queue, most useful first, bounded in number and age."""
+"""One outbox holds each still through its whole life, from the crop that waits to the report that names it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import threading
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 
+from hvt_common.values import Still
+from hvt_edge.backlog.entry import FIRST_STORED
+from hvt_edge.link.transmitter import StillEnvelope
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.policy.base import Request
 
-__all__ = ["PendingStill", "QueueSettings", "StillQueue"]
+__all__ = ["AGAIN", "Outbox", "OutboxSettings", "OutboxStill", "StillState"]
+
+AGAIN = "again"
+"""The reason of a still whose crop was sent before, and the parameter that names the sequence of the first."""
+_SECOND_NS = 1_000_000_000
+_MIB = 2**20
+
+
+class StillState(Enum):
+    """Where a still is in its life; `Outbox` has the table."""
+
+    PENDING = "waits for its allowance"
+    SENT = "sent, and not named by any report"
+    ACKNOWLEDGED = "received by the primary receiver"
+    LOST = "sent before the link went away, and not acknowledged"
+    STORED = "in the backlog"
+    EXPIRED = "given up"
 
 
 @dataclass(frozen=True, slots=True)
-class QueueSettings:
-    """A crop that waited longer than ``max_age_ns`` shows a past the operator no longer looks at."""
+class OutboxSettings:
+    """Bounds, and when a still is overdue."""
 
-    max_length: int = 8
-    max_age_ns: int = 1_000_000_000
+    max_pending: int = 8
+    """Of the method; those that grounds request have their own bound."""
+    max_pending_ns: int = _SECOND_NS
+    """A crop that has waited longer shows a past the operator no longer looks at."""
+    max_on_demand_ns: int = 10 * _SECOND_NS
+    max_sent: int = 64
+    max_sent_bytes: int = 2 * _MIB
+    """Of coded stills that are not acknowledged."""
+    max_crop_bytes: int = 8 * _MIB
+    """Of the pixels of sent stills that can be coded again."""
+    max_sent_ns: int = 4 * _SECOND_NS
+    """What was sent longer ago is not sent again."""
+    least_wait_ns: int = _SECOND_NS
+    wait_round_trips: int = 3
+    """A still is overdue after so many round trips, and after ``least_wait_ns`` at the earliest."""
 
 
-@dataclass(frozen=True, slots=True)
-class PendingStill:
-    """A wish for a still, with the crop that it is to show."""
+@dataclass(slots=True, eq=False)
+class OutboxStill:
+    """One still. Only the outbox changes its state."""
 
-    request: Request
-    cut: CropJob
-    since_ns: int
+    job: CropJob | None
+    """The crop to be coded; of a sent still the crop to be coded again, None where that cannot be."""
+    request: Request | None
+    """Of the method; None where a ground requested it."""
+    utility: float
+    """As the method scored it; infinite where a ground requested it."""
+    since_ns: int | None
+    """Since when it is pending; None until the stills' thread has met it."""
     again: bool = False
-    """It was sent before, and the ground could make nothing of it."""
+    """The ground could not decode the first still of this crop."""
+    state: StillState = StillState.PENDING
+    coded: Still | None = None
+    """None while it is pending."""
+    envelope: StillEnvelope | None = None
+    """With its header, packed once: by the first that sends or stores it."""
+    sent_ns: int = 0
+    copies: int = 0
+
+    @property
+    def still(self) -> Still:
+        """The coded still."""
+        assert self.coded is not None, f"{self.state}: it is not coded"
+        return self.coded
+
+    @property
+    def crop(self) -> CropJob:
+        """The crop of a pending still."""
+        assert self.job is not None, f"{self.state}: its crop is gone"
+        return self.job
 
     @property
     def track_id(self) -> int:
-        """Of the candidate that leads the wish."""
-        return self.request.candidate.track_id
+        """Of the candidate that leads it."""
+        return (self.coded or self.crop.header).track_id
 
     @property
     def track_ids(self) -> set[int]:
-        """Of all that the still will show."""
-        return {self.track_id, *(one.track_id for one in self.request.also)}
+        """Of all that it shows."""
+        return {self.track_id, *(track_id for track_id, _ in self.crop.header.also)}
 
 
-class StillQueue:
-    """Holds at most one wish a track; a newer one takes the place of the older."""
+class Outbox:
+    """Every still of a run, bounded in number, bytes and age. Thread-safe; time is an argument.
 
-    def __init__(self, settings: QueueSettings = QueueSettings()) -> None:
+    ============  =================================================  =======================================
+    state         event                                              then
+    ============  =================================================  =======================================
+    PENDING       a newer still of its track (`offer`)               EXPIRED, ``replaced``
+    PENDING       too many pending, and this the least useful        EXPIRED, ``queue_full``
+    PENDING       it waits too long (`expire`)                       EXPIRED, ``stale``
+    PENDING       no still comes of it, or the run ends              EXPIRED
+    PENDING       coded, the link carries it (`sent`)                SENT
+    PENDING       coded, the link is away (`stored`)                 STORED
+    SENT          a report ought to have named it (`overdue`)        SENT, as a second copy (`sent_again`)
+    SENT          a report names it (`on_report`)                    ACKNOWLEDGED
+    SENT          the link goes away, or the run ends (`lose`)       LOST
+    SENT          newer ones need its space                          EXPIRED
+    SENT, ACK.    the ground cannot decode it (`on_undecodable`)     as before, and its crop PENDING once more
+    ACKNOWLEDGED  its crop is too old to be coded again              EXPIRED
+    LOST          handed over without the base (`stored`)            STORED
+    ============  =================================================  =======================================
+
+    Pending stills of the method are ordered by utility, at most one of each track; those that grounds request wait
+    in a queue of their own, first come first served. ``reports``: whether reports count. In lockstep they do not,
+    because when they come must not decide what is sent.
+    """
+
+    def __init__(self, settings: OutboxSettings = OutboxSettings(), *, reports: bool = True) -> None:
         self._settings = settings
-        self._waiting: dict[int, PendingStill] = {}
+        self._reports = reports
+        self._lock = threading.RLock()
+        self._pending: dict[int, OutboxStill] = {}
         """By the track that leads."""
+        self._on_demand: deque[OutboxStill] = deque()
+        self._sent: dict[int, OutboxStill] = {}
+        """By sequence, in the order of sending: not acknowledged, or with a crop to be coded again."""
+        self._undecodable: set[int] = set()
+        self._next_sequences = {False: 0, True: FIRST_STORED}
+        """Of the next still: for the link, and for the backlog."""
+        self._reported_ns = 0
+        self._round_trip_ns = 0
+
+    # Pending
 
     def __len__(self) -> int:
-        return len(self._waiting)
-
-    def __iter__(self) -> Iterator[PendingStill]:
-        return iter(tuple(self._waiting.values()))
+        """Pending stills of the method."""
+        return len(self._pending)
 
     def __contains__(self, track_id: int) -> bool:
-        return any(track_id in waiting.track_ids for waiting in self._waiting.values())
+        with self._lock:
+            return any(track_id in pending.track_ids for pending in self._pending.values())
+
+    @property
+    def pending(self) -> tuple[OutboxStill, ...]:
+        """Of the method, in no order."""
+        with self._lock:
+            return tuple(self._pending.values())
+
+    @property
+    def on_demand(self) -> OutboxStill | None:
+        """The first that a ground requested; None where none is pending."""
+        with self._lock:
+            return self._on_demand[0] if self._on_demand else None
+
+    @property
+    def on_demand_pending(self) -> int:
+        """How many that grounds requested are pending."""
+        return len(self._on_demand)
+
+    @property
+    def any_pending(self) -> bool:
+        """Whether a still waits for its allowance, one that a ground requested included."""
+        return bool(self._pending or self._on_demand)
 
     def admits(self, request: Request, *, now_ns: int) -> bool:
-        """Whether this wish would stay if it were offered now."""
-        full = len(self._waiting) >= self._settings.max_length
-        if not full or request.candidate.track_id in self._waiting:
-            return True
-        least = min(_usefulness(waiting.request, waiting.since_ns) for waiting in self._waiting.values())
-        return _usefulness(request, now_ns) > least
+        """Whether a still of this request would stay if it were offered now."""
+        with self._lock:
+            if len(self._pending) < self._settings.max_pending or request.candidate.track_id in self._pending:
+                return True
+            least = min(map(_order, self._pending.values()))
+        return (request.score, -now_ns, -request.candidate.track_id) > least
 
-    def offer(self, waiting: PendingStill) -> list[tuple[PendingStill, str]]:
-        """Take in one wish; return those that had to leave for it, with the reason.
+    def offer(self, new: OutboxStill) -> list[tuple[OutboxStill, str]]:
+        """Take in a pending still; return those that had to leave for it, with the reason.
 
-        An older wish leaves where the new one shows the track that leads it; a track that rides with another's wish
-        only gets off that one.
+        An older still leaves where the new one shows the track that leads it; a track that rides along in another's
+        still is taken off that one.
         """
-        left: list[tuple[PendingStill, str]] = []
-        for older in self:
-            if older.track_id in waiting.track_ids:
-                left.append((self._waiting.pop(older.track_id), "replaced"))
-            elif older.track_ids & waiting.track_ids:
-                self._waiting[older.track_id] = _without(older, waiting.track_ids)
-        self._waiting[waiting.track_id] = waiting
-        if len(self._waiting) > self._settings.max_length:
-            least = min(self._waiting.values(), key=_order)
-            left.append((self._waiting.pop(least.track_id), "queue_full"))
+        left: list[tuple[OutboxStill, str]] = []
+        with self._lock:
+            for older in self.pending:
+                if older.track_id in new.track_ids:
+                    left.append(self._expire(older, "replaced"))
+                elif older.track_ids & new.track_ids:
+                    _take_off(older, new.track_ids)
+            self._pending[new.track_id] = new
+            if len(self._pending) > self._settings.max_pending:
+                left.append(self._expire(min(self._pending.values(), key=_order), "queue_full"))
         return left
 
-    def expire(self, now_ns: int) -> list[tuple[PendingStill, str]]:
-        """Remove and return what has waited too long."""
-        limit_ns = now_ns - self._settings.max_age_ns
-        old = [waiting for waiting in self._waiting.values() if waiting.since_ns < limit_ns]
-        return [(self._waiting.pop(waiting.track_id), "stale") for waiting in old]
+    def offer_on_demand(self, new: OutboxStill) -> None:
+        """Take in a still that a ground requested; who offers it bounds their number."""
+        with self._lock:
+            self._on_demand.append(new)
 
-    def best(self) -> PendingStill | None:
-        """Return the most useful wish, without removing it."""
-        return max(self._waiting.values(), key=_order, default=None)
+    def best(self) -> OutboxStill | None:
+        """The most useful pending still of the method."""
+        with self._lock:
+            return max(self._pending.values(), key=_order, default=None)
 
-    def remove(self, waiting: PendingStill) -> None:
-        """Take a wish out: it was sent or given up."""
-        self._waiting.pop(waiting.track_id, None)
+    def expire(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
+        """Give up what has been pending for too long."""
+        settings = self._settings
+        with self._lock:
+            for one in self._on_demand:
+                one.since_ns = now_ns if one.since_ns is None else one.since_ns
+            old = [one for one in self._on_demand if now_ns - _since_ns(one) > settings.max_on_demand_ns]
+            old += [one for one in self.pending if now_ns - _since_ns(one) > settings.max_pending_ns]
+            return [self._expire(one, "stale") for one in old]
 
-    def clear(self) -> list[PendingStill]:
-        """Empty the queue and return what was in it."""
-        left = list(self._waiting.values())
-        self._waiting.clear()
+    def give_up(self, pending: OutboxStill) -> None:
+        """No still comes of it."""
+        with self._lock:
+            self._expire(pending, "")
+
+    def clear(self) -> list[tuple[OutboxStill, str]]:
+        """The run ends: give up all that is pending."""
+        with self._lock:
+            return [self._expire(one, "ended") for one in (*self._on_demand, *self.pending)]
+
+    @property
+    def max_pending_ns(self) -> int:
+        """How long a still of the method may be pending."""
+        return self._settings.max_pending_ns
+
+    # Coded
+
+    def sequence(self, *, store: bool) -> int:
+        """The number of the next still: for the link, or for the backlog."""
+        return self._next_sequences[store]
+
+    def sent(self, pending: OutboxStill, still: Still, *, now_ns: int, resend: CropJob | None = None) -> None:
+        """It goes out. ``resend`` is its crop as it would be coded for a ground that cannot decode the still."""
+        settings = self._settings
+        with self._lock:
+            self._leave_pending(pending)
+            self._next_sequences[False] += 1
+            pending.state, pending.coded = StillState.SENT, still
+            pending.sent_ns, pending.copies, pending.job = now_ns, 1, resend
+            if self._reports or resend is not None:
+                self._sent[still.sequence] = pending
+            for one in tuple(self._sent.values()):
+                if self.crop_bytes <= settings.max_crop_bytes:
+                    break
+                self._drop_crop(one)
+            while len(self._sent) > settings.max_sent or self.sent_bytes > settings.max_sent_bytes:
+                self._forget(next(iter(self._sent.values())))
+
+    def sent_again(self, sent: OutboxStill) -> None:
+        """A second copy of it goes out."""
+        sent.copies += 1
+
+    def stored(self, one: OutboxStill, still: Still) -> None:
+        """It goes to the backlog: a pending still while the link is away, or a lost one."""
+        with self._lock:
+            if one.state is StillState.PENDING:
+                self._leave_pending(one)
+                self._next_sequences[True] += 1
+            one.state, one.coded, one.job = StillState.STORED, still, None
+
+    # Sent
+
+    @property
+    def unacknowledged(self) -> int:
+        """How many were sent that no report has named."""
+        with self._lock:
+            return sum(one.state is StillState.SENT for one in self._sent.values()) if self._reports else 0
+
+    @property
+    def sent_bytes(self) -> int:
+        """Of coded stills that are not acknowledged."""
+        sent = [one for one in self._sent.values() if one.state is StillState.SENT]
+        return sum(len(one.still.data) for one in sent) if self._reports else 0
+
+    @property
+    def crop_bytes(self) -> int:
+        """Of the pixels of sent stills."""
+        return sum(one.job.size_bytes for one in self._sent.values() if one.job is not None)
+
+    def on_report(
+        self, still_sequence: int, missing: Sequence[int], *, now_ns: int, round_trip_ns: int = 0
+    ) -> bool:
+        """The primary receiver has all stills up to a sequence but those ``missing``; return whether that is news."""
+        if not self._reports:
+            return False
+        with self._lock:
+            self._reported_ns, self._round_trip_ns = now_ns, round_trip_ns
+            lost = set(missing)
+            named = [
+                one
+                for sequence, one in self._sent.items()
+                if one.state is StillState.SENT and sequence <= still_sequence and sequence not in lost
+            ]
+            for one in named:
+                one.state = StillState.ACKNOWLEDGED
+                if one.job is None:
+                    del self._sent[one.still.sequence]
+        return bool(named)
+
+    def on_undecodable(self, sequence: int) -> None:
+        """A ground does not have the base frame that this still builds on. Of what is not here nothing comes."""
+        with self._lock:
+            if sequence in self._sent and self._sent[sequence].job is not None:
+                self._undecodable.add(sequence)
+
+    def offer_undecodable(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
+        """Let the crops of these be pending once more, each once, unless something newer of the track is.
+
+        Returns those that had to leave for them, as `offer` does.
+        """
+        left: list[tuple[OutboxStill, str]] = []
+        with self._lock:
+            for one in tuple(self._sent.values()):
+                if now_ns - one.sent_ns > self._settings.max_sent_ns:
+                    self._drop_crop(one)
+            for sequence in sorted(self._undecodable):
+                sent = self._sent[sequence]
+                job, request = sent.crop, sent.request
+                assert request is not None, "what a ground requests never builds on the base"
+                self._drop_crop(sent)
+                if job.header.track_id in self or not self.admits(request, now_ns=now_ns):
+                    continue
+                header = replace(
+                    job.header, reason=AGAIN, parameters={**job.header.parameters, AGAIN: sequence}
+                )
+                again = OutboxStill(replace(job, header=header), request, sent.utility, now_ns, again=True)
+                left += self.offer(again)
         return left
 
+    def overdue(self, now_ns: int) -> list[OutboxStill]:
+        """Those to be sent again, most useful first: each once, while it is young.
 
-def _without(waiting: PendingStill, track_ids: set[int]) -> PendingStill:
-    """The same wish, in which these tracks are named no more; its crop stays as it was cut."""
-    also = tuple(one for one in waiting.request.also if one.track_id not in track_ids)
-    named = tuple(shown for shown in waiting.cut.header.also if shown[0] not in track_ids)
-    cut = replace(waiting.cut, header=replace(waiting.cut.header, also=named))
-    return replace(waiting, request=replace(waiting.request, also=also), cut=cut)
+        Only what a report could have named counts: where none comes, nothing is known of what has arrived.
+        """
+        settings = self._settings
+        wait_ns = max(settings.least_wait_ns, settings.wait_round_trips * self._round_trip_ns)
+        with self._lock:
+            overdue = [
+                one
+                for one in self._sent.values()
+                if one.state is StillState.SENT
+                and one.copies == 1
+                and self._reported_ns - one.sent_ns >= wait_ns
+                and now_ns - one.sent_ns <= settings.max_sent_ns
+            ]
+        return sorted(overdue, key=lambda one: -one.utility)
+
+    def lose(self) -> list[OutboxStill]:
+        """The link is away: take what no report has named for lost; most useful first."""
+        if not self._reports:
+            return []
+        with self._lock:
+            lost = [one for one in self._sent.values() if one.state is StillState.SENT]
+            for one in lost:
+                one.state = StillState.LOST
+                del self._sent[one.still.sequence]
+                self._undecodable.discard(one.still.sequence)
+        return sorted(lost, key=lambda one: -one.utility)
+
+    # Leaving
+
+    def _expire(self, pending: OutboxStill, reason: str) -> tuple[OutboxStill, str]:
+        self._leave_pending(pending)
+        pending.state = StillState.EXPIRED
+        return pending, reason
+
+    def _leave_pending(self, pending: OutboxStill) -> None:
+        if pending in self._on_demand:
+            self._on_demand.remove(pending)
+        else:
+            self._pending.pop(pending.track_id, None)
+
+    def _drop_crop(self, sent: OutboxStill) -> None:
+        """It will not be coded again."""
+        sent.job = None
+        self._undecodable.discard(sent.still.sequence)
+        if sent.state is StillState.ACKNOWLEDGED or not self._reports:
+            self._forget(sent)
+
+    def _forget(self, sent: OutboxStill) -> None:
+        sent.state, sent.job = StillState.EXPIRED, None
+        del self._sent[sent.still.sequence]
+        self._undecodable.discard(sent.still.sequence)
 
 
-def _order(waiting: PendingStill) -> tuple[float, int, int]:
-    return _usefulness(waiting.request, waiting.since_ns)
+def _take_off(pending: OutboxStill, track_ids: set[int]) -> None:
+    """These tracks are named no more; the crop stays as it is."""
+    job, request = pending.crop, pending.request
+    assert request is not None, "only stills of the method show several tracks"
+    named = tuple(shown for shown in job.header.also if shown[0] not in track_ids)
+    pending.job = replace(job, header=replace(job.header, also=named))
+    pending.request = replace(
+        request, also=tuple(one for one in request.also if one.track_id not in track_ids)
+    )
 
 
-def _usefulness(request: Request, since_ns: int) -> tuple[float, int, int]:
-    # Ties go to the older wish, then to the older track: the order is the same in every run.
-    return (request.score, -since_ns, -request.candidate.track_id)
+def _order(pending: OutboxStill) -> tuple[float, int, int]:
+    # Ties go to the older still, then to the older track: the order is the same in every run.
+    return pending.utility, -_since_ns(pending), -pending.track_id
+
+
+def _since_ns(pending: OutboxStill) -> int:
+    assert pending.since_ns is not None, "it has been met"
+    return pending.since_ns

@@ -1,7 +1,7 @@
-"""Temporal suppression: which candidates may be asked for at all at this step, in front of every method.
+"""Which candidates may get a still at this step, before every method: temporal suppression, then the gate.
 
-One stage for all methods, so that they differ in what they want and in nothing else. The paper's plain variants run
-with it off (``--cooldown 0``).
+One stage for all methods, so that they differ in what they request and in nothing else. The paper's plain variants
+run with suppression off (``--cooldown 0``).
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from hvt_edge.perception.base_loss import BaseLoss
 from hvt_edge.perception.candidates import Candidate
 
-__all__ = ["Suppression"]
+__all__ = ["Gate", "Suppression"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +46,15 @@ class Suppression:
         self, candidates: Sequence[Candidate], *, now_ns: int
     ) -> tuple[list[Candidate], list[tuple[Candidate, str]]]:
         """Split into those that may go on and those held, each with ``refused cooldown border no_gain``."""
-        kept: list[Candidate] = []
+        allowed: list[Candidate] = []
         held: list[tuple[Candidate, str]] = []
         for candidate in candidates:
             reason = self._reason(candidate, now_ns)
             if reason is None:
-                kept.append(candidate)
+                allowed.append(candidate)
             else:
                 held.append((candidate, reason))
-        return kept, held
+        return allowed, held
 
     def _reason(self, candidate: Candidate, now_ns: int) -> str | None:
         if _since_s(candidate.last_refused_ns, now_ns) < self.retry_s:
@@ -85,6 +86,30 @@ class Suppression:
         if candidate.sharpness is None or candidate.last_sent_sharpness is None:
             return False
         return candidate.sharpness() >= self.min_gain * candidate.last_sent_sharpness
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """Refuses a still of what the base already shows well enough; refuses nothing at 0 dB. Frozen, without state.
+
+    The edge decodes its own stream and knows what the base lost of each candidate (`base_loss`). Both conditions have
+    to hold, because each has its blind spot: PSNR is high on a dark or smooth object whatever became of its edges,
+    and lost detail is small on a coarse object that is plainly wrong in colour. docs/stills.md has the figures.
+    """
+
+    psnr_y_db: float = 0.0
+    """Luma PSNR of the base crop from which on the base counts as good; 0: no gate."""
+    most_detail_lost: float = 0.4
+    """Nor may the base have lost more than this share of the crop's detail (`BaseLoss.detail_lost`)."""
+
+    @property
+    def on(self) -> bool:
+        """Whether anything is ever refused."""
+        return self.psnr_y_db > 0
+
+    def good_enough(self, loss: BaseLoss) -> bool:
+        """Whether a still of what the base shows so well is not worth its bits."""
+        return self.on and loss.psnr_y_db >= self.psnr_y_db and loss.detail_lost <= self.most_detail_lost
 
 
 def _since_s(then_ns: int | None, now_ns: int) -> float:

@@ -105,6 +105,8 @@ class BaseStage:
             self._backlog.base(unit, now_ns=now_ns, sent=probes)
             if probes:
                 self._sender.base(unit, now_ns=now_ns, after_hole=not unit.keyframe)
+            else:
+                self._sender.store_base(unit, now_ns=now_ns)
             return
         if self._backlog is not None:
             self._backlog.sent(unit)

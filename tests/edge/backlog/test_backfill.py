@@ -90,7 +90,9 @@ class Rig:
     def report(self) -> None:
         """What the ground has to say."""
         acknowledged_ranges = self.ground.assembly.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES)
-        self.backfill.hear(acknowledged_ranges, receiver_id=self.ground.receiver_id, now_ns=self.now_ns)
+        self.backfill.on_acknowledged(
+            acknowledged_ranges, receiver_id=self.ground.receiver_id, now_ns=self.now_ns
+        )
 
 
 def fill(folder, *, stills: int = 6) -> None:
@@ -232,7 +234,7 @@ def test_a_ground_that_answers_is_busy_and_not_gone(tmp_path):
         for _ in range(60):
             rig.run(1, reports=False)
             acknowledged_range = AcknowledgedRange(session_id=7, kind=key[1], number=1, acknowledged_bytes=0)
-            rig.backfill.hear([acknowledged_range], receiver_id=1, now_ns=rig.now_ns)
+            rig.backfill.on_acknowledged([acknowledged_range], receiver_id=1, now_ns=rig.now_ns)
         assert rig.backfill.given_up == 0
         rig.listening = True
         rig.run(5)
@@ -253,7 +255,7 @@ def test_a_word_that_comes_late_still_counts(tmp_path):
             acknowledged_range = AcknowledgedRange(
                 session_id=7, kind=BacklogKind.STILL, number=1, acknowledged_bytes=acknowledged_bytes
             )
-            rig.backfill.hear([acknowledged_range], receiver_id=1, now_ns=rig.now_ns)
+            rig.backfill.on_acknowledged([acknowledged_range], receiver_id=1, now_ns=rig.now_ns)
             assert folder.stills == left
         assert rig.done == [(7, BacklogKind.STILL, 1)]
 
@@ -285,8 +287,8 @@ def test_reports_of_nonsense_and_of_other_grounds_change_nothing(tmp_path):
         def acknowledged_range(bytes_: int, *, number: int = 0, kind: str = "base") -> AcknowledgedRange:
             return AcknowledgedRange(session_id=7, kind=kind, number=number, acknowledged_bytes=bytes_)
 
-        rig.backfill.hear([acknowledged_range(total)], receiver_id=99, now_ns=rig.now_ns)
-        rig.backfill.hear(
+        rig.backfill.on_acknowledged([acknowledged_range(total)], receiver_id=99, now_ns=rig.now_ns)
+        rig.backfill.on_acknowledged(
             [
                 acknowledged_range(total + 1),
                 acknowledged_range(5, number=77),
@@ -310,8 +312,8 @@ def test_only_facts_that_are_here_can_be_asked_for(tmp_path):
             AcknowledgedRange(session_id=n, kind="info", number=0, acknowledged_bytes=0)
             for n in range(7, 2000)
         ]
-        backfill.hear(strangers, receiver_id=1, now_ns=1)
-        assert backfill._asked == {7}
+        backfill.on_acknowledged(strangers, receiver_id=1, now_ns=1)
+        assert backfill._requested == {7}
 
 
 def test_bytes_count_as_arrived_once_whatever_the_link_does(tmp_path):

@@ -1,8 +1,11 @@
-"""When the link is away."""
+"""When the link is away, and which frames it took with it."""
 
 from __future__ import annotations
 
-from hvt_edge.backlog.outage import Outage
+import threading
+
+from hvt_common.values import AccessUnit
+from hvt_edge.backlog.outage import BaseInFlight, InFlightSettings, Outage
 
 S = 1_000_000_000
 
@@ -10,8 +13,8 @@ S = 1_000_000_000
 def states(outage: Outage, *, first: float, last: float, linked: bool, reports: float = 0) -> list[bool]:
     """Asked fifteen times a second; a ground reports each ``reports`` seconds."""
     answers, next_report = [], first
-    for tick in range(round(first * 15), round(last * 15)):
-        now = tick / 15
+    for index in range(round(first * 15), round(last * 15)):
+        now = index / 15
         if reports and now >= next_report:
             outage.reported(round(now * S))
             next_report += reports
@@ -60,3 +63,66 @@ def test_a_ground_that_left_does_not_keep_the_others_from_seeing():
     after = states(outage, first=3, last=30, linked=True)
     assert after[-1] is False
     assert 13 <= sum(after) / 15 <= 14.5
+
+
+def unit(index: int, size: int = 1_000) -> AccessUnit:
+    """An access unit."""
+    return AccessUnit(index, index * S // 15, bytes(size), keyframe=index == 0)
+
+
+def flown(count: int, *, each_ns: int = S // 10, settings: InFlightSettings | None = None) -> BaseInFlight:
+    """So many access units sent."""
+    in_flight = BaseInFlight(settings or InFlightSettings())
+    for index in range(count):
+        in_flight.sent(index, unit(index), now_ns=index * each_ns)
+    return in_flight
+
+
+def lost(in_flight: BaseInFlight) -> list[int]:
+    """What an outage takes."""
+    return [one.frame_index for one in in_flight.take()]
+
+
+def test_frames_that_no_report_has_named_are_taken_in_order():
+    """The store would hold a video that cannot be decoded, or what the ground has."""
+    in_flight = flown(4)
+    assert in_flight.on_report(1)
+    assert not in_flight.on_report(1), "it is no news"
+    assert (len(in_flight), in_flight.size_bytes) == (2, 2_000)
+    assert lost(in_flight) == [2, 3]
+    assert (len(in_flight), in_flight.size_bytes, lost(in_flight)) == (0, 0, [])
+
+
+def test_frames_in_flight_are_bounded_in_bytes_and_age():
+    """A ground that never reports would let the edge grow; or what was lost long ago would count for this outage."""
+    in_flight = flown(60, each_ns=S // 100, settings=InFlightSettings(max_bytes=10_000))
+    assert in_flight.size_bytes <= 10_000
+    assert lost(in_flight) == list(range(50, 60))
+    assert lost(flown(10, each_ns=S)) == [5, 6, 7, 8, 9]
+
+
+def test_frame_loop_and_link_may_act_at_once():
+    """The edge would crash in flight, once in a thousand."""
+    in_flight, errors = BaseInFlight(), []
+
+    def run(work) -> None:
+        try:
+            for index in range(800):
+                work(index)
+        except Exception as error:  # noqa: BLE001 - told in the main thread
+            errors.append(error)
+
+    threads = [
+        threading.Thread(target=run, args=[work])
+        for work in (
+            lambda index: in_flight.sent(index, unit(index, 10), now_ns=index),
+            lambda index: in_flight.on_report(index - 5),
+            lambda index: in_flight.take() if index % 50 == 0 else None,
+        )
+    ]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    in_flight.take()
+    assert (errors, in_flight.size_bytes) == ([], 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import pytest
 
@@ -90,8 +89,8 @@ def test_a_kept_still_is_as_it_would_have_come_and_takes_its_budget(tmp_path):
     rig.play(0, 5, linked=True)
     rig.play(5, 8, linked=False)
     for _ in range(40):
-        rig.backlog.still(STILL, utility=1.5, now_ns=rig.now_ns)
-    assert rig.sender.still_room_bytes(rig.now_ns, paced=False) <= 100_000 - 40 * 1500
+        rig.store(utility=1.5)
+    assert rig.sender.still_allowance_bytes(rig.now_ns, paced=False) <= 100_000 - 40 * 1500
     rig.backlog.close()
     with opened(tmp_path / "store", session_id=8) as folder:
         (entry,) = folder.best_stills()
@@ -102,20 +101,18 @@ def test_a_kept_still_is_as_it_would_have_come_and_takes_its_budget(tmp_path):
     assert not [row for row, _, _ in rig.out.puts if row is Channel.ROI]
 
 
-def test_stills_that_the_outage_swallowed_are_known_with_their_worth(tmp_path):
+def test_stills_that_the_outage_took_are_known_with_their_worth(tmp_path):
     """What was on its way would be lost, or come back as worth nothing."""
     rig = Rig(tmp_path / "store")
     rig.play(0, 5, linked=True)
-    still = replace(STILL, sequence=0)
-    rig.sender.still(still, now_ns=rig.now_ns, utility=2.5)
-    rig.backlog.note_utility(still, 2.5)
+    rig.still(0, utility=2.5)
     rig.play(5, 8, linked=False)
-    rig.backlog.store_lost(rig.now_ns)
+    rig.stills.store_lost(rig.now_ns)
     rig.backlog.close()
     with opened(tmp_path / "store", session_id=8) as folder:
         (entry,) = folder.best_stills()
         kept = parse_backlog_still(folder.read(entry))
-        assert (entry.number, kept.payload) == (0, still.data)
+        assert (entry.number, kept.payload) == (0, STILL.data)
         assert entry.path.name.endswith("-2.5.still"), "with its utility"
 
 
@@ -149,8 +146,10 @@ def test_nobody_keeps_where_nothing_is_to_be_kept(tmp_path, settings):
         config,
         session_id=1,
         live=True,
-        link=rig.out,
+        has_subscriber=lambda: True,
         sender=rig.sender,
+        in_flight=rig.in_flight,
+        outbox=rig.outbox,
         keyframes=rig.keyframes,
         clock=lambda: START_NS,
         info=INFO.pack,

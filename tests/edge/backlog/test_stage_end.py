@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from hvt_common.protocol.channels import Channel
-from keeping import STILL, NoStills, Rig
+from hvt_edge.backlog.worker import ChunkAllowance
+from hvt_edge.stills.crop_job import CropJob
+from hvt_edge.stills.outbox import OutboxStill
+from keeping import STILL, Rig
 from kept import S, add_stills, opened
 
 
@@ -68,7 +72,7 @@ def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path):
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
     rig.play(21, 45, linked=False)
-    rig.backlog.still(STILL, utility=1.0, now_ns=rig.now_ns)
+    rig.store()
     rig.linked = True
     rig.finish()
     ground = rig.out.ground
@@ -100,7 +104,7 @@ def test_stills_sent_while_the_link_was_coming_back_are_kept(tmp_path):
     rig.still(0, utility=1.5)  # the other thread had not noticed
     rig.play(30, 31, linked=True)
     assert not rig.backlog.offline
-    rig.backlog.store_lost(rig.now_ns)
+    rig.stills.store_lost(rig.now_ns)
     assert rig.stored_stills() == {0: f"still-0-{STILL.capture_ns}-1.5.still"}
 
 
@@ -148,10 +152,10 @@ def test_only_to_who_reports_is_anything_sent_that_was_kept(tmp_path):
         add_stills(folder, {1: 1.0})
     rig = Rig(tmp_path / "store")
     rig.play(0, 60)
-    assert not rig.backlog.may_send(rig.now_ns)
+    assert rig.backlog.chunk_allowance(rig.now_ns) is None
     rig.report()
-    assert rig.backlog.may_send(rig.now_ns)
-    assert not rig.backlog.may_send(rig.now_ns + 2 * S), "it has fallen silent"
+    assert rig.backlog.chunk_allowance(rig.now_ns) is not None
+    assert rig.backlog.chunk_allowance(rig.now_ns + 2 * S) is None, "it has fallen silent"
     rig.backlog.close()
 
 
@@ -159,25 +163,27 @@ def test_what_may_be_sent_now_and_how_much(tmp_path):
     """Backfill would go before the picture, or before a live still."""
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
-    assert not rig.backlog.may_send(rig.now_ns), "the link is two seconds old at the least"
+    assert rig.backlog.chunk_allowance(rig.now_ns) is None, "the link is two seconds old at the least"
     rig.play(21, 60, reports=True)
-    assert rig.backlog.may_send(rig.now_ns)
+    assert rig.backlog.chunk_allowance(rig.now_ns) is not None
     rig.keyframes.request(rig.now_ns)
-    assert not rig.backlog.may_send(rig.now_ns), "a keyframe is to come"
+    assert rig.backlog.chunk_allowance(rig.now_ns) is None, "a keyframe is to come"
     rig.play(60, 75, reports=True)
-    assert rig.backlog.may_send(rig.now_ns)
-    assert rig.backlog.room_bytes(rig.now_ns, live_waits=False) == 5000, "50 ms of 800 kbps"
-    assert rig.backlog.room_bytes(rig.now_ns, live_waits=True) == 1400
-    rig.backlog.attend(NoStills(live_waits=True))
-    assert rig.backlog.live_waits()
+    assert rig.backlog.chunk_allowance(rig.now_ns) is not None
+    pending = OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8), None, None), None, 1.0, rig.now_ns)
+    assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(5000), "50 ms of 800 kbps"
+    rig.outbox.offer(pending)
+    assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(1400, trickle=True)
+    rig.outbox.give_up(pending)
     for number in range(22):
         rig.still(number)
-    assert rig.backlog.room_bytes(rig.now_ns, live_waits=False) == 0, (
+    assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(0), (
         "a third of the stills' share stays free"
     )
-    assert rig.backlog.room_bytes(rig.now_ns, live_waits=True) == 1400
+    rig.outbox.offer(pending)
+    assert rig.backlog.chunk_allowance(rig.now_ns) == ChunkAllowance(1400, trickle=True)
     rig.play(75, 90, linked=False)
-    assert not rig.backlog.may_send(rig.now_ns)
+    assert rig.backlog.chunk_allowance(rig.now_ns) is None
     rig.backlog.close()
 
 
@@ -188,11 +194,11 @@ def test_kept_video_leaves_the_stills_its_share_and_no_more(tmp_path):
     stills = 0
     for first in range(15, 150):
         rig.play(first, first + 1, linked=False)
-        room = rig.sender.still_room_bytes(rig.now_ns, paced=False)
+        room = rig.sender.still_allowance_bytes(rig.now_ns, paced=False)
         while room >= 1500:
-            rig.backlog.still(STILL, utility=1.0, now_ns=rig.now_ns)
+            rig.store()
             stills += 1
-            room = rig.sender.still_room_bytes(rig.now_ns, paced=False)
+            room = rig.sender.still_allowance_bytes(rig.now_ns, paced=False)
     video = sum(len(rig.coded[index]) for index in range(15, 150))
     carry = 2.0 * 100_000 / 8
     assert stills * 1500 + video <= 9 * 400_000 / 8 + carry
@@ -210,7 +216,7 @@ def test_in_an_outage_stills_have_the_room_that_the_link_gave_them(tmp_path):
     assert rig.backlog.offline
     assert rig.link_control.pacer.rate_bps == 100_000
     assert rig.sender.total_bps == 800_000
-    assert rig.sender.still_room_bytes(rig.now_ns, paced=False) > 5_000
+    assert rig.sender.still_allowance_bytes(rig.now_ns, paced=False) > 5_000
     rig.out.dark = False
     rig.report()
     rig.play(60, 62)
@@ -229,7 +235,7 @@ def test_the_end_of_the_stores_thread_is_noticed_on_a_good_link(tmp_path):
 
     rig = Rig(tmp_path / "store", info=broken)
     rig.play(0, 7, reports=True)
-    rig.backlog.still(STILL, utility=1.0, now_ns=rig.now_ns)
+    rig.store()
     rig.backlog._worker._thread.join(timeout=10)
     with pytest.raises(ZeroDivisionError):
         rig.play(7, 8, linked=True)

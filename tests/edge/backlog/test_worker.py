@@ -16,8 +16,7 @@ from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.intake import EndSegment, Intake, IntakeUnit
-from hvt_edge.backlog.outgoing import Outgoing
-from hvt_edge.backlog.worker import StoreWorker
+from hvt_edge.backlog.worker import ChunkAllowance, ChunkThread, StoreWorker
 from keeping import Rig
 from kept import INFO, UNITS, S, add_stills, add_units, opened, shifted
 from processes import eventually
@@ -37,27 +36,20 @@ class Link:
         """So many pieces find that their room is gone."""
         self.now_ns = START_NS
         self.sent: list[tuple[int, Chunk]] = []
-        self.round_trip_ns, self.total_bps = S // 10, 800_000
 
-    def may_send(self, now_ns: int) -> bool:
-        """Whether the link is there."""
-        return self.open
+    def allowance(self, now_ns: int) -> ChunkAllowance | None:
+        """Of a chunk; None while the link is not there."""
+        if not self.open:
+            return None
+        return ChunkAllowance(1400, trickle=True) if self.waits else ChunkAllowance(5000)
 
-    def live_waits(self) -> bool:
-        """Whether a live still waits."""
-        return self.waits
-
-    def room_bytes(self, now_ns: int, *, live_waits: bool) -> int:
-        """Of a piece."""
-        return 1400 if live_waits else 5000
-
-    def send(self, chunk: Chunk, *, now_ns: int) -> int:
+    def send(self, chunk: Chunk) -> int:
         """Send it."""
         self.full.wait(timeout=20)
         if self.gone:
             self.gone -= 1
             return 0
-        self.sent.append((now_ns, chunk))
+        self.sent.append((self.now_ns, chunk))
         self.now_ns += S // 1000
         return len(chunk.data) + 60
 
@@ -66,9 +58,12 @@ def worker_of(path: Path, link: Link, *, info=INFO.pack, close_s: float = 5.0) -
     """A store with its thread."""
     return StoreWorker(
         lambda: Folder(path, max_bytes=50_000_000, session_id=7, info=info),
-        link,
         session_id=7,
         clock=lambda: link.now_ns,
+        allowance=link.allowance,
+        send=link.send,
+        round_trip_ns=lambda: S // 10,
+        total_bps=lambda: 800_000,
         close_s=close_s,
     )
 
@@ -107,7 +102,7 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
     worker.video_first()
     disk.set()
     eventually(
-        lambda: not worker.waiting and worker._folder.open_segments == 0, within_s=20, what="all is kept"
+        lambda: not worker.queued and worker._folder.open_segments == 0, within_s=20, what="all is kept"
     )
     assert worker._backfill.video_first
     assert not worker.offer(IntakeUnit(UNITS[0], b"")) or worker.numbers.segments > 1
@@ -142,7 +137,7 @@ def test_the_words_of_a_full_line_are_few():
         acknowledged_range = AcknowledgedRange(
             session_id=7, kind=BacklogKind.BASE, number=number, acknowledged_bytes=5
         )
-        intake.hear([acknowledged_range], receiver_id=3)
+        intake.on_acknowledged([acknowledged_range], receiver_id=3)
     assert len(intake) == 2
     news, first = intake.take(0.0)
     assert (news.interrupted, first) == (True, UNIT)
@@ -163,10 +158,10 @@ def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
     link = Link()
     link.full.clear()
     worker = worker_of(tmp_path / "store", link)
-    eventually(lambda: worker._outgoing.busy, within_s=10, what="a piece is being sent")
+    eventually(lambda: worker._sending.busy, within_s=10, what="a piece is being sent")
     for unit in UNITS[:10]:
         worker.offer(IntakeUnit(shifted(unit, 50), UNITS[0].data))
-    eventually(lambda: worker.numbers.segments == 2 and not worker.waiting, within_s=10, what="it is kept")
+    eventually(lambda: worker.numbers.segments == 2 and not worker.queued, within_s=10, what="it is kept")
     assert link.sent == []
     link.full.set()
     eventually(lambda: len(link.sent) > 3, within_s=10, what="it goes on")
@@ -180,12 +175,12 @@ def test_after_the_last_word_nothing_goes_out(tmp_path):
     link = Link()
     link.full.clear()
     worker = worker_of(tmp_path / "store", link)
-    eventually(lambda: worker._outgoing.busy, within_s=10, what="a piece is being sent")
+    eventually(lambda: worker._sending.busy, within_s=10, what="a piece is being sent")
     worker.send_no_more()
     link.full.set()
     for unit in UNITS[:10]:
         worker.offer(IntakeUnit(shifted(unit, 50), UNITS[0].data))
-    eventually(lambda: worker.numbers.segments == 2 and not worker.waiting, within_s=10, what="it is kept")
+    eventually(lambda: worker.numbers.segments == 2 and not worker.queued, within_s=10, what="it is kept")
     worker.close()
     assert len(link.sent) == 1, "the one that was under way"
 
@@ -217,7 +212,7 @@ def test_where_live_stills_always_wait_a_trickle_goes_on(tmp_path):
         link.now_ns += S // 10
         worker._intake.wake()
         eventually(
-            lambda: worker._intake._woken is False and not worker._outgoing._chunk, within_s=5, what="a turn"
+            lambda: worker._intake._woken is False and not worker._sending._chunk, within_s=5, what="a turn"
         )
         assert len(link.sent) - before <= 1
     worker.close()
@@ -269,12 +264,12 @@ def test_an_error_in_sending_ends_the_process_too():
         raise ZeroDivisionError
 
     woken = threading.Event()
-    outgoing = Outgoing(broken, on_done=woken.set)
-    outgoing.put(Chunk(7, BacklogKind.STILL, 1, 0, 3, b"abc"))
+    sending = ChunkThread(broken, on_done=woken.set)
+    sending.put(Chunk(7, BacklogKind.STILL, 1, 0, 3, b"abc"))
     assert woken.wait(timeout=10)
     with pytest.raises(ZeroDivisionError):
-        outgoing.take()
-    outgoing.close(5.0)
+        sending.take()
+    sending.close(5.0)
 
 
 def test_the_link_that_blocks_is_the_edges_own(tmp_path):
@@ -285,8 +280,8 @@ def test_the_link_that_blocks_is_the_edges_own(tmp_path):
     rig.play(0, 21, reports=True)
     rig.play(21, 40, linked=False)
     rig.play(40, 90, linked=True, reports=True)
-    eventually(lambda: rig.backlog._worker._outgoing.busy, within_s=10, what="a piece is being sent")
+    eventually(lambda: rig.backlog._worker._sending.busy, within_s=10, what="a piece is being sent")
     rig.play(90, 110, linked=False)
-    eventually(lambda: not rig.backlog._worker.waiting, within_s=10, what="frames are kept")
+    eventually(lambda: not rig.backlog._worker.queued, within_s=10, what="frames are kept")
     gate.set()
     assert {unit.frame_index for unit in rig.kept()} >= set(range(90, 110))

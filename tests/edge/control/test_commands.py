@@ -257,7 +257,7 @@ def test_no_request_breaks_the_edge(command, arguments):
     answer = HOSTILE.ask(command, **arguments)
     HOSTILE.run(1)
     assert answer.accepted == (not answer.reason)
-    assert HOSTILE.on_demand.waiting <= 4
+    assert HOSTILE.outbox.on_demand_pending <= 4
     assert HOSTILE.reconfiguration.count == 0
 
 

@@ -16,12 +16,15 @@ from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, Flags, Health, RoiHeader, Status
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.transmitter import (
     BASE_ATTACHMENT_BYTES,
     STATUS_BYTES,
     Transmitter,
     base_overhead_bps,
 )
+from messages import feedback
 
 SECOND_NS = 1_000_000_000
 NOW_NS = 1_790_000_000 * SECOND_NS
@@ -53,7 +56,9 @@ class Out:
 class Rig:
     """A sender with all that it needs."""
 
-    def __init__(self, *, total_bps: int = 800_000, lockstep: bool = False) -> None:
+    def __init__(
+        self, *, total_bps: int = 800_000, lockstep: bool = False, pacer: Pacer | None = None
+    ) -> None:
         self.out, self.ledger, self.waits = Out(), Ledger(), []
         self.budget = RollingBudget(BudgetSettings(total_bps, round(total_bps * 0.8), fps=15))
         self.sender = Transmitter(
@@ -64,6 +69,7 @@ class Rig:
             session_id=2**64 - 1,
             lockstep=lockstep,
             wait_until=self.waits.append,
+            pacer=pacer,
         )
 
 
@@ -152,7 +158,7 @@ def test_lockstep_is_flagged():
     """The ground would show media time as delay."""
     rig = Rig(lockstep=True)
     rig.sender.base(unit(0, keyframe=True), now_ns=NOW_NS)
-    rig.sender.still(still(), now_ns=NOW_NS)
+    rig.sender.still(rig.sender.envelope(still()), now_ns=NOW_NS)
     (_, payload, attachment, _), (_, data, roi, _) = rig.out.puts
     assert BaseHeader.parse(attachment, payload).flags == 7
     assert RoiHeader.parse(roi, data).flags == Flags.LOCKSTEP
@@ -162,7 +168,7 @@ def test_a_still_says_what_it_shows():
     """The ground could not place it."""
     rig = Rig()
     sent = still(sequence=6)
-    rig.sender.still(sent, now_ns=NOW_NS + 50)
+    rig.sender.still(rig.sender.envelope(sent), now_ns=NOW_NS + 50)
     ((row, payload, attachment, encoding),) = rig.out.puts
     header = RoiHeader.parse(attachment, payload)
     assert (row, payload, encoding) == (Channel.ROI, sent.data, JPEG)
@@ -192,7 +198,7 @@ def test_the_ledger_counts_the_very_bytes_that_were_put():
         around = overhead_bytes(len(payload), len(attachment), key="hvt/uav-1/base", encoding=encoding)
         assert line == len(payload) + len(attachment) + around
         if index % 3 == 0:
-            rig.sender.still(still(300 + index, sequence=index // 3), now_ns=now_ns)
+            rig.sender.still(rig.sender.envelope(still(300 + index, sequence=index // 3)), now_ns=now_ns)
         if index % 15 == 0:
             rig.sender.status(lambda at_ns: status(at_ns, reasons=3), now_ns=now_ns)
     puts = rig.out.puts
@@ -262,9 +268,9 @@ def test_a_still_of_just_the_room_takes_just_the_room(  # noqa: PLR0917 - hypoth
         also=tuple(also),
     )
     room_line = rig.budget.still_room(now_ns)
-    room = rig.sender.still_room_bytes(now_ns, still=asked)
+    room = rig.sender.still_allowance_bytes(now_ns, still=asked)
     before = rig.ledger.line_bytes
-    rig.sender.still(replace(asked, data=bytes(room)), now_ns=now_ns)
+    rig.sender.still(rig.sender.envelope(replace(asked, data=bytes(room))), now_ns=now_ns)
     _, payload, attachment, encoding = rig.out.puts[-1]
     assert encoding == ("application/octet-stream" if "hvt" in media_type else media_type)
     taken = rig.ledger.line_bytes - before
@@ -280,8 +286,8 @@ def test_before_there_is_a_still_the_room_is_that_of_a_usual_one():
     rig = Rig()
     now_ns = NOW_NS + 10 * SECOND_NS
     usual = still(track_id=150, sequence=300, frame_index=900, box_source_px=(1.5, 900.0, 99.25, 999.0))
-    exact = rig.sender.still_room_bytes(now_ns, still=usual)
-    assert abs(rig.sender.still_room_bytes(now_ns) - exact) < 32
+    exact = rig.sender.still_allowance_bytes(now_ns, still=usual)
+    assert abs(rig.sender.still_allowance_bytes(now_ns) - exact) < 32
     assert abs(rig.sender.most_still_bytes() - exact) < 32
 
 
@@ -341,8 +347,8 @@ def test_two_threads_keep_one_account():
         try:
             for number in range(1_500):
                 now_ns = NOW_NS + number * 1_000_000
-                if rig.sender.still_room_bytes(now_ns, still=still()) > 200:
-                    rig.sender.still(still(200, sequence=number), now_ns=now_ns)
+                if rig.sender.still_allowance_bytes(now_ns, still=still()) > 200:
+                    rig.sender.still(rig.sender.envelope(still(200, sequence=number)), now_ns=now_ns)
                 rig.sender.outcome("sent", f"reason{number % 20}")
         except BaseException as error:  # noqa: BLE001
             errors.append(error)
@@ -389,5 +395,53 @@ def test_a_keyframe_is_weighed_against_the_window(fits):
         rig.sender.base(unit(index, int(rng.integers(4_900, 5_100))), now_ns=now_ns)
     now_ns += SECOND_NS // 15
     if not fits:
-        rig.sender.still(still(15_000), now_ns=now_ns)
+        rig.sender.still(rig.sender.envelope(still(15_000)), now_ns=now_ns)
     assert rig.sender.keyframe_fits(20_000, now_ns=now_ns) is fits
+
+
+def test_a_second_copy_has_the_same_number_and_bytes_and_is_counted():
+    """The ground would show it twice; or the budget and the account would not hold what crossed the line."""
+    rig = Rig()
+    envelopes = [rig.sender.envelope(still(400, sequence=sequence)) for sequence in range(3)]
+    for number, envelope in enumerate(envelopes):
+        rig.sender.still(envelope, now_ns=NOW_NS + number * 1_000_000)
+    now_ns = NOW_NS + 2_000_000
+    line_bytes, allowance = rig.ledger.line_bytes, rig.sender.still_allowance_bytes(now_ns)
+    rig.sender.still(envelopes[1], now_ns=now_ns, copy=True)
+    (_, data, attachment, _), (_, again, second, _) = rig.out.puts[1], rig.out.puts[3]
+    header, copy = RoiHeader.parse(attachment, data), RoiHeader.parse(second, again)
+    assert data == again
+    assert copy == replace(header, send_delay_ns=copy.send_delay_ns)
+    assert copy.send_ns == now_ns
+    assert rig.sender.still_sequence == 2
+    assert rig.ledger.messages(Account.ROI) == 4
+    assert rig.ledger.line_bytes - line_bytes > 400
+    assert rig.sender.still_allowance_bytes(now_ns) < allowance - 400
+
+
+def test_a_second_copy_does_not_confuse_the_pacer():
+    """It would take reports for those of stills that were never sent, and the rate would fall to its floor."""
+    pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
+    pacer.link(True, now_ns=NOW_NS)
+    rig = Rig(pacer=pacer)
+    envelopes = [rig.sender.envelope(still(400, sequence=sequence)) for sequence in range(3)]
+    for number, envelope in enumerate(envelopes):
+        rig.sender.base(unit(number), now_ns=NOW_NS + number * 66_000_000)
+        rig.sender.still(envelope, now_ns=NOW_NS + number * 66_000_000)
+    rig.sender.still(envelopes[0], now_ns=NOW_NS + 1_300_000_000, copy=True)
+    report = feedback(sequence=0, send_ns=NOW_NS, base_sequence=2, still_sequence=2)
+    pacer.hear(report, now_ns=NOW_NS + 1_400_000_000)
+    assert pacer.ignored == 0
+    assert 0 < pacer.round_trip_ns < 1_400_000_000
+
+
+def test_a_stored_still_has_the_bytes_that_it_would_have_had():
+    """The ground could not place what comes back after an outage."""
+    rig = Rig()
+    envelope = rig.sender.envelope(still(400))
+    rig.sender.still(envelope, now_ns=NOW_NS)
+    stored = rig.sender.store_still(envelope, now_ns=NOW_NS)
+    (_, data, attachment, encoding) = rig.out.puts[0]
+    assert (stored.payload, stored.encoding) == (data, encoding)
+    sent = RoiHeader.parse(attachment, data)
+    assert RoiHeader.parse(stored.attachment, data) == replace(sent, flags=Flags.STORED)

@@ -41,7 +41,8 @@ class Rig:
 
     def still(self, number: int, size: int, *, now_ns: int = NOW_NS) -> None:
         """One of so many bytes."""
-        self.sender.still(replace(STILL, sequence=number, data=b"\xff" * size), now_ns=now_ns)
+        still = replace(STILL, sequence=number, data=b"\xff" * size)
+        self.sender.still(self.sender.envelope(still), now_ns=now_ns)
 
     def backlog(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:
         """A piece of so many bytes."""
@@ -66,7 +67,7 @@ def test_a_still_that_lost_its_room_waits_until_there_is_some():
     """A still and a piece that were both admitted would exceed the window together."""
     rig = Rig()
     assert rig.backlog(40_000)
-    room = rig.sender.still_room_bytes(NOW_NS)
+    room = rig.sender.still_allowance_bytes(NOW_NS)
     assert room > 7_000
     assert rig.backlog(55_000, offset=40_000)  # by the store's thread, meanwhile
     rig.still(0, room)
@@ -81,7 +82,7 @@ def test_a_still_that_lost_its_room_waits_until_there_is_some():
 def test_a_still_that_has_its_room_goes_at_once():
     """Each still would wait a window."""
     rig = Rig()
-    rig.still(0, rig.sender.still_room_bytes(NOW_NS))
+    rig.still(0, rig.sender.still_allowance_bytes(NOW_NS))
     assert rig.waits == [NOW_NS]
 
 
@@ -111,7 +112,7 @@ def stills(rig: Rig, clock: Clock) -> Iterator[None]:
     """The stills' thread."""
     for number in count():
         at_ns = clock()
-        room = rig.sender.still_room_bytes(at_ns)
+        room = rig.sender.still_allowance_bytes(at_ns)
         yield
         if room > 500:
             rig.still(number, min(room, 12_000), now_ns=at_ns)

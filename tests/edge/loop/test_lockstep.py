@@ -54,7 +54,7 @@ class Stills:
         self.seen: list[tuple[int, int | None]] = []
         self.latest_tracks = None
 
-    def see(self, frame, unit):
+    def analyze(self, frame, unit):
         """Keep it."""
         self.seen.append((frame.index, unit and unit.frame_index))
         return frame.index
@@ -63,7 +63,7 @@ class Stills:
         """Nothing."""
         return set()
 
-    def hear(self, results):
+    def on_results(self, results):
         """Nothing."""
 
 

@@ -22,13 +22,10 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import TrackMemory
-from hvt_edge.stills import stage as still_stage
-from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings
-from hvt_edge.stills.stage import StillStage, StillWorker
-from hvt_edge.stills.suppression import Suppression
+from hvt_edge.stills import worker as still_worker
+from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from still_stage import make_still_stage
 
 NOISE = (
     8
@@ -211,28 +208,21 @@ class Rig:
             lockstep=False,
             wait_until=lambda _at: None,
         )
-        chooser = Chooser(
-            method("M1"),
-            suppression=Suppression.for_cooldown(0),
-            maker=StillMaker(),
-            memory=self.memory,
+        self.stage = make_still_stage(
+            sender,
+            analyzer(detector=detector),
+            keyframes=self.keyframes,
+            outcomes=self.outcomes,
             view=VIEW,
             class_names=CLASSES,
-            settings=ChooserSettings(fps=15, most_bytes=10_000),
-            on_outcome=lambda *outcome: self.outcomes.update([outcome]),
-        )
-        self.stage = StillStage(
-            analyzer(detector=detector),
-            chooser,
-            sender=sender,
-            keyframes=self.keyframes,
+            memory=self.memory,
         )
         self.keyframes.done(FRAMES[0].capture_ns)
 
     def run(self, count: int = 30) -> None:
         """Frame after frame, as the lockstep loop does."""
         for frame, unit in zip(FRAMES[:count], UNITS, strict=False):
-            self.stage.send(self.stage.see(frame, unit), now_ns=frame.capture_ns)
+            self.stage.send(self.stage.analyze(frame, unit), now_ns=frame.capture_ns)
 
 
 def test_a_track_gets_its_stills_when_they_are_due():
@@ -255,7 +245,7 @@ def test_while_a_keyframe_is_due_stills_are_held():
     rig.run()
     assert rig.out.stills == []
     rig.keyframes.done(FRAMES[-1].capture_ns)
-    assert rig.stage.waiting == 1
+    assert rig.stage.pending == 1
     rig.stage.close()
     assert rig.outcomes["dropped", "ended"] == 1
 
@@ -272,9 +262,9 @@ def test_what_the_ground_says_counts_and_no_opinion_does_not():
         "ground_track_id": 3,
         "again": False,
     }
-    rig.stage.hear([StillResult(class_name="", **answer)])
+    rig.stage.on_results([StillResult(class_name="", **answer)])
     assert rig.memory._histories[1].class_posterior is None
-    rig.stage.hear(
+    rig.stage.on_results(
         [
             StillResult(class_name="bus", **answer),
             StillResult(class_name="bus", **(answer | {"track_id": 99})),
@@ -285,11 +275,11 @@ def test_what_the_ground_says_counts_and_no_opinion_does_not():
 
 def test_the_worker_takes_all_frames_in_order_and_finishes(monkeypatch):
     """The last stills of a clip would be missing."""
-    monkeypatch.setattr(still_stage, "_FINISH_S", 30 * still_stage._FINISH_S)  # on a busy machine as well
+    monkeypatch.setattr(still_worker, "_FINISH_S", 30 * still_worker._FINISH_S)  # on a busy machine as well
     rig = Rig()
-    with StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns) as worker:
+    with StillWorker(rig.stage, results=list, clock=lambda: FRAMES[0].capture_ns) as worker:
         for frame, unit in zip(FRAMES, UNITS, strict=True):
-            while worker._frames.qsize() > 1:  # it is not hurried
+            while worker.queued > 1:  # it is not hurried
                 time.sleep(0.001)
             worker.offer(frame, unit)
     assert rig.stage._steps == 30
@@ -306,7 +296,7 @@ def test_an_error_in_the_worker_is_raised_even_when_its_queue_is_full():
             raise RuntimeError("model is gone")
 
     rig = Rig(detector=Broken())
-    worker = StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns, length=2)
+    worker = StillWorker(rig.stage, results=list, clock=lambda: FRAMES[0].capture_ns, length=2)
     for frame, unit in zip(FRAMES[:3], UNITS, strict=False):
         worker.offer(frame, unit)
     offered.set()
@@ -325,7 +315,7 @@ def test_closing_a_busy_worker_is_quick_and_leaves_nothing_running():
             return super().detect(image_bgr)
 
     rig = Rig(detector=Slow())
-    worker = StillWorker(rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns)
+    worker = StillWorker(rig.stage, results=list, clock=lambda: FRAMES[0].capture_ns)
     for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
         worker.offer(frame, unit)
     worker.close()

@@ -450,14 +450,14 @@ def test_parameters_take_their_part_of_the_admission():
     source = scene(*SIZE)
     base = blurred(source)
     view = View.fitted(SIZE, SIZE, fit="letterbox")
-    cut = BASE_CODED.cut(frame_of(source), request_for(CAR), view=view, base_bgr=base)
-    whole = BASE_CODED.code(cut, sequence=0, room=lambda _: 10**6)
+    job = BASE_CODED.crop(frame_of(source), request_for(CAR), view=view, base_bgr=base)
+    whole = BASE_CODED.code(job, sequence=0, allowance=lambda _: 10**6)
     limit = len(whole.data) + 3
 
     def room(still: Still) -> int:
         return limit - 10 * len(still.parameters)
 
-    still = BASE_CODED.code(cut, sequence=0, room=room)
+    still = BASE_CODED.code(job, sequence=0, allowance=room)
     assert len(still.data) <= limit - 10
     assert still.quality_pct < whole.quality_pct
 

@@ -1,132 +1,173 @@
-"""Stills that wait for room."""
+"""The whole life of a still: pending, sent, acknowledged, lost, stored, expired."""
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.values import Still
+from hvt_edge.backlog.entry import FIRST_STORED
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.crop_job import CropJob
-from hvt_edge.stills.outbox import PendingStill, QueueSettings, StillQueue
+from hvt_edge.stills.outbox import AGAIN, Outbox, OutboxSettings, OutboxStill, StillState
 from hvt_edge.stills.policy.base import Request
 
-DRAFT = Still(0, 0, 0, 1, (0, 0, 4, 4), (0, 0, 4, 4), "car", 0.5, "test", "jpeg", 65, b"")
-CUT = CropJob(DRAFT, np.zeros((4, 4, 3), np.uint8), None, None)
+MS, S = 1_000_000, 1_000_000_000
+RTT = 80 * MS
+BOX = (0.0, 0.0, 10.0, 10.0)
+HEADER = Still(0, 0, 0, 1, BOX, (0, 0, 10, 10), "car", 0.5, "test", "residual", 65, b"")
 
 
-def wish(track: int, score: float, *, since_ns: int = 0) -> PendingStill:
-    """A wish for a still."""
-    candidate = Candidate(
-        frame_index=0,
-        track_id=track,
-        box_base_px=(0, 0, 4, 4),
-        box_source_px=(0, 0, 4, 4),
-        class_id=0,
-        class_name="car",
-        confidence=0.5,
-        area_share=0.1,
-        crop_area_px=16,
-        born_frame=0,
-    )
-    return PendingStill(Request(candidate, "test", score), CUT, since_ns)
+def crop(track: int = 1, *also: int, side: int = 10) -> CropJob:
+    """A crop of ``3 * side * side`` bytes."""
+    header = replace(HEADER, track_id=track, also=tuple((one, BOX) for one in also))
+    return CropJob(header, np.zeros((side, side, 3), np.uint8), None, None)
 
 
-def shared(lead: PendingStill, *others: PendingStill) -> PendingStill:
-    """One still for several."""
-    header = replace(
-        lead.cut.header, also=tuple((one.track_id, one.request.candidate.box_source_px) for one in others)
-    )
-    request = replace(lead.request, also=tuple(one.request.candidate for one in others))
-    return replace(lead, request=request, cut=replace(lead.cut, header=header))
+def request_of(track: int, score: float, *also: int) -> Request:
+    """Of one candidate, or of several."""
+    lead, *others = (Candidate(0, one, BOX, BOX, 0, "car", 0.5, 0.1, 100.0, 0) for one in (track, *also))
+    return Request(lead, "test", score, tuple(others))
 
 
-def tracks(queue: StillQueue) -> list[int]:
-    """Ids in the queue, in order."""
-    return sorted(one.request.candidate.track_id for one in queue)
+def pending(track: int, utility: float, *also: int, since_ns: int = 0) -> OutboxStill:
+    """One that waits."""
+    return OutboxStill(crop(track, *also), request_of(track, utility, *also), utility, since_ns)
+
+
+def tracks(outbox: Outbox) -> list[int]:
+    """Ids of the tracks that lead, in order."""
+    return sorted(one.track_id for one in outbox.pending)
+
+
+def sent(outbox: Outbox, sequence: int, *, at_ns: int = 0, size: int = 400, resend: int = 0) -> OutboxStill:
+    """One that goes out, of a track and a utility of its own; ``resend``: the side of its crop."""
+    one = pending(100 + sequence, float(sequence), since_ns=at_ns)
+    job = crop(100 + sequence, side=resend) if resend else None
+    still = replace(one.crop.header, sequence=sequence, data=bytes(size))
+    outbox.sent(one, still, now_ns=at_ns, resend=job)
+    return one
+
+
+def flown(count: int = 4) -> Outbox:
+    """So many sent, 100 ms apart; the utility of a still is its number."""
+    outbox = Outbox()
+    for sequence in range(count):
+        sent(outbox, sequence, at_ns=sequence * 100 * MS)
+    return outbox
+
+
+def overdue(outbox: Outbox, at_s: float) -> list[int]:
+    """The sequences that are to be sent again."""
+    return [one.still.sequence for one in outbox.overdue(round(at_s * S))]
+
+
+def lost(outbox: Outbox) -> list[int]:
+    """What an outage takes, by sequence."""
+    return [one.still.sequence for one in outbox.lose()]
+
+
+# Pending
 
 
 def test_the_most_useful_comes_first_and_ties_go_to_the_older():
     """The budget would go to lesser stills, or to others in each run."""
-    queue = StillQueue()
-    assert queue.best() is None
+    outbox = Outbox()
+    assert outbox.best() is None
     for one in (
-        wish(3, 0.5, since_ns=2),
-        wish(2, 0.9, since_ns=2),
-        wish(1, 0.9, since_ns=1),
-        wish(0, 0.9, since_ns=2),
+        pending(3, 0.5, since_ns=2),
+        pending(2, 0.9, since_ns=2),
+        pending(1, 0.9, since_ns=1),
+        pending(0, 0.9, since_ns=2),
     ):
-        assert queue.offer(one) == []
+        assert outbox.offer(one) == []
     order = []
-    while (best := queue.best()) is not None:
-        order.append(best.request.candidate.track_id)
-        queue.remove(best)
+    while (best := outbox.best()) is not None:
+        order.append(best.track_id)
+        outbox.give_up(best)
+        assert best.state is StillState.EXPIRED
     assert order == [1, 0, 2, 3]
 
 
-def test_a_newer_wish_of_a_track_takes_the_place_of_the_older():
+def test_a_newer_still_of_a_track_takes_the_place_of_the_older():
     """The operator would get the object as it was, and then once more as it is."""
-    queue = StillQueue()
-    first, second = wish(1, 0.9), wish(1, 0.1, since_ns=5)
-    queue.offer(first)
-    assert queue.offer(second) == [(first, "replaced")]
-    assert list(queue) == [second]
+    outbox = Outbox()
+    first, second = pending(1, 0.9), pending(1, 0.1, since_ns=5)
+    outbox.offer(first)
+    assert outbox.offer(second) == [(first, "replaced")]
+    assert outbox.pending == (second,)
+    assert (first.state, second.state) == (StillState.EXPIRED, StillState.PENDING)
 
 
-def test_the_least_useful_leaves_a_full_queue():
+def test_the_least_useful_leaves_a_full_outbox():
     """One busy frame would push the best still out, or fill the memory with source frames."""
-    queue = StillQueue(QueueSettings(max_length=2))
-    queue.offer(wish(1, 0.5))
-    queue.offer(wish(2, 0.2))
-    least = wish(3, 0.1)
-    assert queue.offer(least) == [(least, "queue_full")]
-    (left,) = queue.offer(wish(4, 0.9))
-    assert left[0].request.candidate.track_id == 2
-    assert tracks(queue) == [1, 4]
+    outbox = Outbox(OutboxSettings(max_pending=2))
+    outbox.offer(pending(1, 0.5))
+    outbox.offer(pending(2, 0.2))
+    least = pending(3, 0.1)
+    assert outbox.offer(least) == [(least, "queue_full")]
+    (left,) = outbox.offer(pending(4, 0.9))
+    assert left[0].track_id == 2
+    assert tracks(outbox) == [1, 4]
 
 
-def test_what_waited_too_long_leaves():
+def test_what_was_pending_for_too_long_leaves():
     """A still of a past that nobody looks at any more would cost its bits."""
-    queue = StillQueue(QueueSettings(max_age_ns=10))
-    old, young = wish(1, 0.9, since_ns=0), wish(2, 0.1, since_ns=5)
-    queue.offer(old)
-    queue.offer(young)
-    assert queue.expire(10) == []
-    assert queue.expire(11) == [(old, "stale")]
-    assert tracks(queue) == [2]
-    assert queue.clear() == [young]
-    assert len(queue) == 0
+    outbox = Outbox(OutboxSettings(max_pending_ns=10))
+    old, young = pending(1, 0.9, since_ns=0), pending(2, 0.1, since_ns=5)
+    outbox.offer(old)
+    outbox.offer(young)
+    assert outbox.expire(10) == []
+    assert outbox.expire(11) == [(old, "stale")]
+    assert tracks(outbox) == [2]
+    assert outbox.clear() == [(young, "ended")]
+    assert len(outbox) == 0
 
 
-def test_a_shared_wish_keeps_every_track_to_one_wish():
+def test_a_still_of_several_keeps_every_track_to_one_still():
     """A track would be sent twice, in its own still and in its neighbour's."""
-    queue = StillQueue()
-    pair = shared(wish(1, 0.9), wish(2, 0.4), wish(3, 0.4))
-    assert queue.offer(pair) == []
-    assert 3 in queue
-    alone = wish(2, 0.5, since_ns=5)
-    assert queue.offer(alone) == [], "it only gets off the shared one"
-    (kept,) = (one for one in queue if one.track_id == 1)
-    assert kept.track_ids == {1, 3}
-    assert [track for track, _ in kept.cut.header.also] == [3]
-    other = shared(wish(4, 0.2), wish(1, 0.2), wish(3, 0.2))
-    assert [(gone.track_id, why) for gone, why in queue.offer(other)] == [(1, "replaced")]
-    assert sorted(map(tuple, (sorted(one.track_ids) for one in queue))) == [(1, 3, 4), (2,)]
+    outbox = Outbox()
+    assert outbox.offer(pending(1, 0.9, 2, 3)) == []
+    assert 3 in outbox
+    assert outbox.offer(pending(2, 0.5, since_ns=5)) == [], "it is only taken off the shared one"
+    (shared,) = (one for one in outbox.pending if one.track_id == 1)
+    assert shared.track_ids == {1, 3}
+    assert [one.track_id for one in shared.request.also] == [3]
+    left = outbox.offer(pending(4, 0.2, 1, 3))
+    assert [(gone.track_id, why) for gone, why in left] == [(1, "replaced")]
+    assert sorted(tuple(sorted(one.track_ids)) for one in outbox.pending) == [(1, 3, 4), (2,)]
 
 
-def test_only_what_would_stay_is_worth_the_cutting():
-    """Crops would be taken out of frames for wishes that leave at once, or wishes refused that would have stayed."""
-    queue = StillQueue(QueueSettings(max_length=2))
-    for one in (wish(1, 0.5), wish(2, 0.3)):
-        assert queue.admits(one.request, now_ns=0)
-        queue.offer(one)
+def test_only_what_would_stay_is_worth_a_crop():
+    """Crops would be taken for requests that leave at once, or requests refused that would have stayed."""
+    outbox = Outbox(OutboxSettings(max_pending=2))
+    for one in (pending(1, 0.5), pending(2, 0.3)):
+        assert outbox.admits(one.request, now_ns=0)
+        outbox.offer(one)
     for score, track, stays in ((0.2, 3, False), (0.3, 3, False), (0.31, 3, True), (0.1, 2, True)):
-        asked = wish(track, score)
-        assert queue.admits(asked.request, now_ns=0) == stays
-    assert queue.offer(wish(3, 0.31))[0][0].track_id == 2
+        assert outbox.admits(request_of(track, score), now_ns=0) == stays
+    assert outbox.offer(pending(3, 0.31))[0][0].track_id == 2
+
+
+def test_what_grounds_request_waits_in_its_own_queue_in_order():
+    """A busy scene would push out what the operator waits for; or it would wait for ever."""
+    outbox = Outbox(OutboxSettings(max_pending=1))
+    first, second = (OutboxStill(crop(-1), None, float("inf"), None) for _ in range(2))
+    outbox.offer_on_demand(first)
+    outbox.offer_on_demand(second)
+    other = pending(1, 9.0)
+    outbox.offer(other)
+    assert (outbox.on_demand, outbox.on_demand_pending, len(outbox)) == (first, 2, 1)
+    assert outbox.expire(5 * S) == [(other, "stale")], "their own time begins when they are met"
+    outbox.sent(first, replace(HEADER, data=b"x"), now_ns=6 * S)
+    assert outbox.on_demand is second
+    assert outbox.expire(16 * S) == [(second, "stale")]
+    assert not outbox.any_pending
 
 
 @given(
@@ -134,22 +175,218 @@ def test_only_what_would_stay_is_worth_the_cutting():
     st.integers(1, 5),
     st.integers(0, 20),
 )
-def test_every_wish_leaves_exactly_once(offers, length, age):
+def test_every_pending_still_leaves_exactly_once(offers, length, age):
     """The ledger would say of a candidate that it was sent and dropped, or nothing at all."""
-    queue = StillQueue(QueueSettings(max_length=length, max_age_ns=age))
+    outbox = Outbox(OutboxSettings(max_pending=length, max_pending_ns=age))
     offered, left, now = [], [], 0
     for track, score, action in offers:
         now += 3
-        one = wish(track, score, since_ns=now)
+        one = pending(track, score, since_ns=now)
         offered.append(one)
-        left += [gone for gone, _ in queue.offer(one)]
-        assert len(queue) <= length
-        assert len(set(tracks(queue))) == len(queue)
+        left += [gone for gone, _ in outbox.offer(one)]
+        assert len(outbox) <= length
+        assert len(set(tracks(outbox))) == len(outbox)
         if action == 1:
-            left += [gone for gone, _ in queue.expire(now)]
-        if action == 2 and (best := queue.best()) is not None:
-            assert best.request.score == max(each.request.score for each in queue)
-            queue.remove(best)
+            left += [gone for gone, _ in outbox.expire(now)]
+        if action == 2 and (best := outbox.best()) is not None:
+            assert best.utility == max(each.utility for each in outbox.pending)
+            outbox.give_up(best)
             left.append(best)
-    left += queue.clear()
+    left += [gone for gone, _ in outbox.clear()]
     assert sorted(map(id, left)) == sorted(map(id, offered))
+    assert {one.state for one in left} <= {StillState.EXPIRED}
+
+
+# Sent, and what reports say of it
+
+
+def test_what_a_report_names_is_acknowledged_and_what_is_missing_is_not():
+    """After an outage the edge would store what the ground has, or lose what it has not."""
+    outbox = flown()
+    assert outbox.on_report(3, (1,), now_ns=S)
+    assert not outbox.on_report(3, (1,), now_ns=S), "it is no news"
+    assert (outbox.unacknowledged, outbox.sent_bytes) == (1, 400)
+    (one,) = outbox.lose()
+    assert (one.still.sequence, one.state) == (1, StillState.LOST)
+    assert (outbox.unacknowledged, outbox.sent_bytes, lost(outbox)) == (0, 0, [])
+    outbox.stored(one, one.still)
+    assert one.state is StillState.STORED
+
+
+def test_an_outage_takes_the_most_useful_first():
+    """The store would keep the least useful."""
+    assert lost(flown()) == [3, 2, 1, 0]
+
+
+def test_numbers_of_stored_stills_leave_no_hole_in_those_that_are_sent():
+    """The ground would ask for numbers that never come."""
+    outbox = Outbox()
+    one = pending(1, 1.0)
+    outbox.stored(one, replace(HEADER, sequence=outbox.sequence(store=True), data=b"x"))
+    assert (outbox.sequence(store=True), outbox.sequence(store=False)) == (FIRST_STORED + 1, 0)
+    outbox.stored(sent(outbox, 0), HEADER)
+    assert (outbox.sequence(store=True), outbox.sequence(store=False)) == (FIRST_STORED + 1, 1)
+
+
+def test_memory_is_bounded_and_the_oldest_leaves_first():
+    """A ground that never reports would let the edge grow for the whole flight."""
+    outbox = Outbox(OutboxSettings(max_sent=5, max_sent_bytes=1_500))
+    stills = [sent(outbox, sequence, at_ns=sequence * 10 * MS) for sequence in range(60)]
+    assert outbox.sent_bytes <= 1_500
+    assert lost(outbox) == [59, 58, 57]
+    assert {one.state for one in stills[:57]} == {StillState.EXPIRED}
+
+
+def test_in_lockstep_no_report_decides_anything():
+    """The same input would give other stills, depending on when a report came."""
+    outbox = Outbox(reports=False)
+    sent(outbox, 0)
+    assert not outbox.on_report(0, (), now_ns=S)
+    assert (outbox.unacknowledged, outbox.overdue(2 * S), outbox.lose()) == (0, [], [])
+
+
+# What is sent again
+
+
+def test_a_still_is_overdue_when_a_report_ought_to_have_named_it():
+    """Stills would be sent twice while they are on their way, or not at all; the most useful first."""
+    for round_trip_ns, expected in ((RTT, [2, 0]), (400 * MS, [0]), (420 * MS, [])):
+        outbox = flown()
+        outbox.on_report(1, (0,), now_ns=1_250 * MS, round_trip_ns=round_trip_ns)
+        assert overdue(outbox, 1.25) == expected
+        if round_trip_ns == RTT:
+            assert overdue(outbox, 2.0) == [2, 0], "3 was sent too shortly before the last report"
+
+
+def test_in_silence_nothing_is_overdue():
+    """Into an outage, or to a receiver that never reports, every still would be sent twice."""
+    outbox = flown()
+    assert overdue(outbox, 3.0) == []
+    outbox.on_report(-1, (), now_ns=300 * MS)
+    assert overdue(outbox, 3.0) == []
+
+
+def test_each_is_sent_again_once_and_only_while_it_is_young():
+    """A still that cannot get through would take the budget of all others."""
+    outbox = flown()
+    for at_ms in range(500, 5_000, 500):
+        outbox.on_report(-1, (), now_ns=at_ms * MS)
+    assert overdue(outbox, 3.9) == [3, 2, 1, 0]
+    outbox.sent_again(outbox.overdue(3_900 * MS)[1])
+    assert overdue(outbox, 4.1) == [3, 1]
+    assert overdue(outbox, 4.5) == []
+    assert lost(outbox) == [3, 2, 1, 0], "what never arrived can still be stored"
+
+
+def test_a_second_copy_of_what_has_arrived_meanwhile_is_not_kept():
+    """It would be stored, and shown once more, after the next outage."""
+    outbox = flown()
+    outbox.on_report(-1, (), now_ns=2 * S)
+    again = outbox.overdue(2 * S)
+    outbox.on_report(3, (), now_ns=2 * S)
+    outbox.sent_again(again[0])
+    assert lost(outbox) == []
+
+
+# What the ground cannot decode
+
+
+@pytest.mark.parametrize("reported", [True, False], ids=["acknowledged", "unnamed"])
+def test_what_the_ground_cannot_decode_is_pending_once_more_and_only_once(reported):
+    """Stills would be sent twice, or none at all."""
+    outbox = Outbox()
+    for sequence in (3, 4):
+        sent(outbox, sequence, resend=10)
+    if reported:
+        outbox.on_report(4, (), now_ns=1)
+    for sequence in (4, 3, 4, 99, -1):
+        outbox.on_undecodable(sequence)
+    assert outbox.offer_undecodable(1) == []
+    headers = [one.crop.header for one in outbox.pending]
+    assert [(one.reason, one.parameters) for one in headers] == [(AGAIN, {AGAIN: 3}), (AGAIN, {AGAIN: 4})]
+    assert all(one.again for one in outbox.pending)
+    outbox.clear()
+    for sequence in (3, 4):
+        outbox.on_undecodable(sequence)
+    outbox.offer_undecodable(2)
+    assert len(outbox) == 0
+    assert outbox.crop_bytes == 0
+    assert outbox.unacknowledged == (0 if reported else 2)
+
+
+def test_a_newer_still_of_the_track_makes_it_needless():
+    """Bits would go to the object as it was, while its present picture waits."""
+    outbox = Outbox()
+    sent(outbox, 0, resend=10)
+    outbox.offer(pending(100, 0.5))
+    outbox.on_undecodable(0)
+    assert outbox.offer_undecodable(1) == []
+    assert not any(one.again for one in outbox.pending)
+
+
+def test_a_crop_that_is_too_old_is_forgotten():
+    """The operator would get an object as it was long ago."""
+    outbox = Outbox()
+    old, young = sent(outbox, 0, resend=10), sent(outbox, 1, at_ns=S, resend=10)
+    outbox.on_report(1, (), now_ns=S)
+    outbox.on_undecodable(0)
+    outbox.on_undecodable(1)
+    outbox.offer_undecodable(5 * S)
+    assert tracks(outbox) == [101]
+    assert (old.state, young.state) == (StillState.EXPIRED, StillState.EXPIRED)
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 40), st.lists(st.integers(-3, 80), max_size=30)), max_size=60),
+    st.integers(1, 8),
+    st.integers(300, 9_000),
+    st.booleans(),
+)
+def test_whatever_grounds_request_the_memory_is_bounded(stills, count, size_bytes, reports):
+    """A hostile or broken ground would fill the drone's memory, or crash the edge."""
+    settings = OutboxSettings(max_sent=count, max_crop_bytes=size_bytes, max_sent_ns=5)
+    outbox = Outbox(settings, reports=reports)
+    again: list[int] = []
+    for sequence, (side, undecodable) in enumerate(stills):
+        sent(outbox, sequence, at_ns=sequence, resend=side)
+        for one in undecodable:
+            outbox.on_undecodable(one)
+        assert outbox.crop_bytes <= size_bytes
+        assert outbox.unacknowledged <= count
+        if sequence % 3 == 0:
+            outbox.offer_undecodable(sequence)
+            again += [one.crop.header.parameters[AGAIN] for one in outbox.pending]
+            outbox.clear()
+    assert len(set(again)) == len(again)
+
+
+def test_stills_thread_and_link_may_act_at_once():
+    """The edge would crash in flight, once in a thousand."""
+    outbox, errors = Outbox(OutboxSettings(max_sent=8)), []
+
+    def run(work) -> None:
+        try:
+            for index in range(800):
+                work(index)
+        except Exception as error:  # noqa: BLE001 - told in the main thread
+            errors.append(error)
+
+    threads = [
+        threading.Thread(target=run, args=[work])
+        for work in (
+            lambda index: sent(outbox, index, at_ns=index * MS, size=10, resend=4),
+            lambda index: outbox.on_report(index - 5, (), now_ns=index * MS),
+            lambda index: outbox.on_undecodable(index - 3),
+            lambda index: outbox.overdue(index * MS),
+            lambda index: outbox.lose() if index % 50 == 0 else None,
+            lambda index: outbox.offer_on_demand(OutboxStill(crop(-1), None, 1.0, None)),
+            lambda index: outbox.expire(index * S),
+        )
+    ]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert errors == []
+    outbox.lose()
+    assert outbox.sent_bytes == 0

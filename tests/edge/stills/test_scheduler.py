@@ -1,13 +1,14 @@
-"""From tracks to stills, with the real codec; every wish has one fate."""
+"""From tracks to stills, with the real codec; every request has one outcome."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,12 +18,12 @@ from hvt_common.values import Frame, Still, Tracks, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import Candidate, TrackMemory
-from hvt_edge.stills.gate import Gate
+from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.outbox import QueueSettings
+from hvt_edge.stills.outbox import Outbox, OutboxSettings, OutboxStill
 from hvt_edge.stills.policy.base import Request, Step
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
-from hvt_edge.stills.suppression import Suppression
+from hvt_edge.stills.suppression import Gate, Suppression
 
 SIZE = (640, 360)
 PICTURE = hard_pictures(1, size=SIZE)[0]
@@ -48,7 +49,7 @@ class ByScore:
 
 
 class Rig:
-    """A chooser, its fates, and steps of a third of a second."""
+    """A chooser, its outcomes, and steps of a third of a second."""
 
     def __init__(
         self,
@@ -63,16 +64,16 @@ class Rig:
         self.picture, self.memory = picture, TrackMemory()
         self.outcomes: Counter[tuple[str, str]] = Counter()
         view = View.fitted(SIZE, SIZE, fit="letterbox")
+        self.outbox = Outbox(OutboxSettings(max_pending=3))
         self.chooser = Chooser(
             method or ByScore(),
+            outbox=self.outbox,
             suppression=Suppression.for_cooldown(cooldown),
             maker=maker or StillMaker(),
             memory=self.memory,
             view=view,
             class_names=("car",),
-            settings=ChooserSettings(
-                fps=3, most_bytes=most_bytes, queue=QueueSettings(max_length=3), **settings
-            ),
+            settings=ChooserSettings(fps=3, most_bytes=most_bytes, **settings),
             on_outcome=lambda outcome, reason: self.outcomes.update([(outcome, reason)]),
         )
         self.number = -1
@@ -100,17 +101,21 @@ class Rig:
         seen = AnalyzedFrame(
             Frame(self.number, self.now_ns, self.picture, self.picture), base, tracks, detected=detected
         )
-        self.chooser.consider(seen, now_ns=self.now_ns, room_bytes=1000)
+        self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)
 
-    def stills(self, room: int) -> list[int]:
-        """Send what fits ``room`` in all; the tracks of the stills."""
-        sent, left = [], [room]
-        for still in self.chooser.stills(now_ns=self.now_ns, room=lambda _still: left[-1]):
-            assert len(still.data) <= left[-1]
-            left.append(left[-1] - len(still.data))
-            sent.append(still.track_id)
-            self.sent.append(still)
-        return sent
+    def coded(self, allowance: int) -> list[OutboxStill]:
+        """Send what fits ``allowance`` in all."""
+        coded, left = [], [allowance]
+        for one in self.chooser.stills(now_ns=self.now_ns, allowance=lambda _still: left[-1]):
+            assert len(one.still.data) <= left[-1]
+            left.append(left[-1] - len(one.still.data))
+            coded.append(one)
+            self.sent.append(one.still)
+        return coded
+
+    def stills(self, allowance: int) -> list[int]:
+        """Send what fits ``allowance`` in all; the tracks of the stills."""
+        return [one.track_id for one in self.coded(allowance)]
 
 
 SMALL, LARGE = (20.0, 20.0, 60.0, 50.0), (150.0, 50.0, 500.0, 330.0)
@@ -128,7 +133,7 @@ def test_the_most_useful_is_sent_first_as_long_as_there_is_room():
     rig.consider({1: box_at(1), 3: box_at(3), 2: box_at(2)})
     assert rig.stills(100_000) == [3, 2, 1]
     assert rig.outcomes == {("sent", "test"): 3}
-    assert rig.chooser.waiting == 0
+    assert len(rig.outbox) == 0
 
 
 def test_a_lesser_one_does_not_slip_in_before_the_most_useful():
@@ -136,7 +141,7 @@ def test_a_lesser_one_does_not_slip_in_before_the_most_useful():
     rig = Rig(ByScore(((1, 1.0), (2, 2.0))))
     rig.consider({1: SMALL, 2: LARGE})
     assert rig.stills(2_500) == []
-    assert rig.chooser.waiting == 2
+    assert len(rig.outbox) == 2
     assert rig.stills(60_000) == [2, 1]
 
 
@@ -145,7 +150,7 @@ def test_one_that_never_fits_does_not_block_the_others_for_ever():
     rig = Rig(ByScore(((1, 1.0), (2, 2.0))))
     sent: list[int] = []
     for _ in range(12):
-        rig.consider({1: SMALL, 2: LARGE})  # wished for again at each step, so that no wish grows old
+        rig.consider({1: SMALL, 2: LARGE})  # requested again at each step, so that none grows old
         sent += rig.stills(2_500)
     assert set(sent) == {1}
     assert len(sent) >= 3
@@ -174,7 +179,7 @@ def test_what_the_base_shows_as_well_is_not_sent():
     assert rig.outcomes["deferred", "refused"] == 1, "it rests before it is tried again"
 
 
-def test_between_detections_nothing_is_wished_for_but_what_waits_may_go():
+def test_between_detections_nothing_is_requested_but_what_is_pending_may_go():
     """Stills would wait for the next detection although there is room now."""
     rig = Rig()
     rig.consider({1: SMALL})
@@ -189,9 +194,7 @@ def test_sequence_numbers_count_stills_and_nothing_else():
     numbers = []
     for step in range(4):
         rig.consider({1: SMALL, 2: box_at(7)}, base=PICTURE if step % 2 else FLAT)
-        numbers += [
-            still.sequence for still in rig.chooser.stills(now_ns=rig.now_ns, room=lambda _still: 10**6)
-        ]
+        numbers += [one.still.sequence for one in rig.coded(10**6)]
         rig.number += 3  # past the rest of what was refused
     assert numbers == list(range(len(numbers)))
     assert len(numbers) >= 4
@@ -263,7 +266,7 @@ def test_the_gate_holds_back_what_the_base_shows_well_before_the_method_chooses(
 
 
 def test_stills_that_build_on_the_base_wait_for_a_frame_that_has_one():
-    """A step on a tick that is not coded would be lost, or its stills be sent without what they build on."""
+    """A step on a frame that is not coded would be lost, or its stills be sent without what they build on."""
     rig = Rig(maker=BASE_CODED)
     rig.consider({1: SMALL}, base=None)
     assert rig.stills(100_000) == []
@@ -283,7 +286,7 @@ def test_a_still_without_its_base_is_sent_once_more_and_only_once():
     rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
     assert rig.stills(100_000) == [2, 1]
     for sequence in (1, 1, 7, 2**32 - 1):
-        rig.chooser.ask_again(sequence)
+        rig.outbox.on_undecodable(sequence)
     rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
     assert rig.stills(100_000) == [1]
     first, again = rig.sent[1:]
@@ -297,18 +300,18 @@ def test_a_still_without_its_base_is_sent_once_more_and_only_once():
     assert np.mean((seen.astype(float) - crop) ** 2) < 150
     assert rig.memory._histories[1].sent_count == 1, "its rest began with the first"
     for sequence in (1, 2):
-        rig.chooser.ask_again(sequence)
+        rig.outbox.on_undecodable(sequence)
     rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
     assert rig.stills(100_000) == []
     assert rig.outcomes["sent", "again"] == 1
 
 
-def test_the_newer_wish_of_a_track_makes_the_old_still_needless():
+def test_the_newer_still_of_a_track_makes_the_old_still_needless():
     """Bits would go to the object as it was, while its present picture waits."""
     rig = Rig(maker=BASE_CODED)
     rig.consider({1: SMALL}, base=BLURRED)
     assert rig.stills(100_000) == [1]
-    rig.chooser.ask_again(0)
+    rig.outbox.on_undecodable(0)
     rig.consider({1: SMALL}, base=BLURRED)
     assert rig.stills(100_000) == [1]
     assert [one.reason for one in rig.sent] == ["test", "test"]
@@ -320,7 +323,7 @@ def test_stills_of_other_codecs_are_never_sent_again():
     rig = Rig(cooldown=60.0)
     rig.consider({1: SMALL})
     assert rig.stills(100_000) == [1]
-    rig.chooser.ask_again(0)
+    rig.outbox.on_undecodable(0)
     rig.consider({1: SMALL})
     assert rig.stills(100_000) == []
 
@@ -335,14 +338,78 @@ def test_stills_of_other_codecs_are_never_sent_again():
     st.sampled_from([0.0, 1.0]),
     st.sampled_from([0.0, 30.0]),
 )
-def test_every_candidate_of_a_step_has_exactly_one_fate(steps, cooldown, gate_db):
-    """The table of fates would not add up to the candidates there were."""
+def test_every_candidate_of_a_step_has_exactly_one_outcome(steps, cooldown, gate_db):
+    """The table of outcomes would not add up to the candidates there were."""
     rig, candidates = Rig(cooldown=cooldown, gate=Gate(psnr_y_db=gate_db)), 0
     for tracks, room, good in steps:
         rig.consider({one: box_at(one) for one in sorted(tracks)}, base=PICTURE if good else FLAT)
         candidates += len(tracks)
         rig.stills(room)
-        assert rig.chooser.waiting <= 3
-        assert set(rig.chooser._held_up) <= {one.track_id for one in rig.chooser._queue}
+        assert len(rig.outbox) <= 3
     rig.chooser.close()
     assert sum(rig.outcomes.values()) == candidates
+
+
+# What the link has lost
+
+
+class LossRig(Rig):
+    """A chooser with stills that were sent two seconds ago, and that a report ought to have named."""
+
+    def lose(self, *losses: tuple[int, float, int]) -> None:
+        """So many stills of (track, utility, bytes)."""
+        self.number = 0
+        for track, utility, size in losses:
+            still = replace(
+                LOST, sequence=self.outbox.sequence(store=False), track_id=track, data=bytes(size)
+            )
+            one = OutboxStill(CropJob(still, PICTURE[:4, :4], None, None), None, utility, 0)
+            self.outbox.sent(one, still, now_ns=self.now_ns - 2 * STEP_NS * 3)
+        self.outbox.on_report(-1, (), now_ns=self.now_ns)
+        self.number = -1
+
+    def sent_tracks(self, allowance: int = 100_000) -> list[tuple[int, float]]:
+        """(track, utility) of each that goes out."""
+        return [(one.track_id, one.utility) for one in self.coded(allowance)]
+
+
+LOST = Still(0, 0, START_NS, 50, (0, 0, 9, 9), (0, 0, 9, 9), "car", 0.5, "test", "jpeg", 65, b"")
+
+
+def test_a_lost_still_goes_before_pending_ones_that_are_less_useful():
+    """The link's loss would decide what is seen, not the policy."""
+    rig = LossRig()
+    rig.lose((50, 2.5, 400), (51, 0.5, 400))
+    rig.consider({1: box_at(1), 2: box_at(3), 3: box_at(5)})
+    assert rig.sent_tracks() == [(3, 3.0), (50, 2.5), (2, 2.0), (1, 1.0), (51, 0.5)]
+    assert rig.outcomes == {("sent", "test"): 3, ("sent", "again"): 2}
+    assert rig.outbox.sequence(store=False) == 5, "a second copy takes no number"
+    assert rig.sent_tracks() == [], "once"
+
+
+def test_a_lost_still_that_is_not_allowed_holds_up_nobody():
+    """A large one would let all others grow old, and then be too old itself."""
+    rig = LossRig()
+    rig.lose((50, 9.0, 9_000))
+    rig.consider({1: SMALL})
+    assert rig.sent_tracks(8_000) == [(1, 1.0)]
+    assert rig.sent_tracks(9_000) == [(50, 9.0)]
+
+
+def test_a_lost_still_leaves_precedence_to_a_newer_of_its_track():
+    """The operator would see the past of a car in place of its present."""
+    rig = LossRig()
+    rig.lose((3, 9.0, 400))
+    rig.consider({3: SMALL})
+    assert rig.sent_tracks(10) == []
+    assert rig.sent_tracks()[0] == (3, 3.0)
+
+
+@pytest.mark.parametrize("allowance", [0, 399])
+def test_a_lost_still_keeps_to_the_budget(allowance):
+    """Loss would make the edge spend more than it was given, on a link that has less."""
+    rig = LossRig()
+    rig.lose((50, 9.0, 400))
+    rig.consider({})
+    assert rig.sent_tracks(allowance) == []
+    assert rig.sent_tracks(400) == [(50, 9.0)]

@@ -25,13 +25,10 @@ from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
-from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings
-from hvt_edge.stills.stage import StillStage, StillWorker
-from hvt_edge.stills.suppression import Suppression
+from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from still_stage import make_still_stage
 
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 _NOISE = np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0]))
@@ -64,10 +61,22 @@ class Out:
         ]
 
 
+def make_analyzer(candidates: str = "decoded", *, detector=None, every: int = 5) -> Analyzer:
+    """With the real decoder and tracker."""
+    return Analyzer(
+        detector or RedSquares(),
+        ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+        view=VIEW,
+        settings=AnalyzerSettings(detect_every=every, candidates=candidates),
+    )
+
+
 class Rig:
     """A still stage whose stills build on the base, with a real budget of 200 kbps for them."""
 
-    def __init__(self, *, reports: bool = False, sparse: bool = False) -> None:
+    def __init__(
+        self, *, reports: bool = False, sparse: bool = False, analyzer: Analyzer | None = None
+    ) -> None:
         self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframePlan()
         self.sender = Transmitter(
             self.out,
@@ -78,25 +87,14 @@ class Rig:
             lockstep=False,
             wait_until=lambda _at: None,
         )
-        self.stage = StillStage(
-            Analyzer(
-                RedSquares(),
-                ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
-                view=VIEW,
-                settings=AnalyzerSettings(detect_every=5, candidates="source" if sparse else "decoded"),
-            ),
-            Chooser(
-                method("M1"),
-                suppression=Suppression.for_cooldown(0),
-                maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
-                memory=TrackMemory(),
-                view=VIEW,
-                class_names=CLASSES,
-                settings=ChooserSettings(fps=15, most_bytes=10_000),
-                on_outcome=lambda *outcome: self.outcomes.update([outcome]),
-            ),
-            sender=self.sender,
+        self.stage = make_still_stage(
+            self.sender,
+            analyzer or make_analyzer("source" if sparse else "decoded"),
             keyframes=self.keyframes,
+            outcomes=self.outcomes,
+            view=VIEW,
+            class_names=CLASSES,
+            maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
             reporter=self if reports else None,
         )
         self.keyframes.done(FRAMES[0].capture_ns)
@@ -108,7 +106,7 @@ class Rig:
     def run(self, count: int = 30, *, start: int = 0) -> None:
         """Frame after frame, as the lockstep loop does."""
         for frame, unit in list(zip(FRAMES, UNITS, strict=True))[start:count]:
-            seen = self.stage.see(frame, unit)
+            seen = self.stage.analyze(frame, unit)
             self.stage.send(seen, now_ns=frame.capture_ns)
 
 
@@ -150,14 +148,14 @@ def test_a_still_that_the_ground_cannot_show_is_sent_again_from_the_same_frame()
     """A lost picture of the base would cost the stills on it as well."""
     rig = Rig()
     rig.run(4)
-    rig.stage.hear([answer(0, again=True), answer(0, again=True), answer(4_000_000, again=True)])
+    rig.stage.on_results([answer(0, again=True), answer(0, again=True), answer(4_000_000, again=True)])
     rig.run(8, start=4)
     (first, _), (second, data) = rig.out.stills
     assert (first.codec, second.codec, second.reason) == ("stand-in", "jpeg", "again")
     assert (second.sequence, second.frame_index, second.parameters) == (1, 0, {"again": 0})
     crop = second.crop_source_px
     assert JpegCodec().decode(data, size=(crop[2] - crop[0], crop[3] - crop[1])) is not None
-    rig.stage.hear([answer(0, again=True), answer(1, again=True)])
+    rig.stage.on_results([answer(0, again=True), answer(1, again=True)])
     rig.run(12, start=8)
     assert len(rig.out.stills) == 2
 
@@ -166,7 +164,7 @@ def test_a_flood_of_requests_costs_no_more_than_each_still_once():
     """Whoever can speak to the edge could spend its budget."""
     rig = Rig()
     for index in range(30):
-        rig.stage.hear([answer(number, again=True) for number in range(500)])
+        rig.stage.on_results([answer(number, again=True) for number in range(500)])
         rig.run(index + 1, start=index)
     headers = [header for header, _ in rig.out.stills]
     assert [one.reason for one in headers] == ["due", "again", "due", "again"]
@@ -179,7 +177,7 @@ def test_between_coded_ticks_tracks_go_on_and_stills_wait_for_a_coded_one():
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=1.5, bitrate_bps=120_000, preset="ultrafast"))
     for frame in FRAMES:
         unit = encoder.encode(frame) if frame.index % 10 == 3 else None
-        rig.stage.send(rig.stage.see(frame, unit), now_ns=frame.capture_ns)
+        rig.stage.send(rig.stage.analyze(frame, unit), now_ns=frame.capture_ns)
     headers = [header for header, _ in rig.out.stills]
     assert headers
     assert all(one.frame_index % 10 == 3 for one in headers)
@@ -206,20 +204,13 @@ def test_frames_that_wait_are_bounded_in_bytes():
             assert counted.wait(30)
             return super().detect(image_bgr)
 
-    rig = Rig()
     frame_bytes = FRAMES[0].source_bgr.nbytes + FRAMES[0].base_bgr.nbytes
-    slow = Analyzer(
-        Slow(),
-        ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
-        view=VIEW,
-        settings=AnalyzerSettings(detect_every=1),
-    )
-    rig.stage._analyzer = slow
+    rig = Rig(analyzer=make_analyzer(detector=Slow(), every=1))
     worker = StillWorker(
-        rig.stage, hear=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=4 * frame_bytes + 1
+        rig.stage, results=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=4 * frame_bytes + 1
     )
     worker.offer(FRAMES[0], UNITS[0])
-    while worker._frames.qsize():
+    while worker.queued:
         time.sleep(0.001)
     offered = 1
     while not worker.full and offered < 16:
@@ -228,17 +219,17 @@ def test_frames_that_wait_are_bounded_in_bytes():
     counted.set()
     assert offered == 5, "four wait, and one is in hand"
     worker.close()
-    roomy = StillWorker(Rig().stage, hear=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=1)
+    roomy = StillWorker(Rig().stage, results=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=1)
     assert not roomy.full
     roomy.offer(FRAMES[0], UNITS[0])
-    while roomy._frames.qsize():
+    while roomy.queued:
         time.sleep(0.001)
     assert not roomy.full, "one frame always has its place"
     roomy.close()
 
 
-def test_a_wish_that_waits_keeps_no_frame():
-    """Eight wishes would hold eight frames of a 4K camera: 200 MB."""
+def test_a_pending_still_holds_no_frame():
+    """Eight of them would hold eight frames of a 4K camera: 200 MB."""
     import gc
     import weakref
 
@@ -249,10 +240,10 @@ def test_a_wish_that_waits_keeps_no_frame():
     source = FRAMES[0].source_bgr.copy().view(Tracked)
     watch = weakref.ref(source)
     frame = Frame(0, FRAMES[0].capture_ns, source, FRAMES[0].base_bgr)
-    seen = rig.stage.see(frame, UNITS[0])
+    seen = rig.stage.analyze(frame, UNITS[0])
     rig.stage.send(seen, now_ns=frame.capture_ns, held=True)
-    assert rig.stage.waiting == 1
+    assert rig.stage.pending == 1
     del source, frame, seen
     gc.collect()
     assert watch() is None
-    assert rig.stage.waiting == 1
+    assert rig.stage.pending == 1

@@ -17,15 +17,11 @@ from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.commands import Commands, Served
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
-from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.maker import StillMaker
-from hvt_edge.stills.policy.registry import method
-from hvt_edge.stills.scheduler import Chooser, ChooserSettings
-from hvt_edge.stills.stage import StillStage
-from hvt_edge.stills.suppression import Suppression
 from keeping import FRAMES, SIZE, Rig
 from kept import opened
 from processes import eventually
+from still_stage import make_still_stage
 
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 _NOISE = np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0]))
@@ -36,31 +32,24 @@ class StillRig(Rig):
     """Base stage and still stage, one after the other for each frame; stills build on the base where they can."""
 
     def __init__(self, folder) -> None:
-        super().__init__(folder)
+        super().__init__(folder, maker=StillMaker(codec=StandIn(), fallback=JpegCodec()))
         self.chosen: Counter[tuple[str, str]] = Counter()
-        chooser = Chooser(
-            method("M1"),
-            suppression=Suppression.for_cooldown(0),
-            maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
-            memory=TrackMemory(),
-            view=VIEW,
-            class_names=CLASSES,
-            settings=ChooserSettings(fps=15, most_bytes=10_000),
-            on_outcome=lambda *outcome: self.chosen.update([outcome]),
-        )
-        self.side = StillStage(
+        self.side = make_still_stage(
+            self.sender,
             Analyzer(
                 RedSquares(),
                 ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
                 view=VIEW,
                 settings=AnalyzerSettings(detect_every=5),
             ),
-            chooser,
-            sender=self.sender,
             keyframes=self.keyframes,
+            outcomes=self.chosen,
+            view=VIEW,
+            class_names=CLASSES,
+            maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
+            outbox=self.outbox,
             backlog=self.backlog,
         )
-        self.backlog.attend(self.side)
 
     def fly(self, first: int, end: int, *, linked: bool = True) -> None:
         """Frames of that stretch; nobody reports."""
@@ -71,7 +60,7 @@ class StillRig(Rig):
             unit = self.stage.encode(frame, now_ns=self.now_ns)
             self.stage.send(unit, now_ns=self.now_ns)
             source = np.clip(frame.base_bgr + _TEXTURE, 0, 255).astype(np.uint8)
-            seen = self.side.see(Frame(frame.index, frame.capture_ns, source, frame.base_bgr), unit)
+            seen = self.side.analyze(Frame(frame.index, frame.capture_ns, source, frame.base_bgr), unit)
             self.side.send(seen, now_ns=self.now_ns)
 
     @property
@@ -81,7 +70,7 @@ class StillRig(Rig):
 
     def stored(self) -> list[RoiHeader]:
         """Stills that another start of the edge finds, by number."""
-        self.backlog.close()
+        self.close()
         with opened(self.path, session_id=8) as folder:
             stills = [parse_backlog_still(folder.read(entry)) for entry in folder.best_stills()]
         return sorted(
@@ -112,15 +101,15 @@ def test_stills_of_an_outage_are_kept_without_holes_and_without_the_base(tmp_pat
     assert rig.chosen["sent", "stored"] == 0
 
 
-def test_stills_that_the_link_swallowed_are_kept_as_they_are_without_the_base(tmp_path):
+def test_stills_that_the_link_lost_are_stored_without_the_base(tmp_path):
     """Those sent in the second before the break would be lost, or come back as nothing that can be shown."""
     rig = StillRig(tmp_path / "store")
     rig.fly(0, 20)
     sent = {one.sequence: one.frame_index for one in rig.live}
     rig.fly(20, 22, linked=False)
-    swallowed = [one for one in rig.stored() if one.sequence < 2**31]
-    assert {one.sequence: one.frame_index for one in swallowed} == sent
-    assert {one.codec for one in swallowed} == {"jpeg"}
+    lost = [one for one in rig.stored() if one.sequence < 2**31]
+    assert {one.sequence: one.frame_index for one in lost} == sent
+    assert {one.codec for one in lost} == {"jpeg"}
 
 
 def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
@@ -141,11 +130,7 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
         answer = commands.answer(ControlRequest.parse(request.pack()))
         return "" if answer.accepted else answer.reason
 
-    commands.serve(
-        Served(
-            None, rig.link_control._reconfiguration, rig.side._chooser, base_size=SIZE, backlog=rig.backlog
-        )
-    )
+    commands.serve(Served(None, rig.link_control._reconfiguration, None, base_size=SIZE, backlog=rig.backlog))
     assert "nothing is kept" in ask()
     rig.fly(0, 7)
     rig.report()
@@ -158,7 +143,5 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
     kinds = [header.kind for header, _ in rig.out.backlog]
     assert kinds.index("still") > max(n for n, kind in enumerate(kinds) if kind == "base")
     rig.backlog.close()
-    commands.serve(
-        Served(None, rig.link_control._reconfiguration, rig.side._chooser, base_size=SIZE, backlog=None)
-    )
+    commands.serve(Served(None, rig.link_control._reconfiguration, None, base_size=SIZE, backlog=None))
     assert "--store 0" in ask()

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from clips import hard_pictures
 from hvt_common.values import Tracks, View
+from hvt_edge.perception.base_loss import BaseLoss, measure_loss
 from hvt_edge.perception.candidates import Candidate, TrackMemory, sharpness
-from hvt_edge.stills.suppression import Suppression
+from hvt_edge.stills.suppression import Gate, Suppression
 
 SECOND = 1_000_000_000
 VIEW = View.fitted((1920, 1080), (1280, 720), fit="letterbox")
@@ -256,3 +258,34 @@ def test_sharpness_falls_with_blur_and_distance():
     )
     assert one.sharpness is not None
     assert one.sharpness() == 0.0
+
+
+# The gate
+
+CROP = hard_pictures(1, size=(160, 96))[0]
+
+
+@pytest.mark.parametrize(
+    ("psnr_y_db", "detail_lost", "good"),
+    [(36.0, 0.0, True), (35.9, 0.0, False), (60.0, 0.4, True), (60.0, 0.41, False)],
+)
+def test_both_conditions_have_to_hold(psnr_y_db, detail_lost, good):
+    """An object whose edges are gone, or whose colours are wrong, would never be shown."""
+    assert Gate(psnr_y_db=36.0).good_enough(BaseLoss(psnr_y_db, detail_lost)) == good
+
+
+def test_off_it_holds_nothing_back():
+    """The paper's methods would lose stills."""
+    gate = Gate()
+    assert not gate.on
+    assert not gate.good_enough(BaseLoss(99.0, 0.0))
+
+
+def test_a_dim_object_without_its_edges_is_not_good():
+    """PSNR alone would call every object in the shade good: there is little of anything to lose."""
+    gate = Gate(psnr_y_db=36.0)
+    dim = (CROP * 0.12).astype(np.uint8)
+    loss = measure_loss(dim, cv2.GaussianBlur(dim, (0, 0), 3))
+    assert loss.psnr_y_db > 36
+    assert not gate.good_enough(loss)
+    assert gate.good_enough(measure_loss(dim, dim))

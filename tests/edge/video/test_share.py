@@ -25,7 +25,7 @@ def moment(seconds: float, *, from_source: bool = False) -> Step:
         fps=15.0,
         base_size=(1280, 720),
         cost=CostEstimate(150, 0.1, 700),
-        room_bytes=2000,
+        allowance_bytes=2000,
         from_source=from_source,
     )
 

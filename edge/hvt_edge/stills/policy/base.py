@@ -1,4 +1,4 @@
-"""What a method is: a pure function from the candidates of a step to wishes for stills, most wanted first.
+"""What a method is: a pure function from the candidates of a step to requests for stills, most wanted first.
 
 To add one: a frozen dataclass with its parameters in a file of its own, and one row in `registry`.
 """
@@ -6,7 +6,7 @@ To add one: a frozen dataclass with its parameters in a file of its own, and one
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from hvt_edge.perception.candidates import Candidate
@@ -30,7 +30,7 @@ class Step:
     """(width, height) in base pixels."""
     cost: CostEstimate
     """What a still is expected to cost, learnt from those already sent."""
-    room_bytes: float
+    allowance_bytes: float
     """What the rolling budget would admit now."""
     still_overhead_bytes: float = STILL_OVERHEAD_BYTES
     """Line bytes that a still takes beside its payload: header, framing, transport."""
@@ -40,7 +40,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A wish for a still of one candidate."""
+    """A request for a still of one candidate."""
 
     candidate: Candidate
     reason: str
@@ -49,6 +49,12 @@ class Request:
     """The queue sends the highest first; comparable within one method only."""
     also: tuple[Candidate, ...] = ()
     """Neighbours that the same still shows (`hvt_edge.stills.merging`), by track id; never ``candidate`` itself."""
+
+    def without_frame(self) -> Request:
+        """The same, with what is measured on the frame measured now: a pending still must not hold frames."""
+        return replace(
+            self, candidate=_measured(self.candidate), also=tuple(_measured(one) for one in self.also)
+        )
 
 
 class Method(Protocol):
@@ -65,7 +71,7 @@ class Method(Protocol):
         ...
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
-        """The wishes of this step, most wanted first, at most one a track; the same for the same input."""
+        """The requests of this step, most wanted first, at most one a track; the same for the same input."""
         ...
 
 
@@ -79,3 +85,10 @@ def ranked(
         if (value := score(candidate)) is not None
     ]
     return sorted(wanted, key=lambda request: (-request.score, request.candidate.track_id))
+
+
+def _measured(candidate: Candidate) -> Candidate:
+    if candidate.sharpness is None:
+        return replace(candidate, loss=None)
+    value = candidate.sharpness()
+    return replace(candidate, sharpness=lambda: value, loss=None)

@@ -22,12 +22,12 @@ class OnStart:
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
         """Tracks whose last start has not been answered yet."""
-        return ranked(candidates, score=lambda one: self._waiting_frames(one, step), reason="new")
+        return ranked(candidates, score=lambda one: self._frames_unanswered(one, step), reason="new")
 
-    def _waiting_frames(self, candidate: Candidate, step: Step) -> float | None:
+    def _frames_unanswered(self, candidate: Candidate, step: Step) -> float | None:
         start_frame = step.frame_index - candidate.frames_since_start
         if candidate.last_sent_frame is not None and candidate.last_sent_frame >= start_frame:
             return None
-        waiting = candidate.frames_since_start
-        fresh = candidate.started or waiting <= self.patience_s * step.fps
-        return float(waiting) if fresh else None
+        elapsed = candidate.frames_since_start
+        fresh = candidate.started or elapsed <= self.patience_s * step.fps
+        return float(elapsed) if fresh else None

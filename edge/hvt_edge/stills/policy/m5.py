@@ -42,7 +42,7 @@ class Utility:
         spent = 0.0
         for count, request in enumerate(wanted):
             spent += step.cost.of(request.candidate)
-            if spent > step.room_bytes:
+            if spent > step.allowance_bytes:
                 return wanted[: max(count, 1)]
         return wanted
 

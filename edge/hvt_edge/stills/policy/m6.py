@@ -27,9 +27,9 @@ _MOST_LOGIT = 50.0
 
 @dataclass(frozen=True, slots=True)
 class ExpectedGain:
-    """Highest expected gain per byte first, from ``min_gain`` on, as many as ``look_ahead`` times the room holds.
+    """Highest expected gain per byte first, from ``min_gain`` on, as many as ``lookahead`` times the room holds.
 
-    Wishes beyond the room are for neighbours that may share a still, and for the queue.
+    Requests beyond the room are for neighbours that may share a still, and for the queue.
     """
 
     bias: float = 0.5
@@ -62,7 +62,7 @@ class ExpectedGain:
     """The use of another still of the same view, against the first."""
     min_gain: float = 0.02
     """Nothing below it is sent: about twice the rate at which a still spoils a class that was right."""
-    look_ahead: float = 3.0
+    lookahead: float = 3.0
     name: str = field(default="M6", init=False)
     video_only: bool = field(default=False, init=False)
 
@@ -77,7 +77,7 @@ class ExpectedGain:
         spent = 0.0
         for count, request in enumerate(wanted):
             spent += _line_bytes(request.candidate, step)
-            if spent > self.look_ahead * step.room_bytes:
+            if spent > self.lookahead * step.allowance_bytes:
                 return wanted[: max(count, 1)]
         return wanted
 

@@ -60,8 +60,8 @@ def select(
     ``boxes_xyxy_px`` is (N, 4) in base pixels, ``class_names`` the N names of the detections' classes.
     """
     confidence = np.asarray(confidences, np.float64).reshape(-1)
-    kept, score, _ = _judge(selector, boxes_xyxy_px, confidence, class_names, frame_area_px)
-    indices = np.flatnonzero(kept)
+    passed, score, _ = _judge(selector, boxes_xyxy_px, confidence, class_names, frame_area_px)
+    indices = np.flatnonzero(passed)
     best = np.argsort(-score[indices], kind="stable")[: selector.per_frame]
     return indices[best].astype(np.int64)
 
@@ -78,10 +78,10 @@ def _judge(
     width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     small = width * height / frame_area_px < selector.small_share
     allowed = {name: _allows(selector, name) for name in set(class_names)}
-    kept = np.array([allowed[name] for name in class_names], np.bool_)
-    kept &= (width >= selector.min_side_px) & (height >= selector.min_side_px)
-    kept &= confidence >= selector.min_confidence
-    return kept, selector.small_weight * small + selector.doubt_weight * (1 - confidence), small
+    passed = np.array([allowed[name] for name in class_names], np.bool_)
+    passed &= (width >= selector.min_side_px) & (height >= selector.min_side_px)
+    passed &= confidence >= selector.min_confidence
+    return passed, selector.small_weight * small + selector.doubt_weight * (1 - confidence), small
 
 
 def _allows(selector: Selector, class_name: str) -> bool:

@@ -454,7 +454,7 @@ def test_the_document_lists_every_field_with_its_bounds(message):
 
 @given(st.integers(-I63, I63), st.integers(0, 255), st.integers(0, U32), st.binary(max_size=40))
 def test_a_header_packed_once_has_the_bytes_of_one_packed_anew(delay_ns, flags, sequence, payload):
-    """A still that is sent late, or again, would be refused by every ground; or the budget would count other bytes."""
+    """A still that is sent late, or again, would be refused by grounds; or the budget would count other bytes."""
     packed = PackedMessage.of(ROI).with_fields(send_delay_ns=delay_ns, flags=flags, sequence=sequence)
     anew = replace(ROI, send_delay_ns=delay_ns, flags=flags, sequence=sequence).pack(payload)
     assert packed.pack(payload) == anew

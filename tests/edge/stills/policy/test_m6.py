@@ -26,7 +26,7 @@ def step(**changes) -> Step:
         fps=15.0,
         base_size=(1280, 720),
         cost=CostEstimate(500, 0, 500),
-        room_bytes=1e9,
+        allowance_bytes=1e9,
         still_overhead_bytes=180,
     )
     return replace(plain, **changes)
@@ -148,7 +148,7 @@ def test_it_asks_for_some_more_than_fits_and_always_for_the_best():
     """Neighbours would find nobody to share with, or a needed still would never wait for its room."""
     some = [car(number, confidence=0.1 * number) for number in range(1, 7)]
     for room, count in ((0, 1), (226, 1), (680, 3), (1e9, 6)):
-        wanted = M6.requests(some, step(room_bytes=room))
+        wanted = M6.requests(some, step(allowance_bytes=room))
         assert [one.candidate.track_id for one in wanted] == list(range(1, count + 1))
 
 

@@ -27,7 +27,7 @@ def step(frame: int = 300, **changes) -> Step:
         fps=FPS,
         base_size=(1280, 720),
         cost=CostEstimate(),
-        room_bytes=1e9,
+        allowance_bytes=1e9,
     )
     return replace(plain, **changes)
 
@@ -86,7 +86,7 @@ def candidates(draw):
 @settings(max_examples=40, deadline=None)
 def test_every_method_is_a_pure_function_of_its_input(name, given_candidates, room, seed):
     """The same flight would give other stills each time, and tables that nobody can reproduce."""
-    policy, moment = method(name), step(room_bytes=room)
+    policy, moment = method(name), step(allowance_bytes=room)
     wanted = policy.requests(given_candidates, moment)
     assert policy.requests(given_candidates, moment) == wanted
     assert method(name).requests(given_candidates, moment) == wanted
@@ -222,7 +222,7 @@ def test_m5_asks_for_what_fits_and_always_for_the_best():
     cost = CostEstimate(fixed_bytes=1000, bytes_per_px=0, mean_bytes=1000)
     some = [candidate(i, confidence=0.1 * i) for i in range(1, 9)]
     for room, count in ((0, 1), (999, 1), (1000, 1), (3500, 3), (8000, 8), (1e9, 8)):
-        wanted = method("M5").requests(some, step(cost=cost, room_bytes=room))
+        wanted = method("M5").requests(some, step(cost=cost, allowance_bytes=room))
         assert [one.candidate.track_id for one in wanted] == list(range(1, count + 1))
 
 
@@ -300,7 +300,7 @@ def test_registry_names_all_and_says_what_is_accepted():
 
 def test_tuning_reads_what_a_user_writes():
     """A weight would be ignored, or a slip end in a traceback."""
-    assert tuning(["min_gain=0.05, look_ahead=2", "min_gain=0.1"]) == {"min_gain": 0.1, "look_ahead": 2.0}
+    assert tuning(["min_gain=0.05, lookahead=2", "min_gain=0.1"]) == {"min_gain": 0.1, "lookahead": 2.0}
     assert tuning([]) == {}
     assert method("M6", **tuning(["min_gain=0.5"])).requests([candidate()], step()) == []
     for bad in ("min_gain", "min_gain=", "=3", "min gain=3", "min_gain=much", ""):

@@ -139,7 +139,9 @@ def test_ties_keep_the_order_of_detection():
 
 def test_as_a_method_only_this_frame_s_detections_count():
     """A predicted box, of which no detector says that it is there, would be sent."""
-    moment = Step(frame_index=5, now_ns=0, fps=15, base_size=(1280, 720), cost=CostEstimate(), room_bytes=1e9)
+    moment = Step(
+        frame_index=5, now_ns=0, fps=15, base_size=(1280, 720), cost=CostEstimate(), allowance_bytes=1e9
+    )
 
     def one(track_id, confidence, *, detected=True, side=40.0):
         return Candidate(

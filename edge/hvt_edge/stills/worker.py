@@ -1,0 +1,120 @@
+"""The thread of perception and stills in real time, so that detection never delays the base stream."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Self
+
+from hvt_common.protocol.messages import StillResult
+from hvt_common.runtime.priority import lower_priority
+from hvt_common.values import AccessUnit, Frame
+from hvt_edge.stills.stage import StillStage
+
+__all__ = ["MAX_QUEUE_BYTES", "StillWorker"]
+
+_BEHIND_FRAMES = 3
+"""With more frames queued than this, detection is put off; decoding never is."""
+_LEAST_FRAMES = 2
+MAX_QUEUE_BYTES = 160 * 2**20
+"""Of frames that are queued: 16 of 1280x720 and 1920x1080, 5 of 3840x2160."""
+_FINISH_S = 1.0
+_RETRY_S = 0.025
+
+
+class StillWorker:
+    """Runs a `StillStage` in a thread of its own.
+
+    The queue is bounded in frames and in bytes; where it is `full` the frame loop drops the next frame before
+    encoding. Before each frame the thread takes ``results()``, what grounds have reported of stills. An error in it
+    ends the process: `full`, `offer` and `close` raise it.
+    """
+
+    def __init__(
+        self,
+        stage: StillStage,
+        *,
+        results: Callable[[], Sequence[StillResult]],
+        clock: Callable[[], int],
+        length: int = 16,
+        max_bytes: int = MAX_QUEUE_BYTES,
+    ) -> None:
+        self._stage = stage
+        self._results = results
+        self._clock = clock
+        self._frames: queue.Queue[tuple[Frame, AccessUnit | None] | None] = queue.Queue(length)
+        self._most_frames = length
+        self._max_bytes = max_bytes
+        self._error: BaseException | None = None
+        self._given_up = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="hvt-stills", daemon=True)
+        self._thread.start()
+
+    @property
+    def queued(self) -> int:
+        """Frames that are not taken yet."""
+        return self._frames.qsize()
+
+    @property
+    def full(self) -> bool:
+        """Whether the next `offer` would have to wait."""
+        self._raise_error()  # a dead thread leaves a full queue, and `offer` is not called any more
+        return self._frames.qsize() >= self._most_frames
+
+    def offer(self, frame: Frame, unit: AccessUnit | None) -> None:
+        """Hand over one frame, in order, with its access unit if it has one."""
+        self._raise_error()
+        # All frames of a source have one size, so a bound in bytes is a bound in frames.
+        fitting = self._max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
+        self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
+        self._frames.put((frame, unit))
+
+    def close(self) -> None:
+        """Let the thread finish what it has, at most for a second, then leave the rest; join it."""
+        until_s = time.monotonic() + _FINISH_S
+        with contextlib.suppress(queue.Full):
+            self._frames.put(None, timeout=_FINISH_S)
+        self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
+        self._given_up.set()
+        self._thread.join(timeout=_FINISH_S)
+        self._raise_error()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        lower_priority()
+        try:
+            while (item := self._next()) is not None and not self._given_up.is_set():
+                behind = self._frames.qsize() >= _BEHIND_FRAMES
+                self._stage.on_results(self._results())
+                analyzed = self._stage.analyze(*item, hurry=behind)
+                self._stage.send(analyzed, now_ns=self._clock())
+        except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
+            self._error = error
+
+    def _next(self) -> tuple[Frame, AccessUnit | None] | None:
+        """Return the next frame; until it comes what is pending is tried again.
+
+        Right behind a base frame the link is busy: with few frames a second there would be no other moment.
+        """
+        while True:
+            try:
+                return self._frames.get(timeout=_RETRY_S)
+            except queue.Empty:
+                if self._stage.any_pending:
+                    self._stage.send_pending(now_ns=self._clock())
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
