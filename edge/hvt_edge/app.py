@@ -189,7 +189,7 @@ class Edge:
             sender=sender,
             recorder=recorder,
             first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
-            plan=make_regions(config, view.base_size),
+            regions=make_regions(config, view.base_size),
             frame_skip=LimitedFrameSkip(
                 make_frame_skip(config, decimation), reconfiguration.least_decimation
             ),

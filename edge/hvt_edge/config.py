@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,7 +44,6 @@ __all__ = [
     "Regime",
     "check",
     "check_rate",
-    "parse_grid",
 ]
 
 
@@ -55,7 +53,6 @@ _LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, 60.0
 _R0_DEPTH = 0.1
 _MIN_BUDGET_BPS = 100_000
 _LEAST_STORE_BYTES = 10_000_000
-_MOST_CELLS = 64
 LEAST_FPS = 2.0
 """To this ``--fps auto`` may fall: two frames in a window of a second."""
 TRACKS_BPS = 8_000
@@ -188,14 +185,6 @@ class EdgeConfig:
     )
 
     preset: str = option(choice(*PRESETS), "veryfast", "x265 preset")
-    refresh: float = option(DURATION, 0.0, "a whole frame at better quality once in so long; 0 for none")
-    refresh_depth: float = option(
-        number(0.01, 1), 0.15, "how much better a pulse is; 1 is the whole quantiser range"
-    )
-    rolling_refresh: str = option(
-        TEXT, "off", "pulses of one region a frame in rotation, grid CxR, tracks first; or off"
-    )
-    rolling_refresh_depth: float = option(number(0.01, 1), 0.1, "how much better that region is")
     roi_depth: float = option(
         number(0, 1), 0.0, "quantise active tracks better by so much; 0 for not, 0.1 for --method R0"
     )
@@ -303,7 +292,6 @@ def check(config: EdgeConfig) -> EdgeConfig:
             f"{_LEAST_STORE_BYTES // 10**6}MB or more, or 0 to keep nothing"
         )
     _check_stills(config)
-    _check_regions(config)
     if config.fixed_size is not None:
         check_rate(config, config.fixed_size)
     return config
@@ -341,21 +329,3 @@ def _check_stills(config: EdgeConfig) -> None:
         )
     if parse_tiles(config.tiles) != "off" and config.candidates != "source":
         raise UserError(f"--tiles {config.tiles} cuts up the source: add --candidates source")
-
-
-def _check_regions(config: EdgeConfig) -> None:
-    parse_grid(config.rolling_refresh)
-    if config.refresh and config.refresh < 2 / config.nominal_fps:
-        raise UserError(f"--pulse {config.refresh:g}s is shorter than two frames: give more, or 0 for none")
-
-
-def parse_grid(text: str) -> tuple[int, int] | None:
-    """The value of ``--rolling``: columns and rows; None for ``off``."""
-    found = re.fullmatch(r"(\d{1,2})x(\d{1,2})", text)
-    if text == "off":
-        return None
-    if found is None or not 2 <= int(found[1]) * int(found[2]) <= _MOST_CELLS:
-        raise UserError(
-            f"--rolling {text!r} is not accepted: give off, or CxR such as 5x3, 2 to {_MOST_CELLS} cells"
-        )
-    return int(found[1]), int(found[2])

@@ -17,7 +17,7 @@ from hvt_common.video.still_codecs import still_codec
 from hvt_edge.backlog.disk import Folder, check_folder, default_folder
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
-from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig, parse_grid
+from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
@@ -36,8 +36,8 @@ from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.least_rate import encoder_settings, least_base_bps, payload_bps
-from hvt_edge.video.quality_refresh import RefreshPlan, RegionPlan, RollingRefreshPlan, TrackRegions, combined
 from hvt_edge.video.rate_model import choose_base, most_decimation
+from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.share import Split, SplitSettings
 from hvt_edge.video.x265 import BaseEncoder
 
@@ -290,27 +290,15 @@ def make_encoder(config: EdgeConfig, *, size: tuple[int, int], decimation: int, 
         total_bps=config.budget_bps - config.metadata_bps,
         base_bps=base_bps,
         edge_id=config.edge_id,
-        side_data=bool(config.roi_depth or parse_grid(config.rolling_refresh)),
-        refreshes=config.refresh > 0,
+        side_data=config.roi_depth > 0,
     )
     threads = 1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1)
     return BaseEncoder(replace(settings, threads=threads))
 
 
-def make_regions(config: EdgeConfig, size: tuple[int, int]) -> RegionPlan | None:
+def make_regions(config: EdgeConfig, size: tuple[int, int]) -> TrackRegions | None:
     """Which regions of the base get more bits; None for none."""
-    grid = parse_grid(config.rolling_refresh)
-    refresh = rolling_refresh = tracks = None
-    if config.refresh:
-        period = max(1, round(config.refresh * config.nominal_fps))
-        refresh = RefreshPlan(size, period_ticks=period, depth=config.refresh_depth)
-    if grid is not None:
-        rolling_refresh = RollingRefreshPlan(
-            size, columns=grid[0], rows=grid[1], depth=config.rolling_refresh_depth
-        )
-    if config.roi_depth:
-        tracks = TrackRegions(size, depth=config.roi_depth)
-    return combined(refresh, rolling_refresh, tracks)
+    return TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None
 
 
 def make_keyframes(config: EdgeConfig) -> KeyframePlan:

@@ -129,7 +129,7 @@ _ZENOH = (
 )
 _EDGE_LINES = (
     b"--source\0demo\0--budget\0800kbps\0--size\0640x360\0--method\0M6",
-    b"--source\0a.mp4\0--fps\0auto\0--tiles\0auto\0--pulse\0001s\0--pulse-depth\0000.3",
+    b"--source\0a.mp4\0--fps\0auto\0--tiles\0auto\0--roi-depth\0000.1\0--ring-time\0001s",
     b"--connect\0tcp/127.0.0.1:7447\0--edge-id\0uav-1\0--video-share\00081%",
 )
 _GROUND_LINES = (

@@ -53,10 +53,6 @@ METHODS: Mapping[str, MethodRow] = MappingProxyType(
                 "video and stills of what it lacks",
                 unlike="M5-jpeg",
             ),
-            MethodRow(
-                "pulse", (*_VIDEO_ONLY, *_BLIND, "--pulse", "2s"), "a better whole frame every two seconds"
-            ),
-            MethodRow("rolling", (*_VIDEO_ONLY, "--rolling", "8x4"), "a better part of each frame, in turn"),
             MethodRow("tracks", (*_VIDEO_ONLY, *_SOURCE), "video, and what the edge sees in the source"),
             MethodRow(
                 "M6",

@@ -5,14 +5,12 @@ from __future__ import annotations
 from hvt_edge.link.transmitter import base_overhead_bps
 from hvt_edge.video.x265 import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
 
-__all__ = ["REFRESH_VBV_S", "encoder_settings", "least_base_bps", "payload_bps"]
+__all__ = ["encoder_settings", "least_base_bps", "payload_bps"]
 
 # The fullest rolling second over the target, keyframes on demand included, from 300 kbps up (see encode).
 _PEAK = 1.14
 _TIGHT_VBV_S = 0.1
 _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (budget.earliest_ns)
-REFRESH_VBV_S = 0.5
-"""Whole-frame pulses need a deep VBV: with 0.15 s nothing is left of them (docs/base-stream.md)."""
 _KEYFRAME_EVERY_S = 5.0
 """x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
 So much is asked for less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
@@ -27,7 +25,6 @@ def encoder_settings(
     base_bps: int,
     edge_id: str,
     side_data: bool = False,
-    refreshes: bool = False,
 ) -> EncoderSettings:
     """What to ask of x265 so that the base stream stays within B_v, and its fullest second within B_tot.
 
@@ -35,8 +32,7 @@ def encoder_settings(
     nothing can yield: the VBV is made tighter and the target lowered by the peak that is left.
 
     ``fps`` is the rate of coded frames: with fewer of them less goes into headers, and the VBV holds one at least.
-    ``side_data`` is needed by any `RegionPlan`, ``refreshes`` by those of whole frames (`RefreshPlan`), which
-    make the VBV deeper: what then does not fit the budget's window waits.
+    ``side_data`` is needed by `TrackRegions`.
     """
     tight = base_bps * _PEAK > total_bps
     line_bps = min(base_bps, total_bps / _TIGHT_PEAK) if tight else base_bps
@@ -46,8 +42,8 @@ def encoder_settings(
         fps=fps,
         bitrate_bps=max(1, round(payload_bps)),
         preset=preset,
-        vbv_s=max(REFRESH_VBV_S if refreshes else _TIGHT_VBV_S if tight else VBV_S, 1 / fps),
-        side_data=side_data or refreshes,
+        vbv_s=max(_TIGHT_VBV_S if tight else VBV_S, 1 / fps),
+        side_data=side_data,
     )
 
 

@@ -10,7 +10,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.local_copy import BaseRecorder
-from hvt_edge.video.quality_refresh import RegionPlan
+from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.x265 import BaseEncoder
 
 __all__ = ["BaseStage"]
@@ -25,7 +25,7 @@ class BaseStage:
         sender: takes the units.
         recorder: keeps them in a file too.
         first_keyframe_bytes: the guess until a keyframe has been seen.
-        plan: which regions get more bits; None for none.
+        regions: which regions get more bits; None for none.
         cadence: which ticks are coded; all by default.
         renew: called with (n, ``now_ns``) before each keyframe, each n-th tick being coded from it on. Returns an
             encoder newly opened for that, where anything has changed, or None to go on with the one there is. x265
@@ -42,7 +42,7 @@ class BaseStage:
         sender: Transmitter,
         recorder: BaseRecorder | None,
         first_keyframe_bytes: int,
-        plan: RegionPlan | None = None,
+        regions: TrackRegions | None = None,
         frame_skip: FrameSkip | None = None,
         renew: Callable[[int, int], BaseEncoder | None] | None = None,
         admits: Callable[[int], bool] = lambda _now_ns: True,
@@ -53,7 +53,7 @@ class BaseStage:
         self._sender = sender
         self._recorder = recorder
         self._keyframe_bytes = first_keyframe_bytes
-        self._plan = plan
+        self._regions = regions
         self._frame_skip = frame_skip or FrameSkip()
         self._renew = renew
         self._admits = admits
@@ -87,7 +87,7 @@ class BaseStage:
             return None
         if keyframe and not self._kept:
             self._begin_run(frame.index, now_ns=now_ns)
-        regions = [] if self._plan is None else self._plan.regions(frame.index, tracks, keyframe=keyframe)
+        regions = [] if self._regions is None else self._regions.regions(tracks)
         unit = self._encoder.encode(frame, keyframe=keyframe, regions=regions)
         self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self._encoder.mean_qp)
         self._note(unit, now_ns)

@@ -68,8 +68,6 @@ METHODS: Mapping[str, MatrixMethod] = MappingProxyType(
             _video("M0"),
             _video("M0-fps", fps_choices=_FPS_CHOICES),
             _video("R0"),
-            _video("pulse"),
-            _video("rolling"),
             _stills("M1", "a still of each track every second"),
             _stills("M2", "a still when a track begins"),
             _stills("M3", "a still of tracks that are uncertain"),

@@ -85,8 +85,6 @@ _LOOKS: Mapping[str, Look] = MappingProxyType(
         "M0": Look(PALETTE["black"], "o", "--"),
         "M0-fps": Look(PALETTE["black"], "s", "-"),
         "R0": Look(PALETTE["sky"], "^", "-"),
-        "pulse": Look(PALETTE["green"], "P", "--"),
-        "rolling": Look(PALETTE["green"], "X", "-"),
         "M1": Look(PALETTE["blue"], "o", ":"),
         "M2": Look(PALETTE["blue"], "v", "--"),
         "M3": Look(PALETTE["blue"], "D", "-."),

@@ -8,7 +8,7 @@ from clips import framed, hard_pictures, real_pictures
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_edge.link.transmitter import BASE_ATTACHMENT_BYTES, STATUS_BYTES
-from hvt_edge.video.least_rate import REFRESH_VBV_S, encoder_settings, least_base_bps
+from hvt_edge.video.least_rate import encoder_settings, least_base_bps
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings, minimum_bps
 
 SIZE, FPS = (1280, 720), 15
@@ -111,22 +111,3 @@ def test_fewer_frames_leave_more_for_each_and_keep_the_share(decimation):
     header = len(pictures) * 110
     assert 0.85 * 320_000 <= 8 * (payload + header) / (len(pictures) / fps) <= 1.03 * 320_000
     assert least_base_bps(SIZE, fps, edge_id="edge-1") < 0.6 * least_base_bps(SIZE, FPS, edge_id="edge-1")
-
-
-def test_whole_frame_pulses_get_the_buffer_they_need():
-    """The pulse would be asked for and not happen."""
-    both = [
-        encoder_settings(
-            size=SIZE,
-            fps=FPS,
-            preset="veryfast",
-            total_bps=400_000,
-            base_bps=base,
-            edge_id="a",
-            refreshes=True,
-        )
-        for base in (320_000, 400_000)
-    ]
-    assert [one.vbv_s for one in both] == [REFRESH_VBV_S] * 2
-    assert all(one.side_data for one in both)
-    assert not asked(320_000, 400_000).side_data

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 
 from clips import START_NS, framed, hard_pictures, smooth_pictures
+from flight import tracks_at
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
-from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.local_copy import BaseRecorder
-from hvt_edge.video.quality_refresh import RollingRefreshPlan
-from hvt_edge.video.regions import Region
+from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 
@@ -45,7 +44,7 @@ class Kept:
 class Rig:
     """A base stage with all that it needs."""
 
-    def __init__(self, *, frame_skip=None, plan=None, recorder=None, interval_s=10.0) -> None:
+    def __init__(self, *, frame_skip=None, regions=None, recorder=None, interval_s=10.0) -> None:
         self.kept = Kept()
         self.opened: list[int] = []
         self.frame_skip = frame_skip or FrameSkip()
@@ -64,7 +63,7 @@ class Rig:
             ),
             recorder=recorder,
             first_keyframe_bytes=5000,
-            plan=plan,
+            regions=regions,
             frame_skip=self.frame_skip,
             renew=self._renew,
         )
@@ -90,18 +89,6 @@ class Rig:
         return BaseEncoder(replace(SETTINGS, fps=15.0 / decimation))
 
 
-class Asked:
-    """A plan that keeps what it was asked."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[int, Tracks | None, bool]] = []
-
-    def regions(self, tick: int, tracks: Tracks | None, *, keyframe: bool = False) -> list[Region]:
-        """Nothing special."""
-        self.calls.append((tick, tracks, keyframe))
-        return []
-
-
 def test_ticks_that_are_not_coded_cost_nothing():
     """``--fps auto`` would save no bit."""
     rig = Rig(frame_skip=FrameSkip(3))
@@ -116,31 +103,6 @@ def test_a_keyframe_on_demand_does_not_wait_for_its_tick():
     rig.opened.append(8)
     assert rig.play(smooth_pictures(30, size=SIZE), asks=(10,)) == [0, 8, 10, 18, 26]
     assert BaseDecoder().decode(rig.kept.units[2]) is not None, "it is a keyframe"
-
-
-def test_the_plan_is_asked_for_coded_ticks_and_told_the_tracks():
-    """Pulses would fall on ticks that nobody sees, and R0 would know of no track."""
-    plan = Asked()
-    known = Tracks(0, **_no_tracks())
-    rig = Rig(frame_skip=FrameSkip(4), plan=plan)
-    rig.opened.append(4)
-    rig.play(smooth_pictures(9, size=SIZE), tracks=known)
-    assert [(tick, keyframe) for tick, _, keyframe in plan.calls] == [(0, True), (4, False), (8, False)]
-    assert all(tracks is known for _, tracks, _ in plan.calls)
-
-
-def _no_tracks() -> dict[str, np.ndarray]:
-    """The arrays of no tracks."""
-    empty = np.empty(0, np.int64)
-    return {
-        "ids": empty,
-        "boxes_xyxy_px": np.empty((0, 4), np.float32),
-        "confidences": np.empty(0, np.float32),
-        "class_ids": np.empty(0, np.int32),
-        "born_frames": empty,
-        "seen_frames": empty,
-        "started": np.empty(0, np.bool_),
-    }
 
 
 def starving() -> MeasuredFrameSkip:
@@ -170,11 +132,11 @@ def test_the_rate_changes_with_a_keyframe_and_every_decoder_follows():
 def test_the_same_frames_give_the_same_bytes():
     """In lockstep no table could be repeated."""
     runs = []
+    car = tracks_at(0, {1: (30.0, 30.0, 90.0, 90.0)})
     for _ in range(2):
-        rig = Rig(
-            frame_skip=starving(), plan=RollingRefreshPlan(SIZE, columns=4, rows=3, depth=0.1), interval_s=2.0
-        )
-        runs.append((rig.play(hard_pictures(100, size=SIZE), asks=(40,)), rig.kept.units))
+        rig = Rig(frame_skip=starving(), regions=TrackRegions(SIZE, depth=0.1), interval_s=2.0)
+        coded = rig.play(hard_pictures(100, size=SIZE), asks=(40,), tracks=car)
+        runs.append((coded, rig.kept.units))
     assert runs[0] == runs[1]
 
 

@@ -153,7 +153,7 @@ BOX = (96, 64, 192, 128)
 
 @pytest.mark.parametrize("preset", ["ultrafast", "superfast", "veryfast"])
 def test_a_region_gets_a_better_picture(preset):
-    """R0, pulses and rolling pulses would all change nothing."""
+    """R0 would change nothing."""
     pictures = hard_pictures(24, size=SIZE)[:20]
     plain = errors_at(pictures, encode(pictures, preset=preset, side_data=True), BOX)
     units = encode(pictures, preset=preset, side_data=True, regions=lambda _: [Region(BOX, -0.2)])
@@ -163,7 +163,7 @@ def test_a_region_gets_a_better_picture(preset):
 
 
 def test_where_regions_overlap_the_deeper_one_counts():
-    """A pulse over a frame with tracks would take from the tracks what they had."""
+    """A track beside another would lose what it has."""
     pictures = hard_pictures(24, size=SIZE)[:16]
     both = [Region((0, 0, *SIZE), 0.1), Region(BOX, -0.2)]
     first, second = (
