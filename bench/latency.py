@@ -17,7 +17,7 @@ import psutil
 from bench.material import FPS, SIZE, clip, frames, nano
 from hvt_common.inference.detect import open_detector
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.least_rate import encoder_settings
+from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 
 

@@ -29,12 +29,12 @@ from hvt_common.protocol.channels import EdgeKeys
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
 from hvt_common.video.still_codecs import still_codec
+from hvt_edge.operating.point import base_rate_bps
 from hvt_edge.profiles import PROFILES
 from hvt_edge.source.opening import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
-from hvt_edge.video.least_rate import least_base_bps
+from hvt_edge.video.encoder_settings import PRESETS, least_base_bps
 from hvt_edge.video.share import FIRST_SHARE
-from hvt_edge.video.x265 import PRESETS
 
 __all__ = [
     "DEFAULT_SIZE",
@@ -226,7 +226,12 @@ class EdgeConfig:
     @property
     def floor_bps(self) -> int:
         """What ``--adapt`` never goes below, in bits a second."""
-        return min(self.budget_bps, self.min_budget or _MIN_BUDGET_BPS)
+        return min(self.budget_bps, self.min_budget_bps)
+
+    @property
+    def min_budget_bps(self) -> int:
+        """The same, where the budget is not lower itself."""
+        return self.min_budget or _MIN_BUDGET_BPS
 
     @property
     def adapts(self) -> bool:
@@ -234,10 +239,20 @@ class EdgeConfig:
         return self.adapt and self.pace == "realtime"
 
     @property
+    def window_ns(self) -> int:
+        """The budget's window in nanoseconds."""
+        return round(self.window * 1e9)
+
+    @property
     def share(self) -> float:
         """Share of the budget for the base stream; where it is to follow the scene, the one to begin with."""
         assert self.video_share is not None, "check() fills it"
         return FIRST_SHARE if isinstance(self.video_share, str) else self.video_share
+
+    @property
+    def fixed_share(self) -> float | None:
+        """The same; None where it is to track the scene."""
+        return None if isinstance(self.video_share, str) else self.share
 
     @property
     def metadata_bps(self) -> int:
@@ -247,7 +262,7 @@ class EdgeConfig:
     @property
     def base_bps(self) -> int:
         """B_v in bits a second."""
-        return round(min(self.budget_bps * self.share, self.budget_bps - self.metadata_bps))
+        return base_rate_bps(self.budget_bps, self.share, metadata_bps=self.metadata_bps)
 
     @property
     def nominal_fps(self) -> float:

@@ -1,6 +1,8 @@
-"""What the edge says of itself: `Info` when asked, `Status` once a second, and a line for whoever looks at it."""
+"""What the edge reports of itself: `Info` on request, `Status` once a second, and a line on the terminal."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 from hvt_common import __version__
 from hvt_common.protocol.ledger import Ledger
@@ -8,123 +10,155 @@ from hvt_common.protocol.messages import Health, Info, Status, fitted_class_name
 from hvt_common.units import bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
+from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.operating.point import LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
 
-__all__ = ["make_info", "make_status", "status_text"]
+__all__ = ["InfoReporter", "StatusReporter"]
 
 _SECOND_NS = 1_000_000_000
+_MILLION = 1_000_000
 
 
-def make_info(
-    config: EdgeConfig,
-    *,
-    session_id: int,
-    started_ns: int,
-    view: View,
-    class_names: tuple[str, ...],
-    window_ns: int,
-    received_ns: int,
-    answered_ns: int,
-) -> Info:
-    """What does not change while the session runs; both times are of the clock that the headers go by."""
-    return Info(
-        session_id=session_id,
-        edge=config.edge_id,
-        software=__version__,
-        started_ns=started_ns,
-        source_size=view.source_size,
-        base_size=view.base_size,
-        view_scale=view.scale,
-        view_offset_px=view.offset_px,
-        fps=config.nominal_fps,
-        codec="hevc",
-        pace=config.pace,
-        method=config.method,
-        budget_bps=config.budget_bps,
-        base_bps=config.base_bps,
-        window_ns=window_ns,
-        class_names=fitted_class_names(class_names),
-        received_ns=received_ns,
-        answered_ns=answered_ns,
-    )
+class InfoReporter:
+    """Answers ``info``; from any thread."""
+
+    def __init__(
+        self,
+        config: EdgeConfig,
+        *,
+        session_id: int,
+        operating: Operating,
+        view: View,
+        class_names: tuple[str, ...],
+        clock: Callable[[], int],
+    ) -> None:
+        self._config = config
+        self._session_id = session_id
+        self._operating = operating
+        self._view = view
+        self._class_names = fitted_class_names(class_names)
+        self._clock = clock
+
+    def info(self, received_ns: int | None = None) -> bytes:
+        """What a ground needs to know of the session; times are of the clock that the headers go by."""
+        config, view, now = self._config, self._view, self._operating.now
+        answered_ns = self._clock()
+        info = Info(
+            session_id=self._session_id,
+            edge=config.edge_id,
+            software=__version__,
+            started_ns=now.started_ns,
+            source_size=view.source_size,
+            base_size=view.base_size,
+            view_scale=view.scale,
+            view_offset_px=view.offset_px,
+            fps=config.nominal_fps,
+            codec="hevc",
+            pace=config.pace,
+            method=now.method,
+            budget_bps=now.budget_bps,
+            base_bps=now.base_bps,
+            window_ns=config.window_ns,
+            class_names=self._class_names,
+            received_ns=answered_ns if received_ns is None else received_ns,
+            answered_ns=answered_ns,
+        )
+        return info.pack()
 
 
-def make_status(
-    state: str,
-    *,
-    session_id: int,
-    sequence: int,
-    at_ns: int,
-    started_ns: int,
-    fps: float,
-    ledger: Ledger,
-    counts: FrameCounts,
-    keyframes: KeyframePlan,
-    sender: Transmitter,
-    stills: StillStage,
-    feedback_age_ms: int,
-    measured: bool,
-) -> Status:
-    """Totals, fates and health at ``at_ns``.
+class StatusReporter:
+    """Sends ``status`` and makes the status line; in the frame loop."""
 
-    Without ``measured`` (lockstep) no field hangs on this machine's speed: the same input gives the same bytes.
-    """
-    account = ledger.summary(counts.duration_s(fps))
-    worst = account.worst_window_bps
-    return Status(
-        session_id=session_id,
-        sequence=sequence,
-        state=state,
-        send_ns=at_ns,
-        media_ns=max(0, at_ns - started_ns),
-        last_base_sequence=sender.base_sequence,
-        last_still_sequence=sender.still_sequence,
-        base_bytes=account.base_bytes,
-        roi_bytes=account.roi_bytes,
-        backlog_bytes=account.backlog_bytes,
-        meta_bytes=account.meta_bytes,
-        overhead_bytes=account.overhead_bytes,
-        base_messages=account.messages["base"],
-        roi_messages=account.messages["roi"],
-        backlog_messages=account.messages["backlog"],
-        meta_messages=account.messages["meta"],
-        worst_window_bps=(worst.base, worst.roi, worst.total),
-        sent=account.outcomes["sent"],
-        deferred=account.outcomes["deferred"],
-        dropped=account.outcomes["dropped"],
-        health=Health(
-            frames_captured=counts.captured,
-            frames_encoded=counts.encoded,
-            frames_dropped=counts.dropped,
-            keyframes=keyframes.sent,
-            tracks=stills.tracks,
-            base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
-            still_queue=stills.pending,
-            encode_ms=counts.encode_ms if measured else 0.0,
-            detect_ms=stills.perception_ms if measured else 0.0,
-            feedback_age_ms=feedback_age_ms if measured else -1,
-        ),
-    )
+    def __init__(
+        self,
+        config: EdgeConfig,
+        *,
+        session_id: int,
+        operating: Operating,
+        ledger: Ledger,
+        counts: FrameCounts,
+        keyframes: KeyframeRequests,
+        transmitter: Transmitter,
+        stills: StillStage,
+        inbox: FeedbackInbox,
+        clock: Callable[[], int],
+        loop_clock: LoopClock,
+    ) -> None:
+        self._config = config
+        self._session_id = session_id
+        self._operating = operating
+        self._ledger = ledger
+        self._counts = counts
+        self._keyframes = keyframes
+        self._transmitter = transmitter
+        self._stills = stills
+        self._inbox = inbox
+        self._clock = clock
+        self._loop_clock = loop_clock
+        self._sequence = 0
 
+    def send(self, state: str) -> None:
+        """Send the report, made for the moment at which it may go."""
+        self._transmitter.status(lambda at_ns: self._status(state, at_ns), now_ns=self._loop_clock())
+        self._sequence += 1
 
-def status_text(
-    config: EdgeConfig,
-    *,
-    counts: FrameCounts,
-    ledger: Ledger,
-    stills: StillStage,
-    now_ns: int,
-    allowed_bps: float,
-    link: str,
-) -> str:
-    """The status line; ``allowed_bps`` is what the budget or the link allows now."""
-    rate_bps = ledger.window_bytes(None, now_ns) * 8 * _SECOND_NS / ledger.window_ns
-    sent = sum(ledger.outcomes("sent").values())
-    return (
-        f"{config.edge_id} {counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "
-        f"{bitrate_text(allowed_bps)}  {config.method}  stills {sent}, {stills.pending} waiting  "
-        f"tracks {stills.tracks}  {link}"
-    )
+    def line(self, link: str) -> str:
+        """The status line."""
+        config, now, ledger = self._config, self._operating.now, self._ledger
+        rate_bps = ledger.window_bytes(None, self._loop_clock()) * 8 * _SECOND_NS / ledger.window_ns
+        sent = sum(ledger.outcomes("sent").values())
+        return (
+            f"{config.edge_id} {self._counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "
+            f"{bitrate_text(now.total_bps)}  {now.method}  stills {sent}, {self._stills.pending} pending  "
+            f"tracks {self._stills.tracks}  {link}"
+        )
+
+    def _status(self, state: str, at_ns: int) -> Status:
+        """Totals, outcomes and health at ``at_ns``.
+
+        In lockstep no field depends on this machine's speed: the same input gives the same bytes.
+        """
+        counts, stills, transmitter = self._counts, self._stills, self._transmitter
+        account = self._ledger.summary(counts.duration_s(self._config.nominal_fps))
+        worst = account.worst_window_bps
+        measured = self._config.pace != "lockstep"
+        reported_ns = self._inbox.received_ns
+        age_ms = -1 if reported_ns is None else max(0, (self._clock() - reported_ns) // _MILLION)
+        return Status(
+            session_id=self._session_id,
+            sequence=self._sequence,
+            state=state,
+            send_ns=at_ns,
+            media_ns=max(0, at_ns - self._operating.now.started_ns),
+            last_base_sequence=transmitter.base_sequence,
+            last_still_sequence=transmitter.still_sequence,
+            base_bytes=account.base_bytes,
+            roi_bytes=account.roi_bytes,
+            backlog_bytes=account.backlog_bytes,
+            meta_bytes=account.meta_bytes,
+            overhead_bytes=account.overhead_bytes,
+            base_messages=account.messages["base"],
+            roi_messages=account.messages["roi"],
+            backlog_messages=account.messages["backlog"],
+            meta_messages=account.messages["meta"],
+            worst_window_bps=(worst.base, worst.roi, worst.total),
+            sent=account.outcomes["sent"],
+            deferred=account.outcomes["deferred"],
+            dropped=account.outcomes["dropped"],
+            health=Health(
+                frames_captured=counts.captured,
+                frames_encoded=counts.encoded,
+                frames_dropped=counts.dropped,
+                keyframes=self._keyframes.sent,
+                tracks=stills.tracks,
+                base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
+                still_queue=stills.pending,
+                encode_ms=counts.encode_ms if measured else 0.0,
+                detect_ms=stills.perception_ms if measured else 0.0,
+                feedback_age_ms=age_ms if measured else -1,
+            ),
+        )

@@ -1,14 +1,18 @@
-"""From settings to stages: everything at the edge that is made once and needs no network."""
+"""From settings to stages: every part of an edge is built here, once, from what it needs. The parts form a tree."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, cast
 
 from hvt_common.inference.detect import Detector, open_detector, warm_up
 from hvt_common.inference.tiles import tiled, warm_up_source
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.transport.zenoh_config import LinkSettings
@@ -18,49 +22,52 @@ from hvt_edge.backlog.disk import Folder, check_folder, default_folder
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
+from hvt_edge.control.commands import Commands
+from hvt_edge.control.link_control import LinkControl
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings, keyframe_interval_s
+from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
+from hvt_edge.operating.point import LoopClock, Operating
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.source.contract import Source
+from hvt_edge.source.demo import write_truth_of
 from hvt_edge.source.resample import BaseSize
+from hvt_edge.status import InfoReporter
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.stills.policy.registry import method, tuning
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.sending import StillSender
+from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.suppression import Gate, Suppression
-from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
-from hvt_edge.video.least_rate import encoder_settings, least_base_bps, payload_bps
+from hvt_edge.video.encoder_settings import encoder_settings, least_base_bps, payload_bps
+from hvt_edge.video.frame_skip import FrameSkip, LimitedFrameSkip, MeasuredFrameSkip
+from hvt_edge.video.keyframes import keyframe_interval_s
+from hvt_edge.video.local_copy import BaseRecorder
 from hvt_edge.video.rate_model import choose_base, most_decimation
+from hvt_edge.video.reconfigure import EncoderReconfiguration, ReconfigurationSettings
 from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.share import Split, SplitSettings
+from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
 
 __all__ = [
     "SECOND_NS",
+    "Stages",
     "base_size",
+    "build_stages",
     "check_files",
-    "first_decimation",
-    "make_analyzer",
-    "make_backlog",
-    "make_budget",
-    "make_chooser",
     "make_detector",
-    "make_encoder",
-    "make_frame_skip",
-    "make_keyframes",
     "make_link_settings",
-    "make_on_demand",
-    "make_pacer",
-    "make_regions",
-    "make_split",
-    "make_still_maker",
-    "make_suppression",
     "warm_up_for",
 ]
 
@@ -98,7 +105,7 @@ def make_link_settings(config: EdgeConfig) -> LinkSettings:
     )
 
 
-# Seeing
+# Perception
 
 
 def make_detector(config: EdgeConfig) -> Detector:
@@ -138,11 +145,11 @@ def make_analyzer(config: EdgeConfig, *, detector: Detector, view: View) -> Anal
     )
 
 
-# Choosing
+# Stills
 
 
 def make_suppression(config: EdgeConfig) -> Suppression:
-    """Which tracks rest, and for how long."""
+    """Which tracks pause, and for how long."""
     return Suppression.for_cooldown(config.cooldown, min_gain=config.min_gain)
 
 
@@ -154,10 +161,10 @@ def make_chooser(
     class_names: tuple[str, ...],
     most_bytes: int,
     on_outcome: Callable[[str, str], None],
-    observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
-    on_demand: OnDemand | None = None,
+    observe: Callable[[Sequence[Candidate], Step], None],
+    on_demand: OnDemand,
 ) -> Chooser:
-    """Method, suppression, queue and still stage; ``most_bytes`` is the largest payload the budget ever admits."""
+    """Method, suppression, gate and maker; ``most_bytes`` is the largest payload the budget ever admits."""
     return Chooser(
         method(config.method, **tuning(config.tune)),
         suppression=make_suppression(config),
@@ -222,7 +229,7 @@ def base_size(config: EdgeConfig) -> BaseSize:
 
 
 def first_decimation(config: EdgeConfig, size: tuple[int, int]) -> int:
-    """Each n-th tick is coded at the start."""
+    """Each n-th source frame is coded at the start."""
     return _chosen(config, size, size=size)[1]
 
 
@@ -246,11 +253,13 @@ def _chosen(
 
 
 def make_frame_skip(config: EdgeConfig, decimation: int) -> FrameSkip:
-    """Which ticks are coded."""
+    """Which source frames are coded."""
     if not config.auto_fps:
         return FrameSkip(decimation)
     most = most_decimation(config.nominal_fps, least_fps=LEAST_FPS)
-    return MeasuredFrameSkip(decimation, most_decimation=most, rest_ticks=round(_REST_S * config.nominal_fps))
+    return MeasuredFrameSkip(
+        decimation, most_decimation=most, rest_frames=round(_REST_S * config.nominal_fps)
+    )
 
 
 def make_budget(config: EdgeConfig, *, decimation: int) -> RollingBudget:
@@ -281,13 +290,15 @@ def make_split(config: EdgeConfig, size: tuple[int, int]) -> Split | None:
     )
 
 
-def make_encoder(config: EdgeConfig, *, size: tuple[int, int], decimation: int, base_bps: int) -> BaseEncoder:
+def make_encoder(
+    config: EdgeConfig, *, size: tuple[int, int], total_bps: int, base_bps: int, decimation: int
+) -> BaseEncoder:
     """x265 at the rate that the budget leaves it; with several threads only where bytes need not repeat."""
     settings = encoder_settings(
         size=size,
         fps=config.nominal_fps / decimation,
         preset=config.preset,
-        total_bps=config.budget_bps - config.metadata_bps,
+        total_bps=total_bps - config.metadata_bps,
         base_bps=base_bps,
         edge_id=config.edge_id,
         side_data=config.roi_depth > 0,
@@ -296,27 +307,39 @@ def make_encoder(config: EdgeConfig, *, size: tuple[int, int], decimation: int, 
     return BaseEncoder(replace(settings, threads=threads))
 
 
+def reconfiguration_settings(config: EdgeConfig, size: tuple[int, int]) -> ReconfigurationSettings:
+    """What bounds the rates in flight."""
+    return ReconfigurationSettings(
+        size=size,
+        nominal_fps=config.nominal_fps,
+        least_fps=LEAST_FPS,
+        edge_id=config.edge_id,
+        metadata_bps=config.metadata_bps,
+        min_budget_bps=config.min_budget_bps,
+    )
+
+
 def make_regions(config: EdgeConfig, size: tuple[int, int]) -> TrackRegions | None:
     """Which regions of the base get more bits; None for none."""
     return TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None
 
 
-def make_keyframes(config: EdgeConfig) -> KeyframePlan:
-    """Keyframes on a long schedule and on demand."""
+def make_keyframes(config: EdgeConfig) -> KeyframeRequests:
+    """Where keyframes are requested, on a long schedule and on demand."""
     interval_s = config.keyframe_interval
     if isinstance(interval_s, str):
         interval_s = keyframe_interval_s(config.fixed_size or DEFAULT_SIZE, config.base_bps)
-    return KeyframePlan(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
+    return KeyframeRequests(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
 
 
 def make_pacer(config: EdgeConfig) -> Pacer | None:
-    """What follows the link's rate; None where the budget is to stay as it is."""
+    """What tracks the link's rate; None where the budget is to stay as it is."""
     if not config.adapts:
         return None
     return Pacer(RateController(RateSettings(ceiling_bps=config.budget_bps, floor_bps=config.floor_bps)))
 
 
-# Keeping
+# Storing
 
 
 def make_backlog(
@@ -325,14 +348,14 @@ def make_backlog(
     session_id: int,
     live: bool,
     has_subscriber: Callable[[], bool],
-    sender: Transmitter,
+    transmitter: Transmitter,
     in_flight: BaseInFlight,
     outbox: Outbox,
-    keyframes: KeyframePlan,
+    keyframes: KeyframeRequests,
     clock: Callable[[], int],
     info: Callable[[], bytes],
 ) -> BacklogStage | None:
-    """Who keeps what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
+    """Who stores what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
     if not config.store or config.pace == "lockstep":
         return None
     path = config.store_folder or default_folder(config.edge_id)
@@ -343,15 +366,192 @@ def make_backlog(
         live=live,
         link=BacklogLink(
             has_subscriber=has_subscriber,
-            allowance_bytes=lambda now_ns, reserve: sender.backlog_allowance_bytes(now_ns, reserve=reserve),
-            send=lambda chunk, now_ns: sender.backlog(chunk, now_ns=now_ns),
-            round_trip_ns=lambda: sender.round_trip_ns,
-            total_bps=lambda: sender.total_bps,
+            allowance_bytes=lambda now_ns, reserve: transmitter.backlog_allowance_bytes(
+                now_ns, reserve=reserve
+            ),
+            send=lambda chunk, now_ns: transmitter.backlog(chunk, now_ns=now_ns),
+            round_trip_ns=lambda: transmitter.round_trip_ns,
+            total_bps=lambda: transmitter.total_bps,
             stills_pending=lambda: outbox.any_pending,
             stills_in_flight=lambda: outbox.unacknowledged,
         ),
         in_flight=in_flight,
         keyframes=keyframes,
         clock=clock,
-        on_outcome=sender.outcome,
+        on_outcome=transmitter.outcome,
+    )
+
+
+# All together
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """What a frame goes through, and what a ground reaches."""
+
+    base: BaseStage
+    stills: StillStage
+    transmitter: Transmitter
+    link_control: LinkControl
+    commands: Commands
+    reconfiguration: EncoderReconfiguration
+    operating: Operating
+    keyframes: KeyframeRequests
+    backlog: BacklogStage | None
+    info: InfoReporter
+
+
+def build_stages(
+    stack: ExitStack,
+    config: EdgeConfig,
+    *,
+    source: Source,
+    detector: Detector,
+    link: EdgeLink,
+    session_id: int,
+    ledger: Ledger,
+    inbox: FeedbackInbox,
+    clock: Callable[[], int],
+    loop_clock: LoopClock,
+    wait_until: Callable[[int], None],
+) -> Stages:
+    """Build every part once, each with all that it needs; files and threads end with ``stack``.
+
+    Raises:
+        UserError: x265 does not take the settings, or a file cannot be written.
+    """
+    view, class_names = source.view, detector.class_names
+    lockstep = config.pace == "lockstep"
+    decimation = first_decimation(config, view.base_size)
+    operating = Operating(
+        budget_bps=config.budget_bps,
+        video_share=config.fixed_share,
+        base_bps=config.base_bps,
+        method=config.method,
+        decimation=decimation,
+    )
+    keyframes, pacer = make_keyframes(config), make_pacer(config)
+    open_encoder = partial(make_encoder, config, size=view.base_size)
+    encoder = open_encoder(total_bps=config.budget_bps, base_bps=config.base_bps, decimation=decimation)
+    budget = make_budget(config, decimation=decimation)
+    # Files come after all that may be refused: a failed start leaves nothing behind.
+    write_truth_of(source, config.truth, fps=config.nominal_fps)
+    recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
+    in_flight, outbox = BaseInFlight(), Outbox(reports=not lockstep)
+    transmitter = Transmitter(
+        link,
+        ledger=ledger,
+        budget=budget,
+        edge_id=config.edge_id,
+        session_id=session_id,
+        lockstep=lockstep,
+        wait_until=wait_until,
+        pacer=pacer,
+        in_flight=None if lockstep else in_flight,
+    )
+    reconfiguration = EncoderReconfiguration(
+        operating,
+        reconfiguration_settings(config, view.base_size),
+        open_encoder=open_encoder,
+        transmitter=transmitter,
+        split=make_split(config, view.base_size),
+        pacer=pacer,
+    )
+    info = InfoReporter(
+        config,
+        session_id=session_id,
+        operating=operating,
+        view=view,
+        class_names=class_names,
+        clock=clock,
+    )
+    backlog = make_backlog(
+        config,
+        session_id=session_id,
+        live=source.live,
+        has_subscriber=partial(link.has_subscriber, Channel.BACKLOG),
+        transmitter=transmitter,
+        in_flight=in_flight,
+        outbox=outbox,
+        keyframes=keyframes,
+        clock=clock,
+        info=info.info,
+    )
+    if backlog is not None:
+        stack.enter_context(backlog)
+    still_sender = StillSender(
+        outbox, maker=make_still_maker(config), transmitter=transmitter, backlog=backlog
+    )
+    stack.callback(lambda: still_sender.close(clock()))
+    link_control = LinkControl(
+        has_ground=link.has_ground,
+        session_id=session_id,
+        transmitter=transmitter,
+        keyframes=keyframes,
+        inbox=inbox,
+        reconfiguration=reconfiguration,
+        clock=clock,
+        pacer=pacer,
+        in_flight=in_flight,
+        outbox=outbox,
+        stills=still_sender,
+        backlog=backlog,
+    )
+    base = BaseStage(
+        encoder,
+        keyframes=keyframes,
+        transmitter=transmitter,
+        recorder=recorder,
+        first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
+        regions=make_regions(config, view.base_size),
+        frame_skip=LimitedFrameSkip(make_frame_skip(config, decimation), reconfiguration.least_decimation),
+        reconfigure=reconfiguration,
+        admits=link_control.admits,
+        backlog=backlog,
+    )
+    on_demand = make_on_demand(
+        config, outbox=outbox, view=view, class_names=class_names, most_bytes=transmitter.most_still_bytes
+    )
+    chooser = make_chooser(
+        config,
+        outbox=outbox,
+        view=view,
+        class_names=class_names,
+        most_bytes=transmitter.most_still_bytes(),
+        on_outcome=transmitter.outcome,
+        observe=reconfiguration.observe,
+        on_demand=on_demand,
+    )
+    stills = StillStage(
+        make_analyzer(config, detector=detector, view=view),
+        chooser,
+        outbox=outbox,
+        sender=still_sender,
+        transmitter=transmitter,
+        keyframes=keyframes,
+        reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
+    )
+    commands = Commands(
+        config,
+        operating=operating,
+        session_id=session_id,
+        keyframes=keyframes,
+        on_demand=on_demand,
+        chooser=chooser,
+        backlog=backlog,
+        base_size=view.base_size,
+        clock=clock,
+        loop_clock=loop_clock,
+    )
+    return Stages(
+        base,
+        stills,
+        transmitter,
+        link_control,
+        commands,
+        reconfiguration,
+        operating,
+        keyframes,
+        backlog,
+        info,
     )

@@ -13,6 +13,7 @@ from hvt_common.protocol.messages import ControlRequest, Feedback, WireError
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_ground.link.reassemble import REORDER_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
@@ -107,16 +108,16 @@ def _command_seeds() -> list[bytes]:
 
 def _reports(data: bytes) -> None:
     pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
-    inbox, now_ns = FeedbackInbox(), 1_790_000_000_000 * _MS
+    primary, inbox, now_ns = PrimaryReceiver(), FeedbackInbox(), 1_790_000_000_000 * _MS
     for n in range(60):
         pacer.sent_base(n, 5000, now_ns=now_ns + n * 66 * _MS, keyframe=n == 0)
     now_ns += 61 * 66 * _MS
     for part in parted(data):
         now_ns += 120 * _MS
         with contextlib.suppress(WireError):
-            report = Feedback.parse(part)
-            inbox.receive(report, now_ns=now_ns)
-            pacer.hear(report, now_ns=now_ns)
+            report = primary.judge(Feedback.parse(part), sent=(59, -1), now_ns=now_ns)
+            inbox.on_report(report)
+            pacer.on_report(report)
         pacer.admits_base(now_ns)
         pacer.admits_still(now_ns)
         assert 100_000 <= pacer.rate_bps <= 800_000

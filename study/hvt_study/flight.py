@@ -1,6 +1,6 @@
 """A whole flight in one process: the very edge and ground that fly, a simulated serial link between them, no clock.
 
-The edge is `hvt_edge.app.Edge` with its borders replaced: where frames come from (`FrameSource`), where messages go
+The edge is `hvt_edge.app.Edge` in another world: where frames come from (`FrameSource`), where messages go
 (`SerialLink`), and when feedback comes back. The ground is `GroundSession`. Media time is the only
 time: a message acts at the ground when the link has delivered it and not before, and what the ground says of a still
 is heard at the edge as much later as that still took to cross. The same input gives the same flight, always.
@@ -16,14 +16,14 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 
-from hvt_common.inference.detect import MOTION, Detector
+from hvt_common.inference.detect import Detector
 from hvt_common.inference.tiles import tiled
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import LedgerSummary, overhead_bytes
@@ -34,10 +34,10 @@ from hvt_common.values import Fit, Frame
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
-from hvt_edge.loop.lockstep import LockstepPace
-from hvt_edge.source.contract import Source
+from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.source.resample import Resizer
 from hvt_edge.wiring import base_size
+from hvt_edge.world import World
 from hvt_ground.config import GroundConfig
 from hvt_ground.wiring import Models
 from hvt_study.cached_detector import CachedDetector
@@ -46,7 +46,7 @@ from hvt_study.flight_ground import GroundSide, InlineExecutor
 from hvt_study.list_score import Listed
 from hvt_study.serial_link import LinkReport, SerialLink
 
-__all__ = ["FlightPlan", "FlightReport", "coded_ticks", "fly", "weigh"]
+__all__ = ["Flight", "FlightPlan", "FlightReport", "coded_ticks", "fly", "weigh"]
 
 _START_NS = 1_700_000_000_000_000_000
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
@@ -112,12 +112,15 @@ def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport
         UserError: the edge refuses its settings.
     """
     saved_s = detector.saved_cpu_s if isinstance(detector, CachedDetector) else 0.0
-    edge = _Edge(plan, detector=detector, models=models)
-    edge.run()
-    edge.ground.close()
+    flight = Flight(
+        plan,
+        detector=detector,
+        make_ground=lambda info, link: GroundSide(info, config=plan.ground, models=models, link=link),
+    )
+    flight.run()
     if isinstance(detector, CachedDetector):
         saved_s = detector.saved_cpu_s - saved_s
-    return edge.report(saved_cpu_s=saved_s)
+    return flight.report(saved_cpu_s=saved_s)
 
 
 def weigh(plan: FlightPlan, *, detector: Detector) -> float:
@@ -128,9 +131,9 @@ def weigh(plan: FlightPlan, *, detector: Detector) -> float:
     Raises:
         UserError: the edge refuses its settings.
     """
-    edge = _Scales(plan, detector=detector)
-    edge.run()
-    return edge.line_bytes * 8 / (plan.clip.ticks / NOMINAL_FPS)
+    flight = Flight(plan, detector=detector, make_ground=lambda _info, link: _NoGround(link))
+    flight.run()
+    return flight.line_bytes * 8 / (plan.clip.ticks / NOMINAL_FPS)
 
 
 class _MediaClock(SteadyClock):
@@ -162,13 +165,20 @@ class _Inbox(FeedbackInbox):
 
 
 class _Outlet:
-    """The edge's end of the link: `hvt_edge.link.publisher.EdgeLink` without Zenoh."""
+    """The edge's end of the link: `hvt_edge.link.publisher.EdgeLink` without Zenoh.
+
+    ``on_listen(info)`` is called with what the edge answers to ``info`` once it is ready.
+    """
 
     unusable = 0
+    trouble = ""
 
-    def __init__(self, link: SerialLink[Received], *, edge_id: str) -> None:
+    def __init__(
+        self, link: SerialLink[Received], *, edge_id: str, on_listen: Callable[[bytes], None]
+    ) -> None:
         self._link = link
         self._keys = EdgeKeys(edge_id)
+        self._on_listen = on_listen
         self._digest = hashlib.sha256()
         self.line_bytes: Counter[str] = Counter()
         self.messages: Counter[str] = Counter()
@@ -176,163 +186,181 @@ class _Outlet:
         self.last_frame = -1
         """Index of the newest frame sent."""
 
-    def heard(self) -> bool:
+    def has_ground(self) -> bool:
         return True
 
+    def has_subscriber(self, channel: Channel) -> bool:  # noqa: ARG002
+        return True
+
+    def listen(self, *, info: Callable[[int], bytes], **_: Any) -> None:
+        self._on_listen(info(_START_NS))
+
     def put(
-        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+        self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
         """Hand over one message at the time that it says itself."""
         attached = attachment or b""
-        key = self._keys.key(row)
+        key = self._keys.key(channel)
         size_bytes = (
             len(payload)
             + len(attached)
             + overhead_bytes(len(payload), len(attached), key=key, encoding=encoding)
         )
-        self.line_bytes[row] += size_bytes
-        self.messages[row] += 1
-        if row is not Channel.STATUS:  # it counts what the machine did
+        self.line_bytes[channel] += size_bytes
+        self.messages[channel] += 1
+        if channel is not Channel.STATUS:  # it counts what the machine did
             self._digest.update(payload)
         self._link.put(
             Received(key, payload, attached, encoding, 0),
             size_bytes=size_bytes,
-            enter_ns=self._enter_ns(row, payload, attached),
-            urgent=row is Channel.BASE,
+            enter_ns=self._enter_ns(channel, payload, attached),
+            urgent=channel is Channel.BASE,
         )
 
     @property
     def digest(self) -> str:
         return self._digest.hexdigest()
 
-    def _enter_ns(self, row: Channel, payload: bytes, attachment: bytes) -> int:
-        if row is Channel.BASE:
+    def _enter_ns(self, channel: Channel, payload: bytes, attachment: bytes) -> int:
+        if channel is Channel.BASE:
             header = BaseHeader.parse(attachment, payload)
             self.last_frame = header.frame_index
             self.max_frame_bytes = max(self.max_frame_bytes, len(payload))
             return header.send_ns
-        if row is Channel.ROI:
+        if channel is Channel.ROI:
             return RoiHeader.parse(attachment, payload).send_ns
-        if row is Channel.TRACKS:
+        if channel is Channel.TRACKS:
             return TrackStep.parse(payload).send_ns
-        assert row is Channel.STATUS, f"the edge sends no {row}"
+        assert channel is Channel.STATUS, f"the edge sends no {channel}"
         return Status.parse(payload).send_ns
 
 
-class _Pace(LockstepPace):
-    """The lockstep of the edge with the ground in step: after each frame, what has arrived by then is taken in."""
+class _SteppedSource(FrameSource):
+    """A clip with the ground in step: after each frame, what has arrived by then is taken in."""
+
+    def __init__(self, flight: Flight, resizer: Resizer, *, ticks: frozenset[int]) -> None:
+        super().__init__(flight.plan.clip, resizer, ticks=ticks)
+        self._flight = flight
+
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        for frame in super().frames(start_ns=start_ns):
+            began_s = self._flight.before_frame(frame)
+            yield frame
+            self._flight.after_frame(frame, began_s=began_s)
+
+
+class _FlightWorld(World):
+    """A clip of ticks, a simulated link, a detector that is open already, and media time alone."""
+
+    def __init__(self, flight: Flight, detector: Detector) -> None:
+        super().__init__()
+        self._flight = flight
+        self._detector = detector
+        self.session_id = _SESSION
+        self.clock = _MediaClock()
+        self.inbox = flight.inbox
+        self.executor = InlineExecutor()
+
+    def open_detector(self, config: EdgeConfig) -> Detector:
+        return tiled(self._detector, config.tiles) if config.candidates == "source" else self._detector
+
+    def warm_up(self, *_: Any) -> None:
+        """It is open already."""
+
+    def open_source(self, config: EdgeConfig) -> FrameSource:
+        clip = self._flight.plan.clip
+        # With --fps auto the edge sees every tick, and leaves out by itself what it does not code.
+        fps = NOMINAL_FPS if isinstance(config.fps, str) else config.fps
+        resizer = Resizer(clip.source_size, base_size(config), fit=cast("Fit", config.fit))
+        return _SteppedSource(self._flight, resizer, ticks=coded_ticks(clip.ticks, fps))
+
+    def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:  # noqa: ARG002
+        return self._flight.outlet
+
+
+class Flight:
+    """The edge's own app over a clip and a simulated link; ``make_ground`` makes what is at its other end."""
 
     def __init__(
-        self, *stages: Any, inbox: _Inbox, ground: GroundSide, outlet: _Outlet, **named: Any
+        self,
+        plan: FlightPlan,
+        *,
+        detector: Detector,
+        make_ground: Callable[[Info, SerialLink[Received]], Any],
     ) -> None:
-        super().__init__(*stages, inbox=inbox, **named)
-        self._worker = InlineExecutor()
-        self._feedback, self._ground, self._outlet = inbox, ground, outlet
+        self.plan = plan
+        self.inbox = _Inbox()
+        self._link: SerialLink[Received] = SerialLink(rate_bps=plan.link_bps)
+        self._make_ground = make_ground
+        self.outlet = _Outlet(self._link, edge_id=plan.edge.edge_id, on_listen=self._open_ground)
+        self._edge = Edge(
+            replace(plan.edge, quiet=True), stop=threading.Event(), world=_FlightWorld(self, detector)
+        )
         self._next_tick = 0
-        self.cpu_s = 0.0
+        self._cpu_s = 0.0
+        self.ground: Any
 
-    def step(self, frame: Frame) -> None:
-        began_s = time.process_time()
-        self._feedback.now_ns = frame.capture_ns
-        super().step(frame)
-        self.cpu_s += time.process_time() - began_s
-        self.pass_over(frame.index)
-        if self._outlet.last_frame != frame.index:
-            self._ground.pass_over(frame.index, capture_ns=frame.capture_ns)
-        self._next_tick = frame.index + 1
-        self._ground.advance(frame.capture_ns)
-        self._feedback.due += self._ground.results
-        self._ground.results.clear()
+    def run(self) -> None:
+        """Fly to the end of the clip.
 
-    def pass_over(self, until_tick: int) -> None:
-        """The source did not give the ticks before this one."""
-        for tick in range(self._next_tick, until_tick):
-            self._ground.pass_over(tick, capture_ns=_START_NS + round(tick * _SECOND_NS / NOMINAL_FPS))
-        self._next_tick = max(self._next_tick, until_tick)
+        Raises:
+            UserError: the edge refuses its settings.
+        """
+        self._edge.run()
+        self._pass_over(self.plan.clip.ticks)
+        self.ground.close()
 
-
-class _Edge(Edge):
-    """The edge's own app over a clip of ticks and a simulated link."""
-
-    def __init__(self, plan: FlightPlan, *, detector: Detector, models: Models | None) -> None:
-        # The detector is open already: the app is told of one that costs nothing to open.
-        super().__init__(replace(plan.edge, quiet=True, detector=MOTION, tiles="off"), stop=threading.Event())
-        self._plan = plan
-        self._detector = detector
-        self._models = models
-        self._session_id = _SESSION
-        self._clock = _MediaClock()
-        self._inbox: _Inbox = _Inbox()
-        self._pace: _Pace | None = None
-        self.ground: GroundSide
+    @property
+    def line_bytes(self) -> int:
+        """All that left, with headers and transport."""
+        return sum(self.outlet.line_bytes.values())
 
     def report(self, *, saved_cpu_s: float) -> FlightReport:
         """After `run`."""
-        ticks, outlet, pace = self._plan.clip.ticks, self._outlet, self._pace
-        assert pace is not None, "run() makes it"
+        ticks, outlet = self.plan.clip.ticks, self.outlet
         return FlightReport(
             lists=tuple(self.ground.lists[tick] for tick in range(ticks)),
-            account=self._ledger.summary(ticks / NOMINAL_FPS),
+            account=self._edge.ledger.summary(ticks / NOMINAL_FPS),
             line_bytes=dict(outlet.line_bytes),
             messages=dict(outlet.messages),
             max_frame_bytes=outlet.max_frame_bytes,
             link=LinkReport.of(self.ground.base_delays_ns, self.ground.arrivals),
             picture_age_p95_ms=self._picture_age_p95_ms(),
-            edge_cpu_ms=1e3 * (pace.cpu_s + saved_cpu_s) / ticks,
+            edge_cpu_ms=1e3 * (self._cpu_s + saved_cpu_s) / ticks,
             digest=outlet.digest,
             back_bytes=self.ground.back_bytes,
         )
 
-    def _make_flow(self, stack: ExitStack, source: Source, detector: Detector) -> Any:  # noqa: ARG002
-        config = self._plan.edge
-        own = tiled(self._detector, config.tiles) if config.candidates == "source" else self._detector
-        return super()._make_flow(stack, source, own)
+    def before_frame(self, frame: Frame) -> float:
+        """The edge is about to take this frame; return its CPU time so far."""
+        self.inbox.now_ns = frame.capture_ns
+        return time.process_time()
 
-    def _open_source(self) -> FrameSource:
-        config, clip = self._plan.edge, self._plan.clip
-        # With --fps auto the edge sees every tick, and leaves out by itself what it does not code.
-        fps = NOMINAL_FPS if isinstance(config.fps, str) else config.fps
-        resizer = Resizer(clip.source_size, base_size(config), fit=cast("Fit", config.fit))
-        return FrameSource(clip, resizer, ticks=coded_ticks(clip.ticks, fps))
+    def after_frame(self, frame: Frame, *, began_s: float) -> None:
+        """The edge has done with this frame: the ground takes in what has arrived."""
+        self._cpu_s += time.process_time() - began_s
+        self._pass_over(frame.index)
+        if self.outlet.last_frame != frame.index:
+            self.ground.pass_over(frame.index, capture_ns=frame.capture_ns)
+        self._next_tick = frame.index + 1
+        self.ground.advance(frame.capture_ns)
+        self.inbox.due += self.ground.results
+        self.ground.results.clear()
 
-    def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> Any:  # noqa: ARG002
-        link: SerialLink[Received] = SerialLink(rate_bps=self._plan.link_bps)
-        info = Info.parse(self._info(source, class_names, _START_NS))
-        self._outlet = _Outlet(link, edge_id=self._config.edge_id)
-        self.ground = self._make_ground(replace(info, fps=NOMINAL_FPS, started_ns=_START_NS), link)
-        return self._outlet
+    def _open_ground(self, answer: bytes) -> None:
+        info = replace(Info.parse(answer), fps=NOMINAL_FPS, started_ns=_START_NS)
+        self.ground = self._make_ground(info, self._link)
 
-    def _make_ground(self, info: Info, link: SerialLink[Received]) -> GroundSide:
-        assert self._models is not None, "only the scales do without"
-        return GroundSide(info, config=self._plan.ground, models=self._models, link=link)
-
-    def _wait_for_ground(self, *_: Any) -> None:
-        """It is there."""
-
-    def _make_pace(self, flow: Any, source: Source) -> LockstepPace:  # noqa: ARG002
-        self._pace = _Pace(
-            flow.base,
-            flow.stills,
-            inbox=self._inbox,
-            ground=self.ground,
-            outlet=self._outlet,
-            keyframes=self._keyframes,
-            fps=NOMINAL_FPS,  # frame indices count ticks
-            counts=self._counts,
-            heard=self._outlet.heard,
-            stop=self._stop,
-        )
-        return self._pace
-
-    def _say_goodbye(self, flow: Any) -> None:
-        super()._say_goodbye(flow)
-        if self._pace is not None:
-            self._pace.pass_over(self._plan.clip.ticks)
+    def _pass_over(self, until_tick: int) -> None:
+        """The source did not give the ticks before this one."""
+        for tick in range(self._next_tick, until_tick):
+            self.ground.pass_over(tick, capture_ns=_START_NS + round(tick * _SECOND_NS / NOMINAL_FPS))
+        self._next_tick = max(self._next_tick, until_tick)
 
     def _picture_age_p95_ms(self) -> float:
         """Over the ticks from the first picture on."""
         shown = np.array(self.ground.shown_ns, np.int64).reshape(-1, 2)
-        at_ns = _START_NS + np.round(np.arange(self._plan.clip.ticks) * _SECOND_NS / NOMINAL_FPS).astype(
+        at_ns = _START_NS + np.round(np.arange(self.plan.clip.ticks) * _SECOND_NS / NOMINAL_FPS).astype(
             np.int64
         )
         at_ns = at_ns[at_ns >= shown[0, 0]]
@@ -340,8 +368,8 @@ class _Edge(Edge):
         return float(np.percentile((at_ns - newest) / 1e6, 95)) if len(at_ns) else 0.0
 
 
-class _Nobody:
-    """A ground that takes what comes and looks at nothing."""
+class _NoGround:
+    """A ground that takes what comes and analyzes nothing."""
 
     def __init__(self, link: SerialLink[Received]) -> None:
         self._link = link
@@ -354,16 +382,5 @@ class _Nobody:
         """Let go of what has arrived."""
         self._link.arrived(now_ns)
 
-
-class _Scales(_Edge):
-    """The same edge, of which only the bytes are of interest."""
-
-    def __init__(self, plan: FlightPlan, *, detector: Detector) -> None:
-        super().__init__(plan, detector=detector, models=None)
-
-    @property
-    def line_bytes(self) -> int:
-        return sum(self._outlet.line_bytes.values())
-
-    def _make_ground(self, info: Info, link: SerialLink[Received]) -> Any:  # noqa: ARG002
-        return _Nobody(link)
+    def close(self) -> None:
+        """Nothing is open."""

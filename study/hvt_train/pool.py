@@ -18,7 +18,8 @@ import numpy as np
 
 from hvt_common.values import Frame, Image, View
 from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.x265 import BaseEncoder
 from hvt_scene import Look, Scene
 from hvt_train.places import Picture, draw_place
 

@@ -7,7 +7,8 @@ import pytest
 from clips import framed, smooth_pictures
 from flight import Flight
 from hvt_edge.backlog.disk import Folder
-from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.x265 import BaseEncoder
 from lab.link.kills import (
     BARS,
     Trial,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 
 import cv2
 import numpy as np
@@ -17,10 +18,11 @@ from hvt_common.units import parse_bitrate
 from hvt_common.values import Frame, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.control.commands import Commands, Served
+from hvt_edge.control.commands import Commands
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.operating.point import Operating
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
@@ -31,7 +33,9 @@ from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.suppression import Suppression
+from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.reconfigure import EncoderReconfiguration
+from hvt_edge.wiring import make_encoder, reconfiguration_settings
 
 SOURCE, BASE = (960, 540), (640, 360)
 VIEW = View.fitted(SOURCE, BASE, fit="letterbox")
@@ -42,7 +46,7 @@ SESSION = 77
 
 
 def picture(index: int) -> np.ndarray:
-    """The source frame of this tick: no two are alike."""
+    """The source frame of this index: no two are alike."""
     return np.ascontiguousarray(np.roll(WORLD, 4 * index, axis=1))
 
 
@@ -59,12 +63,12 @@ class Out:
 
 
 class Rig:
-    """The side channel of an edge, tick by tick; a car drives from left to right."""
+    """The side channel of an edge, frame by frame; a car drives from left to right."""
 
     def __init__(self, budget="400kbps", *, share=0.75, name="M1", codec="jpeg", ring_s=5.0) -> None:
         argv = {"source": "demo", "size": BASE, "budget": parse_bitrate(budget, name="b"), "method": name}
         self.config = check(EdgeConfig(**argv, video_share=share, preset="ultrafast"))
-        self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframePlan()
+        self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframeRequests()
         self.budget = RollingBudget(BudgetSettings(self.config.budget_bps, self.config.base_bps, fps=15))
         self.sender = Transmitter(
             self.out,
@@ -98,37 +102,53 @@ class Rig:
             on_outcome=lambda *outcome: self.outcomes.update([outcome]),
             on_demand=self.on_demand,
         )
-        self.reconfiguration = EncoderReconfiguration(
-            self.config, size=BASE, decimation=1, sender=self.sender, split=None
+        self.plan = KeyframePlan(self.keyframes)
+        self.operating = Operating(
+            budget_bps=self.config.budget_bps,
+            video_share=self.config.fixed_share,
+            base_bps=self.config.base_bps,
+            method=self.config.method,
+            decimation=1,
         )
-        self.tick, self.request_ns = -1, 0
+        self.reconfiguration = EncoderReconfiguration(
+            self.operating,
+            reconfiguration_settings(self.config, BASE),
+            open_encoder=partial(make_encoder, self.config, size=BASE),
+            transmitter=self.sender,
+            split=None,
+        )
+        self.index, self.request_ns = -1, 0
         self.commands = Commands(
             self.config,
+            operating=self.operating,
             session_id=SESSION,
             keyframes=self.keyframes,
+            on_demand=self.on_demand,
+            chooser=self.chooser,
+            backlog=None,
+            base_size=BASE,
             clock=lambda: self.request_ns,
-            window_ns=lambda: self.now_ns,
+            loop_clock=lambda: self.now_ns,
         )
-        self.commands.serve(Served(self.on_demand, self.reconfiguration, self.chooser, base_size=BASE))
-        self.keyframes.done(START_NS)
+        self.plan.done(START_NS)
 
     @property
     def now_ns(self) -> int:
-        """Time of the newest tick."""
-        return START_NS + max(0, self.tick) * FRAME_NS
+        """Time of the newest frame."""
+        return START_NS + max(0, self.index) * FRAME_NS
 
-    def box(self, tick: int) -> tuple[float, float, float, float]:
+    def box(self, index: int) -> tuple[float, float, float, float]:
         """Where the car is, base pixels."""
-        return 20.0 + 3 * tick, 100.0, 80.0 + 3 * tick, 140.0
+        return 20.0 + 3 * index, 100.0, 80.0 + 3 * index, 140.0
 
-    def run(self, ticks: int, *, others: bool = False) -> None:
-        """So many ticks; with ``others`` the method's own stills are sent as well."""
-        for _ in range(ticks):
-            self.tick += 1
-            pixels = picture(self.tick)
+    def run(self, frames: int, *, others: bool = False) -> None:
+        """So many frames; with ``others`` the method's own stills are sent as well."""
+        for _ in range(frames):
+            self.index += 1
+            pixels = picture(self.index)
             base = cv2.blur(cv2.resize(pixels, BASE, interpolation=cv2.INTER_AREA), (31, 31))
-            tracks = tracks_at(self.tick, {5: self.box(self.tick)})
-            seen = AnalyzedFrame(Frame(self.tick, self.now_ns, pixels, base), base, tracks, detected=others)
+            tracks = tracks_at(self.index, {5: self.box(self.index)})
+            seen = AnalyzedFrame(Frame(self.index, self.now_ns, pixels, base), base, tracks, detected=others)
             self.budget.record_base(int(self.budget.base_step_bytes), now_ns=self.now_ns)
             self.chooser.consider(seen, now_ns=self.now_ns, allowance_bytes=1000)
             sender = StillSender(self.outbox, maker=self.maker, transmitter=self.sender)

@@ -6,6 +6,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,24 +23,28 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
-from hvt_common.values import Still
+from hvt_common.values import AccessUnit, Frame, Still
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.link_control import LinkControl
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
+from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
+from hvt_edge.operating.point import Operating
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxStill
 from hvt_edge.stills.sending import StillSender
+from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
-from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_edge.video.x265 import BaseEncoder
+from hvt_edge.wiring import make_encoder, reconfiguration_settings
 from hvt_ground.backlog import BacklogAssembly
 from kept import INFO, S, opened
 from messages import feedback
@@ -166,10 +171,10 @@ class Rig:
     ) -> None:
         self.path, self.out, self.now_ns = folder, Out(), START_NS
         self.linked = True
-        self.keyframes = KeyframePlan(KeyframeSettings(interval_ns=60 * S))
+        self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=60 * S))
         self.in_flight, self.outbox, self.ledger = BaseInFlight(), Outbox(), Ledger()
         pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000))) if adapt else None
-        self.link_control = LinkControl(pacer, self.in_flight, self.outbox, keyframes=self.keyframes)
+        self.pacer = pacer
         self.sender = Transmitter(
             self.out,
             ledger=self.ledger,
@@ -196,22 +201,43 @@ class Rig:
         self.stills = StillSender(
             self.outbox, maker=maker or StillMaker(), transmitter=self.sender, backlog=self.backlog
         )
-        self.link_control.attach(
-            linked=lambda: self.linked,
-            sender=self.sender,
+        self.operating = Operating(
+            budget_bps=config.budget_bps,
+            video_share=config.fixed_share,
+            base_bps=config.base_bps,
+            method=config.method,
+            decimation=1,
+        )
+        self.link_control = LinkControl(
+            has_ground=self._has_ground,
+            session_id=session_id,
+            transmitter=self.sender,
+            keyframes=self.keyframes,
+            inbox=FeedbackInbox(),
             reconfiguration=EncoderReconfiguration(
-                config, size=SIZE, decimation=1, sender=self.sender, split=None, pacer=pacer
+                self.operating,
+                reconfiguration_settings(config, SIZE),
+                open_encoder=partial(make_encoder, config, size=SIZE),
+                transmitter=self.sender,
+                split=None,
+                pacer=pacer,
             ),
+            clock=lambda: self.now_ns,
+            pacer=pacer,
+            in_flight=self.in_flight,
+            outbox=self.outbox,
             stills=self.stills,
             backlog=self.backlog,
         )
+        self.before_link: Callable[[], None] = lambda: None
+        """Called before the edge is told whether anybody is there."""
         self.asked: list[int] = []
         """When the link was asked for room for a frame."""
         self.admits: Callable[[int], bool] = self.link_control.admits
         self.stage = BaseStage(
             BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast")),
             keyframes=self.keyframes,
-            sender=self.sender,
+            transmitter=self.sender,
             recorder=None,
             first_keyframe_bytes=5000,
             admits=self._asked_to_admit,
@@ -225,12 +251,23 @@ class Rig:
         for frame in FRAMES[first:end]:
             self.now_ns = frame.capture_ns
             self.link_control.before_frame(self.now_ns)
-            unit = self.stage.encode(frame, now_ns=self.now_ns)
+            unit = self.base(frame)
             if unit is not None:
                 self.coded[frame.index] = unit.data
-                self.stage.send(unit, now_ns=self.now_ns)
             if reports and frame.index % 7 == 6:
                 self.report()
+
+    def base(self, frame: Frame) -> AccessUnit | None:
+        """The base stage for one frame."""
+        decision = self.stage.decide(frame.index, now_ns=self.now_ns)
+        unit = self.stage.encode(frame, decision, now_ns=self.now_ns)
+        if unit is not None:
+            self.stage.send(unit, decision, now_ns=self.now_ns)
+        return unit
+
+    def _has_ground(self) -> bool:
+        self.before_link()
+        return self.linked
 
     def _asked_to_admit(self, now_ns: int) -> bool:
         self.asked.append(now_ns)
@@ -239,7 +276,7 @@ class Rig:
     def report(self) -> None:
         """The ground says what it has, unless nobody hears it."""
         if not self.out.dark:
-            self.link_control.hear(self.out.ground.report(self.now_ns), now_ns=self.now_ns)
+            self.link_control.on_feedback(self.out.ground.report(self.now_ns))
 
     def still(self, sequence: int, *, utility: float = 1.0) -> None:
         """One goes out."""
@@ -263,15 +300,14 @@ class Rig:
         notes: list[str] = []
         turns = 0
 
-        def linked() -> bool:
+        def turn() -> None:
             nonlocal turns
             turns += 1
             self.now_ns += S // 10
             if reports and turns % 4 == 0:
                 self.report()
-            return self.linked
 
-        self.link_control._linked = linked
+        self.before_link = turn
         self.link_control.finish(stop=threading.Event(), note=notes.append)
         return notes
 

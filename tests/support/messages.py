@@ -24,6 +24,7 @@ from hvt_common.protocol.messages import (
     TrackStep,
 )
 from hvt_common.protocol.messages.fields import I63, U32, U64
+from hvt_edge.link.receivers import Report
 
 BASE = BaseHeader(
     session_id=0x1234567890ABCDEF,
@@ -175,3 +176,8 @@ EXAMPLES: tuple[Message, ...] = (BASE, ROI, STEP, INFO, STATUS, REQUEST, ANSWER,
 def feedback(**changes: Any) -> Feedback:
     """A receiver report that says nothing, but for ``changes``."""
     return replace(_SILENT, **changes)
+
+
+def counted(report: Feedback, *, now_ns: int, first: bool = False) -> Report:
+    """The same as the edge hands it on, where it counts."""
+    return Report(report, now_ns, primary=True, first=first)

@@ -7,7 +7,7 @@ from collections import Counter
 from hvt_common.values import View
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.maker import StillMaker
@@ -25,7 +25,7 @@ def make_still_stage(
     transmitter: Transmitter,
     analyzer: Analyzer,
     *,
-    keyframes: KeyframePlan,
+    keyframes: KeyframeRequests,
     outcomes: Counter[tuple[str, str]],
     view: View,
     class_names: tuple[str, ...],

@@ -26,7 +26,7 @@ from hvt_edge.backlog.worker import (
     StoreNumbers,
     StoreWorker,
 )
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
 
 __all__ = ["BacklogLink", "BacklogStage", "State"]
 
@@ -85,7 +85,7 @@ class BacklogStage:
         live: bool,
         link: BacklogLink,
         in_flight: BaseInFlight,
-        keyframes: KeyframePlan,
+        keyframes: KeyframeRequests,
         clock: Callable[[], int],
         on_outcome: Callable[[str, str], None],
     ) -> None:
@@ -137,24 +137,18 @@ class BacklogStage:
         elif self.offline and not offline:
             self.state = State.RETURNING
             self._back_ns = now_ns
-            self._keyframes.renew(now_ns)
+            self._keyframes.require(now_ns)
         return offline
 
-    def keeps(self, *, keyframe: bool) -> bool:
-        """Whether the next frame is kept; ``keyframe``: it could be the one to go on with on the link."""
-        return self.offline or (self.state is State.RETURNING and not keyframe)
-
-    def wants_keyframe(self, now_ns: int, *, due: bool = False) -> bool:
-        """Whether the next frame that is kept should begin a segment; ``due``: the plan has one for now.
-
-        The one to go on with on the link stays due until it can be sent.
-        """
-        long = self._segment_ns is None or now_ns - self._segment_ns >= SEGMENT_NS
-        return long or (due and self.offline)
+    def segment_due(self, now_ns: int) -> bool:
+        """Whether the next stored frame should be a keyframe that begins a segment."""
+        return self._segment_ns is None or now_ns - self._segment_ns >= SEGMENT_NS
 
     def base(self, unit: AccessUnit, *, now_ns: int, sent: bool = False) -> None:
         """Store a frame; ``sent``: it goes out too."""
-        if not sent:
+        if sent:
+            self._probed_ns = now_ns
+        else:
             self.frames += 1
         if unit.keyframe:
             self._keyframe = unit.data
@@ -162,12 +156,9 @@ class BacklogStage:
         if not self._worker.offer(IntakeUnit(unit, self._keyframe)):
             self._segment_ns = None  # what follows can be shown from a keyframe on only
 
-    def probes(self, now_ns: int) -> bool:
-        """Whether this frame is sent too, to show whether the link is back; without the others none can show it."""
-        if not (self.offline and self._linked) or now_ns - self._probed_ns < _PROBE_NS:
-            return False
-        self._probed_ns = now_ns
-        return True
+    def probe_due(self, now_ns: int) -> bool:
+        """Whether the next frame should be sent too: without any, no ground can show that the link is back."""
+        return self.offline and self._linked and now_ns - self._probed_ns >= _PROBE_NS
 
     def resume(self) -> None:
         """The keyframe to go on with has been made: it and what follows is sent."""
@@ -277,7 +268,7 @@ class BacklogStage:
         self._worker.send_no_more()
 
     def close(self) -> None:
-        """Store what no ground has acknowledged, and leave the store in order; after the last report to the ground."""
+        """Store what no ground has acknowledged, and leave the store in order; after the last report."""
         try:
             self.end_in_flight()
         finally:

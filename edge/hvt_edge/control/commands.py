@@ -1,7 +1,7 @@
-"""What a ground may ask of the edge on ``control``: a keyframe, a still, the tracks, another budget or method.
+"""What a ground may command on ``control``: a keyframe, a still, the tracks, another budget or method.
 
-Runs in the link's callbacks: each answer is made at once, from what is at hand, and nothing that is asked costs more
-than the cutting of a crop. Whoever asks is not trusted: arguments have bounds, and requests a rate.
+Runs in the link's callbacks: each answer is made at once, from what is at hand, and no command costs more than one
+crop. Who commands is not trusted: arguments have bounds, and requests a rate.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from hvt_common.errors import UserError
@@ -18,15 +18,16 @@ from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest,
 from hvt_common.units import bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import LEAST_FPS, REGIMES, EdgeConfig
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.operating.point import Operating, base_rate_bps
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError
 from hvt_edge.stills.policy.registry import method
 from hvt_edge.stills.scheduler import Chooser
-from hvt_edge.video.least_rate import least_base_bps
-from hvt_edge.video.reconfigure import EncoderReconfiguration
+from hvt_edge.video.encoder_settings import least_base_bps
+from hvt_edge.video.share import FIRST_SHARE
 
-__all__ = ["Commands", "Served"]
+__all__ = ["Commands"]
 
 _SECOND_NS = 1_000_000_000
 _MOST_REQUESTS = 32
@@ -44,18 +45,7 @@ Arguments = Mapping[str, int | float | str]
 
 
 @dataclass(frozen=True, slots=True)
-class Served:
-    """The parts of a running edge that commands reach."""
-
-    on_demand: OnDemand
-    reconfiguration: EncoderReconfiguration
-    chooser: Chooser
-    base_size: tuple[int, int]
-    backlog: BacklogStage | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Said:
+class _Result:
     """What an accepted command answers beside yes."""
 
     still_request: int = -1
@@ -68,34 +58,45 @@ class Commands:
 
     Args:
         config: the settings at the start.
+        operating: takes what is commanded.
         session_id: of this run.
-        keyframes: the plan that a change of rates waits for.
+        keyframes: where keyframes are requested, also the one that a change of rates waits for.
+        on_demand: serves stills and tracks.
+        chooser: takes another method.
+        backlog: None where nothing is stored while the link is offline.
+        base_size: (width, height) of the base stream.
         clock: Unix nanoseconds, for the rate of requests.
-        window_ns: the time that the budget's windows go by, which keyframes are planned in.
+        loop_clock: the time that the budget's windows go by, which keyframes are planned in.
     """
 
     def __init__(
         self,
         config: EdgeConfig,
         *,
+        operating: Operating,
         session_id: int,
-        keyframes: KeyframePlan,
+        keyframes: KeyframeRequests,
+        on_demand: OnDemand,
+        chooser: Chooser,
+        backlog: BacklogStage | None,
+        base_size: tuple[int, int],
         clock: Callable[[], int],
-        window_ns: Callable[[], int],
+        loop_clock: Callable[[], int],
     ) -> None:
         self._config = config
-        self._started_with = config
+        self._operating = operating
         self._session_id = session_id
         self._keyframes = keyframes
+        self._on_demand = on_demand
+        self._chooser = chooser
+        self._backlog = backlog
+        self._base_size = base_size
         self._clock = clock
-        self._window_ns = window_ns
-        self._served: Served | None = None
+        self._loop_clock = loop_clock
         self._lock = threading.Lock()
         self._request_times: deque[int] = deque(maxlen=_MOST_REQUESTS)
         self._changed_ns: int | None = None
-        self.highest_budget_bps = config.budget_bps
-        """Of all that were in force."""
-        self._commands: dict[str, Callable[[Arguments], _Said]] = {
+        self._commands: dict[str, Callable[[Arguments], _Result]] = {
             Command.KEYFRAME: self._keyframe,
             Command.STILL: self._still,
             Command.STILL_OUTCOME: self._still_outcome,
@@ -105,35 +106,26 @@ class Commands:
             Command.SEND_BACKLOG: self._send_backlog,
         }
 
-    @property
-    def config(self) -> EdgeConfig:
-        """The settings as they are now: budget, method and share may have been changed by a command."""
-        return self._config
-
-    def serve(self, served: Served) -> None:
-        """All parts are there; before, only keyframes are served."""
-        self._served = served
-
     def answer(self, request: ControlRequest) -> ControlAnswer:
         """Do it or say why not; never raises for what a ground may send."""
         try:
             with self._lock:
-                said = self._obey(request)
+                result = self._obey(request)
         except (RefusedError, UserError) as refusal:
-            return self._answer(_Said(), reason=fitted_text(str(refusal), _REASON_BYTES))
-        return self._answer(said)
+            return self._answer(_Result(), reason=fitted_text(str(refusal), _REASON_BYTES))
+        return self._answer(result)
 
-    def _answer(self, said: _Said, *, reason: str = "") -> ControlAnswer:
+    def _answer(self, result: _Result, *, reason: str = "") -> ControlAnswer:
         return ControlAnswer(
             session_id=self._session_id,
             accepted=not reason,
             reason=reason,
-            still_request=said.still_request,
-            frame_index=said.frame_index,
-            tracks=said.tracks,
+            still_request=result.still_request,
+            frame_index=result.frame_index,
+            tracks=result.tracks,
         )
 
-    def _obey(self, request: ControlRequest) -> _Said:
+    def _obey(self, request: ControlRequest) -> _Result:
         if request.session_id not in (0, self._session_id):
             raise RefusedError("that session has ended")
         self._check_rate()
@@ -150,100 +142,95 @@ class Commands:
 
     # The commands
 
-    def _keyframe(self, arguments: Arguments) -> _Said:
+    def _keyframe(self, arguments: Arguments) -> _Result:
         _Reader("keyframe", arguments).end()
-        refusal = self._keyframes.request(self._window_ns())
+        refusal = self._keyframes.request(self._loop_clock())
         if refusal is not None:
             raise RefusedError(refusal)
-        return _Said()
+        return _Result()
 
-    def _still(self, arguments: Arguments) -> _Said:
-        number, frame_index = self._parts().on_demand.request(_on_demand_request(arguments))
-        return _Said(still_request=number, frame_index=frame_index)
+    def _still(self, arguments: Arguments) -> _Result:
+        number, frame_index = self._on_demand.request(_on_demand_request(arguments))
+        return _Result(still_request=number, frame_index=frame_index)
 
-    def _still_outcome(self, arguments: Arguments) -> _Said:
+    def _still_outcome(self, arguments: Arguments) -> _Result:
         reader = _Reader("still-outcome", arguments)
         number = reader.needed("ask", 0, _U32)
         reader.end()
-        self._parts().on_demand.outcome(number)
-        return _Said()
+        self._on_demand.outcome(number)
+        return _Result()
 
-    def _tracks(self, arguments: Arguments) -> _Said:
+    def _tracks(self, arguments: Arguments) -> _Result:
         _Reader("tracks", arguments).end()
-        frame_index, tracks = self._parts().on_demand.tracks()
-        return _Said(frame_index=frame_index, tracks=tracks)
+        frame_index, tracks = self._on_demand.tracks()
+        return _Result(frame_index=frame_index, tracks=tracks)
 
-    def _set_budget(self, arguments: Arguments) -> _Said:
+    def _set_budget(self, arguments: Arguments) -> _Result:
         reader = _Reader("set-budget", arguments)
         bps = reader.needed("bps", 1, _MOST_BPS)
         reader.end()
-        self._change(replace(self._config, budget=bps))
-        return _Said()
+        now = self._operating.now
+        self._change(bps, now.video_share, now.method)
+        return _Result()
 
-    def _set_method(self, arguments: Arguments) -> _Said:
+    def _set_method(self, arguments: Arguments) -> _Result:
         reader = _Reader("set-method", arguments)
         name = reader.text("method")
         reader.end()
-        chooser = self._parts().chooser
-        before, policy = method(self._config.method), method(name)
+        now = self._operating.now
+        before, policy = method(now.method), method(name)
         if policy.name == before.name:
-            return _Said()
+            return _Result()
         if "R0" in (policy.name, before.name):
             raise RefusedError(
                 "R0 codes the video in another way from the first frame on: start the edge with it"
             )
-        self._change(
-            replace(self._config, method=policy.name, tune=(), video_share=self._share_for(policy.video_only))
-        )
-        chooser.set_method(policy)
-        return _Said()
+        self._change(now.budget_bps, self._share_for(policy.video_only), policy.name)
+        self._chooser.set_method(policy)
+        return _Result()
 
-    def _send_backlog(self, arguments: Arguments) -> _Said:
+    def _send_backlog(self, arguments: Arguments) -> _Result:
         _Reader("send-backlog", arguments).end()
-        backlog = self._parts().backlog
-        if backlog is None:
-            raise RefusedError("this edge keeps nothing while its link is away (--store 0)")
-        if not backlog.send_video():
-            raise RefusedError("nothing is kept that was not sent")
-        return _Said()
+        if self._backlog is None:
+            raise RefusedError("this edge stores nothing while its link is away (--store 0)")
+        if not self._backlog.send_video():
+            raise RefusedError("nothing is stored that was not sent")
+        return _Result()
 
     # Changes of the rates
 
-    def _change(self, config: EdgeConfig) -> None:
-        served, before = self._parts(), self._config
-        if (config.budget, config.video_share) != (before.budget, before.video_share):
+    def _change(self, budget_bps: int, video_share: float | None, method_name: str) -> None:
+        now = self._operating.now
+        rates_change = (budget_bps, video_share) != (now.budget_bps, now.video_share)
+        if rates_change:
             now_ns = self._clock()
             if self._changed_ns is not None and now_ns - self._changed_ns < _REST_NS:
                 raise RefusedError("the rates were changed a moment ago: wait two seconds")
-            _check_base(config, served.base_size)
+            self._check_base(budget_bps, video_share)
             self._changed_ns = now_ns
-            served.reconfiguration.change(config)
-            self._keyframes.renew(self._window_ns())
-        self._config = config
-        self.highest_budget_bps = max(self.highest_budget_bps, config.budget_bps)
+        self._operating.command(budget_bps=budget_bps, video_share=video_share, method=method_name)
+        if rates_change:
+            self._keyframes.require(self._loop_clock())
 
-    def _share_for(self, video_only: bool) -> float | str | None:  # noqa: FBT001 - one caller
+    def _share_for(self, video_only: bool) -> float | None:  # noqa: FBT001 - one caller
         """The base's share for a method of that kind: with no stills it is all, else what the edge began with."""
         if video_only:
             return 1.0
-        began = self._started_with
-        return REGIMES["low"].video_share if method(began.method).video_only else began.video_share
+        began = self._config
+        return REGIMES["low"].video_share if method(began.method).video_only else began.fixed_share
 
-    def _parts(self) -> Served:
-        if self._served is None:
-            raise RefusedError("this edge is still starting: ask again")
-        return self._served
-
-
-def _check_base(config: EdgeConfig, size: tuple[int, int]) -> None:
-    """As `hvt_edge.config.check_rate`, in words for whoever asks from afar."""
-    fps = LEAST_FPS if config.auto_fps else config.nominal_fps
-    least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
-    if config.base_bps < least_bps:
-        raise RefusedError(
-            f"{bitrate_text(config.budget_bps)} would leave {bitrate_text(config.base_bps)} for video, and "
-            f"{size[0]}x{size[1]} at {fps:g} fps takes at least {bitrate_text(least_bps)}"
-        )
+    def _check_base(self, budget_bps: int, video_share: float | None) -> None:
+        """As `hvt_edge.config.check_rate`, in words for whoever commands from afar."""
+        config, size = self._config, self._base_size
+        fps = LEAST_FPS if config.auto_fps else config.nominal_fps
+        least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
+        share = FIRST_SHARE if video_share is None else video_share
+        base_bps = base_rate_bps(budget_bps, share, metadata_bps=config.metadata_bps)
+        if base_bps < least_bps:
+            raise RefusedError(
+                f"{bitrate_text(budget_bps)} would leave {bitrate_text(base_bps)} for video, and "
+                f"{size[0]}x{size[1]} at {fps:g} fps takes at least {bitrate_text(least_bps)}"
+            )
 
 
 def _on_demand_request(arguments: Arguments) -> OnDemandRequest:

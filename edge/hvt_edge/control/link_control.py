@@ -1,4 +1,4 @@
-"""What the link carries, decided in one place: pace, rate, what is sent again, and what is kept for later."""
+"""What the link carries, decided in one place: pace, rate, what is sent again, and what is stored for later."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from collections.abc import Callable
 from hvt_common.protocol.messages import Feedback
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogStage
-from hvt_edge.config import EdgeConfig
+from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.sending import StillSender
 from hvt_edge.video.reconfigure import EncoderReconfiguration
@@ -25,120 +25,124 @@ _MOST_WAIT_NS = 100_000_000
 
 
 class LinkControl:
-    """One for each run: `hear` in the link's thread, all else in the frame loop.
+    """`on_feedback` in the link's thread, all else in the frame loop.
 
-    ``pacer`` is None without ``--adapt``. `attach` before the first frame; reports may come before that.
+    Args:
+        has_ground: whether a ground subscribes.
+        session_id: reports on another session do not count.
+        transmitter: what leaves.
+        keyframes: where keyframes are requested.
+        inbox: takes what grounds made of stills.
+        reconfiguration: tracks the rate of the link.
+        clock: the edge's, for the time at which reports come.
+        pacer: None without ``--adapt``.
+        in_flight: access units that no report has named.
+        outbox: stills, until a report names them.
+        stills: stores what is lost after the last frame.
+        backlog: stores what the link cannot carry away; None where nobody does.
     """
 
     def __init__(
-        self, pacer: Pacer | None, in_flight: BaseInFlight, outbox: Outbox, *, keyframes: KeyframePlan
-    ) -> None:
-        self.pacer = pacer
-        self.in_flight = in_flight
-        self.outbox = outbox
-        self._primary = PrimaryReceiver()
-        self.backlog: BacklogStage | None = None
-        """Who keeps what the link cannot carry away; None where nobody does."""
-        self._keyframes = keyframes
-        self._linked: Callable[[], bool] = lambda: False
-        self._sender: Transmitter | None = None
-        self._reconfiguration: EncoderReconfiguration | None = None
-        self._stills: StillSender | None = None
-
-    def attach(
         self,
         *,
-        linked: Callable[[], bool],
-        sender: Transmitter,
+        has_ground: Callable[[], bool],
+        session_id: int,
+        transmitter: Transmitter,
+        keyframes: KeyframeRequests,
+        inbox: FeedbackInbox,
         reconfiguration: EncoderReconfiguration,
+        clock: Callable[[], int],
+        pacer: Pacer | None,
+        in_flight: BaseInFlight,
+        outbox: Outbox,
         stills: StillSender,
         backlog: BacklogStage | None,
     ) -> None:
-        """What it decides for. ``linked()`` tells whether a ground listens."""
-        self._linked, self._sender, self._reconfiguration, self.backlog = (
-            linked,
-            sender,
-            reconfiguration,
-            backlog,
-        )
+        self._has_ground = has_ground
+        self._session_id = session_id
+        self._transmitter = transmitter
+        self._keyframes = keyframes
+        self._inbox = inbox
+        self._reconfiguration = reconfiguration
+        self._clock = clock
+        self._pacer = pacer
+        self._in_flight = in_flight
+        self._outbox = outbox
         self._stills = stills
+        self._backlog = backlog
+        self._primary = PrimaryReceiver()
 
     def before_frame(self, now_ns: int) -> None:
         """What the link carries decides on budget, base rate, keyframe, and on whether anything is sent at all."""
-        linked = self._linked()
-        offline = self.backlog is not None and self.backlog.before_frame(now_ns, linked=linked)
-        if self.pacer is None:
+        linked = self._has_ground()
+        offline = self._backlog is not None and self._backlog.before_frame(now_ns, linked=linked)
+        if not linked:
+            self._primary.forget()
+        if self._pacer is None:
             return
-        back = self.pacer.link(linked, now_ns=now_ns)
-        assert self._reconfiguration is not None, "attached before the first frame"
-        if offline:  # what is kept keeps the quality that the link had
+        back = self._pacer.link(linked, now_ns=now_ns)
+        if offline:  # what is stored has the quality that the link had
             self._reconfiguration.hold(now_ns)
         if offline or not linked:  # nothing is carried anywhere
             return
-        if self._reconfiguration.follow(now_ns) or back:
-            self._keyframes.renew(now_ns)
+        if self._reconfiguration.track_link(now_ns) or back:
+            self._keyframes.require(now_ns)
 
     def admits(self, now_ns: int) -> bool:
         """Whether a frame may be coded now; what is held back would only wait and grow old."""
-        if self.pacer is None:
+        if self._pacer is None:
             return True
-        assert self._sender is not None, "attached before the first frame"
-        return self.pacer.admits_base(now_ns) and self._sender.base_wait_ns(now_ns) <= _MOST_WAIT_NS
-
-    def text(self) -> str:
-        """What is kept, for the status line; empty where nothing is."""
-        return "" if self.backlog is None else self.backlog.text()
+        return self._pacer.admits_base(now_ns) and self._transmitter.base_wait_ns(now_ns) <= _MOST_WAIT_NS
 
     def finish(self, *, stop: threading.Event, note: Callable[[str], None]) -> None:
-        """After the last frame of a recorded source: send what was kept."""
-        if self.backlog is not None:
-            self.backlog.finish(before_frame=self._after_last, stop=stop, note=note)
+        """After the last frame of a recorded source: send what was stored."""
+        if self._backlog is not None:
+            self._backlog.finish(before_frame=self._after_last, stop=stop, note=note)
 
     def _after_last(self, now_ns: int) -> None:
-        assert self._stills is not None, "attached before the first frame"
         self._stills.store_lost(now_ns)
         self.before_frame(now_ns)
         self.admits(now_ns)  # which gives up what is lost: nothing else would, without frames
 
-    def hear(self, feedback: Feedback, *, now_ns: int) -> None:
-        """A ground reports on this session (any thread)."""
-        self._keyframes.note_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)
-        if self.pacer is not None:
-            self.pacer.hear(feedback, now_ns=now_ns)
-        self._acknowledge(feedback, now_ns)
-        if self.backlog is not None:
-            self.backlog.on_feedback(feedback, now_ns=now_ns)
-
-    def _acknowledge(self, feedback: Feedback, now_ns: int) -> None:
-        # Numbers that were never sent mean nothing, and who names them does not become the primary receiver.
-        sender = self._sender
-        if sender is None or feedback.base_sequence > sender.base_sequence:
+    def on_feedback(self, feedback: Feedback) -> None:
+        """A ground reports (any thread); whether its report counts is decided here, once."""
+        if feedback.session_id != self._session_id:
             return
-        if feedback.still_sequence > sender.still_sequence:
-            return
-        if self._primary.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns) is None:
-            return
-        progress = self.in_flight.on_report(feedback.base_sequence)
-        progress |= self.outbox.on_report(
-            feedback.still_sequence,
-            feedback.missing_stills,
-            now_ns=now_ns,
-            round_trip_ns=0 if self.pacer is None else self.pacer.round_trip_ns,
-        )
-        if progress:
-            self._primary.note_progress(now_ns)
+        now_ns = self._clock()
+        sent = (self._transmitter.base_sequence, self._transmitter.still_sequence)
+        report = self._primary.judge(feedback, sent=sent, now_ns=now_ns)
+        self._keyframes.report_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)
+        if self._pacer is not None:
+            self._pacer.on_report(report)
+        if report.primary:
+            self._in_flight.on_report(feedback.base_sequence)
+            self._outbox.on_report(
+                feedback.still_sequence,
+                feedback.missing_stills,
+                now_ns=now_ns,
+                round_trip_ns=0 if self._pacer is None else self._pacer.round_trip_ns,
+            )
+        if self._backlog is not None:
+            self._backlog.on_feedback(feedback, now_ns=now_ns)
+        # Last: who waits there for the end goes on to store what is not acknowledged.
+        self._inbox.on_report(report)
 
 
 def wait_for_ground(
-    linked: Callable[[], bool], config: EdgeConfig, *, stop: threading.Event, note: Callable[[str], None]
+    has_ground: Callable[[], bool],
+    *,
+    edge_id: str,
+    wait_s: float,
+    stop: threading.Event,
+    note: Callable[[str], None],
 ) -> None:
-    """Until somebody listens, or for ``--wait``: a recorded source can wait for its audience."""
-    if linked():
+    """Until a ground subscribes, or for ``--wait``: a recorded source can wait for its audience."""
+    if has_ground():
         return
-    deadline_s = time.monotonic() + config.wait
-    note(f"{config.edge_id}: waiting up to {config.wait:g} s for a ground (--wait)")
-    while not linked() and not stop.is_set():
+    deadline_s = time.monotonic() + wait_s
+    note(f"{edge_id}: waiting up to {wait_s:g} s for a ground (--wait)")
+    while not has_ground() and not stop.is_set():
         if time.monotonic() >= deadline_s:
-            note(f"{config.edge_id}: no ground yet; playing on, one may join at any time")
+            note(f"{edge_id}: no ground yet; playing on, one may join at any time")
             return
         stop.wait(0.02)

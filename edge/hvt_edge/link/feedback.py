@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from hvt_common.protocol.messages import Feedback, StillResult
+from hvt_common.protocol.messages import StillResult
+from hvt_edge.link.receivers import Report
 
 __all__ = ["FeedbackInbox"]
 
@@ -32,10 +33,11 @@ class FeedbackInbox:
         self.received_ns: int | None = None
         """When the last report came, this side's clock."""
 
-    def receive(self, feedback: Feedback, *, now_ns: int) -> None:
-        """Take in one report (any thread)."""
+    def on_report(self, report: Report) -> None:
+        """Take in one report, whichever ground's (any thread)."""
+        feedback = report.feedback
         with self._changed:
-            self.received_ns = now_ns
+            self.received_ns = report.now_ns
             self._last_frame_index = max(self._last_frame_index, feedback.last_frame_index)
             self._base_messages = max(self._base_messages, feedback.base_messages)
             self._roi_messages = max(self._roi_messages, feedback.roi_messages)

@@ -12,9 +12,8 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from hvt_common.protocol.messages import Feedback
 from hvt_edge.link.rate_control import LeastDelay, Progress, RateController
-from hvt_edge.link.receivers import PrimaryReceiver
+from hvt_edge.link.receivers import Report
 
 __all__ = ["Flight", "Pacer"]
 
@@ -140,17 +139,20 @@ class Flight:
 
 
 class Pacer:
-    """Hears reports, keeps the rate, and says what may go. Thread-safe; time is an argument.
+    """Paces sending: bounds bytes in flight to the link's rate times 250 ms. Thread-safe; time is an argument.
 
-    It follows one receiver (`hvt_edge.link.receivers`): the pace of one that is itself badly connected must not be
-    everybody's.
+    Only the primary receiver's reports count (`hvt_edge.link.receivers`): the pace of a ground that is itself badly
+    connected must not be everybody's.
     """
 
     def __init__(self, controller: RateController) -> None:
         self._controller = controller
         self._flight = Flight()
         self._lock = threading.Lock()
-        self._primary = PrimaryReceiver()
+        self._reported_ns: int | None = None
+        """When the primary receiver reported last; None while there is none."""
+        self._progress_ns = 0
+        """When it last named a base message that was on its way."""
         self._held_ns = _FIRST_HELD_NS
         self._round_trip = LeastDelay(15 * _SECOND_NS)
         self._round_trip_ns = _SECOND_NS // 2
@@ -213,12 +215,17 @@ class Pacer:
 
     # What comes back
 
-    def hear(self, feedback: Feedback, *, now_ns: int) -> None:
+    def on_report(self, report: Report) -> None:
         """Take in one report of this session."""
+        feedback, now_ns = report.feedback, report.now_ns
         with self._lock:
-            if not self._follow(feedback, now_ns):
+            if not report.primary:
                 self.ignored += 1
                 return
+            if report.first:
+                self._forget_path()
+                self._progress_ns = now_ns
+            self._reported_ns = now_ns
             sent = self._flight.acknowledge(feedback.base_sequence, feedback.still_sequence)
             if sent is None:
                 return
@@ -246,7 +253,7 @@ class Pacer:
                 self._started_ns = None
             if before and not there:
                 self._flight.clear()
-                if self._primary.receiver_id is not None:
+                if self._reported_ns is not None:
                     self._controller.on_silence(now_ns)
                 self._leave()
             return before is False and there and self.backoffs > 0
@@ -256,16 +263,16 @@ class Pacer:
     def admits_base(self, now_ns: int) -> bool:
         """Whether a frame may be encoded and sent now."""
         with self._lock:
-            if self._primary.receiver_id is None:
+            if self._reported_ns is None:
                 return self._may_start(now_ns)
-            if now_ns - self._primary.heard_ns > _FORGET_NS and self._linked:
+            if now_ns - self._reported_ns > _FORGET_NS and self._linked:
                 self._leave()
                 self._controller.forget_silence()
                 return True
-            if now_ns - self._primary.heard_ns > _SILENCE_NS:
+            if now_ns - self._reported_ns > _SILENCE_NS:
                 self._controller.on_silence(now_ns)
                 return now_ns - self._last_sent_ns >= _PROBE_NS
-            if min(self._overdue_ns(now_ns), now_ns - self._primary.progress_ns) > _GIVEN_UP_NS:
+            if min(self._overdue_ns(now_ns), now_ns - self._progress_ns) > _GIVEN_UP_NS:
                 self._controller.on_silence(now_ns)
                 self._flight.clear()
             return self._is_open(now_ns, _MOST_BACKLOG_NS)
@@ -273,9 +280,9 @@ class Pacer:
     def admits_still(self, now_ns: int) -> bool:
         """Whether a still may go now."""
         with self._lock:
-            if self._primary.receiver_id is None:
+            if self._reported_ns is None:
                 return self._may_start(now_ns)
-            return now_ns - self._primary.heard_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
+            return now_ns - self._reported_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
 
     def _may_start(self, now_ns: int) -> bool:
         if not self._linked or self._started_ns is None:
@@ -293,15 +300,8 @@ class Pacer:
             0 if oldest is None else now_ns - oldest.sent_ns - oldest.serialization_ns - self._round_trip_ns
         )
 
-    def _follow(self, feedback: Feedback, now_ns: int) -> bool:
-        """Whether this report is the newest of the receiver that counts."""
-        kind = self._primary.take(feedback.receiver_id, feedback.sequence, now_ns=now_ns)
-        if kind == "first":
-            self._forget_path()
-        return kind is not None
-
     def _leave(self) -> None:
-        self._primary.forget()
+        self._reported_ns = None
         self._forget_path()
 
     def _forget_path(self) -> None:
@@ -314,5 +314,5 @@ class Pacer:
         # Quickly up, slowly down: what is expected is the longest of the usual.
         held_ns = min(max(held_ns, _LEAST_HELD_NS), _MOST_HELD_NS)
         self._held_ns = max((9 * self._held_ns + held_ns) // 10, min(held_ns, 2 * self._held_ns))
-        self._primary.note_progress(now_ns)
+        self._progress_ns = now_ns
         self._round_trip_ns = self._round_trip.add(max(0, now_ns - sent.sent_ns), now_ns=now_ns)

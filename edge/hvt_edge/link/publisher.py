@@ -1,35 +1,147 @@
-"""The edge's end of the link: what it declares, sends and hears. Knows Zenoh; knows nothing of frames."""
+"""The edge's end of the link: publishers, then queryables and feedback. Knows Zenoh; knows nothing of frames."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import ExitStack
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, Feedback, WireError
+from hvt_common.transport.doctor.diagnose import LinkWatch
+from hvt_common.transport.doctor.duplicate_edge import refuse_same_id
 from hvt_common.transport.flood import FloodWatch
-from hvt_common.transport.session import declare_publisher, serve
+from hvt_common.transport.session import declare_publisher, open_session, serve
+from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_edge.link.transmitter import Outlet
 
-__all__ = ["EdgeLink"]
+__all__ = ["EdgeLink", "EdgeListener", "ZenohLink"]
 
 _log = logging.getLogger(__name__)
 
 _PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.BACKLOG, Channel.STATUS)
 _MOST_PER_S = 1000
-"""Questions, or reports: a ground sends some ten a second."""
+"""Requests, or reports: a ground sends some ten a second."""
 _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
-"""Rows that a ground subscribes to in any case; one that only shows the video may leave out tracks and past."""
+"""Channels that a ground subscribes to in any case; one that only shows the video may leave out the others."""
 
 
-class EdgeLink:
-    """Publishers of all rows; queryables info and control; a subscriber of feedback; the alive token.
+class EdgeLink(Outlet, Protocol):
+    """The link as an edge uses it: `ZenohLink`, or a study's."""
 
-    ``answer_info(received_ns)``, ``answer_control(request)`` and ``hear(feedback)`` run in Zenoh's callbacks and
-    must be quick; ``clock`` is that of the headers.
+    @property
+    def unusable(self) -> int:
+        """Messages from grounds that were skipped: damaged, foreign or of another version."""
+        ...
+
+    @property
+    def trouble(self) -> str:
+        """Why no ground can be reached, where the log has said it."""
+        ...
+
+    def has_ground(self) -> bool:
+        """Whether a ground subscribes to base, stills and status."""
+        ...
+
+    def has_subscriber(self, channel: Channel) -> bool:
+        """Whether somebody subscribes to this channel."""
+        ...
+
+    def listen(
+        self,
+        *,
+        info: Callable[[int], bytes],
+        control: Callable[[ControlRequest], ControlAnswer],
+        on_feedback: Callable[[Feedback], None],
+    ) -> None:
+        """Answer grounds from now on: all that answers them is there."""
+        ...
+
+
+class ZenohLink:
+    """One Zenoh session with publishers of all channels; a context manager.
+
+    Raises:
+        UserError: a port or an endpoint cannot be used, or another edge of that id is on the link.
+    """
+
+    def __init__(self, settings: LinkSettings, *, edge_id: str, clock: Callable[[], int]) -> None:
+        self._keys = EdgeKeys(edge_id)
+        self._clock = clock
+        refuse_same_id(settings, self._keys)
+        self._listener: EdgeListener | None = None
+        self._stack = ExitStack()
+        self._session = self._stack.enter_context(open_session(settings))
+        self._publishers = {
+            channel: declare_publisher(self._session, channel, keys=self._keys) for channel in _PUBLISHED
+        }
+        watch = LinkWatch(self._session, settings, served=lambda _ground: self.has_ground())
+        self._watch = self._stack.enter_context(watch)
+
+    @property
+    def trouble(self) -> str:
+        """Why no ground can be reached, where the log has said it."""
+        return self._watch.trouble
+
+    @property
+    def unusable(self) -> int:
+        """Messages from grounds that were skipped: damaged, foreign or of another version."""
+        return 0 if self._listener is None else self._listener.unusable
+
+    def has_ground(self) -> bool:
+        """Whether a ground subscribes to base, stills and status."""
+        return all(self.has_subscriber(channel) for channel in _NEEDED)
+
+    def has_subscriber(self, channel: Channel) -> bool:
+        """Whether somebody subscribes to this channel."""
+        # Zenoh's own stub calls the status a bool.
+        return bool(self._publishers[channel].matching_status.matching)  # type: ignore[attr-defined]
+
+    def put(
+        self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+    ) -> None:
+        """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
+        try:
+            self._publishers[channel].put(payload, attachment=attachment, encoding=encoding or None)
+        except zenoh.ZError as error:
+            _log.debug("%s was not sent: %s", channel, error)
+
+    def listen(
+        self,
+        *,
+        info: Callable[[int], bytes],
+        control: Callable[[ControlRequest], ControlAnswer],
+        on_feedback: Callable[[Feedback], None],
+    ) -> None:
+        """Answer grounds from now on; see `EdgeListener`."""
+        listener = EdgeListener(
+            self._session,
+            self._keys,
+            info=info,
+            control=control,
+            on_feedback=on_feedback,
+            clock=self._clock,
+        )
+        self._listener = self._stack.enter_context(listener)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+
+class EdgeListener:
+    """Queryables info and control; a subscriber of feedback; last the alive token, by which grounds find the edge.
+
+    ``info(received_ns)``, ``control(request)`` and ``on_feedback(feedback)`` run in Zenoh's callbacks and must be
+    quick; ``clock`` is that of the headers.
     """
 
     def __init__(
@@ -37,43 +149,22 @@ class EdgeLink:
         session: zenoh.Session,
         keys: EdgeKeys,
         *,
-        answer_info: Callable[[int], bytes],
-        answer_control: Callable[[ControlRequest], ControlAnswer],
-        hear: Callable[[Feedback], None],
+        info: Callable[[int], bytes],
+        control: Callable[[ControlRequest], ControlAnswer],
+        on_feedback: Callable[[Feedback], None],
         clock: Callable[[], int],
     ) -> None:
-        self._keys = keys
-        self._answer_info = answer_info
-        self._answer_control = answer_control
-        self._hear = hear
+        self._info = info
+        self._control = control
+        self._handle_feedback = on_feedback
         self._clock = clock
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
-        self._publishers = {row: declare_publisher(session, row, keys=keys) for row in _PUBLISHED}
-        serve(session, Channel.INFO, keys=keys, answer=self._info)
-        serve(session, Channel.CONTROL, keys=keys, answer=self._control)
+        serve(session, Channel.INFO, keys=keys, answer=self._on_info)
+        serve(session, Channel.CONTROL, keys=keys, answer=self._on_control)
         self._feedback = session.declare_subscriber(keys.key(Channel.FEEDBACK), self._on_feedback)
-        # Last: who sees the token may ask at once.
         self._token = session.liveliness().declare_token(keys.key(Channel.ALIVE))
-
-    def heard(self) -> bool:
-        """Whether a ground subscribes to base, stills and status."""
-        return all(self.listens(row) for row in _NEEDED)
-
-    def listens(self, row: Channel) -> bool:
-        """Whether somebody subscribes to this row."""
-        # Zenoh's own stub calls the status a bool.
-        return bool(self._publishers[row].matching_status.matching)  # type: ignore[attr-defined]
-
-    def put(
-        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
-    ) -> None:
-        """Send one message; blocks while the link is full. A link that is gone takes nothing and says nothing."""
-        try:
-            self._publishers[row].put(payload, attachment=attachment, encoding=encoding or None)
-        except zenoh.ZError as error:
-            _log.debug("%s was not sent: %s", row, error)
 
     def close(self) -> None:
         """Withdraw the token, so that grounds see the end."""
@@ -87,17 +178,17 @@ class EdgeLink:
     ) -> None:
         self.close()
 
-    def _info(self, _question: bytes) -> bytes:
-        return self._answer_info(self._clock())
+    def _on_info(self, _query: bytes) -> bytes:
+        return self._info(self._clock())
 
-    def _control(self, question: bytes) -> bytes | None:
+    def _on_control(self, query: bytes) -> bytes | None:
         self._watch(Channel.CONTROL)
         try:
-            request = ControlRequest.parse(question)
+            request = ControlRequest.parse(query)
         except WireError as error:
             self._skip("control", error)
             return None
-        return self._answer_control(request).pack()
+        return self._control(request).pack()
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
         self._watch(Channel.FEEDBACK)
@@ -106,18 +197,18 @@ class EdgeLink:
         except WireError as error:
             self._skip("feedback", error)
             return
-        self._hear(feedback)
+        self._handle_feedback(feedback)
 
-    def _watch(self, row: Channel) -> None:
-        if self._flood.note(row, now_ns=self._clock()) is not None:
+    def _watch(self, channel: Channel) -> None:
+        if self._flood.note(channel, now_ns=self._clock()) is not None:
             _log.warning(
                 "more than %d messages a second on %s, far more than any ground sends: somebody floods this edge "
                 "(docs/security.md has keys against that)",
                 _MOST_PER_S,
-                row,
+                channel,
             )
 
-    def _skip(self, row: str, error: WireError) -> None:
+    def _skip(self, channel: str, error: WireError) -> None:
         self.unusable += 1
         if self.unusable.bit_count() == 1:  # 1, 2, 4, 8 …: a flood does not fill the log
-            _log.warning("%s message skipped (%d so far): %s", row, self.unusable, error)
+            _log.warning("%s message skipped (%d so far): %s", channel, self.unusable, error)

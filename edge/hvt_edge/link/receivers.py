@@ -1,55 +1,88 @@
-"""Which ground's reports count where several may report, and which of them is new.
+"""Which ground steers: whose reports count where several may report, decided once for each report.
 
-Several grounds see the same thin link, and what one of them has says nothing of the others. So one is followed: the
-first that reports, until it is silent for a second or names nothing new for as long. Numbers of reports cost a forger
-nothing, so one that is too high silences a receiver for that second and no longer.
+Several grounds see the same thin link, and what one of them has says nothing of the others. So one is the primary
+receiver: the first that reports, until it is silent for a second or names nothing new for as long. Numbers of reports
+cost a forger nothing, so one that is too high silences a receiver for that second and no longer.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+import threading
+from dataclasses import dataclass
 
-__all__ = ["PrimaryReceiver"]
+from hvt_common.protocol.messages import Feedback
+
+__all__ = ["PrimaryReceiver", "Report"]
 
 _OTHER_RECEIVER_NS = 1_000_000_000
 
 
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A ground's report with what was decided on it. Pacer, outbox, store and inbox are all handed the same."""
+
+    feedback: Feedback
+    now_ns: int
+    """When it came, this side's clock."""
+    primary: bool
+    """It is new and of the ground that steers."""
+    first: bool = False
+    """Another ground steers from now on, or this one began anew: what was measured of its path no longer holds."""
+
+
 class PrimaryReceiver:
-    """Not thread-safe; time is an argument."""
+    """Thread-safe; time is an argument."""
 
     def __init__(self) -> None:
-        self.receiver_id: int | None = None
-        """None while nobody is followed."""
-        self.heard_ns = 0
-        """When the last report that counted came."""
-        self.progress_ns = 0
-        """When one last brought news, as `note_progress` was told."""
+        self._lock = threading.Lock()
+        self._receiver_id: int | None = None
         self._sequence = -1
+        self._named = (-1, -1)
+        """The highest base and still sequences that it has named."""
+        self._reported_ns = 0
+        self._progress_ns = 0
+        """When it last named something new."""
 
-    def take(self, receiver_id: int, sequence: int, *, now_ns: int) -> Literal["next", "first"] | None:
-        """Whether this report counts: None where not; ``first`` where what was known of the receiver no longer holds.
+    def judge(self, feedback: Feedback, *, sent: tuple[int, int], now_ns: int) -> Report:
+        """Decide on a report; ``sent`` are the last sequences of base and stills that went out.
 
-        That is at another receiver, and at one whose numbers begin anew.
+        One that names what was never sent does not count.
         """
-        kind: Literal["next", "first"] = "next"
-        if receiver_id != self.receiver_id:
-            # One that reports and never names anything new must not keep the edge from all the others.
-            quiet_ns = max(now_ns - self.heard_ns, now_ns - self.progress_ns)
-            if self.receiver_id is not None and quiet_ns < _OTHER_RECEIVER_NS:
-                return None
-            kind, self.receiver_id, self.progress_ns = "first", receiver_id, now_ns
-        elif sequence <= self._sequence:
-            # Old, or a number was forged that the receiver itself will not reach for years.
-            if now_ns - self.heard_ns < _OTHER_RECEIVER_NS:
-                return None
-            kind = "first"
-        self._sequence, self.heard_ns = sequence, now_ns
-        return kind
-
-    def note_progress(self, now_ns: int) -> None:
-        """The last report named something new."""
-        self.progress_ns = now_ns
+        with self._lock:
+            if feedback.base_sequence > sent[0] or feedback.still_sequence > sent[1]:
+                return Report(feedback, now_ns, primary=False)
+            first = self._begins(feedback, now_ns)
+            if first is None:
+                return Report(feedback, now_ns, primary=False)
+            if first:
+                self._named, self._progress_ns = (-1, -1), now_ns
+            named = (
+                max(self._named[0], feedback.base_sequence),
+                max(self._named[1], feedback.still_sequence),
+            )
+            if named != self._named:
+                self._named, self._progress_ns = named, now_ns
+            self._receiver_id, self._sequence, self._reported_ns = (
+                feedback.receiver_id,
+                feedback.sequence,
+                now_ns,
+            )
+            return Report(feedback, now_ns, primary=True, first=first)
 
     def forget(self) -> None:
-        """Nobody is followed: the next report counts, whose ever it is."""
-        self.receiver_id, self._sequence = None, -1
+        """Nobody can be reached: the next report counts, whose ever it is."""
+        with self._lock:
+            self._receiver_id, self._sequence = None, -1
+
+    def _begins(self, feedback: Feedback, now_ns: int) -> bool | None:
+        """Whether the receiver begins (anew) with this report; None where it does not count."""
+        if self._receiver_id is None:
+            return True
+        quiet_ns = now_ns - self._reported_ns
+        if feedback.receiver_id != self._receiver_id:
+            # One that reports and never names anything new must not keep the edge from all the others.
+            return True if max(quiet_ns, now_ns - self._progress_ns) >= _OTHER_RECEIVER_NS else None
+        if feedback.sequence > self._sequence:
+            return False
+        # Old, or a number was forged that the receiver itself will not reach for years.
+        return True if quiet_ns >= _OTHER_RECEIVER_NS else None

@@ -1,8 +1,18 @@
 """The one place where bytes leave the edge: header, ledger and budget of every message in one step.
 
-Thread-safe: base frames and stills may come from two threads. ``now_ns`` is the time that windows go by: the wall
-clock in real time, media time in lockstep, so that the same input gives the same stills. It is also the time of
-sending that goes on the wire, so that the ground's ledger sees the very same windows.
+Base first, then metadata, stills by utility, the backlog. Four threads send:
+
+* the frame loop: `base`, `status`, and what it stores in place of sending;
+* the stills' thread: `tracks` and `still`;
+* the store's thread: `backlog`;
+* the link's callbacks answer ``info`` and ``control`` themselves: a reply leaves with its query, not here.
+
+The lock covers header, ledger and budget, never a wait or a ``put``. So a still whose ``put`` blocks holds up the
+stills' thread alone; a base frame finds the lock free and a publisher of its own.
+
+``now_ns`` is the time that windows go by: the wall clock in real time, media time in lockstep, so that the same input
+gives the same stills. It is also the time of sending that goes on the wire, so that the ground's ledger has the very
+same windows.
 """
 
 from __future__ import annotations
@@ -29,26 +39,20 @@ from hvt_common.values import AccessUnit, Still
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.link.budget import RollingBudget
+from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
 from hvt_edge.link.pacer import Pacer
 
 __all__ = [
-    "BASE_ATTACHMENT_BYTES",
     "PLAIN_ENCODING",
-    "STATUS_BYTES",
     "STILL_ATTACHMENT_BYTES",
     "Outlet",
     "StillEnvelope",
     "Transmitter",
-    "base_overhead_bps",
 ]
 
-BASE_ATTACHMENT_BYTES = 48
-"""What a `BaseHeader` takes at most."""
 STILL_ATTACHMENT_BYTES = 100
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
 `Transmitter.still_allowance_bytes` of one that is counts its own header."""
-STATUS_BYTES = 320
-"""What a `Status` takes."""
 BACKLOG_ATTACHMENT_BYTES = 48
 """What a `BacklogHeader` takes at most."""
 _LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
@@ -68,22 +72,10 @@ class Outlet(Protocol):
     """Where bytes go: the link, or in the study nowhere."""
 
     def put(
-        self, row: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
+        self, channel: Channel, payload: bytes, *, attachment: bytes | None = None, encoding: str = ""
     ) -> None:
         """Hand over one message; may block while the link is full."""
         ...
-
-
-def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
-    """What headers, framing and ``status`` take of ``base_bps``: the encoder gets the rest."""
-    payload = round(base_bps / 8 / fps)
-    key = EdgeKeys(edge_id).key(Channel.BASE)
-    encoding = DELIVERIES[Channel.BASE].encoding
-    per_frame = BASE_ATTACHMENT_BYTES + overhead_bytes(
-        payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding
-    )
-    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Channel.STATUS))
-    return 8 * (per_frame * fps + per_second)
 
 
 def _encoding(still: Still) -> str:
@@ -110,8 +102,8 @@ class StillEnvelope:
 class Transmitter:
     """Sends access units, stills, tracks and status, and accounts for each.
 
-    ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` is told of all
-    that goes out, and holds stills while the link is busy. ``in_flight`` holds access units until they are reported.
+    ``wait_until(at_ns)`` sleeps until then in real time, and does nothing in lockstep. A ``pacer`` counts all that
+    goes out, and holds stills while the link is busy. ``in_flight`` holds access units until they are reported.
     """
 
     def __init__(
@@ -303,13 +295,8 @@ class Transmitter:
         """
         self._metadata(Channel.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns)
 
-    def set_base(self, base_bps: int, fps: float, *, now_ns: int) -> None:
-        """The base stream's share of the budget and its rate of frames, from the keyframe that comes next."""
-        with self._lock:
-            self._budget.set_base(base_bps, fps, now_ns=now_ns)
-
-    def set_total(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
-        """The total budget from now on; see `RollingBudget.set_total`."""
+    def set_rates(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
+        """Total, base stream's share and coded frames a second from now on; see `RollingBudget.set_total`."""
         with self._lock:
             self._budget.set_total(total_bps, base_bps, fps, now_ns=now_ns)
 
@@ -335,18 +322,18 @@ class Transmitter:
         with self._lock:
             self._ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
 
-    def _metadata(self, row: Channel, make: Callable[[int], bytes], *, now_ns: int) -> None:
+    def _metadata(self, channel: Channel, make: Callable[[int], bytes], *, now_ns: int) -> None:
         """Send what belongs to neither stream as soon as the budget's window has room for it."""
         with self._lock:
-            size_bytes = _GROWTH_BYTES + self._line_bytes(row, make(now_ns), 0)
+            size_bytes = _GROWTH_BYTES + self._line_bytes(channel, make(now_ns), 0)
             at_ns = self._budget.earliest_ns(size_bytes, now_ns=now_ns)
             payload = make(at_ns)
-            line_bytes = self._count(row, Account.META, payload, b"", at_ns=at_ns)
+            line_bytes = self._count(channel, Account.META, payload, b"", at_ns=at_ns)
             self._budget.record_metadata(line_bytes, now_ns=at_ns)
             if self._pacer is not None:
                 self._pacer.sent_other(line_bytes, now_ns=at_ns)
         self._wait_until(at_ns)
-        self._outlet.put(row, payload, encoding=DELIVERIES[row].encoding)
+        self._outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
 
     def _still_header(self, still: Still) -> RoiHeader:
         """All of it but send delay and flags."""
@@ -388,17 +375,17 @@ class Transmitter:
 
     def _count(
         self,
-        row: Channel,
-        channel: Account,
+        channel: Channel,
+        account: Account,
         payload: bytes,
         attachment: bytes,
         *,
         at_ns: int,
         encoding: str = "",
     ) -> int:
-        line_bytes = self._line_bytes(row, payload, len(attachment), encoding=encoding)
+        line_bytes = self._line_bytes(channel, payload, len(attachment), encoding=encoding)
         self._ledger.count(
-            channel,
+            account,
             payload_bytes=len(payload),
             attachment_bytes=len(attachment),
             overhead_bytes=line_bytes - len(payload) - len(attachment),
@@ -406,12 +393,14 @@ class Transmitter:
         )
         return line_bytes
 
-    def _line_bytes(self, row: Channel, payload: bytes, attachment_bytes: int, *, encoding: str = "") -> int:
+    def _line_bytes(
+        self, channel: Channel, payload: bytes, attachment_bytes: int, *, encoding: str = ""
+    ) -> int:
         """Payload, attachment and what the transport adds."""
         overhead = overhead_bytes(
             len(payload),
             attachment_bytes,
-            key=self._keys.key(row),
-            encoding=encoding or DELIVERIES[row].encoding,
+            key=self._keys.key(channel),
+            encoding=encoding or DELIVERIES[channel].encoding,
         )
         return len(payload) + attachment_bytes + overhead

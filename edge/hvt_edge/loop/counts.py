@@ -15,6 +15,8 @@ class FrameCounts:
     encoded: int = 0
     dropped: int = 0
     """Before encoding, because the link or the machine was behind."""
+    unanalyzed: int = 0
+    """Coded, or left out by frame decimation, and skipped by perception, because stills or detection were behind."""
     encode_ns: int = 0
     first_index: int | None = None
     last_index: int = -1

@@ -1,1 +1,1 @@
-"""What changes in flight: everybody reads it, one owner writes it."""
+"""What changes in flight: rates, method and keyframe requests, read by everybody and written by their owners."""

@@ -1,7 +1,8 @@
-"""What the edge sees: its own decoded stream or the camera's own frames, and the tracks on every tick."""
+"""The tracks on every source frame, from the edge's own decoded stream or from the source itself."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -20,28 +21,28 @@ class AnalyzerSettings:
     """``candidates`` says on which pixels the detector runs and the tracker follows the camera.
 
     Of the source means before it is coded, at the finer of its two sizes: a source that the base enlarges is
-    looked at enlarged, for so the ground's detector sees it, and who looks at fewer pixels finds less.
+    analyzed enlarged, as by the ground's detector, which finds less in fewer pixels.
     """
 
     detect_every: int = 5
-    """Ticks from one detection to the next; see `Analyzer.see` for streams that code fewer ticks than that."""
+    """Source frames from one detection to the next; see `Analyzer.analyze` for streams that code fewer."""
     candidates: Literal["decoded", "source"] = "decoded"
 
 
 @dataclass(frozen=True, slots=True)
 class AnalyzedFrame:
-    """One tick with all that is known of it."""
+    """One source frame with all that is known of it."""
 
     frame: Frame
     base_bgr: Image | None
-    """The decoded base frame: what the ground has. None at a tick that is not coded."""
+    """The decoded base frame: what the ground has. None where the frame is not coded."""
     tracks: Tracks
     detected: bool
-    """A decision step: the detector ran at this tick."""
+    """A decision step: the detector ran on this frame."""
 
     @property
     def coded(self) -> bool:
-        """Whether the base stream shows this tick. Only then can the ground apply a still to its picture."""
+        """Whether the base stream shows this frame. Only then can the ground apply a still to its picture."""
         return self.base_bgr is not None
 
 
@@ -50,7 +51,7 @@ class _Decoder(Protocol):
 
 
 class Analyzer:
-    """Decodes the edge's own access units, detects on every n-th tick and tracks on each."""
+    """Decodes the edge's own access units, detects on every n-th frame and tracks on each."""
 
     def __init__(
         self,
@@ -70,15 +71,25 @@ class Analyzer:
         self._coded_index: int | None = None
         self._coded_gap = 1
 
-    def see(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool = False) -> AnalyzedFrame:
-        """Take in the next tick; ``unit`` is None where it is not coded.
+    def analyze(
+        self,
+        frame: Frame,
+        unit: AccessUnit | None,
+        *,
+        skipped: Sequence[AccessUnit] = (),
+        hurry: bool = False,
+    ) -> AnalyzedFrame:
+        """Take in the next source frame; ``unit`` is None where it is not coded.
 
-        Detection is due ``detect_every`` ticks after the last one. With candidates of the decoded stream that can
-        only be a coded tick. With candidates of the source it waits for a coded tick too, as long as those are no
-        further apart than ``detect_every``; where they are, detection runs at its own pace and at each coded tick
+        Detection is due ``detect_every`` frames after the last one. With candidates of the decoded stream that can
+        only be a coded frame. With candidates of the source it waits for a coded frame too, as long as those are no
+        further apart than ``detect_every``; where they are, detection runs at its own pace and at each coded frame
         besides, so that stills are always chosen by what that very picture shows. With ``hurry`` detection waits
-        for a later tick; decoding never does.
+        for a later frame; decoding never does. ``skipped`` are the units since the frame before, of frames that were
+        not analyzed: they are decoded and no more.
         """
+        for one in skipped:
+            self._decode(one.frame_index, one)
         base_bgr = None if unit is None else self._decode(frame.index, unit)
         pixels = frame.base_bgr if self._settings.candidates == "source" else base_bgr
         if hurry or not self._due(frame.index, coded=unit is not None):
@@ -98,7 +109,7 @@ class Analyzer:
         return base_bgr
 
     def _due(self, index: int, *, coded: bool) -> bool:
-        """Whether the detector is to run at this tick. By counts of ticks alone, never by a clock."""
+        """Whether the detector is to run on this frame. By frame counts alone, never by a clock."""
         every, last = self._settings.detect_every, self._detected_index
         rested = last is None or index - last >= every
         since_coded = 0 if self._coded_index is None else index - self._coded_index
@@ -109,7 +120,7 @@ class Analyzer:
 
     def _detect(self, frame: Frame, base_bgr: Image | None) -> Detections:
         if self._settings.candidates == "decoded":
-            assert base_bgr is not None, "detection on the decoded stream is due at coded ticks only"
+            assert base_bgr is not None, "detection on the decoded stream is due on coded frames only"
             return self._detector.detect(base_bgr)
         if self._view.enlarges:
             return self._detector.detect(frame.base_bgr)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 
-from hvt_common.runtime.clock import SteadyClock
 from hvt_common.values import Frame
 
 __all__ = ["realtime_admits"]
@@ -12,7 +12,7 @@ __all__ = ["realtime_admits"]
 _SECOND_NS = 1_000_000_000
 
 
-def realtime_admits(frame: Frame, *, clock: SteadyClock, fps: float, stop: threading.Event) -> bool:
+def realtime_admits(frame: Frame, *, clock: Callable[[], int], fps: float, stop: threading.Event) -> bool:
     """Wait until the frame of a recorded clip is due; False where it is so late that the next is due already."""
     early_ns = frame.capture_ns - clock()
     if early_ns > 0:

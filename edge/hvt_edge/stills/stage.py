@@ -10,7 +10,7 @@ from hvt_common.runtime.distinct import DistinctIds
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser
@@ -33,7 +33,7 @@ class StillStage:
         outbox: Outbox,
         sender: StillSender,
         transmitter: Transmitter,
-        keyframes: KeyframePlan,
+        keyframes: KeyframeRequests,
         reporter: TrackReporter | None = None,
     ) -> None:
         self._analyzer = analyzer
@@ -76,10 +76,20 @@ class StillStage:
         """Mean time to decode, detect and track, over all frames."""
         return self._perception_ns / max(1, self._steps) / 1e6
 
-    def analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool = False) -> AnalyzedFrame:
-        """Decode, detect and track one frame; ``unit`` is None for one that is not part of the base stream."""
+    def analyze(
+        self,
+        frame: Frame,
+        unit: AccessUnit | None,
+        skipped: Sequence[AccessUnit] = (),
+        *,
+        hurry: bool = False,
+    ) -> AnalyzedFrame:
+        """Decode, detect and track one frame; ``unit`` is None for one that is not part of the base stream.
+
+        ``skipped`` are units before it, of frames that were not analyzed.
+        """
         began_ns = time.perf_counter_ns()
-        analyzed = self._analyzer.see(frame, unit, hurry=hurry)
+        analyzed = self._analyzer.analyze(frame, unit, skipped=skipped, hurry=hurry)
         self._perception_ns += time.perf_counter_ns() - began_ns
         self._steps += 1
         self._track_ids.add(analyzed.tracks.ids.tolist())
@@ -94,6 +104,8 @@ class StillStage:
         self._latest_tracks = analyzed.tracks
         if self._reporter is not None and analyzed.detected:
             self._reporter.report(analyzed, now_ns=now_ns)
+        if most_bytes := self._transmitter.most_still_bytes():
+            self._chooser.set_most_bytes(most_bytes)
         # What is requested waits until the link is free, which right behind a base frame it never is.
         allowance_bytes = self._transmitter.still_allowance_bytes(now_ns, paced=False)
         self._chooser.consider(analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes)

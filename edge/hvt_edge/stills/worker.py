@@ -29,8 +29,8 @@ _RETRY_S = 0.025
 class StillWorker:
     """Runs a `StillStage` in a thread of its own.
 
-    The queue is bounded in frames and in bytes; where it is `full` the frame loop drops the next frame before
-    encoding. Before each frame the thread takes ``results()``, what grounds have reported of stills. An error in it
+    The queue is bounded in frames and in bytes; where it is `full` the frame loop goes on without
+    analysis. Before each frame the thread takes ``results()``, what grounds have reported of stills. An error in it
     ends the process: `full`, `offer` and `close` raise it.
     """
 
@@ -46,7 +46,9 @@ class StillWorker:
         self._stage = stage
         self._results = results
         self._clock = clock
-        self._frames: queue.Queue[tuple[Frame, AccessUnit | None] | None] = queue.Queue(length)
+        self._frames: queue.Queue[tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None] = queue.Queue(
+            length
+        )
         self._most_frames = length
         self._max_bytes = max_bytes
         self._error: BaseException | None = None
@@ -65,13 +67,13 @@ class StillWorker:
         self._raise_error()  # a dead thread leaves a full queue, and `offer` is not called any more
         return self._frames.qsize() >= self._most_frames
 
-    def offer(self, frame: Frame, unit: AccessUnit | None) -> None:
-        """Hand over one frame, in order, with its access unit if it has one."""
+    def offer(self, frame: Frame, unit: AccessUnit | None, skipped: Sequence[AccessUnit] = ()) -> None:
+        """Hand over one frame, in order, with its access unit if it has one, and those skipped before it."""
         self._raise_error()
         # All frames of a source have one size, so a bound in bytes is a bound in frames.
         fitting = self._max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
         self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
-        self._frames.put((frame, unit))
+        self._frames.put((frame, unit, skipped))
 
     def close(self) -> None:
         """Let the thread finish what it has, at most for a second, then leave the rest; join it."""
@@ -102,7 +104,7 @@ class StillWorker:
         except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
             self._error = error
 
-    def _next(self) -> tuple[Frame, AccessUnit | None] | None:
+    def _next(self) -> tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None:
         """Return the next frame; until it comes what is pending is tried again.
 
         Right behind a base frame the link is busy: with few frames a second there would be no other moment.

@@ -1,21 +1,22 @@
-"""Which ticks of the source are coded: each n-th, and with ``--fps auto`` an n that follows from what was measured.
+"""Which source frames are coded: each n-th, and with ``--fps auto`` an n that follows from what was measured.
 
 Fewer frames get more bits each. How many are best depends on how hard the scene is to code, which shows in the
-quantiser that x265 needs at the given rate: `MeasuredFrameSkip` keeps it in a band (see base_model). The rate changes
-at keyframes only, because the encoder is opened anew for it, and not more often than once in ``rest_ticks``.
+quantiser that x265 needs at the given rate: `MeasuredFrameSkip` holds it in a band (see rate_model). The rate changes
+at keyframes only, because the encoder is opened anew for it, and not more often than once in ``rest_frames``.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from hvt_edge.video.rate_model import better_decimation
 
-__all__ = ["FrameSkip", "MeasuredFrameSkip"]
+__all__ = ["FrameSkip", "LimitedFrameSkip", "MeasuredFrameSkip"]
 
 
 class FrameSkip:
-    """Each ``decimation``-th tick. Where one was missed, the next tick is coded in its place."""
+    """Each ``decimation``-th source frame. Where one was missed, the next is coded in its place."""
 
     def __init__(self, decimation: int = 1) -> None:
         assert decimation >= 1
@@ -23,21 +24,21 @@ class FrameSkip:
         """Changed by `at_keyframe` only."""
         self._next: int | None = None
 
-    def codes(self, tick: int) -> bool:
-        """Tell whether this tick is to be coded; ticks rise."""
-        return self._next is None or tick >= self._next
+    def codes(self, index: int) -> bool:
+        """Tell whether this source frame is to be coded; indices rise."""
+        return self._next is None or index >= self._next
 
-    def coded(self, tick: int, *, keyframe: bool, mean_qp: float) -> None:
-        """This tick was coded. After a keyframe, which may come at any tick, the count starts anew."""
+    def coded(self, index: int, *, keyframe: bool, mean_qp: float) -> None:
+        """This frame was coded. After a keyframe, which may come at any index, the count starts anew."""
         del mean_qp
         if self._next is None or keyframe:
-            self._next = tick + self.decimation
+            self._next = index + self.decimation
         else:
-            self._next += self.decimation * max(1, math.ceil((tick + 1 - self._next) / self.decimation))
+            self._next += self.decimation * max(1, math.ceil((index + 1 - self._next) / self.decimation))
 
-    def at_keyframe(self, tick: int) -> int:
-        """Decide on ``decimation`` from this tick on, which will be a keyframe."""
-        del tick
+    def at_keyframe(self, index: int) -> int:
+        """Decide on ``decimation`` from this frame on, which will be a keyframe."""
+        del index
         return self.decimation
 
 
@@ -47,29 +48,49 @@ class MeasuredFrameSkip(FrameSkip):
     Depends on the coded frames alone, so that in lockstep the same input gives the same bytes.
     """
 
-    def __init__(self, decimation: int = 1, *, most_decimation: int, rest_ticks: int) -> None:
+    def __init__(self, decimation: int = 1, *, most_decimation: int, rest_frames: int) -> None:
         super().__init__(decimation)
         self._most_decimation = most_decimation
-        self._rest_ticks = rest_ticks
-        self._decided_tick: int | None = None
+        self._rest_frames = rest_frames
+        self._decided_index: int | None = None
         self._qp_sum = 0.0
         self._frames = 0
 
-    def coded(self, tick: int, *, keyframe: bool, mean_qp: float) -> None:
+    def coded(self, index: int, *, keyframe: bool, mean_qp: float) -> None:
         """See `FrameSkip`. Keyframes are coarser by nature and tell nothing."""
-        super().coded(tick, keyframe=keyframe, mean_qp=mean_qp)
-        if self._decided_tick is None:
-            self._decided_tick = tick
+        super().coded(index, keyframe=keyframe, mean_qp=mean_qp)
+        if self._decided_index is None:
+            self._decided_index = index
         if not keyframe and math.isfinite(mean_qp):
             self._qp_sum += mean_qp
             self._frames += 1
 
-    def at_keyframe(self, tick: int) -> int:
+    def at_keyframe(self, index: int) -> int:
         """See `FrameSkip`."""
-        if self._decided_tick is None or tick - self._decided_tick < self._rest_ticks or not self._frames:
+        decided = self._decided_index
+        if decided is None or index - decided < self._rest_frames or not self._frames:
             return self.decimation
         self.decimation = better_decimation(
             self.decimation, mean_qp=self._qp_sum / self._frames, most_decimation=self._most_decimation
         )
-        self._decided_tick, self._qp_sum, self._frames = tick, 0.0, 0
+        self._decided_index, self._qp_sum, self._frames = index, 0.0, 0
+        return self.decimation
+
+
+class LimitedFrameSkip(FrameSkip):
+    """Another choice, with no more frames than ``least_decimation()`` allows at the time of a keyframe."""
+
+    def __init__(self, preferred: FrameSkip, least_decimation: Callable[[], int]) -> None:
+        super().__init__(preferred.decimation)
+        self._preferred = preferred
+        self._least_decimation = least_decimation
+
+    def coded(self, index: int, *, keyframe: bool, mean_qp: float) -> None:
+        """See `FrameSkip`."""
+        super().coded(index, keyframe=keyframe, mean_qp=mean_qp)
+        self._preferred.coded(index, keyframe=keyframe, mean_qp=mean_qp)
+
+    def at_keyframe(self, index: int) -> int:
+        """See `FrameSkip`."""
+        self.decimation = max(self._preferred.at_keyframe(index), self._least_decimation())
         return self.decimation

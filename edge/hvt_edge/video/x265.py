@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -33,50 +32,14 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit, Frame
 from hvt_common.video.hevc import UNBIASED
+from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.regions import Region, RegionTagger
 
-__all__ = ["PRESETS", "VBV_S", "BaseEncoder", "EncoderSettings", "keyframe_floor_bytes", "minimum_bps"]
+__all__ = ["BaseEncoder", "EncoderSettings"]
 
-PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
-VBV_S = 0.15
-"""Depth of the VBV buffer in seconds of the base rate."""
-
-# At QP 51 a keyframe of textured pictures of 320x180, 640x360, 960x540 and 1280x720 takes 3.0, 3.9, 4.9 and 5.9 kB:
-# about 2060 bytes and 4 for each pixel of the square root of the area. x265 can go no lower, whatever the target is.
-# The frames after it follow a target down to some 300 bits and 0.0045 bit a pixel each: 67 kbps at 1280x720 and
-# 15 fps.
-_KEYFRAME_FLOOR_BYTES = 2060
-_KEYFRAME_FLOOR_BYTES_PER_SIDE_PX = 4.0
-_FRAME_FLOOR_BITS = 300
-_FRAME_FLOOR_BITS_PER_PX = 0.0045
 _QP_TO_LAMBDA = 118
 _WITHOUT_AQ = ("ultrafast", "superfast")
 """Presets without adaptive quantisation, where x265 ignores regions: a trace of it makes them count."""
-
-
-def keyframe_floor_bytes(size: tuple[int, int]) -> int:
-    """The least that a keyframe of a textured picture of ``size`` (width, height) takes."""
-    return round(_KEYFRAME_FLOOR_BYTES + _KEYFRAME_FLOOR_BYTES_PER_SIDE_PX * math.sqrt(size[0] * size[1]))
-
-
-def minimum_bps(size: tuple[int, int], fps: float) -> int:
-    """The lowest payload rate that x265 can follow at this size and frame rate, keyframes apart."""
-    return round(fps * (_FRAME_FLOOR_BITS + size[0] * size[1] * _FRAME_FLOOR_BITS_PER_PX))
-
-
-@dataclass(frozen=True, slots=True)
-class EncoderSettings:
-    """What x265 is asked for; ``bitrate_bps`` is the payload alone, without headers of any transport."""
-
-    size: tuple[int, int]
-    fps: float
-    bitrate_bps: int
-    preset: str = "veryfast"
-    vbv_s: float = VBV_S
-    threads: int = 1
-    """Worker threads; more than one is faster, and not the same bytes each run."""
-    side_data: bool = False
-    """Whether `BaseEncoder.encode` takes regions."""
 
 
 class BaseEncoder:

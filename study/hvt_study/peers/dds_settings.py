@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from hvt_common.errors import UserError
-from hvt_edge.video.x265 import PRESETS
+from hvt_edge.video.encoder_settings import PRESETS
 from hvt_study.compare_clip import NOMINAL_FPS
 
 __all__ = ["RATES", "DdsSettings"]

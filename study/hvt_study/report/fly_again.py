@@ -23,7 +23,7 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.still_codecs import psnr_y_db
 from hvt_ground.events.events import Event, Refinement
 from hvt_study.compare_clip import NOMINAL_FPS, Clip
-from hvt_study.flight import FlightPlan, FlightReport, _Edge
+from hvt_study.flight import Flight, FlightPlan, FlightReport
 from hvt_study.flight_ground import GroundSide, SharedModels
 from hvt_study.matrix.flights import flight_plan
 from hvt_study.matrix.plan import StudyPlan
@@ -33,7 +33,7 @@ from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.contract import NO_ID
 from hvt_study.metrics.seen import ObservedFrame, refined_objects, refined_ticks
 from hvt_study.report.examples import CropExample, Example, Lane, Timeline, Word, percentile_rows
-from hvt_study.serial_link import Arrival, SerialLink
+from hvt_study.serial_link import Arrival
 
 __all__ = ["example_of", "fly_again"]
 
@@ -63,14 +63,15 @@ def example_of(flight: FlightPlan, shop: RunContext, *, key: str, rule: str, tit
     Raises:
         UserError: the edge refuses its settings.
     """
-    edge = _WatchedEdge(
-        flight, detector=shop.edge_detector, models=SharedModels(shop.detector, shop.classifier)
+    models = SharedModels(shop.detector, shop.classifier)
+    again = Flight(
+        flight,
+        detector=shop.edge_detector,
+        make_ground=lambda info, link: _WatchedGround(info, config=flight.ground, models=models, link=link),
     )
-    edge.run()
-    ground = edge.ground
-    assert isinstance(ground, _WatchedGround), "the edge made it"
-    ground.close()
-    report = edge.report(saved_cpu_s=0.0)
+    again.run()
+    ground = again.ground
+    report = again.report(saved_cpu_s=0.0)
     crops = list(_compared(ground.shown, flight.clip, view=ground.view))
     rows = percentile_rows([crop.gain_db for crop in crops])
     return Example(
@@ -82,14 +83,6 @@ def example_of(flight: FlightPlan, shop: RunContext, *, key: str, rule: str, tit
         crops=tuple(replace(crops[index], percentile=percentile) for percentile, index in rows),
         timeline=_timeline(report, ground, shop, budget_bps=flight.link_bps),
     )
-
-
-class _WatchedEdge(_Edge):
-    """The same flight, with a ground that keeps more."""
-
-    def _make_ground(self, info: Info, link: SerialLink[Received]) -> GroundSide:
-        assert self._models is not None, "it sees"
-        return _WatchedGround(info, config=self._plan.ground, models=self._models, link=link)
 
 
 @dataclass(frozen=True, slots=True)

@@ -147,7 +147,7 @@ def test_nobody_keeps_where_nothing_is_to_be_kept(tmp_path, settings):
         session_id=1,
         live=True,
         has_subscriber=lambda: True,
-        sender=rig.sender,
+        transmitter=rig.sender,
         in_flight=rig.in_flight,
         outbox=rig.outbox,
         keyframes=rig.keyframes,

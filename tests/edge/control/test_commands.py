@@ -174,14 +174,14 @@ def test_another_budget_counts_from_a_keyframe_that_comes_at_once():
     """An operator whose link got thin could not say so, or would wait ten seconds for it."""
     rig = Rig("800kbps")
     rig.run(20)
-    rig.keyframes.done(rig.now_ns)  # so fresh that a request for a picture would be answered by it
+    rig.plan.done(rig.now_ns)  # so fresh that a request for a picture would be answered by it
     assert rig.ask("set-budget", bps=500_000).accepted
     assert rig.keyframes.due(rig.now_ns)
     encoder = rig.reconfiguration(1, rig.now_ns)
     assert encoder is not None
-    assert rig.reconfiguration.base_bps == 375_000
+    assert rig.operating.now.base_bps == 375_000
     assert rig.budget.base_step_bytes == 375_000 / 8 / 15
-    assert rig.commands.config.budget_bps == 500_000
+    assert rig.operating.now.budget_bps == 500_000
     assert rig.reconfiguration(1, rig.now_ns) is None, "once"
 
 
@@ -190,7 +190,7 @@ def test_a_budget_that_x265_cannot_follow_is_refused_and_changes_nothing():
     rig = Rig("800kbps")
     answer = rig.ask("set-budget", bps=20_000)
     assert "20 kbps would leave 15 kbps for video, and 640x360 at 15 fps takes at least" in answer.reason
-    assert rig.commands.config.budget_bps == 800_000
+    assert rig.operating.now.budget_bps == 800_000
     assert rig.reconfiguration(1, rig.now_ns) is None
     assert not rig.ask("set-budget", bps=0).accepted
     assert not rig.ask("set-budget", bps=10**12).accepted
@@ -211,9 +211,9 @@ def test_another_method_decides_from_then_on():
     rig = Rig(name="M0", share=None)
     rig.run(5)
     assert rig.ask("set-method", method="m1").accepted
-    assert rig.commands.config.method == "M1"
+    assert rig.operating.now.method == "M1"
     rig.reconfiguration(1, rig.now_ns)
-    assert rig.reconfiguration.base_bps == 0.8125 * 400_000, "stills have their share again"
+    assert rig.operating.now.base_bps == 0.8125 * 400_000, "stills have their share again"
     rig.run(60, others=True)
     assert rig.out.stills
     rig.request_ns += 2_000_000_000
@@ -223,7 +223,7 @@ def test_another_method_decides_from_then_on():
     assert len(rig.out.stills) <= sent + 1
     for name in ("M99", "R0"):
         assert not rig.ask("set-method", method=name).accepted
-    assert rig.commands.config.method == "M0"
+    assert rig.operating.now.method == "M0"
 
 
 def test_requests_of_another_session_and_floods_are_refused():

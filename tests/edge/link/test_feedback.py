@@ -6,7 +6,7 @@ import threading
 
 from hvt_common.protocol.messages import Feedback, StillResult
 from hvt_edge.link.feedback import FeedbackInbox
-from messages import feedback
+from messages import counted, feedback
 
 U32 = 2**32 - 1
 
@@ -41,42 +41,48 @@ def test_results_are_taken_once_as_they_come():
     """A class would count twice for M3 and M5, or never."""
     inbox = FeedbackInbox()
     assert inbox.received_ns is None
-    inbox.receive(report(result(1), result(0)), now_ns=5)
-    inbox.receive(report(result(1, name="bus"), receiver=2), now_ns=6)  # another ground says it too
+    inbox.on_report(counted(report(result(1), result(0)), now_ns=5))
+    inbox.on_report(
+        counted(report(result(1, name="bus"), receiver=2), now_ns=6)
+    )  # another ground says it too
     assert [one.still_sequence for one in inbox.take()] == [1, 0]
     assert inbox.take() == []
     assert inbox.received_ns == 6
-    inbox.receive(report(result(1)), now_ns=7)
+    inbox.on_report(counted(report(result(1)), now_ns=7))
     assert inbox.take() == []
 
 
 def test_lockstep_takes_exactly_the_stills_it_waited_for_in_their_order():
     """What a ground says early would count early in one run and late in the next: other stills each time."""
     inbox = FeedbackInbox()
-    inbox.receive(report(result(3), result(1), result(2), frame=4), now_ns=1)
+    inbox.on_report(counted(report(result(3), result(1), result(2), frame=4), now_ns=1))
     assert inbox.wait_for(frame_index=4, stills={1, 2}, timeout_s=0)
     assert [one.still_sequence for one in inbox.take_up_to(2)] == [1, 2]
     assert inbox.wait_for(frame_index=4, stills={3}, timeout_s=0)
     assert [one.still_sequence for one in inbox.take_up_to(3)] == [3]
-    inbox.receive(report(result(2, name="bus"), result(3), result(4)), now_ns=2)  # a second ground, later
+    inbox.on_report(
+        counted(report(result(2, name="bus"), result(3), result(4)), now_ns=2)
+    )  # a second ground, later
     assert [one.still_sequence for one in inbox.take_up_to(10)] == [4]
 
 
 def test_a_shared_still_has_an_answer_for_each_of_its_tracks():
     """Of neighbours in one still only one would ever get a class."""
     inbox = FeedbackInbox()
-    inbox.receive(report(result(0, track=5), result(0, track=3), result(0, track=5, name="bus")), now_ns=1)
+    inbox.on_report(
+        counted(report(result(0, track=5), result(0, track=3), result(0, track=5, name="bus")), now_ns=1)
+    )
     assert [(one.track_id, one.class_name) for one in inbox.take_up_to(0)] == [(3, "car"), (5, "car")]
 
 
 def test_a_request_for_a_still_is_heard_beside_the_opinion_of_another_ground():
     """Of two grounds the one that missed a picture would never see the object."""
     inbox = FeedbackInbox()
-    inbox.receive(report(result(4)), now_ns=1)
+    inbox.on_report(counted(report(result(4)), now_ns=1))
     for _ in range(2):
-        inbox.receive(report(result(4, name="", again=True), receiver=2), now_ns=2)
+        inbox.on_report(counted(report(result(4, name="", again=True), receiver=2), now_ns=2))
     assert [one.again for one in inbox.take()] == [False, True]
-    inbox.receive(report(result(5, name="", again=True)), now_ns=3)
+    inbox.on_report(counted(report(result(5, name="", again=True)), now_ns=3))
     assert inbox.wait_for(frame_index=-1, stills={5}, timeout_s=0), "it is an answer too"
 
 
@@ -84,10 +90,10 @@ def test_waiting_ends_when_frame_and_stills_are_there_or_the_time_is_up():
     """A lockstep edge would run ahead of its ground, or wait for ever for one that is gone."""
     inbox = FeedbackInbox()
     assert not inbox.wait_for(frame_index=0, stills=set(), timeout_s=0.01)
-    inbox.receive(report(frame=3), now_ns=1)
+    inbox.on_report(counted(report(frame=3), now_ns=1))
     assert inbox.wait_for(frame_index=3, stills=set(), timeout_s=0)
     assert not inbox.wait_for(frame_index=3, stills={0}, timeout_s=0.01)
-    later = threading.Timer(0.05, lambda: inbox.receive(report(result(0), frame=4), now_ns=2))
+    later = threading.Timer(0.05, lambda: inbox.on_report(counted(report(result(0), frame=4), now_ns=2)))
     later.start()
     assert inbox.wait_for(frame_index=4, stills={0}, timeout_s=10)
     later.join()
@@ -96,18 +102,18 @@ def test_waiting_ends_when_frame_and_stills_are_there_or_the_time_is_up():
 def test_the_goodbye_waits_for_all_messages():
     """The last pictures and stills would be lost with the session."""
     inbox = FeedbackInbox()
-    inbox.receive(report(base=10, roi=2), now_ns=1)
+    inbox.on_report(counted(report(base=10, roi=2), now_ns=1))
     assert inbox.wait_for_end(base=10, roi=2, frame_index=10**6, still_sequence=-1, timeout_s=0)
     assert not inbox.wait_for_end(base=11, roi=2, frame_index=10**6, still_sequence=-1, timeout_s=0.01)
     assert not inbox.wait_for_end(base=10, roi=3, frame_index=10**6, still_sequence=-1, timeout_s=0.01)
-    inbox.receive(report(base=3, roi=3), now_ns=2)  # an older report, or another ground's
+    inbox.on_report(counted(report(base=3, roi=3), now_ns=2))  # an older report, or another ground's
     assert inbox.wait_for_end(base=10, roi=3, frame_index=10**6, still_sequence=-1, timeout_s=0)
 
 
 def test_the_goodbye_to_a_ground_that_joined_late_is_short():
     """It never gets the first messages; Ctrl-C must not wait for them."""
     inbox = FeedbackInbox()
-    inbox.receive(report(result(7), base=10, roi=1, frame=90), now_ns=1)
+    inbox.on_report(counted(report(result(7), base=10, roi=1, frame=90), now_ns=1))
     assert inbox.wait_for_end(base=90, roi=8, frame_index=90, still_sequence=7, timeout_s=0)
     assert not inbox.wait_for_end(base=90, roi=9, frame_index=90, still_sequence=8, timeout_s=0.01)
     assert not inbox.wait_for_end(base=90, roi=8, frame_index=91, still_sequence=7, timeout_s=0.01)
@@ -118,9 +124,9 @@ def test_hostile_reports_take_no_memory_and_do_not_hide_true_ones():
     inbox = FeedbackInbox()
     for number in range(0, 100_000, 32):
         never_asked = tuple(result(U32 - number - one) for one in range(32))
-        inbox.receive(report(*never_asked, frame=U32, base=2**53 - 1), now_ns=1)
+        inbox.on_report(counted(report(*never_asked, frame=U32, base=2**53 - 1), now_ns=1))
     assert max(len(inbox._answered), len(inbox._known)) <= 2048
-    inbox.receive(report(result(5)), now_ns=2)
+    inbox.on_report(counted(report(result(5)), now_ns=2))
     assert inbox.wait_for(frame_index=9, stills={5}, timeout_s=0)
     assert [one.still_sequence for one in inbox.take_up_to(5)] == [5]
     taken = inbox.take()

@@ -24,9 +24,9 @@ from hvt_edge.link.rate_control import (
     RateSettings,
     ReconfigurationTrigger,
 )
-from hvt_edge.video.frame_skip import FrameSkip
-from hvt_edge.video.reconfigure import LimitedFrameSkip
-from messages import feedback
+from hvt_edge.link.receivers import PrimaryReceiver
+from hvt_edge.video.frame_skip import FrameSkip, LimitedFrameSkip
+from messages import counted, feedback
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -66,6 +66,7 @@ class World:
     def __post_init__(self) -> None:
         self.controller = RateController(RateSettings(ceiling_bps=self.ceiling_bps, floor_bps=self.floor_bps))
         self.pacer = Pacer(self.controller)
+        self.primary = PrimaryReceiver()
         self.trigger = ReconfigurationTrigger()
         self.base_bps = self.share * self.ceiling_bps
         self.random = random.Random(self.seed)
@@ -109,13 +110,18 @@ class World:
 
     def _step(self) -> None:
         while self.reports and self.reports[0][0] <= self.now_ns:
-            self.pacer.hear(self.reports.pop(0)[1], now_ns=self.now_ns)
+            self.take(self.reports.pop(0)[1])
         if self.now_ns >= self.next_frame_ns:
             self.next_frame_ns += round(S / FPS)
             self._frame()
         self._carry()
         self._report()
         self.rates.append((self.t, self.pacer.rate_bps))
+
+    def take(self, said: Feedback) -> None:
+        """A report arrives."""
+        sent = (self.sequence, self.still_sequence)
+        self.pacer.on_report(self.primary.judge(said, sent=sent, now_ns=self.now_ns))
 
     def _frame(self) -> None:
         rate = self.pacer.rate_bps
@@ -363,9 +369,7 @@ def test_reports_of_others_do_not_steer():
     """Anybody who may send feedback would slow the edge down, or make it flood its link."""
     world = World(steps((0, 1e6))).run(5)
     for number in range(200):
-        world.pacer.hear(
-            report(number, receiver=2, base=world.sequence, send_ns=number * 10**15), now_ns=world.now_ns
-        )
+        world.take(report(number, receiver=2, base=world.sequence, send_ns=number * 10**15))
     assert world.pacer.ignored == 200
     assert min(world.run(10).rate_between(0, 15)) == 800_000
 
@@ -393,13 +397,11 @@ def test_absurd_reports_keep_the_rate_within_its_bounds(reports):
     for number, (receiver, sequence, base, still, send_ns, held_us, lost, pause_ns) in enumerate(reports):
         now_ns += pause_ns
         pacer.sent_base(number, 5_000, now_ns=now_ns)
-        pacer.hear(
-            report(
-                sequence, receiver=receiver, base=base % (number + 3) - 1, still=still, send_ns=send_ns,
-                held_us=held_us, lost=lost,
-            ),
-            now_ns=now_ns,
+        said = report(
+            sequence, receiver=receiver, base=base % (number + 3) - 1, still=still, send_ns=send_ns,
+            held_us=held_us, lost=lost,
         )  # fmt: skip
+        pacer.on_report(counted(said, now_ns=now_ns, first=receiver == 0))
         pacer.admits_still(now_ns)
         pacer.admits_base(now_ns)
         assert 100_000 <= pacer.rate_bps <= 800_000
@@ -458,7 +460,7 @@ def test_the_start_waits_for_the_first_report():
             pacer.sent_base(len(admitted) - 1, 5_000, now_ns=now_ns, keyframe=number == 2)
     # 0.5 s from the keyframe on, and after the wait who never reports is served all the same.
     assert admitted == [*range(10), *range(40, 75)]
-    pacer.hear(report(0, base=10), now_ns=5 * S)
+    pacer.on_report(counted(report(0, base=10), now_ns=5 * S, first=True))
     assert pacer.ignored == 0
 
 

@@ -16,14 +16,11 @@ from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import MAX_ALSO, BaseHeader, Flags, Health, RoiHeader, Status
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES, STATUS_BYTES, base_overhead_bps
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
-from hvt_edge.link.transmitter import (
-    BASE_ATTACHMENT_BYTES,
-    STATUS_BYTES,
-    Transmitter,
-    base_overhead_bps,
-)
+from hvt_edge.link.receivers import PrimaryReceiver
+from hvt_edge.link.transmitter import Transmitter
 from messages import feedback
 
 SECOND_NS = 1_000_000_000
@@ -430,7 +427,8 @@ def test_a_second_copy_does_not_confuse_the_pacer():
         rig.sender.still(envelope, now_ns=NOW_NS + number * 66_000_000)
     rig.sender.still(envelopes[0], now_ns=NOW_NS + 1_300_000_000, copy=True)
     report = feedback(sequence=0, send_ns=NOW_NS, base_sequence=2, still_sequence=2)
-    pacer.hear(report, now_ns=NOW_NS + 1_400_000_000)
+    sent = (rig.sender.base_sequence, rig.sender.still_sequence)
+    pacer.on_report(PrimaryReceiver().judge(report, sent=sent, now_ns=NOW_NS + 1_400_000_000))
     assert pacer.ignored == 0
     assert 0 < pacer.round_trip_ns < 1_400_000_000
 

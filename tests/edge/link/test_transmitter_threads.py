@@ -1,8 +1,9 @@
-"""The frame loop, the stills and what was kept send at one time: the budget holds whoever comes first."""
+"""The frame loop, the stills and the backlog send at one time: the budget holds whoever comes first."""
 
 from __future__ import annotations
 
 import random
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
@@ -45,11 +46,11 @@ class Rig:
         self.sender.still(self.sender.envelope(still), now_ns=now_ns)
 
     def backlog(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:
-        """A piece of so many bytes."""
+        """A chunk of so many bytes."""
         return self.sender.backlog(Chunk(7, BacklogKind.BASE, 0, offset, 10**6, bytes(size)), now_ns=now_ns)
 
 
-def test_a_piece_that_lost_its_room_to_a_still_is_not_sent():
+def test_a_chunk_that_lost_its_room_to_a_still_is_not_sent():
     """105000 bytes would go into a window of 100000."""
     rig = Rig()
     for number in range(7):
@@ -64,7 +65,7 @@ def test_a_piece_that_lost_its_room_to_a_still_is_not_sent():
 
 
 def test_a_still_that_lost_its_room_waits_until_there_is_some():
-    """A still and a piece that were both admitted would exceed the window together."""
+    """A still and a chunk that were both admitted would exceed the window together."""
     rig = Rig()
     assert rig.backlog(40_000)
     room = rig.sender.still_allowance_bytes(NOW_NS)
@@ -86,8 +87,31 @@ def test_a_still_that_has_its_room_goes_at_once():
     assert rig.waits == [NOW_NS]
 
 
+def test_a_still_whose_put_blocks_holds_up_no_base_frame():
+    """One still into a full link would freeze the picture for as long as the link stays full."""
+    rig, blocked, entered = Rig(), threading.Event(), threading.Event()
+
+    def block(channel: Channel) -> None:
+        if channel is Channel.ROI:
+            entered.set()
+            assert blocked.wait(60)
+
+    rig.out.before_put = block
+    thread = threading.Thread(target=rig.still, args=[0, 5_000])
+    thread.start()
+    assert entered.wait(60)
+    for index in range(30):  # two seconds of video
+        at_ns = NOW_NS + index * S // 15
+        rig.sender.base(AccessUnit(index, at_ns, bytes(1_500), False), now_ns=at_ns)
+        assert rig.waits[-1] == at_ns, "it does not wait for the budget either"
+    assert thread.is_alive(), "the still is blocked all the while"
+    blocked.set()
+    thread.join()
+    assert [channel for channel, _, _ in rig.out.puts] == [Channel.BASE] * 30 + [Channel.ROI]
+
+
 class Clock:
-    """One for all, in ticks of a hundredth of a second."""
+    """One for all, in steps of a hundredth of a second."""
 
     def __init__(self) -> None:
         self.now_ns = NOW_NS
@@ -119,8 +143,8 @@ def stills(rig: Rig, clock: Clock) -> Iterator[None]:
         yield
 
 
-def kept(rig: Rig, clock: Clock) -> Iterator[None]:
-    """What was kept."""
+def stored(rig: Rig, clock: Clock) -> Iterator[None]:
+    """The backlog."""
     offset = 0
     while True:
         at_ns = clock()
@@ -135,7 +159,7 @@ def kept(rig: Rig, clock: Clock) -> Iterator[None]:
 def test_three_threads_keep_to_one_budget_in_whatever_order_they_run(seed):
     """The hard limit would be hard for one thread only: 105000 bytes in a window of 100000."""
     rig, clock, chance = Rig(), Clock(), random.Random(seed)
-    threads = [one(rig, clock) for one in (frames, stills, kept)]
+    threads = [one(rig, clock) for one in (frames, stills, stored)]
     for _ in range(1_000):
         clock.now_ns += S // 100
         for _ in range(chance.randrange(1, 8)):
@@ -145,8 +169,8 @@ def test_three_threads_keep_to_one_budget_in_whatever_order_they_run(seed):
     assert rig.ledger.worst_window_bps.total <= TOTAL
 
 
-def test_room_for_what_was_kept_leaves_what_base_and_stills_will_want():
-    """A piece would take the room of the next frame, or of a still that comes."""
+def test_room_for_the_backlog_leaves_what_base_and_stills_will_want():
+    """A chunk would take the room of the next frame, or of a still that comes."""
     budget = RollingBudget(BudgetSettings(TOTAL, 400_000, fps=15))
     assert budget.backlog_allowance(NOW_NS, reserve=0.0) == 100_000, (
         "no base frame is expected where none goes out"

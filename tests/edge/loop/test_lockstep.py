@@ -15,11 +15,13 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.operating.point import LoopClock
+from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.stage import BaseStage
-from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
-from messages import feedback
+from hvt_edge.video.x265 import BaseEncoder
+from messages import counted, feedback
 
 SIZE = (320, 192)
 
@@ -44,11 +46,11 @@ class Ground:
             last_frame_index=self.frames[-1],
             base_messages=len(self.frames),
         )
-        self.inbox.receive(report, now_ns=1)
+        self.inbox.on_report(counted(report, now_ns=1))
 
 
 class Stills:
-    """Keeps what it was shown; sends nothing."""
+    """Notes what it was given; sends nothing."""
 
     def __init__(self) -> None:
         self.seen: list[tuple[int, int | None]] = []
@@ -70,11 +72,11 @@ class Stills:
 @pytest.mark.timeout(60)
 def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
     """With ``--fps auto`` a run in lockstep would stand still for 20 s at the first frame that was never sent."""
-    ground, stills, counts, keyframes = Ground(), Stills(), FrameCounts(), KeyframePlan()
+    ground, stills, counts, keyframes = Ground(), Stills(), FrameCounts(), KeyframeRequests()
     stage = BaseStage(
         BaseEncoder(EncoderSettings(size=SIZE, fps=5.0, bitrate_bps=100_000, preset="ultrafast")),
         keyframes=keyframes,
-        sender=Transmitter(
+        transmitter=Transmitter(
             ground,
             ledger=Ledger(),
             budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=5)),
@@ -87,21 +89,21 @@ def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
         first_keyframe_bytes=5000,
         frame_skip=FrameSkip(3),
     )
+    clock = LoopClock(lambda: 0, lockstep=True)
     with LockstepPace(
         stage,
         stills,
         inbox=ground.inbox,
         keyframes=keyframes,
+        clock=clock,
         fps=15,
         counts=counts,
-        heard=lambda: True,
+        has_ground=lambda: True,
         stop=threading.Event(),
     ) as pace:
         for frame in framed(smooth_pictures(50, size=SIZE)):
             pace.step(frame)
-            assert pace._follows
+            assert clock() == frame.capture_ns, "media time"
     assert ground.frames == list(range(0, 50, 3))
     assert stills.seen == [(index, None if index % 3 else index) for index in range(50)]
-    assert pace._follows, "the ground was never given up"
-    assert not pace._in_flight
     assert counts.encoded == 17

@@ -19,11 +19,12 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Frame, View
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills import worker as still_worker
 from hvt_edge.stills.worker import StillWorker
+from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from still_stage import make_still_stage
 
@@ -44,16 +45,16 @@ UNITS = [
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 
 
-def analyzer(*, detector=None, view: View = VIEW, **settings) -> Analyzer:
-    """The edge's eyes."""
+def make(*, detector=None, view: View = VIEW, **settings) -> Analyzer:
+    """The edge's analyzer."""
     tracker = ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15)
     return Analyzer(detector or RedSquares(), tracker, view=view, settings=AnalyzerSettings(**settings))
 
 
 def test_every_frame_is_decoded_and_each_nth_is_searched():
     """Candidates would be of other frames than the stills, or the processor would melt."""
-    eyes = analyzer(detect_every=5)
-    seen = [eyes.see(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
+    analyzer = make(detect_every=5)
+    seen = [analyzer.analyze(frame, unit) for frame, unit in zip(FRAMES, UNITS, strict=True)]
     assert [one.frame.index for one in seen if one.detected] == [0, 5, 10, 15, 20, 25]
     for one in seen[10:]:
         assert one.tracks.frame_index == one.frame.index
@@ -65,10 +66,11 @@ def test_every_frame_is_decoded_and_each_nth_is_searched():
 
 def test_in_a_hurry_detection_is_put_off_and_made_up_for():
     """A slow detector would fall behind more and more; or a busy second would leave it blind for another."""
-    eyes = analyzer(detect_every=5)
+    analyzer = make(detect_every=5)
     hurried = {5, 6, 7, 15}
     seen = [
-        eyes.see(frame, unit, hurry=frame.index in hurried) for frame, unit in zip(FRAMES, UNITS, strict=True)
+        analyzer.analyze(frame, unit, hurry=frame.index in hurried)
+        for frame, unit in zip(FRAMES, UNITS, strict=True)
     ]
     assert [one.frame.index for one in seen if one.detected] == [0, 8, 13, 18, 23, 28]
     assert all(one.base_bgr.shape == (192, 320, 3) for one in seen)
@@ -77,10 +79,10 @@ def test_in_a_hurry_detection_is_put_off_and_made_up_for():
 def test_candidates_of_the_source_lie_in_base_pixels():
     """Stills would be cut at the wrong place where the detector looks at the camera's own frame."""
     view = View.fitted((640, 384), SIZE, fit="letterbox")
-    eyes = analyzer(view=view, candidates="source", detect_every=1)
+    analyzer = make(view=view, candidates="source", detect_every=1)
     for frame, unit in zip(FRAMES[:4], UNITS, strict=False):
         large = np.repeat(np.repeat(frame.base_bgr, 2, axis=0), 2, axis=1)
-        seen = eyes.see(Frame(frame.index, frame.capture_ns, large, frame.base_bgr), unit)
+        seen = analyzer.analyze(Frame(frame.index, frame.capture_ns, large, frame.base_bgr), unit)
     np.testing.assert_allclose(seen.tracks.boxes_xyxy_px[0], square_box(3), atol=3)
 
 
@@ -94,10 +96,10 @@ def test_a_source_smaller_than_the_base_is_looked_at_enlarged():
             return super().detect(picture_bgr)
 
     view = View.fitted((160, 96), SIZE, fit="letterbox")
-    eyes = analyzer(detector=Noting(), view=view, candidates="source", detect_every=1)
+    analyzer = make(detector=Noting(), view=view, candidates="source", detect_every=1)
     for frame, unit in zip(FRAMES[:4], UNITS, strict=False):
         small = frame.base_bgr[::2, ::2]
-        seen = eyes.see(Frame(frame.index, frame.capture_ns, small, frame.base_bgr), unit)
+        seen = analyzer.analyze(Frame(frame.index, frame.capture_ns, small, frame.base_bgr), unit)
     assert all(picture is frame.base_bgr for picture, frame in zip(looked_at, FRAMES, strict=False))
     np.testing.assert_allclose(seen.tracks.boxes_xyxy_px[0], square_box(3), atol=3)
 
@@ -105,19 +107,19 @@ def test_a_source_smaller_than_the_base_is_looked_at_enlarged():
 def test_what_a_cropped_base_does_not_show_is_no_candidate():
     """The ground would get stills of objects that its picture does not have."""
     view = View.fitted((960, 192), SIZE, fit="crop")  # the base shows the middle third
-    eyes = analyzer(view=view, candidates="source", detect_every=1)
+    analyzer = make(view=view, candidates="source", detect_every=1)
     for frame, unit in zip(FRAMES[:3], UNITS, strict=False):
         wide = np.zeros((192, 960, 3), np.uint8)
         wide[:, :320] = frame.base_bgr
-        seen = eyes.see(Frame(frame.index, frame.capture_ns, wide, frame.base_bgr), unit)
+        seen = analyzer.analyze(Frame(frame.index, frame.capture_ns, wide, frame.base_bgr), unit)
     assert len(seen.tracks) == 0
 
 
-def sparse(eyes: Analyzer, *, every: int, hurried: frozenset[int] = frozenset()) -> list:
+def sparse(analyzer: Analyzer, *, every: int, hurried: frozenset[int] = frozenset()) -> list:
     """All ticks, of which only each n-th is coded, as with ``--fps auto``."""
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
     return [
-        eyes.see(
+        analyzer.analyze(
             replace(frame, source_bgr=frame.base_bgr),
             encoder.encode(frame) if frame.index % every == 0 else None,
             hurry=frame.index in hurried,
@@ -141,7 +143,7 @@ def sparse(eyes: Analyzer, *, every: int, hurried: frozenset[int] = frozenset())
 )
 def test_where_few_ticks_are_coded_each_of_them_has_its_own_detection(candidates, every, detected):
     """Stills could not be cut where the base has no picture, or would be chosen by what was seen before it."""
-    seen = sparse(analyzer(candidates=candidates), every=every)
+    seen = sparse(make(candidates=candidates), every=every)
     assert [one.frame.index for one in seen if one.detected] == detected
     assert [one.frame.index for one in seen if one.coded] == list(range(0, 30, every))
     for one in seen:
@@ -153,7 +155,7 @@ def test_where_few_ticks_are_coded_each_of_them_has_its_own_detection(candidates
 
 def test_ticks_that_are_not_coded_still_move_the_tracks():
     """At a frame a second, tracks would jump, and the tracks channel have nothing to say between."""
-    seen = sparse(analyzer(candidates="source", detect_every=3), every=10)
+    seen = sparse(make(candidates="source", detect_every=3), every=10)
     for one in seen[7:]:
         assert one.tracks.ids.tolist() == [1]
         np.testing.assert_allclose(one.tracks.boxes_xyxy_px[0], square_box(one.frame.index), atol=6)
@@ -161,7 +163,7 @@ def test_ticks_that_are_not_coded_still_move_the_tracks():
 
 def test_a_hurried_coded_tick_is_made_up_for():
     """With a slow detector and few coded ticks, detection would be put off until the next coded one."""
-    seen = sparse(analyzer(candidates="source"), every=15, hurried=frozenset({15}))
+    seen = sparse(make(candidates="source"), every=15, hurried=frozenset({15}))
     assert [one.frame.index for one in seen if one.detected] == [0, 6, 11, 16, 21, 26]
 
 
@@ -198,7 +200,7 @@ class Rig:
 
     def __init__(self, *, detector=None) -> None:
         self.out, self.outcomes = Out(), Counter()
-        self.memory, self.keyframes = TrackMemory(), KeyframePlan()
+        self.memory, self.keyframes = TrackMemory(), KeyframeRequests()
         sender = Transmitter(
             self.out,
             ledger=Ledger(),
@@ -210,14 +212,15 @@ class Rig:
         )
         self.stage = make_still_stage(
             sender,
-            analyzer(detector=detector),
+            make(detector=detector),
             keyframes=self.keyframes,
             outcomes=self.outcomes,
             view=VIEW,
             class_names=CLASSES,
             memory=self.memory,
         )
-        self.keyframes.done(FRAMES[0].capture_ns)
+        self.plan = KeyframePlan(self.keyframes)
+        self.plan.done(FRAMES[0].capture_ns)
 
     def run(self, count: int = 30) -> None:
         """Frame after frame, as the lockstep loop does."""
@@ -244,7 +247,7 @@ def test_while_a_keyframe_is_due_stills_are_held():
     assert rig.keyframes.request(FRAMES[0].capture_ns + 500_000_000) is None
     rig.run()
     assert rig.out.stills == []
-    rig.keyframes.done(FRAMES[-1].capture_ns)
+    rig.plan.done(FRAMES[-1].capture_ns)
     assert rig.stage.pending == 1
     rig.stage.close()
     assert rig.outcomes["dropped", "ended"] == 1

@@ -23,10 +23,11 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan
+from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.worker import StillWorker
+from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from still_stage import make_still_stage
 
@@ -77,7 +78,7 @@ class Rig:
     def __init__(
         self, *, reports: bool = False, sparse: bool = False, analyzer: Analyzer | None = None
     ) -> None:
-        self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframePlan()
+        self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframeRequests()
         self.sender = Transmitter(
             self.out,
             ledger=Ledger(),
@@ -97,7 +98,8 @@ class Rig:
             maker=StillMaker(codec=StandIn(), fallback=JpegCodec()),
             reporter=self if reports else None,
         )
-        self.keyframes.done(FRAMES[0].capture_ns)
+        self.plan = KeyframePlan(self.keyframes)
+        self.plan.done(FRAMES[0].capture_ns)
 
     def report(self, seen, *, now_ns) -> None:
         """Report the tracks, as the edge's reporter does."""

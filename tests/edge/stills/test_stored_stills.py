@@ -14,8 +14,9 @@ from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader, par
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Frame, View
 from hvt_common.video.still_codecs import JpegCodec
+from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.control.commands import Commands, Served
+from hvt_edge.control.commands import Commands
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.stills.maker import StillMaker
 from keeping import FRAMES, SIZE, Rig
@@ -57,8 +58,7 @@ class StillRig(Rig):
         for frame in FRAMES[first:end]:
             self.now_ns = frame.capture_ns
             self.link_control.before_frame(self.now_ns)
-            unit = self.stage.encode(frame, now_ns=self.now_ns)
-            self.stage.send(unit, now_ns=self.now_ns)
+            unit = self.base(frame)
             source = np.clip(frame.base_bgr + _TEXTURE, 0, 255).astype(np.uint8)
             seen = self.side.analyze(Frame(frame.index, frame.capture_ns, source, frame.base_bgr), unit)
             self.side.send(seen, now_ns=self.now_ns)
@@ -116,32 +116,35 @@ def test_whoever_commands_gets_the_video_before_the_stills(tmp_path):
     """The command would be refused, or change nothing."""
     rig = StillRig(tmp_path / "store")
     config = check(EdgeConfig(source="demo", size=SIZE))
-    commands = Commands(
-        config,
-        session_id=7,
-        keyframes=rig.keyframes,
-        clock=lambda: rig.now_ns,
-        window_ns=lambda: rig.now_ns,
-    )
 
-    def ask() -> str:
+    def ask(backlog: BacklogStage | None) -> str:
+        commands = Commands(
+            config,
+            operating=rig.operating,
+            session_id=7,
+            keyframes=rig.keyframes,
+            on_demand=None,
+            chooser=None,
+            backlog=backlog,
+            base_size=SIZE,
+            clock=lambda: rig.now_ns,
+            loop_clock=lambda: rig.now_ns,
+        )
         rig.now_ns += 100_000_000
         request = ControlRequest(session_id=7, command=Command.SEND_BACKLOG, arguments={})
         answer = commands.answer(ControlRequest.parse(request.pack()))
         return "" if answer.accepted else answer.reason
 
-    commands.serve(Served(None, rig.link_control._reconfiguration, None, base_size=SIZE, backlog=rig.backlog))
-    assert "nothing is kept" in ask()
+    assert "nothing is stored" in ask(rig.backlog)
     rig.fly(0, 7)
     rig.report()
     rig.fly(7, 50, linked=False)
     eventually(lambda: rig.backlog.numbers.stills >= 2, within_s=10, what="stills are kept")
-    assert ask() == ""
+    assert ask(rig.backlog) == ""
     rig.linked = True
     rig.finish()
     assert rig.backlog.numbers.empty
     kinds = [header.kind for header, _ in rig.out.backlog]
     assert kinds.index("still") > max(n for n, kind in enumerate(kinds) if kind == "base")
     rig.backlog.close()
-    commands.serve(Served(None, rig.link_control._reconfiguration, None, base_size=SIZE, backlog=None))
-    assert "--store 0" in ask()
+    assert "--store 0" in ask(None)

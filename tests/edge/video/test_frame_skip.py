@@ -52,7 +52,7 @@ def test_the_rate_is_kept_whatever_is_missed(decimation, ticks):
 
 def measured(decimation: int = 1) -> MeasuredFrameSkip:
     """As at 15 ticks a second."""
-    return MeasuredFrameSkip(decimation, most_decimation=7, rest_ticks=150)
+    return MeasuredFrameSkip(decimation, most_decimation=7, rest_frames=150)
 
 
 def test_a_starved_stream_gets_fewer_frames_and_a_rich_one_more():

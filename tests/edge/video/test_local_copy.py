@@ -17,8 +17,9 @@ import pytest
 from clips import START_NS, framed, smooth_pictures
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit
+from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.local_copy import BaseRecorder
-from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_edge.video.x265 import BaseEncoder
 
 SIZE = (320, 192)
 TESTS = Path(__file__).resolve().parents[3] / "tests" / "support"

@@ -15,12 +15,13 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
+from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
+from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.local_copy import BaseRecorder
 from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.stage import BaseStage
-from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_edge.video.x265 import BaseEncoder
 
 SIZE = (320, 192)
 SECOND_NS = 1_000_000_000
@@ -44,15 +45,17 @@ class Kept:
 class Rig:
     """A base stage with all that it needs."""
 
-    def __init__(self, *, frame_skip=None, regions=None, recorder=None, interval_s=10.0) -> None:
+    def __init__(
+        self, *, frame_skip=None, regions=None, recorder=None, interval_s=10.0, reconfigures=True
+    ) -> None:
         self.kept = Kept()
         self.opened: list[int] = []
         self.frame_skip = frame_skip or FrameSkip()
-        self.keyframes = KeyframePlan(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
+        self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
         self.stage = BaseStage(
             BaseEncoder(replace(SETTINGS, fps=15.0 / self.frame_skip.decimation)),
             keyframes=self.keyframes,
-            sender=Transmitter(
+            transmitter=Transmitter(
                 self.kept,
                 ledger=Ledger(),
                 budget=RollingBudget(BudgetSettings(800_000, 400_000, fps=15)),
@@ -65,23 +68,24 @@ class Rig:
             first_keyframe_bytes=5000,
             regions=regions,
             frame_skip=self.frame_skip,
-            renew=self._renew,
+            reconfigure=self._reconfigure if reconfigures else None,
         )
 
     def play(self, pictures, *, asks=(), tracks=None) -> list[int]:
-        """Ticks that were coded."""
+        """Indices of the frames that were coded."""
         coded = []
         for frame in framed(pictures):
             if frame.index in asks:
                 self.keyframes.request(frame.capture_ns)
-            unit = self.stage.encode(frame, now_ns=frame.capture_ns, tracks=tracks)
+            decision = self.stage.decide(frame.index, now_ns=frame.capture_ns)
+            unit = self.stage.encode(frame, decision, now_ns=frame.capture_ns, tracks=tracks)
             if unit is not None:
                 assert unit.frame_index == frame.index
-                self.stage.send(unit, now_ns=frame.capture_ns)
+                self.stage.send(unit, decision, now_ns=frame.capture_ns)
                 coded.append(frame.index)
         return coded
 
-    def _renew(self, decimation: int, now_ns: int) -> BaseEncoder | None:
+    def _reconfigure(self, decimation: int, now_ns: int) -> BaseEncoder | None:
         assert now_ns >= START_NS
         if decimation == (self.opened or [1])[-1]:
             return None
@@ -89,7 +93,7 @@ class Rig:
         return BaseEncoder(replace(SETTINGS, fps=15.0 / decimation))
 
 
-def test_ticks_that_are_not_coded_cost_nothing():
+def test_frames_that_are_not_coded_cost_nothing():
     """``--fps auto`` would save no bit."""
     rig = Rig(frame_skip=FrameSkip(3))
     rig.opened.append(3)
@@ -97,7 +101,7 @@ def test_ticks_that_are_not_coded_cost_nothing():
     assert len(rig.kept.units) == 4
 
 
-def test_a_keyframe_on_demand_does_not_wait_for_its_tick():
+def test_a_keyframe_on_demand_does_not_wait_for_its_turn():
     """At three frames a second a ground that joins would look at nothing for longer than promised."""
     rig = Rig(frame_skip=FrameSkip(8))
     rig.opened.append(8)
@@ -107,7 +111,7 @@ def test_a_keyframe_on_demand_does_not_wait_for_its_tick():
 
 def starving() -> MeasuredFrameSkip:
     """Decides after a second; the clip below never reaches a fine quantiser."""
-    return MeasuredFrameSkip(1, most_decimation=5, rest_ticks=15)
+    return MeasuredFrameSkip(1, most_decimation=5, rest_frames=15)
 
 
 def test_the_rate_changes_with_a_keyframe_and_every_decoder_follows():
@@ -156,7 +160,6 @@ def test_a_recording_keeps_its_times_across_a_change(tmp_path):
 
 def test_a_change_without_a_new_encoder_is_a_bug_that_shows():
     """x265 would go on as if all frames came, and spend a third of its bits."""
-    rig = Rig(frame_skip=starving(), interval_s=2.0)
-    rig.stage._renew = None
+    rig = Rig(frame_skip=starving(), interval_s=2.0, reconfigures=False)
     with pytest.raises(AssertionError, match="another encoder"):
         rig.play(hard_pictures(120, size=SIZE))

@@ -26,7 +26,8 @@ from hvt_common.video.still_codecs.avif import av1_data, avif_file
 from hvt_common.video.still_codecs.bits import BitWriter
 from hvt_common.video.still_codecs.h264_syntax import parameter_sets
 from hvt_common.video.still_codecs.hevc_syntax import coded_picture
-from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
+from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.x265 import BaseEncoder
 
 SIZE = (56, 40)
 _MOST_MB = 48

@@ -8,7 +8,8 @@ from itertools import pairwise
 
 import pytest
 
-from hvt_edge.operating.keyframes import KeyframePlan, KeyframeSettings
+from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
+from hvt_edge.video.keyframes import KeyframePlan
 from hvt_ground.link.reassemble import Reassembler
 
 MS = 1_000_000
@@ -68,7 +69,8 @@ class Minute:
     refused: int = 0
 
     def __post_init__(self) -> None:
-        self.plan = KeyframePlan(self.settings)
+        self.requests = KeyframeRequests(self.settings)
+        self.plan = KeyframePlan(self.requests)
         self.sees = [Ground(number, loss=self.loss, seed=self.seed) for number in range(self.grounds)]
         asks: list[tuple[int, tuple[int, int] | None]] = []
         self.sent, next_ns = 0, 0
@@ -76,8 +78,8 @@ class Minute:
             while asks and asks[0][0] <= now_ns:
                 losses = asks.pop(0)[1]
                 if losses is not None:
-                    self.plan.note_losses(*losses)
-                elif self.plan.request(now_ns) is not None:
+                    self.requests.report_losses(*losses)
+                elif self.requests.request(now_ns) is not None:
                     self.refused += 1
             if now_ns >= next_ns:
                 next_ns += FRAME_NS
@@ -93,7 +95,7 @@ class Minute:
         keyframe = self.plan.now(now_ns, fits=True)
         if keyframe:
             self.plan.done(now_ns)
-            self.plan.note_cost(self.takes_ms * MS)
+            self.requests.note_cost(self.takes_ms * MS)
         header = Header(1, self.sent, self.sent, keyframe)
         self.sent += 1
         for ground in self.sees:
@@ -112,8 +114,8 @@ class Minute:
     def __str__(self) -> str:
         return (
             f"loss {self.loss:.0%}, {self.grounds} ground(s), reports {self.reports}, keyframe {self.takes_ms} ms: "
-            f"shown {100 * self.shown:.0f} %, longest dark {self.longest_dark_s:.2f} s, keyframes {self.plan.sent}, "
-            f"refused {self.refused}"
+            f"shown {100 * self.shown:.0f} %, longest dark {self.longest_dark_s:.2f} s, "
+            f"keyframes {self.requests.sent}, refused {self.refused}"
         )
 
 
@@ -136,7 +138,7 @@ def test_a_minute_of_loss_is_as_dark_as_without_a_limit(loss, grounds, takes_ms,
     assert limited.longest_dark_s <= max(1.5, free.longest_dark_s + 0.5), f"{limited}\n{free}"
 
 
-def test_without_reports_the_purse_alone_lasts_for_an_ordinary_loss():
+def test_without_reports_the_token_bucket_alone_lasts_for_an_ordinary_loss():
     """A ground whose reports are lost as well would be left in the dark."""
     limited = Minute(LIMITED, loss=0.05, reports=False)
     assert limited.refused == 0

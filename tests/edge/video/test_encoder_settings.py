@@ -7,9 +7,9 @@ import pytest
 from clips import framed, hard_pictures, real_pictures
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
-from hvt_edge.link.transmitter import BASE_ATTACHMENT_BYTES, STATUS_BYTES
-from hvt_edge.video.least_rate import encoder_settings, least_base_bps
-from hvt_edge.video.x265 import BaseEncoder, EncoderSettings, minimum_bps
+from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES, STATUS_BYTES
+from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings, least_base_bps, minimum_bps
+from hvt_edge.video.x265 import BaseEncoder
 
 SIZE, FPS = (1280, 720), 15
 KEYFRAMES = (20, 46, 95, 125)

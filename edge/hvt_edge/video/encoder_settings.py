@@ -1,11 +1,35 @@
-"""From a budget in line bits to the bits that x265 is given."""
+"""What x265 is opened with, from a budget in line bits: rate, VBV, preset, and the least it can follow."""
 
 from __future__ import annotations
 
-from hvt_edge.link.transmitter import base_overhead_bps
-from hvt_edge.video.x265 import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
+import math
+from dataclasses import dataclass
 
-__all__ = ["encoder_settings", "least_base_bps", "payload_bps"]
+from hvt_edge.link.overhead import base_overhead_bps
+
+__all__ = [
+    "PRESETS",
+    "VBV_S",
+    "EncoderSettings",
+    "encoder_settings",
+    "keyframe_floor_bytes",
+    "least_base_bps",
+    "minimum_bps",
+    "payload_bps",
+]
+
+PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium")
+VBV_S = 0.15
+"""Depth of the VBV buffer in seconds of the base rate."""
+
+# At QP 51 a keyframe of textured pictures of 320x180, 640x360, 960x540 and 1280x720 takes 3.0, 3.9, 4.9 and 5.9 kB:
+# about 2060 bytes and 4 for each pixel of the square root of the area. x265 can go no lower, whatever the target is.
+# The frames after it follow a target down to some 300 bits and 0.0045 bit a pixel each: 67 kbps at 1280x720 and
+# 15 fps.
+_KEYFRAME_FLOOR_BYTES = 2060
+_KEYFRAME_FLOOR_BYTES_PER_SIDE_PX = 4.0
+_FRAME_FLOOR_BITS = 300
+_FRAME_FLOOR_BITS_PER_PX = 0.0045
 
 # The fullest rolling second over the target, keyframes on demand included, from 300 kbps up (see encode).
 _PEAK = 1.14
@@ -14,6 +38,31 @@ _TIGHT_PEAK = 1.04  # of 1.05 to 1.09; what is left waits some milliseconds (bud
 _KEYFRAME_EVERY_S = 5.0
 """x265 never takes back what keyframes cost beyond a frame's share: at low rates all of it, at 650 kbps two thirds.
 So much is asked for less, for the first keyframe, one each ten seconds, and some that grounds ask for."""
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderSettings:
+    """What x265 is asked for; ``bitrate_bps`` is the payload alone, without headers of any transport."""
+
+    size: tuple[int, int]
+    fps: float
+    bitrate_bps: int
+    preset: str = "veryfast"
+    vbv_s: float = VBV_S
+    threads: int = 1
+    """Worker threads; more than one is faster, and not the same bytes each run."""
+    side_data: bool = False
+    """Whether `BaseEncoder.encode` takes regions."""
+
+
+def keyframe_floor_bytes(size: tuple[int, int]) -> int:
+    """The least that a keyframe of a textured picture of ``size`` (width, height) takes."""
+    return round(_KEYFRAME_FLOOR_BYTES + _KEYFRAME_FLOOR_BYTES_PER_SIDE_PX * math.sqrt(size[0] * size[1]))
+
+
+def minimum_bps(size: tuple[int, int], fps: float) -> int:
+    """The lowest payload rate that x265 can follow at this size and frame rate, keyframes apart."""
+    return round(fps * (_FRAME_FLOOR_BITS + size[0] * size[1] * _FRAME_FLOOR_BITS_PER_PX))
 
 
 def encoder_settings(

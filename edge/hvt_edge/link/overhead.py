@@ -1,0 +1,25 @@
+"""What goes beside the base stream's payload: headers, framing and ``status``."""
+
+from __future__ import annotations
+
+from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
+from hvt_common.protocol.ledger import overhead_bytes
+
+__all__ = ["BASE_ATTACHMENT_BYTES", "STATUS_BYTES", "base_overhead_bps"]
+
+BASE_ATTACHMENT_BYTES = 48
+"""What a `BaseHeader` takes at most."""
+STATUS_BYTES = 320
+"""What a `Status` takes."""
+
+
+def base_overhead_bps(base_bps: float, *, fps: float, edge_id: str) -> float:
+    """What headers, framing and ``status`` take of ``base_bps``: the encoder gets the rest."""
+    payload = round(base_bps / 8 / fps)
+    key = EdgeKeys(edge_id).key(Channel.BASE)
+    encoding = DELIVERIES[Channel.BASE].encoding
+    per_frame = BASE_ATTACHMENT_BYTES + overhead_bytes(
+        payload, BASE_ATTACHMENT_BYTES, key=key, encoding=encoding
+    )
+    per_second = STATUS_BYTES + overhead_bytes(STATUS_BYTES, 0, key=EdgeKeys(edge_id).key(Channel.STATUS))
+    return 8 * (per_frame * fps + per_second)

@@ -1,0 +1,103 @@
+"""The operating point: budget, split, method and frame rate as they are now.
+
+Settings are frozen; what commands and the link change lives here. Two write: `hvt_edge.control.commands` what a
+ground commanded, and the frame loop (`hvt_edge.video.reconfigure`) what the link allows and what x265 was opened for.
+The encoder, the budget, ``info``, status and summary all read the same.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+__all__ = ["LoopClock", "Operating", "OperatingPoint", "base_rate_bps"]
+
+
+@dataclass(frozen=True, slots=True)
+class OperatingPoint:
+    """What holds at one moment. Rates in line bits a second."""
+
+    budget_bps: int
+    """B_tot as set or commanded; `total_bps` never exceeds it."""
+    video_share: float | None
+    """The base stream's share of it, as set or commanded; None: it follows the scene."""
+    method: str
+    total_bps: int
+    """What may be sent now: the budget, or less where the link carries less."""
+    base_bps: int
+    """B_v: what x265 was opened for."""
+    decimation: int
+    """Each n-th source frame is coded."""
+    highest_budget_bps: int
+    """Of all budgets that were in force."""
+    started_ns: int = 0
+    """When the first frame was taken; 0 before."""
+
+
+class Operating:
+    """Holds the newest point; thread-safe."""
+
+    def __init__(
+        self,
+        *,
+        budget_bps: int,
+        video_share: float | None,
+        base_bps: int,
+        method: str,
+        decimation: int,
+    ) -> None:
+        self._point = OperatingPoint(
+            budget_bps, video_share, method, budget_bps, base_bps, decimation, highest_budget_bps=budget_bps
+        )
+        self._lock = threading.Lock()
+
+    @property
+    def now(self) -> OperatingPoint:
+        """The point as it is now."""
+        return self._point
+
+    def start(self, now_ns: int) -> None:
+        """The first frame is about to be taken."""
+        self._set(started_ns=now_ns)
+
+    def command(self, *, budget_bps: int, video_share: float | None, method: str) -> None:
+        """What a ground commanded; the rates take effect with the next keyframe."""
+        highest_bps = max(self._point.highest_budget_bps, budget_bps)
+        self._set(
+            budget_bps=budget_bps, video_share=video_share, method=method, highest_budget_bps=highest_bps
+        )
+
+    def allow(self, total_bps: int) -> None:
+        """What may be sent from now on."""
+        self._set(total_bps=total_bps)
+
+    def open(self, *, total_bps: int, base_bps: int, decimation: int) -> None:
+        """What x265 is opened for, and the total that goes with it."""
+        self._set(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
+
+    def _set(self, **changes: object) -> None:
+        with self._lock:
+            self._point = replace(self._point, **changes)  # type: ignore[arg-type]
+
+
+class LoopClock:
+    """The time that the budget's windows go by: the wall clock, or in lockstep the newest frame's capture time."""
+
+    def __init__(self, clock: Callable[[], int], *, lockstep: bool) -> None:
+        self._clock = clock
+        self._lockstep = lockstep
+        self._media_ns = 0
+
+    def __call__(self) -> int:
+        """Nanoseconds."""
+        return self._media_ns if self._lockstep else self._clock()
+
+    def advance(self, capture_ns: int) -> None:
+        """The loop has come to this frame."""
+        self._media_ns = capture_ns
+
+
+def base_rate_bps(total_bps: int, share: float, *, metadata_bps: int) -> int:
+    """B_v of so much in all, with what tracks take left free."""
+    return round(min(total_bps * share, total_bps - metadata_bps))

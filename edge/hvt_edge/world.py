@@ -1,0 +1,71 @@
+"""Where an edge meets the world: camera or clip, detector, link and clock. A study passes its own in their place."""
+
+from __future__ import annotations
+
+import secrets
+from concurrent.futures import Executor
+from contextlib import ExitStack
+from typing import cast
+
+from hvt_common.inference.detect import Detector
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.values import Fit
+from hvt_edge.config import EdgeConfig
+from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.publisher import EdgeLink, ZenohLink
+from hvt_edge.source.opening import Source, open_source
+from hvt_edge.wiring import base_size, make_detector, make_link_settings, warm_up_for
+
+__all__ = ["World"]
+
+
+class World:
+    """The real one."""
+
+    def __init__(self) -> None:
+        self.session_id = secrets.randbits(64)
+        self.clock = SteadyClock()
+        self.inbox = FeedbackInbox()
+        """What grounds have answered."""
+        self.executor: Executor | None = None
+        """Runs perception in lockstep; None: a thread of its own."""
+
+    def open_detector(self, config: EdgeConfig) -> Detector:
+        """Open the detector.
+
+        Raises:
+            UserError: there is none of that name.
+        """
+        return make_detector(config)
+
+    def warm_up(self, config: EdgeConfig, detector: Detector, source: Source) -> None:
+        """Before the first frame: a runtime may compile for the size of the pictures."""
+        warm_up_for(config, detector, source.view)
+
+    def open_source(self, config: EdgeConfig) -> Source:
+        """Open what ``--source`` names.
+
+        Raises:
+            UserError: nothing usable is there.
+        """
+        assert config.source is not None, "check() refuses a missing source"
+        return open_source(
+            config.source,
+            size=base_size(config),
+            fps=config.nominal_fps,
+            fit=cast("Fit", config.fit),
+            seed=config.seed,
+            max_frames=config.max_frames,
+            source_fps=config.source_fps,
+            clock=self.clock,
+        )
+
+    def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
+        """Open the link until ``stack`` closes.
+
+        Raises:
+            UserError: a port, an endpoint or the edge's id cannot be used.
+        """
+        return stack.enter_context(
+            ZenohLink(make_link_settings(config), edge_id=config.edge_id, clock=self.clock)
+        )
