@@ -1,8 +1,9 @@
 """One frozen dataclass per process, filled from defaults, then a TOML file, then flags; validated once.
 
-A field is declared with `option`, which names its kind (how text becomes a value and back) and its help line.
+A field is declared with `option` or a `Group` of them: its kind (how text becomes a value and back) and its help.
 Every value passes through its kind whether it comes from the file or from the command line, so both say the
-same sentence when it is wrong.
+same sentence when it is wrong. ``--help`` leaves out what is ``rare``; ``--help-all`` lists everything. A class
+may name in ``GONE`` what it no longer takes: name → what to do in its place.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, NoReturn, Protocol, TypeVar, cast
 
 import tomli_w
 
@@ -33,6 +34,7 @@ __all__ = [
     "SHARE",
     "SIZE",
     "TEXT",
+    "Group",
     "Loaded",
     "SettingType",
     "choice",
@@ -151,19 +153,49 @@ def or_auto(kind: SettingType) -> SettingType:
 
 
 def option(
-    kind: SettingType, default: Any, help_line: str, *, many: bool = False, shown_default: str = ""
+    kind: SettingType,
+    default: Any,
+    help_line: str,
+    *,
+    many: bool = False,
+    shown_default: str = "",
+    group: str = "",
+    rare: bool = False,
 ) -> Any:
     """Declare a dataclass field that is also a flag ``--its-name`` and a TOML key ``its-name``.
 
-    With ``many`` the flag may be given several times and the value is a tuple.
+    With ``many`` the flag may be given several times and the value is a tuple. ``rare``: only in ``--help-all``.
     """
-    metadata = {"kind": kind, "help": help_line, "many": many, "shown_default": shown_default}
+    metadata = {
+        "kind": kind,
+        "help": help_line,
+        "many": many,
+        "shown_default": shown_default,
+        "group": group,
+        "rare": rare,
+    }
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def switch(help_line: str, *, default: bool = False) -> Any:
+def switch(help_line: str, *, default: bool = False, group: str = "", rare: bool = False) -> Any:
     """Declare a yes/no field: ``--name`` and ``--no-name``."""
-    return dataclasses.field(default=default, metadata={"help": help_line, "switch": True})
+    metadata = {"help": help_line, "switch": True, "group": group, "rare": rare}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Settings that ``--help`` lists under one title."""
+
+    title: str
+
+    def option(self, kind: SettingType, default: Any, help_line: str, **more: Any) -> Any:
+        """See `option`."""
+        return option(kind, default, help_line, group=self.title, **more)
+
+    def switch(self, help_line: str, **more: Any) -> Any:
+        """See `switch`."""
+        return switch(help_line, group=self.title, **more)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,8 +220,10 @@ def load(
     Raises:
         UserError: an unknown flag or key, a value that its kind does not take, an unreadable file.
     """
-    parser = _flags(config_class, program=program, description=description)
-    given = vars(parser.parse_args(_with_joined_values(sys.argv[1:] if argv is None else argv)))
+    words = _with_joined_values(sys.argv[1:] if argv is None else argv)
+    _refuse_gone(config_class, words)
+    parser = _flags(config_class, program=program, description=description, rare="--help-all" in words)
+    given = vars(parser.parse_args(words))
     print_config = bool(given.pop("print_config", False))
     file = given.pop("config", None)
     values: dict[str, Any] = {}
@@ -210,6 +244,18 @@ def _with_joined_values(argv: Sequence[str]) -> list[str]:
         else:
             joined.append(word)
     return joined
+
+
+def _gone(config_class: type) -> Mapping[str, str]:
+    return cast("Mapping[str, str]", getattr(config_class, "GONE", {}))
+
+
+def _refuse_gone(config_class: type, words: Sequence[str]) -> None:
+    """Raise `UserError` for a flag of an earlier version, with what takes its place."""
+    for word in words:
+        name = word.partition("=")[0].removeprefix("--").removeprefix("no-")
+        if word.startswith("--") and name in _gone(config_class):
+            raise UserError(f"--{name} is no longer accepted: {_gone(config_class)[name]}")
 
 
 def to_toml(config: Any) -> str:
@@ -233,7 +279,7 @@ def _flag(field: dataclasses.Field[Any]) -> str:
     return "--" + field.name.replace("_", "-")
 
 
-def _flags(config_class: type, *, program: str, description: str) -> argparse.ArgumentParser:
+def _flags(config_class: type, *, program: str, description: str, rare: bool) -> argparse.ArgumentParser:
     from hvt_common import __version__  # noqa: PLC0415  (only the version line needs it)
 
     parser = _Parser(
@@ -246,20 +292,37 @@ def _flags(config_class: type, *, program: str, description: str) -> argparse.Ar
     parser.add_argument("--version", action="version", version=f"{program} {__version__}")
     parser.add_argument("--config", metavar="FILE", help="TOML file with these settings; flags go over it")
     parser.add_argument("--print-config", action="store_true", help="print the settings as TOML and exit")
-    for field in dataclasses.fields(config_class):
+    fields = dataclasses.fields(config_class)
+    if any(field.metadata["rare"] for field in fields):
+        help_all = "list every setting, also those that few need"
+        parser.add_argument("--help-all", action="help", help=help_all)
+    groups = {title: parser.add_argument_group(title) for title in _titles(fields)}
+    for field in fields:
+        into = groups.get(field.metadata["group"], parser)
         help_line = field.metadata["help"].replace("%", "%%")
+        hidden = field.metadata["rare"] and not rare
         if field.metadata.get("switch"):
-            parser.add_argument(_flag(field), action=argparse.BooleanOptionalAction, help=help_line)
+            into.add_argument(
+                _flag(field),
+                action=argparse.BooleanOptionalAction,
+                help=argparse.SUPPRESS if hidden else help_line,
+            )
             continue
         kind: SettingType = field.metadata["kind"]
         shown = field.metadata["shown_default"] or _shown(kind, field.default)
-        parser.add_argument(
+        shown_help = f"{help_line} [{shown}]" if shown else help_line
+        into.add_argument(
             _flag(field),
             metavar=kind.metavar,
             action="append" if field.metadata["many"] else "store",
-            help=f"{help_line} [{shown}]" if shown else help_line,
+            help=argparse.SUPPRESS if hidden else shown_help,
         )
     return parser
+
+
+def _titles(fields: Sequence[dataclasses.Field[Any]]) -> list[str]:
+    """The groups, in order of their first setting."""
+    return list(dict.fromkeys(field.metadata["group"] for field in fields if field.metadata["group"]))
 
 
 def _shown(kind: SettingType, default: object) -> str:
@@ -303,6 +366,10 @@ def _from_file(config_class: type, file: Path) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key, given in table.items():
         field = fields.get(key.replace("_", "-"))
+        if key.replace("_", "-") in _gone(config_class):
+            raise UserError(
+                f"{key} in {file} is no longer accepted: {_gone(config_class)[key.replace('_', '-')]}"
+            )
         if field is None:
             near = difflib.get_close_matches(key, fields, n=1) or sorted(fields)
             raise UserError(f"--config {file} has an unknown key {key!r}: did you mean {', '.join(near)}?")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import ClassVar
 
 from hvt_common.config import (
     AUTO,
@@ -14,12 +17,11 @@ from hvt_common.config import (
     SHARE,
     SIZE,
     TEXT,
+    Group,
     choice,
     integer,
     number,
-    option,
     or_auto,
-    switch,
 )
 from hvt_common.errors import UserError
 from hvt_common.inference.embedded import DETECTOR as EMBEDDED_DETECTOR
@@ -73,149 +75,210 @@ REGIMES = {
 }
 
 
+_REFRESH_GONE = "give --fps auto, which shows more for the same bits, or --roi-depth 0.1 for the tracks alone"
+_SOURCE, _LINK, _SENT = Group("source"), Group("budget and link"), Group("what to send")
+_MODELS, _FILES = Group("models"), Group("files")
+
+
 @dataclass(frozen=True, slots=True)
 class EdgeConfig:
-    """What ``hvt-edge`` runs with. See ``--help`` for each."""
+    """What ``hvt-edge`` runs with. See ``--help-all`` for each."""
 
-    source: str | None = option(TEXT, None, "clip.mp4, folder/, rtsp://…, /dev/video0 or demo")
-    edge_id: str = option(TEXT, "edge-1", "name of this edge: 1 to 32 of a-z, 0-9 and -")
-    size: tuple[int, int] | str = option(
+    GONE: ClassVar[Mapping[str, str]] = MappingProxyType(
+        {
+            "lend": "give --borrow-unused",
+            "pulse": _REFRESH_GONE,
+            "pulse-depth": _REFRESH_GONE,
+            "rolling": _REFRESH_GONE,
+            "rolling-depth": _REFRESH_GONE,
+        }
+    )
+
+    source: str | None = _SOURCE.option(TEXT, None, "clip.mp4, folder/, rtsp://…, /dev/video0 or demo")
+    edge_id: str = _SOURCE.option(TEXT, "edge-1", "name of this edge: 1 to 32 of a-z, 0-9 and -")
+    size: tuple[int, int] | str = _SOURCE.option(
         or_auto(SIZE), DEFAULT_SIZE, "size of the base stream in pixels; auto: as large as the rate carries"
     )
-    fps: float | str = option(
+    fps: float | str = _SOURCE.option(
         or_auto(number(0.1, 240, unit=" frames a second")),
         DEFAULT_FPS,
         "frame rate of the base stream; auto: up to 15, fewer and better frames where the rate is thin",
     )
-    fit: str = option(choice("letterbox", "crop"), "letterbox", "how another aspect ratio is fitted")
-    source_fps: float | None = option(
-        number(0.1, 1000), None, "frame rate of an image folder, or instead of what a file says"
+    fit: str = _SOURCE.option(
+        choice("letterbox", "crop"), "letterbox", "how another aspect ratio is fitted", rare=True
     )
-    seed: int = option(integer(0, 2**31 - 1), 0, "seed of the demo scene")
-    max_frames: int | None = option(integer(1, 10**9), None, "end after this many base frames")
+    source_fps: float | None = _SOURCE.option(
+        number(0.1, 1000), None, "frame rate of an image folder, or instead of what a file says", rare=True
+    )
+    seed: int = _SOURCE.option(integer(0, 2**31 - 1), 0, "seed of the demo scene", rare=True)
+    max_frames: int | None = _SOURCE.option(
+        integer(1, 10**9), None, "end after this many base frames", rare=True
+    )
+    pace: str = _SOURCE.option(
+        choice("realtime", "lockstep"),
+        "realtime",
+        "play at the clip's speed, or as fast as all parts allow",
+        rare=True,
+    )
 
-    budget: int | None = option(
+    budget: int | None = _LINK.option(
         BITRATE, None, "bits a second in all, every byte counted", shown_default="800kbps"
     )
-    video_share: float | str | None = option(
+    video_share: float | str | None = _LINK.option(
         or_auto(SHARE),
         None,
         "share of the budget for the base stream; auto follows the scene",
         shown_default="0.8125; 1 for M0",
     )
-    regime: str | None = option(
-        choice(*REGIMES), None, "a budget of the paper: low 0.80 Mbps, moderate 1.40 Mbps"
+    regime: str | None = _LINK.option(
+        choice(*REGIMES), None, "a budget of the paper: low 0.80 Mbps, moderate 1.40 Mbps", rare=True
     )
-    adapt: bool = switch(
+    adapt: bool = _LINK.switch(
         "follow the link's rate below --budget by the ground's reports; never in lockstep", default=True
     )
-    min_budget: int | None = option(
-        BITRATE, None, "what --adapt never goes below", shown_default="100kbps, at most --budget"
+    min_budget: int | None = _LINK.option(
+        BITRATE, None, "what --adapt never goes below", shown_default="100kbps, at most --budget", rare=True
     )
-    window: float = option(DURATION, 1.0, "the budget holds in every rolling window of this length")
-
-    method: str = option(choice(*METHODS), "M5", "who gets a still, and when")
-    profile: str | None = option(
-        choice(*PROFILES), None, "settings in one word: thin is everything that helps on a thin link"
+    window: float = _LINK.option(
+        DURATION, 1.0, "the budget holds in every rolling window of this length", rare=True
     )
-    tune: tuple[str, ...] = option(
-        TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True
-    )
-    borrow_unused: bool = switch("stills may use what the base stream leaves unspent, never beyond --budget")
-    group_stills: bool = switch("neighbours share one still where that is cheaper")
-    cooldown: float = option(
-        DURATION, 2.0, "least time between two stills of a track; 0 for the paper's plain methods"
-    )
-    min_gain: float = option(
-        number(1, 100), 1.2, "a track is sent again only when this much larger or sharper"
-    )
-    still_codec: str = option(TEXT, "jpeg", "how stills are coded; residual sends what the base lacks")
-    fallback_codec: str = option(
-        TEXT, "h264-intra", "how a still is coded where residual does not serve: no base, or no gain"
-    )
-    jpeg_quality: int = option(integer(5, 95), 65, "quality of the stills, in percent, whatever the codec")
-    fidelity: float = option(
-        number(0, 60, unit=" dB"),
-        0.0,
-        "fewest bytes that bring a still this near to the source; 0: --jpeg-quality",
-    )
-    gate: float = option(
-        number(0, 60, unit=" dB"), 0.0, "no still where the base is already this good (luma PSNR); 0: no gate"
-    )
-    padding: float = option(number(0, 1), 0.15, "margin around a box, as a share of its sides")
-    ring: int = option(
-        BYTES, 256_000_000, "memory for source frames, from which stills are served on demand; 0 for none"
-    )
-    ring_time: float = option(
-        DURATION, 5.0, "how far back those go; where memory is short, with frames left out"
-    )
-    store: int = option(
-        BYTES, 200_000_000, "disk for what is seen while the link is away, and sent afterwards; 0 for none"
-    )
-    store_folder: Path | None = option(
-        PATH,
-        None,
-        "where that is kept; made when the link first goes",
-        shown_default="~/.local/state/hvt/EDGE_ID",
-    )
-    store_age: float = option(
-        DURATION, 3600.0, "what an earlier run kept longer ago than this is dropped at the start"
-    )
-
-    detector: str = option(
-        TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
-    )
-    labels: Path | None = option(PATH, None, "class names of the detector, one a line")
-    candidates: str = option(
-        choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"
-    )
-    tiles: str = option(
-        TEXT, "off", "detect in tiles of the source too: CxR, auto, or off; needs --candidates source"
-    )
-    send_tracks: bool = switch("also send the edge's own tracks, a few kbps, as part of --budget")
-    detect_every: int = option(integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame")
-    confidence: float = option(number(0.01, 1), 0.25, "confidence from which a detection starts a track")
-    nms_iou: float = option(number(0.01, 1), 0.45, "overlap above which two boxes of a class are one")
-    camera_motion: str = option(
-        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion"
-    )
-    threads: int = option(integer(1, 64), 2, "threads of the detector")
-    provider: str = option(
-        choice(*PROVIDERS), "auto", "what runs the detector; auto says what it took and why"
-    )
-
-    preset: str = option(choice(*PRESETS), "veryfast", "x265 preset")
-    roi_depth: float = option(
-        number(0, 1), 0.0, "quantise active tracks better by so much; 0 for not, 0.1 for --method R0"
-    )
-    keyframe_interval: float | str = option(
-        or_auto(DURATION),
-        AUTO,
-        "time between keyframes beside those that grounds ask for; 0 for none; auto: 10s, up to 60s on a thin link",
-    )
-    pace: str = option(
-        choice("realtime", "lockstep"), "realtime", "play at the clip's speed, or as fast as all parts allow"
-    )
-    connect: tuple[str, ...] = option(
+    connect: tuple[str, ...] = _LINK.option(
         TEXT,
         (),
         "Zenoh endpoint to connect to, for example tcp/HOST:7447",
         many=True,
         shown_default=DEFAULT_ENDPOINT,
     )
-    listen: tuple[str, ...] = option(TEXT, (), "Zenoh endpoint to listen on", many=True)
-    zenoh_config: Path | None = option(PATH, None, "Zenoh configuration, JSON5, that all this goes on top of")
-    links: int = option(
-        integer(1, 2), 1, "2: one Zenoh link for what is urgent and one for the rest (docs/adaptation.md)"
+    listen: tuple[str, ...] = _LINK.option(TEXT, (), "Zenoh endpoint to listen on", many=True)
+    zenoh_config: Path | None = _LINK.option(
+        PATH, None, "Zenoh configuration, JSON5, that all this goes on top of"
     )
-    insecure: bool = switch("allow listening beyond this machine without keys")
-    wait: float = option(
+    links: int = _LINK.option(
+        integer(1, 2),
+        1,
+        "2: one Zenoh link for what is urgent and one for the rest (docs/adaptation.md)",
+        rare=True,
+    )
+    insecure: bool = _LINK.switch("allow listening beyond this machine without keys", rare=True)
+    wait: float = _LINK.option(
         DURATION, 15.0, "how long a file, a folder or the demo waits for the first ground before it plays"
     )
-    record_base: Path | None = option(PATH, None, "also keep the base stream in this Matroska file")
-    truth: Path | None = option(PATH, None, "write the demo's ground truth, MOTChallenge form")
-    summary: Path | None = option(PATH, None, "write the summary as JSON")
-    quiet: bool = switch("no status line")
+
+    method: str = _SENT.option(choice(*METHODS), "M5", "who gets a still, and when")
+    profile: str | None = _SENT.option(
+        choice(*PROFILES), None, "settings in one word: thin is everything that helps on a thin link"
+    )
+    tune: tuple[str, ...] = _SENT.option(
+        TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True, rare=True
+    )
+    borrow_unused: bool = _SENT.switch(
+        "stills may use what the base stream leaves unspent, never beyond --budget", rare=True
+    )
+    group_stills: bool = _SENT.switch("neighbours share one still where that is cheaper", rare=True)
+    cooldown: float = _SENT.option(
+        DURATION, 2.0, "least time between two stills of a track; 0 for the paper's plain methods", rare=True
+    )
+    min_gain: float = _SENT.option(
+        number(1, 100), 1.2, "a track is sent again only when this much larger or sharper", rare=True
+    )
+    still_codec: str = _SENT.option(TEXT, "jpeg", "how stills are coded; residual sends what the base lacks")
+    fallback_codec: str = _SENT.option(
+        TEXT,
+        "h264-intra",
+        "how a still is coded where residual does not serve: no base, or no gain",
+        rare=True,
+    )
+    jpeg_quality: int = _SENT.option(
+        integer(5, 95), 65, "quality of the stills, in percent, whatever the codec"
+    )
+    fidelity: float = _SENT.option(
+        number(0, 60, unit=" dB"),
+        0.0,
+        "fewest bytes that bring a still this near to the source; 0: --jpeg-quality",
+        rare=True,
+    )
+    gate: float = _SENT.option(
+        number(0, 60, unit=" dB"),
+        0.0,
+        "no still where the base is already this good (luma PSNR); 0: no gate",
+        rare=True,
+    )
+    padding: float = _SENT.option(
+        number(0, 1), 0.15, "margin around a box, as a share of its sides", rare=True
+    )
+    send_tracks: bool = _SENT.switch("also send the edge's own tracks, a few kbps, as part of --budget")
+    roi_depth: float = _SENT.option(
+        number(0, 1),
+        0.0,
+        "quantise active tracks better by so much; 0 for not, 0.1 for --method R0",
+        rare=True,
+    )
+    keyframe_interval: float | str = _SENT.option(
+        or_auto(DURATION),
+        AUTO,
+        "time between keyframes beside those that grounds ask for; 0 for none; auto: 10s, up to 60s on a thin link",
+        rare=True,
+    )
+    preset: str = _SENT.option(choice(*PRESETS), "veryfast", "x265 preset", rare=True)
+
+    detector: str = _MODELS.option(
+        TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
+    )
+    labels: Path | None = _MODELS.option(PATH, None, "class names of the detector, one a line")
+    candidates: str = _MODELS.option(
+        choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"
+    )
+    tiles: str = _MODELS.option(
+        TEXT,
+        "off",
+        "detect in tiles of the source too: CxR, auto, or off; needs --candidates source",
+        rare=True,
+    )
+    detect_every: int = _MODELS.option(
+        integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame", rare=True
+    )
+    confidence: float = _MODELS.option(
+        number(0.01, 1), 0.25, "confidence from which a detection starts a track"
+    )
+    nms_iou: float = _MODELS.option(
+        number(0.01, 1), 0.45, "overlap above which two boxes of a class are one", rare=True
+    )
+    camera_motion: str = _MODELS.option(
+        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion", rare=True
+    )
+    threads: int = _MODELS.option(integer(1, 64), 2, "threads of the detector", rare=True)
+    provider: str = _MODELS.option(
+        choice(*PROVIDERS), "auto", "what runs the detector; auto says what it took and why"
+    )
+
+    ring: int = _FILES.option(
+        BYTES,
+        256_000_000,
+        "memory for source frames, from which stills are served on demand; 0 for none",
+        rare=True,
+    )
+    ring_time: float = _FILES.option(
+        DURATION, 5.0, "how far back those go; where memory is short, with frames left out", rare=True
+    )
+    store: int = _FILES.option(
+        BYTES, 200_000_000, "disk for what is seen while the link is away, and sent afterwards; 0 for none"
+    )
+    store_folder: Path | None = _FILES.option(
+        PATH,
+        None,
+        "where that is kept; made when the link first goes",
+        shown_default="~/.local/state/hvt/EDGE_ID",
+        rare=True,
+    )
+    store_age: float = _FILES.option(
+        DURATION, 3600.0, "what an earlier run kept longer ago than this is dropped at the start", rare=True
+    )
+    record_base: Path | None = _FILES.option(PATH, None, "also keep the base stream in this Matroska file")
+    truth: Path | None = _FILES.option(
+        PATH, None, "write the demo's ground truth, MOTChallenge form", rare=True
+    )
+    summary: Path | None = _FILES.option(PATH, None, "write the summary as JSON")
+    quiet: bool = _FILES.switch("no status line")
 
     @property
     def budget_bps(self) -> int:

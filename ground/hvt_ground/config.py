@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hvt_common.config import DURATION, PATH, TEXT, choice, integer, number, option, switch
+from hvt_common.config import DURATION, PATH, TEXT, Group, choice, integer, number
 from hvt_common.errors import UserError
 from hvt_common.inference.embedded import CLASSIFIER as EMBEDDED_CLASSIFIER
 from hvt_common.inference.embedded import DETECTOR as EMBEDDED_DETECTOR
@@ -18,75 +18,90 @@ __all__ = ["DETECTOR", "MOTION", "NONE", "GroundConfig", "check"]
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
 
 
+_LINK, _MODELS, _FILES = Group("link and edges"), Group("models"), Group("files and views")
+
+
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
-    """What ``hvt-ground`` runs with. See ``--help`` for each."""
+    """What ``hvt-ground`` runs with. See ``--help-all`` for each."""
 
-    listen: tuple[str, ...] = option(
+    listen: tuple[str, ...] = _LINK.option(
         TEXT, (), "Zenoh endpoint to listen on", many=True, shown_default=DEFAULT_ENDPOINT
     )
-    connect: tuple[str, ...] = option(
+    connect: tuple[str, ...] = _LINK.option(
         TEXT, (), "Zenoh endpoint to connect to, for example tcp/HOST:7447", many=True
     )
-    zenoh_config: Path | None = option(PATH, None, "Zenoh configuration, JSON5, that all this goes on top of")
-    links: int = option(
-        integer(1, 2), 1, "2: where it connects, one Zenoh link for what is urgent and one for the rest"
+    zenoh_config: Path | None = _LINK.option(
+        PATH, None, "Zenoh configuration, JSON5, that all this goes on top of"
     )
-    insecure: bool = switch("allow listening beyond this machine without keys")
-    edges: str = option(TEXT, "*", "which edges to serve, for example 'uav-*'")
+    links: int = _LINK.option(
+        integer(1, 2),
+        1,
+        "2: where it connects, one Zenoh link for what is urgent and one for the rest",
+        rare=True,
+    )
+    insecure: bool = _LINK.switch("allow listening beyond this machine without keys")
+    edges: str = _LINK.option(TEXT, "*", "which edges to serve, for example 'uav-*'")
+    once: bool = _LINK.switch("end when the edges have ended")
+    wait: float = _LINK.option(
+        DURATION, 0.0, "with --once: give up when no edge came for so long; 0 waits for ever"
+    )
+    patience: float | None = _LINK.option(
+        DURATION,
+        None,
+        "how long an edge that went without a word may stay away before its session is closed",
+        shown_default="10min; 5s with --once",
+        rare=True,
+    )
 
-    detector: str = option(
+    detector: str = _MODELS.option(
         TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
     )
-    labels: Path | None = option(PATH, None, "class names of the classifier, one a line")
-    detector_labels: Path | None = option(PATH, None, "class names of the detector, one a line")
-    detect_every: int = option(
+    labels: Path | None = _MODELS.option(PATH, None, "class names of the classifier, one a line")
+    detector_labels: Path | None = _MODELS.option(
+        PATH, None, "class names of the detector, one a line", rare=True
+    )
+    detect_every: int = _MODELS.option(
         integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame, less when behind"
     )
-    confidence: float = option(number(0.01, 1), 0.25, "confidence from which a detection starts a track")
-    nms_iou: float = option(number(0.01, 1), 0.45, "overlap above which two boxes of a class are one")
-    camera_motion: str = option(
-        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion"
+    confidence: float = _MODELS.option(
+        number(0.01, 1), 0.25, "confidence from which a detection starts a track"
     )
-    classifier: str | None = option(
+    nms_iou: float = _MODELS.option(
+        number(0.01, 1), 0.45, "overlap above which two boxes of a class are one", rare=True
+    )
+    camera_motion: str = _MODELS.option(
+        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion", rare=True
+    )
+    classifier: str | None = _MODELS.option(
         TEXT,
         None,
         "FILE.onnx, a name of hvt-models list, none, or detector: it runs again with the stills pasted in",
         shown_default="aerial-cls; detector where --detector is another",
     )
-    refine: str = option(
+    refine: str = _MODELS.option(
         choice("replace", "fuse"),
         "replace",
         "a still's class replaces the track's, or is weighed with the others",
     )
-    threads: int = option(integer(1, 64), 2, "threads of the detector and the classifier")
-    provider: str = option(
+    threads: int = _MODELS.option(integer(1, 64), 2, "threads of the detector and the classifier", rare=True)
+    provider: str = _MODELS.option(
         choice(*PROVIDERS), "auto", "what runs the networks; auto says what it took and why"
     )
 
-    record: Path | None = option(
+    record: Path | None = _FILES.option(
         PATH, None, "FILE.rrd, or a folder for one file an edge", shown_default="hvt-<edge>-<time>.rrd here"
     )
-    tracks: Path | None = option(
+    tracks: Path | None = _FILES.option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
-    timing: Path | None = option(
-        PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
+    timing: Path | None = _FILES.option(
+        PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv", rare=True
     )
-    view: bool = switch("also open the Rerun viewer")
-    serve: bool = switch("also serve the Rerun web viewer on this machine")
-    once: bool = switch("end when the edges have ended")
-    wait: float = option(
-        DURATION, 0.0, "with --once: give up when no edge came for so long; 0 waits for ever"
-    )
-    patience: float | None = option(
-        DURATION,
-        None,
-        "how long an edge that went without a word may stay away before its session is closed",
-        shown_default="10min; 5s with --once",
-    )
-    summary: Path | None = option(PATH, None, "write the summary as JSON")
-    quiet: bool = switch("no status line")
+    view: bool = _FILES.switch("also open the Rerun viewer")
+    serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")
+    summary: Path | None = _FILES.option(PATH, None, "write the summary as JSON")
+    quiet: bool = _FILES.switch("no status line")
 
     @property
     def patience_s(self) -> float:

@@ -114,10 +114,23 @@ def test_a_source_is_needed():
         check(EdgeConfig())
 
 
+def test_the_short_help_is_short_and_grouped(capsys):
+    """A first reader would look for --budget among sixty settings."""
+    with pytest.raises(SystemExit):
+        load(EdgeConfig, ["--help"], program="hvt-edge", description="")
+    out = capsys.readouterr().out
+    flags = re.findall(r"^  (?:-h, )?--[a-z-]+", out, re.MULTILINE)
+    assert 20 <= len(flags) <= 30
+    for title in ("source:", "budget and link:", "what to send:", "models:", "files:"):
+        assert f"\n{title}\n" in out
+    assert "--help-all" in out
+    assert "--nms-iou" not in out
+
+
 def test_every_flag_explains_itself(capsys):
     """Somebody with a drone in the field would have to read the source."""
     with pytest.raises(SystemExit):
-        load(EdgeConfig, ["--help"], program="hvt-edge", description="")
+        load(EdgeConfig, ["--help-all"], program="hvt-edge", description="")
     out = " ".join(capsys.readouterr().out.split())
     for one in dataclasses.fields(EdgeConfig):
         flag = "--" + one.name.replace("_", "-")

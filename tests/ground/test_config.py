@@ -62,7 +62,7 @@ def test_folders_and_devices_may_be_named_twice(tmp_path):
 def test_every_flag_explains_itself(capsys):
     """Somebody at a ground station would have to read the source."""
     with pytest.raises(SystemExit):
-        load(GroundConfig, ["--help"], program="hvt-ground", description="")
+        load(GroundConfig, ["--help-all"], program="hvt-ground", description="")
     out = " ".join(capsys.readouterr().out.split())
     for one in dataclasses.fields(GroundConfig):
         assert "--" + one.name.replace("_", "-") in out
