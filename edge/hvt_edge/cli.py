@@ -11,8 +11,7 @@ from hvt_common.runtime.allocator import limit_malloc_arenas
 from hvt_common.runtime.reporting import print_table, start_log, write_json
 from hvt_common.runtime.stopping import stop_on_signals
 from hvt_edge.app import Edge
-from hvt_edge.config import EdgeConfig, check
-from hvt_edge.profiles import with_profile
+from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.summary import table
 
 __all__ = ["main"]

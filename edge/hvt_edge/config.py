@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -33,7 +33,7 @@ from hvt_common.units import bitrate_text
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.operating.point import base_rate_bps
 from hvt_edge.profiles import PROFILES
-from hvt_edge.source.opening import check_shape
+from hvt_edge.source.contract import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_edge.video.encoder_settings import PRESETS, least_base_bps
 from hvt_edge.video.share import FIRST_SHARE
@@ -46,6 +46,7 @@ __all__ = [
     "Regime",
     "check",
     "check_rate",
+    "with_profile",
 ]
 
 
@@ -341,6 +342,18 @@ class EdgeConfig:
     def fixed_size(self) -> tuple[int, int] | None:
         """(width, height) of the base stream; None where the rate decides."""
         return None if isinstance(self.size, str) else self.size
+
+
+def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
+    """The configuration with the profile's settings, except for fields that the user has ``given``."""
+    if config.profile is None:
+        return config
+    settings = dict(PROFILES[config.profile])
+    if config.regime is not None:  # which sets the share itself
+        del settings["video_share"]
+    if "candidates" in given and config.candidates != "source":
+        del settings["tiles"]
+    return replace(config, **{name: value for name, value in settings.items() if name not in given})
 
 
 def check(config: EdgeConfig) -> EdgeConfig:

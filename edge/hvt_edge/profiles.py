@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from hvt_edge.config import EdgeConfig
-
-__all__ = ["PROFILES", "with_profile"]
+__all__ = ["PROFILES"]
 
 PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
@@ -32,15 +28,3 @@ PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         ),
     }
 )
-
-
-def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
-    """The configuration with the profile's settings, except for fields that the user has ``given``."""
-    if config.profile is None:
-        return config
-    settings = dict(PROFILES[config.profile])
-    if config.regime is not None:  # which says the share itself
-        del settings["video_share"]
-    if "candidates" in given and config.candidates != "source":
-        del settings["tiles"]
-    return replace(config, **{name: value for name, value in settings.items() if name not in given})

@@ -36,9 +36,8 @@ from hvt_edge.operating.point import LoopClock, Operating
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.perception.candidates import Candidate, TrackMemory
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
-from hvt_edge.source.contract import Source
+from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.demo import write_truth_of
-from hvt_edge.source.resample import BaseSize
 from hvt_edge.status import InfoReporter
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.on_demand import OnDemand

@@ -1,15 +1,20 @@
-"""The contract of a source."""
+"""The contract of a source, and the sizes and rates that a base stream can have."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Self
 
+from hvt_common.errors import UserError
 from hvt_common.values import Frame, View
 
-__all__ = ["Source"]
+__all__ = ["BaseSize", "Source", "check_shape"]
+
+BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
+"""(width, height) of the base frames, or how they follow from those of the source."""
 
 
 class Source(ABC):
@@ -46,3 +51,23 @@ class Source(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
+    """Refuse sizes and rates that no base stream can have.
+
+    Raises:
+        UserError: names the value and what is accepted.
+    """
+    wide, high = (64, 64) if callable(size) else size
+    # HEVC codes 4:2:0 pictures in even sizes only.
+    if wide % 2 or high % 2 or not (64 <= wide <= 8192 and 64 <= high <= 8192):
+        raise UserError(
+            f"size {wide}x{high} is impossible: width and height must be even and between 64 and 8192"
+        )
+    if not (math.isfinite(fps) and 0 < fps <= 240):
+        raise UserError(f"fps {fps:g} is impossible: accepted is above 0 and at most 240 frames a second")
+    if source_fps is not None and not (math.isfinite(source_fps) and 0 < source_fps <= 1000):
+        raise UserError(
+            f"source-fps {source_fps:g} is impossible: accepted is above 0 and at most 1000 frames a second"
+        )

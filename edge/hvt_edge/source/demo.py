@@ -11,8 +11,8 @@ from typing import Protocol
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Fit, Frame, Image, View
-from hvt_edge.source.contract import Source
-from hvt_edge.source.resample import BaseSize, Resizer, capture_time_ns
+from hvt_edge.source.contract import BaseSize, Source
+from hvt_edge.source.resample import Resizer, capture_time_ns
 
 __all__ = ["DemoSource", "DrawnScene", "check_truth", "write_truth_of"]
 

@@ -10,8 +10,8 @@ from typing import Protocol
 from hvt_common.errors import UserError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.values import Fit, Frame, Image
-from hvt_edge.source.contract import Source
-from hvt_edge.source.resample import BaseSize, Gate, Resizer
+from hvt_edge.source.contract import BaseSize, Source
+from hvt_edge.source.resample import Gate, Resizer
 
 __all__ = ["Grabber", "LiveSource", "Shot", "SignalLost"]
 

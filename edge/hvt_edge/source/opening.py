@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -10,11 +9,10 @@ from urllib.parse import urlsplit
 from hvt_common.errors import UserError
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
-from hvt_edge.source.contract import Source
+from hvt_edge.source.contract import BaseSize, Source, check_shape
 from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.folder import FolderSource
 from hvt_edge.source.live import LiveSource
-from hvt_edge.source.resample import BaseSize
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber
 from hvt_edge.source.video import VideoSource
 
@@ -69,23 +67,3 @@ def open_source(
         raise UserError(f"source {spec!r} does not exist; accepted is {_ACCEPTED}")
     kind = FolderSource if not scheme and Path(spec).is_dir() else VideoSource
     return kind(spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps)
-
-
-def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
-    """Refuse sizes and rates that no base stream can have.
-
-    Raises:
-        UserError: names the value and what is accepted.
-    """
-    wide, high = (64, 64) if callable(size) else size
-    # HEVC codes 4:2:0 pictures in even sizes only.
-    if wide % 2 or high % 2 or not (64 <= wide <= 8192 and 64 <= high <= 8192):
-        raise UserError(
-            f"size {wide}x{high} is impossible: width and height must be even and between 64 and 8192"
-        )
-    if not (math.isfinite(fps) and 0 < fps <= 240):
-        raise UserError(f"fps {fps:g} is impossible: accepted is above 0 and at most 240 frames a second")
-    if source_fps is not None and not (math.isfinite(source_fps) and 0 < source_fps <= 1000):
-        raise UserError(
-            f"source-fps {source_fps:g} is impossible: accepted is above 0 and at most 1000 frames a second"
-        )

@@ -7,7 +7,7 @@ both axes and centred: whole between black borders (letterbox) or filling the fr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from typing import TypeVar
 
@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from hvt_common.values import Fit, Frame, Image, View
+from hvt_edge.source.contract import BaseSize
 
 __all__ = [
-    "BaseSize",
     "Gate",
     "Resizer",
     "base_frame_count",
@@ -27,9 +27,6 @@ __all__ = [
 ]
 
 _T = TypeVar("_T")
-
-BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
-"""(width, height) of the base frames, or how they follow from those of the source."""
 
 
 def capture_time_ns(index: int, *, fps: Fraction, start_ns: int) -> int:

@@ -18,8 +18,8 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
 from hvt_common.values import Fit, Frame, Image
-from hvt_edge.source.contract import Source
-from hvt_edge.source.resample import BaseSize, Resizer, base_frame_count, capture_time_ns, hold
+from hvt_edge.source.contract import BaseSize, Source
+from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
 __all__ = ["VideoSource", "upright_bgr", "without_password"]
 

@@ -16,7 +16,7 @@ from rich.table import Table
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
 from hvt_common.units import parse_size
-from hvt_edge.source.opening import check_shape
+from hvt_edge.source.contract import check_shape
 from hvt_study.compare_methods import METHODS, method_rows
 from hvt_study.sight import ComparePlan, CompareResult, CompareRow, compare
 

@@ -17,7 +17,7 @@ from hvt_common.inference.labels import first_synonym
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import parse_size
 from hvt_common.video.still_codecs import still_codec
-from hvt_edge.source.opening import check_shape
+from hvt_edge.source.contract import check_shape
 from hvt_ground.config import DETECTOR, NONE
 from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.uri import DATASETS, open_datasets
