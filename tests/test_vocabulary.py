@@ -33,6 +33,8 @@ _OF_LIBRARIES = """
 haveImageWriter keep_blank_values set_log_tick_enabled set_xticks set_yticks tick_params xticks yticks
 """
 _LIBRARIES_SAY = frozenset(_OF_LIBRARIES.split())
+_FORMER_OPTION = re.compile(r'^\s+"[a-z-]+": (_REFRESH_GONE|"give --)')
+"""A line of the table that answers an option of an earlier version with what takes its place."""
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z0-9]+")
 
 
@@ -65,7 +67,7 @@ def test_words_that_went_stay_away():
     found = []
     for file in _tracked("*.py", "*.md", "*.toml", "Makefile", "*.yaml", "*.service"):
         for number, line in enumerate((ROOT / file).read_text(encoding="utf-8").splitlines(), 1):
-            said = line
+            said = "" if _FORMER_OPTION.match(line) else line
             for name in _LIBRARIES_SAY:
                 said = said.replace(name, "")
             found += [f"{file}:{number}: {match[0]}" for match in _NEVER.finditer(said)]

@@ -28,9 +28,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    config, asked = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
-    config = with_profile(config, given=asked.values)
-    if asked.print_config:
+    config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
+    config = with_profile(config, given=given.values)
+    if given.print_config:
         print(to_toml(config), end="")
         return 0
     config = check(config)

@@ -335,7 +335,7 @@ class EdgeConfig:
 
     @property
     def auto_fps(self) -> bool:
-        """Whether the rate decides how many ticks are sent."""
+        """Whether the rate decides how many source frames are coded."""
         return isinstance(self.fps, str)
 
     @property

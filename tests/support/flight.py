@@ -110,7 +110,7 @@ def pipeline_of(
     edge_classes: Sequence[str] = CLASSES,
     wants_base: bool = False,
 ) -> Pipeline:
-    """Eyes of a session of this flight."""
+    """The perception pipeline of a session of this flight."""
     reader = reader or SameAnswer()
     names, places = unified_names(CLASSES, edge_classes)
     path = CameraPath(ahead_ticks=15)

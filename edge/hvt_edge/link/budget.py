@@ -6,8 +6,8 @@ Two limits hold for stills at once, both in line bytes (payload, attachment and 
 
 * **the share**: stills earn what is neither the base's nor metadata's, ``B_tot - B_v - metadata``, all the time and
   may save up what they do not spend, but no more than ``carry_s`` seconds of it (a token bucket). With
-  ``borrow_unused`` they
-  may also take what the base left of ``B_v`` in the last window: base and what was lent stay within ``B_v`` there;
+  ``borrow_unused`` they may also take what the base left of ``B_v`` in the last window: base and borrowed bits stay
+  within ``B_v`` there;
 * **the window**: in every rolling window of ``window_ns``, past or still to come, base and stills together stay
   within ``B_tot``. A still sent now sits in every window that ends up to one window from now, so the
   base frames that will share those windows are counted in advance, each at the time it is due: at the mean rate of
@@ -81,7 +81,7 @@ class RollingBudget:
         self._base_events: deque[tuple[int, int]] = deque()
         self._lent: deque[tuple[int, float]] = deque()
         """(time, bytes that a still took of what the base had left)."""
-        self._asked_ns: int | None = None
+        self._query_ns: int | None = None
         self._last_ns = 0
         self._last_base_ns: int | None = None
         self._old_peak = (0, 0.0)
@@ -137,23 +137,22 @@ class RollingBudget:
 
     @property
     def most_still_bytes(self) -> int:
-        """The most line bytes that `still_room` ever gives, while the base keeps to its share."""
+        """The most line bytes that `still_allowance` ever gives, while the base keeps to its share."""
         window_s = self._settings.window_ns / _SECOND_NS
         borrowed = self._settings.base_bps * window_s / 8 if self._settings.borrow_unused else 0.0
         return int(min(self._cap + borrowed, self._settings.still_bps * window_s / 8))
 
     def record_base(
-        self, line_bytes: int, *, now_ns: int, keyframe: bool = False, kept: bool = False
+        self, line_bytes: int, *, now_ns: int, keyframe: bool = False, stored: bool = False
     ) -> None:
         """Count one base message; ``now_ns`` is when `earliest_ns` lets it go.
 
-        One that is ``kept`` for later uses up the base's share, so that nobody takes it for left over, and nothing of
-        the line.
+        One that is ``stored`` for later uses up the base's share, so that nobody borrows it, and nothing of the line.
         """
         self._base_events.append((now_ns, line_bytes))
         while self._base_events[0][0] <= now_ns - 2 * self._settings.window_ns:
             self._base_events.popleft()
-        if not kept:
+        if not stored:
             self._record(line_bytes, now_ns)
             self._last_ns = max(self._last_ns, now_ns)
         self._last_base_ns = max(self._last_base_ns or now_ns, now_ns)
@@ -170,7 +169,7 @@ class RollingBudget:
         self._record(line_bytes, now_ns)
 
     def record_still(self, line_bytes: int, *, now_ns: int) -> None:
-        """Count one still; it was admitted by `still_room` at this very time."""
+        """Count one still; it was admitted by `still_allowance` at this very time."""
         self._refill(now_ns)
         # What the base left goes first: it is gone a window later, what was saved up is not.
         borrowed = min(float(line_bytes), self._borrowable(now_ns))
@@ -179,7 +178,7 @@ class RollingBudget:
         self._tokens -= line_bytes - borrowed
         self._record(line_bytes, now_ns)
 
-    def has_room(self, line_bytes: int, *, now_ns: int) -> bool:
+    def fits(self, line_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a message of so many line bytes, sent now, leaves every window within the total.
 
         What another thread has sent since a still or a piece was admitted may have taken its room.
@@ -194,14 +193,14 @@ class RollingBudget:
         their order: never before the base message or metadata recorded last. The wait beyond that is one window at
         the most, also for a message that no window can hold.
         """
-        self._note_asked(now_ns)
+        self._note_query(now_ns)
         at_ns = max(now_ns, self._last_ns)
         latest_ns = at_ns + self._settings.window_ns
         if base:
-            at_ns = self._first_room(self._base_events, self._peak_at(at_ns), line_bytes, at_ns)
-        return min(latest_ns, self._first_room(self._events, self._total, line_bytes, at_ns))
+            at_ns = self._first_fit_ns(self._base_events, self._peak_at(at_ns), line_bytes, at_ns)
+        return min(latest_ns, self._first_fit_ns(self._events, self._total, line_bytes, at_ns))
 
-    def _first_room(
+    def _first_fit_ns(
         self, events: Sequence[tuple[int, int]], limit: float, line_bytes: int, at_ns: int
     ) -> int:
         """The first moment from ``at_ns`` at which the window of these events has room."""
@@ -215,10 +214,10 @@ class RollingBudget:
             at_ns = max(at_ns, event_ns + window_ns)
         return at_ns
 
-    def still_room(self, now_ns: int) -> int:
+    def still_allowance(self, now_ns: int) -> int:
         """Return how many line bytes a still may take now; 0 where it has to wait."""
         self._refill(now_ns)
-        return max(0, int(min(self._tokens + self._borrowable(now_ns), self._window_room(now_ns))))
+        return max(0, int(min(self._tokens + self._borrowable(now_ns), self._window_allowance(now_ns))))
 
     def backlog_allowance(self, now_ns: int, *, reserve: float) -> int:
         """Return how many line bytes of what was kept may go now: what neither base nor stills will want.
@@ -231,23 +230,23 @@ class RollingBudget:
             after_ns = now_ns - settings.window_ns
             free = self._total - sum(size for at_ns, size in self._events if at_ns > after_ns)
         else:
-            free = self._window_room(now_ns)
-        kept_free = reserve * settings.still_bps * settings.window_ns / 8 / _SECOND_NS
-        return max(0, int(free - kept_free))
+            free = self._window_allowance(now_ns)
+        reserved = reserve * settings.still_bps * settings.window_ns / 8 / _SECOND_NS
+        return max(0, int(free - reserved))
 
     def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a keyframe of this many line bytes, sent now, leaves every window within the total."""
-        return self._window_room(now_ns) + self.base_step_bytes >= keyframe_bytes
+        return self._window_allowance(now_ns) + self.base_step_bytes >= keyframe_bytes
 
     def _record(self, line_bytes: int, now_ns: int) -> None:
         insort(self._events, (now_ns, line_bytes))
         # Twice the window before whoever asks: a still may be asked about while a base message waits for later.
-        oldest_ns = min(now_ns, self._asked_ns or now_ns) - 2 * self._settings.window_ns
+        oldest_ns = min(now_ns, self._query_ns or now_ns) - 2 * self._settings.window_ns
         while self._events[0][0] <= oldest_ns:
             del self._events[0]
 
-    def _note_asked(self, now_ns: int) -> None:
-        self._asked_ns = max(now_ns, self._asked_ns or now_ns)
+    def _note_query(self, now_ns: int) -> None:
+        self._query_ns = max(now_ns, self._query_ns or now_ns)
 
     def _refill(self, now_ns: int) -> None:
         if self._tokens_ns is not None:
@@ -277,7 +276,7 @@ class RollingBudget:
         taken = sum(size for at_ns, size in self._base_events if at_ns > first_ns)
         return max(0.0, settings.base_bps * settings.window_ns / 8 / _SECOND_NS - taken - borrowed)
 
-    def _window_room(self, now_ns: int) -> float:
+    def _window_allowance(self, now_ns: int) -> float:
         """The least room over every window that would contain a message sent now.
 
         The fullest windows end with a base frame. The one that ends with the ``k``-th from now holds the past bytes
@@ -285,7 +284,7 @@ class RollingBudget:
         0, ends now and also holds what was recorded for later: with it the room is never more than any window
         has, whatever the base does.
         """
-        self._note_asked(now_ns)
+        self._note_query(now_ns)
         due_ns = max(now_ns, (self._last_base_ns or now_ns - self._step_ns) + self._step_ns)
         # A hair later than due, so that by rounding no frame more falls into the window than its rate has.
         ahead_ns = due_ns - now_ns + (self._forecasts - 1) * self._step_ns + round(_ROUNDING * self._step_ns)

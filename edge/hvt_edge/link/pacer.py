@@ -179,9 +179,9 @@ class Pacer:
         return self._round_trip_ns
 
     @property
-    def settled(self) -> bool:
+    def at_ceiling(self) -> bool:
         """Whether the rate is the ceiling."""
-        return self._controller.settled
+        return self._controller.at_ceiling
 
     @property
     def backoffs(self) -> int:

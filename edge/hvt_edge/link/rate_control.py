@@ -119,7 +119,7 @@ class RateController:
         self._recent: deque[_Judged] = deque(maxlen=64)
         self._judge_from_ns = -(2**63)
         """Only messages sent from here on say something about the present rate."""
-        self._knee = self._low = float(settings.ceiling_bps)
+        self._cubic_max = self._low = float(settings.ceiling_bps)
         self._plateau_ns = settings.plateau_ns
         self._curve_ns = 2**62
         """How far along the curve of growth: only time in which nothing speaks against it counts."""
@@ -139,12 +139,12 @@ class RateController:
     @property
     def steady_bps(self) -> int:
         """What is likely to last, for what cannot follow each step: near where it broke down, a little below that."""
-        if self._rate >= self._settings.ceiling_bps or self._rate > 1.15 * self._knee:
+        if self._rate >= self._settings.ceiling_bps or self._rate > 1.15 * self._cubic_max:
             return self.rate_bps
-        return min(self.rate_bps, max(self._settings.floor_bps, round(0.9 * self._knee)))
+        return min(self.rate_bps, max(self._settings.floor_bps, round(0.9 * self._cubic_max)))
 
     @property
-    def settled(self) -> bool:
+    def at_ceiling(self) -> bool:
         """Whether the rate is the ceiling, and so will stay."""
         return self._rate >= self._settings.ceiling_bps
 
@@ -160,7 +160,7 @@ class RateController:
         floor = min(ceiling_bps, old.floor_bps if floor_bps is None else floor_bps)
         self._settings = replace(old, ceiling_bps=ceiling_bps, floor_bps=floor)
         if at_ceiling or self._rate > ceiling_bps:
-            self._rate = self._knee = float(ceiling_bps)
+            self._rate = self._cubic_max = float(ceiling_bps)
 
     def on_progress(self, progress: Progress) -> int:
         """Take in one report that names a message that none before has named; return the rate."""
@@ -187,7 +187,7 @@ class RateController:
         if not self._silent:
             self._silent = True
             if self._curve_ns >= self._plateau_ns:  # else it is still on its way back
-                self._knee = self._rate
+                self._cubic_max = self._rate
             self._rate = self._low = float(self._settings.floor_bps)
             self._curve_ns, self._plateau_ns = 0, self._settings.resume_ns
             self.backoffs += 1
@@ -199,7 +199,7 @@ class RateController:
         """It was the receiver that left, not the link: the rate is what it was before."""
         if self._silent:
             self._silent = False
-            self._rate, self._curve_ns = max(self._rate, self._knee), self._plateau_ns
+            self._rate, self._curve_ns = max(self._rate, self._cubic_max), self._plateau_ns
 
     def forget_path(self) -> None:
         """The receiver or the transport is another: delays of before say nothing."""
@@ -257,9 +257,9 @@ class RateController:
 
     def _back_off(self, progress: Progress, rate: float) -> None:
         broke_bps = min(self._rate, self._arriving_bps())
-        again = 0.85 * self._knee < broke_bps < 1.15 * self._knee
+        again = 0.85 * self._cubic_max < broke_bps < 1.15 * self._cubic_max
         self._rate = max(rate, self._rate / 10, self._settings.floor_bps)
-        self._knee, self._low, self._curve_ns = max(self._rate, broke_bps), self._rate, 0
+        self._cubic_max, self._low, self._curve_ns = max(self._rate, broke_bps), self._rate, 0
         # A link that breaks down at the same rate time and again is tried more rarely.
         least_ns = self._settings.plateau_ns
         self._plateau_ns = min(2 * least_ns, self._plateau_ns * 13 // 10) if again else least_ns
@@ -286,9 +286,9 @@ class RateController:
     def _on_curve(self, curve_ns: int) -> float:
         if curve_ns < self._plateau_ns:
             left = 1 - curve_ns / self._plateau_ns
-            return self._knee - (self._knee - self._low) * left**3
+            return self._cubic_max - (self._cubic_max - self._low) * left**3
         beyond_s = (curve_ns - self._plateau_ns) / _SECOND_NS
-        return self._knee * (1 + self._settings.beyond_per_s3 * beyond_s**3)
+        return self._cubic_max * (1 + self._settings.beyond_per_s3 * beyond_s**3)
 
     def _lately_bps(self) -> float:
         """What arrived in about the last second; half the rate where that is not known yet."""
@@ -333,11 +333,11 @@ class ReconfigurationTrigger:
         self._done_ns: int | None = None
         self._off_ns: int | None = None
 
-    def wants(self, wanted_bps: float, base_bps: float, *, settled: bool, now_ns: int) -> bool:
-        """``base_bps`` is what x265 is opened for; ``settled``: the wanted rate is the one that will stay."""
+    def wants(self, wanted_bps: float, base_bps: float, *, at_ceiling: bool, now_ns: int) -> bool:
+        """``base_bps`` is what x265 is opened for; ``at_ceiling``: the wanted rate is the one that will stay."""
         settings = self._settings
         ratio = wanted_bps / base_bps
-        if abs(ratio - 1) <= (settings.little if settled else settings.some):
+        if abs(ratio - 1) <= (settings.little if at_ceiling else settings.some):
             self._off_ns = None
             return False
         self._off_ns = now_ns if self._off_ns is None else self._off_ns

@@ -28,7 +28,7 @@ class TrackReportSettings:
     most_bps: int = 12_000
     """Payload bits a second at most: in a crowd steps come less often."""
     fresh_frames: int = 5
-    """A track whose last detection is older than so many ticks is left out."""
+    """A track whose last detection is older than so many source frames is left out."""
     refresh_ns: int = _SECOND_NS
     """So often, in capture time, a step stands by itself: a lost one hurts no longer."""
 
@@ -83,16 +83,16 @@ class TrackReporter:
 
 
 def _fresh(tracks: Tracks, *, most_frames: int) -> Tracks:
-    kept = np.flatnonzero(tracks.frame_index - tracks.seen_frames <= most_frames)
-    if len(kept) == len(tracks):
+    fresh = np.flatnonzero(tracks.frame_index - tracks.seen_frames <= most_frames)
+    if len(fresh) == len(tracks):
         return tracks
     return Tracks(
         frame_index=tracks.frame_index,
-        ids=tracks.ids[kept],
-        boxes_xyxy_px=tracks.boxes_xyxy_px[kept],
-        confidences=tracks.confidences[kept],
-        class_ids=tracks.class_ids[kept],
-        born_frames=tracks.born_frames[kept],
-        seen_frames=tracks.seen_frames[kept],
-        started=tracks.started[kept],
+        ids=tracks.ids[fresh],
+        boxes_xyxy_px=tracks.boxes_xyxy_px[fresh],
+        confidences=tracks.confidences[fresh],
+        class_ids=tracks.class_ids[fresh],
+        born_frames=tracks.born_frames[fresh],
+        seen_frames=tracks.seen_frames[fresh],
+        started=tracks.started[fresh],
     )

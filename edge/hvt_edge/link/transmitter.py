@@ -180,7 +180,7 @@ class Transmitter:
         budget allows, whether or not the link is free at this moment.
         """
         with self._lock:
-            line_bytes = self._budget.still_room(now_ns)
+            line_bytes = self._budget.still_allowance(now_ns)
         if paced and self._pacer is not None and not self._pacer.admits_still(now_ns):
             return 0
         if still is None:
@@ -220,7 +220,7 @@ class Transmitter:
         """An access unit is stored: it has used up its share, and left nothing of it to a still."""
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
-            self._budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, kept=True)
+            self._budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, stored=True)
 
     def store_still(self, envelope: StillEnvelope, *, now_ns: int, counted: bool = True) -> BacklogStill:
         """The still as it would have gone out, for the backlog; ``counted``: its share of the budget is taken."""
@@ -362,7 +362,7 @@ class Transmitter:
         line_bytes = self._line_bytes(
             Channel.ROI, envelope.still.data, header_bytes, encoding=envelope.encoding
         )
-        if self._budget.has_room(line_bytes, now_ns=now_ns):
+        if self._budget.fits(line_bytes, now_ns=now_ns):
             return now_ns
         return self._budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
 

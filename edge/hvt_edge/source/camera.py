@@ -14,8 +14,8 @@ from hvt_edge.source.live import Shot, SignalLost
 
 __all__ = ["CameraGrabber"]
 
-_WISH = (1920, 1080)
-"""Asked of the camera; it answers with the nearest it has. Stills live on what exceeds the base size."""
+_REQUESTED_SIZE = (1920, 1080)
+"""Requested of the camera, which takes the nearest it has. Stills live on what exceeds the base size."""
 
 _READ_MS = 2000
 
@@ -25,7 +25,7 @@ class CameraGrabber:
 
     Args:
         path: /dev/videoN.
-        fps: asked of the camera.
+        fps: requested of the camera.
     """
 
     def __init__(self, path: str, *, fps: float) -> None:
@@ -41,8 +41,8 @@ class CameraGrabber:
         """
         path = Path(self.name)
         if not path.exists():
-            have = ", ".join(sorted(str(found) for found in Path("/dev").glob("video*"))) or "none"
-            raise UserError(f"camera {self.name} does not exist; devices here: {have}")
+            found = ", ".join(sorted(str(one) for one in Path("/dev").glob("video*"))) or "none"
+            raise UserError(f"camera {self.name} does not exist; devices here: {found}")
         # By number: a name like /dev/v4l/by-id/… is a link to it, and OpenCV takes a negative one for "any camera".
         number = re.fullmatch(r"video(\d+)", path.resolve().name)
         if number is None or not stat.S_ISCHR(path.stat().st_mode):
@@ -54,13 +54,13 @@ class CameraGrabber:
             )
         # Uncompressed 1080p does not fit USB 2; a camera without MJPEG keeps its own format.
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
-        capture.set(cv2.CAP_PROP_FRAME_WIDTH, _WISH[0])
-        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, _WISH[1])
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, _REQUESTED_SIZE[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, _REQUESTED_SIZE[1])
         capture.set(cv2.CAP_PROP_FPS, self._fps)
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._capture = capture
 
-    def reopen(self) -> None:
+    def restart(self) -> None:
         """Open again after `SignalLost`."""
         self.close()
         try:
@@ -75,8 +75,8 @@ class CameraGrabber:
             raise SignalLost("the camera delivers no frame")
 
         def shot() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-            kept, image = capture.retrieve()
-            if not kept:
+            decoded, image = capture.retrieve()
+            if not decoded:
                 raise SignalLost("the camera's frame cannot be decoded")
             return np.asarray(image, np.uint8)
 
@@ -91,10 +91,10 @@ class CameraGrabber:
 
 def _quietly_opened(number: int) -> cv2.VideoCapture:
     """The capture, opened or not, without OpenCV's own lines on stderr."""
-    wishes = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
+    timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 5000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.VideoCapture(number, cv2.CAP_V4L2, wishes)
+        return cv2.VideoCapture(number, cv2.CAP_V4L2, timeouts)
     finally:
         cv2.utils.logging.setLogLevel(level)

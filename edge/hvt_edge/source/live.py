@@ -36,7 +36,7 @@ class Grabber(Protocol):
     def open(self) -> None:
         """Open for the first time: raises UserError where there is nothing."""
 
-    def reopen(self) -> None:
+    def restart(self) -> None:
         """Open again after `SignalLost`; raises `SignalLost` if that fails."""
 
     def grab(self) -> Shot:
@@ -147,7 +147,7 @@ class LiveSource(Source):
         _log.warning("%s stopped (%s); opening it again", self._grabber.name, error)
         while not self._stop.wait(wait_s):
             try:
-                self._grabber.reopen()
+                self._grabber.restart()
             except SignalLost as again:
                 wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
                 _log.warning("%s is still away (%s); next try in %g s", self._grabber.name, again, wait_s)

@@ -53,7 +53,7 @@ def hold(
             predecessor replaces it.
         fps: base rate.
         tail_s: how long the last frame is shown.
-        slack_s: how much too late a time stamp may be and still count as on time: the container's tick, because
+        slack_s: how much too late a time stamp may be and still count as on time: the container's time base, because
             Matroska rounds times to milliseconds and 2/30 s becomes 0.067 s.
 
     Yields:
@@ -108,8 +108,8 @@ class Resizer:
     """
 
     def __init__(self, source_size: tuple[int, int], base_size: BaseSize, *, fit: Fit) -> None:
-        settled = base_size(source_size) if callable(base_size) else base_size
-        self.view = View.fitted(source_size, settled, fit=fit)
+        size = base_size(source_size) if callable(base_size) else base_size
+        self.view = View.fitted(source_size, size, fit=fit)
         self._fit = fit
         self._last: tuple[Image, Image] | None = None
 
@@ -160,9 +160,12 @@ def _cropped(source: Image, view: View) -> Image:
         )
         left, top = (grown.shape[1] - base_wide) // 2, (grown.shape[0] - base_high) // 2
         return np.ascontiguousarray(grown[top : top + base_high, left : left + base_wide])
-    cut = (min(wide, max(1, round(base_wide / view.scale))), min(high, max(1, round(base_high / view.scale))))
-    left, top = (wide - cut[0]) // 2, (high - cut[1]) // 2
-    return _scaled(source[top : top + cut[1], left : left + cut[0]], view.base_size)
+    crop = (
+        min(wide, max(1, round(base_wide / view.scale))),
+        min(high, max(1, round(base_high / view.scale))),
+    )
+    left, top = (wide - crop[0]) // 2, (high - crop[1]) // 2
+    return _scaled(source[top : top + crop[1], left : left + crop[0]], view.base_size)
 
 
 def _scaled(picture: Image, size: tuple[int, int]) -> Image:

@@ -17,7 +17,7 @@ __all__ = ["LIVE_SCHEMES", "StreamGrabber"]
 LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
 _OPEN_S = 10.0
-_REOPEN_S = 2.5
+_RESTART_S = 2.5
 _READ_S = 2.0  # also how long closing may take
 
 _OPTIONS = {
@@ -56,11 +56,11 @@ class StreamGrabber:
         """Whether what is open has a known duration: a file behind an address, not a live stream."""
         return bool(self._container.duration)
 
-    def reopen(self) -> None:
+    def restart(self) -> None:
         """Open again after `SignalLost`."""
         self.close()
         try:
-            self._start(_REOPEN_S)
+            self._start(_RESTART_S)
         except UserError as error:
             raise SignalLost(str(error)) from error
 

@@ -88,10 +88,10 @@ class VideoSource(Source):
         base_rate = exact_rate(self.fps)
         container, stream = _open(self._spec)
         with container, closing(_decoded(container, stream, spec=self._spec)) as decoded:
-            tick_s = Fraction(0) if self._override else Fraction(stream.time_base or 0)
+            slack_s = Fraction(0) if self._override else Fraction(stream.time_base or 0)
             stamped = self._stamped(decoded)
             held: tuple[av.VideoFrame, Image] | None = None
-            for index, frame in hold(stamped, fps=base_rate, tail_s=1 / self._rate, slack_s=tick_s):
+            for index, frame in hold(stamped, fps=base_rate, tail_s=1 / self._rate, slack_s=slack_s):
                 if index == self._limit:
                     return
                 if held is None or held[0] is not frame:  # only what is shown is converted

@@ -19,7 +19,7 @@ SIZES = ((1280, 720), (960, 540), (640, 360), (480, 270), (320, 180))
 x265 still codes 15 frames a second on two cores; ``--size`` may ask for more."""
 
 _STEPS = (1, 2, 3, 5, 8, 15)
-"""The ladder of n: each n-th tick is coded."""
+"""The ladder of n: each n-th source frame is coded."""
 _LEAST_FPS = 2.0
 """A budget's window of a second holds two frames at least (see config)."""
 
@@ -41,14 +41,14 @@ def choose_base(
     most_fps: float,
     least_fps: float = _LEAST_FPS,
 ) -> tuple[tuple[int, int], int]:
-    """The base stream's (width, height), and n where each n-th tick of ``most_fps`` is coded.
+    """The base stream's (width, height), and n where each n-th frame of ``most_fps`` is coded.
 
     Args:
         payload_bps: what x265 gets, without headers of any transport.
         source_size: (width, height) of the source; with ``size`` None the base is never larger.
-        size: what the user asks for; None is ``--size auto``.
-        fps: what the user asks for: the ticks themselves, so n is 1. None is ``--fps auto``.
-        most_fps: rate of the ticks where ``fps`` is None.
+        size: what the user sets; None is ``--size auto``.
+        fps: what the user sets: each source frame, so n is 1. None is ``--fps auto``.
+        most_fps: source frame rate where ``fps`` is None.
         least_fps: the lowest rate of coded frames.
 
     Raises:
@@ -79,7 +79,7 @@ def better_decimation(decimation: int, *, mean_qp: float, most_decimation: int) 
 
 
 def most_decimation(fps: float, *, least_fps: float = _LEAST_FPS) -> int:
-    """The largest n of the ladder that leaves ``least_fps`` of ``fps`` ticks a second."""
+    """The largest n of the ladder that leaves ``least_fps`` of ``fps`` source frames a second."""
     return max((n for n in _STEPS if fps / n >= least_fps), default=1)
 
 

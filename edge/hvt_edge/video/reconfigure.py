@@ -86,7 +86,7 @@ class EncoderReconfiguration:
         self._allow(self._pacer.rate_bps, now_ns)
         wanted_bps = self._base_of(self._pacer.steady_bps)
         return self._trigger.wants(
-            wanted_bps, self._operating.now.base_bps, settled=self._pacer.settled, now_ns=now_ns
+            wanted_bps, self._operating.now.base_bps, at_ceiling=self._pacer.at_ceiling, now_ns=now_ns
         )
 
     def hold(self, now_ns: int) -> None:
@@ -145,7 +145,7 @@ class EncoderReconfiguration:
             pacer.set_ceiling(now.budget_bps, floor_bps=floor_bps)
         self._proposed_bps(changed=changed)  # which moves the share
         base_bps = self._base_of(pacer.steady_bps)
-        near = abs(base_bps / now.base_bps - 1) <= _WORTH and not (pacer.settled or changed)
+        near = abs(base_bps / now.base_bps - 1) <= _WORTH and not (pacer.at_ceiling or changed)
         if decimation == now.decimation and (near or base_bps == now.base_bps):
             return None
         self._trigger.done(now_ns)

@@ -67,7 +67,7 @@ class Split:
         self._need_bytes = 0.0
         self._shown = 1.0
         self._observed_ns: int | None = None
-        self._settled_ns = 0
+        self._changed_ns = 0
         """Since when the share is what it is."""
 
     def observe(self, candidates: Sequence[Candidate], step: Step) -> None:
@@ -77,7 +77,7 @@ class Split:
         shown = 1 - sum(doubts) / len(doubts) if doubts else 1.0
         decay = 0.0
         if self._observed_ns is None:
-            self._settled_ns = step.now_ns
+            self._changed_ns = step.now_ns
         else:
             decay = math.exp(-max(0, step.now_ns - self._observed_ns) / 1e9 / self._settings.memory_s)
         self._need_bytes = decay * self._need_bytes + (1 - decay) * need_bytes
@@ -96,12 +96,12 @@ class Split:
         share = self._target()
         if abs(share - self.share) < self._settings.least_change - 1e-9:
             return None
-        self.share, self._settled_ns = share, self._observed_ns
+        self.share, self._changed_ns = share, self._observed_ns
         return share
 
     def wants_keyframe(self, now_ns: int) -> bool:
         """Whether the scene has changed so much that the split should not wait for the next keyframe that comes."""
-        if self._observed_ns is None or now_ns - self._settled_ns < self._settings.own_rest_s * 1e9:
+        if self._observed_ns is None or now_ns - self._changed_ns < self._settings.own_rest_s * 1e9:
             return False
         return abs(self._target() - self.share) >= self._settings.own_change - 1e-9
 

@@ -172,7 +172,7 @@ class DdsEdge:
                 self._asked.clear()
                 self._most_bytes = 0  # what comes later would build on what was left out
                 break
-            if size_bytes > self._budget.still_room(now_ns):
+            if size_bytes > self._budget.still_allowance(now_ns):
                 break
             self._budget.record_still(size_bytes, now_ns=now_ns)
             self._line.send(Channel.ROI, self._ready, at_ns=now_ns)

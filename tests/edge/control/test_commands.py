@@ -271,10 +271,10 @@ def test_after_a_change_every_message_keeps_to_the_budget_of_its_own_time(seed, 
     rng = np.random.default_rng(seed)
     budget = RollingBudget(BudgetSettings(totals[0], round(0.8 * totals[0]), fps=15))
     sent: list[tuple[int, int]] = []
-    for tick in range(45 * len(totals)):
-        total, keyframe = totals[tick // 45], tick % 45 == 0
-        now_ns = START_NS + tick * FRAME_NS
-        if keyframe and tick:
+    for index in range(45 * len(totals)):
+        total, keyframe = totals[index // 45], index % 45 == 0
+        now_ns = START_NS + index * FRAME_NS
+        if keyframe and index:
             budget.set_total(total, round(0.8 * total), 15.0, now_ns=now_ns)
         size = int(min(total / 8, 0.8 * total / 8 / 15 * rng.gamma(4, 0.25) * (4 if keyframe else 1)))
         at_ns = budget.earliest_ns(size, now_ns=now_ns, base=True)
@@ -282,7 +282,7 @@ def test_after_a_change_every_message_keeps_to_the_budget_of_its_own_time(seed, 
             continue  # the frame loop leaves out a frame that would have to wait
         budget.record_base(size, now_ns=at_ns, keyframe=keyframe)
         _check(sent, (at_ns, size), total)
-        while (room := budget.still_room(now_ns)) > 300:
+        while (room := budget.still_allowance(now_ns)) > 300:
             still = int(rng.integers(300, room + 1))
             budget.record_still(still, now_ns=now_ns)
             _check(sent, (now_ns, still), total)

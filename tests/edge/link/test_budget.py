@@ -96,7 +96,7 @@ def test_no_rolling_window_exceeds_the_total(one, seed, burst, greed):
         if number % max(1, round(one.fps)) == 0:
             run.status(400, now_ns)
         for _ in range(4):
-            room = run.budget.still_room(now_ns)
+            room = run.budget.still_allowance(now_ns)
             if room < 300:
                 break
             run.still(int(rng.integers(300, max(300, round(room * greed)) + 1)), now_ns)
@@ -112,7 +112,7 @@ def test_stills_keep_to_their_share(one, seed):
     for number in range(min(240, round(8 * one.fps))):
         now_ns = START_NS + round(number * SECOND_NS / one.fps)
         run.base(int(one.base_bps / 8 / one.fps * rng.uniform(0.1, 0.6)), now_ns)  # it leaves a lot
-        while (room := run.budget.still_room(now_ns)) >= 200:
+        while (room := run.budget.still_allowance(now_ns)) >= 200:
             run.still(int(rng.integers(200, room + 1)), now_ns)
     share = one.still_bps / 8
     for seconds in (one.window_ns / SECOND_NS, 1.0, 4.0):
@@ -168,7 +168,7 @@ def test_two_threads_with_times_a_little_apart_hold_it_too(seed, one, skew):
         run.base(int(min(mean * rng.gamma(1, 1.5), total_bytes(one))), now_ns)
         late_ns = now_ns - int(rng.integers(0, skew + 1))
         for _ in range(3):
-            room = run.budget.still_room(late_ns)
+            room = run.budget.still_allowance(late_ns)
             if room < 200:
                 break
             run.still(int(rng.integers(200, room + 1)), late_ns)
@@ -185,7 +185,7 @@ def test_with_a_steady_base_the_stills_get_their_share(total_bps, base_bps, wind
     for number in range(seconds * 15):
         now_ns = START_NS + round(number * SECOND_NS / 15)
         run.base(round(base_bps / 8 / 15 * rng.uniform(0.9, 1.1)), now_ns)
-        while run.budget.still_room(now_ns) >= 1_500:
+        while run.budget.still_allowance(now_ns) >= 1_500:
             run.still(1_500, now_ns)
             sent += 1_500
     assert sent * 8 / seconds >= 0.85 * (total_bps - base_bps)
@@ -199,7 +199,7 @@ def test_stills_yield_where_the_base_overshoots():
     for number in range(45):
         now_ns = START_NS + round(number * SECOND_NS / 15)
         run.base(round(650_000 / 8 / 15 * (1.2 if number >= 15 else 1.0)), now_ns)
-        rooms.append(run.budget.still_room(now_ns))
+        rooms.append(run.budget.still_allowance(now_ns))
     assert rooms[14] > 15_000
     assert rooms[29] < 3_000
 
@@ -224,7 +224,7 @@ def test_a_keyframe_fits_once_what_was_before_it_has_left():
 
 @pytest.mark.parametrize("window_s", [0.5, 1.0, 4.0])
 def test_the_most_a_still_is_ever_given_is_known(window_s):
-    """A wish larger than that would wait for room that never comes."""
+    """A request larger than that would wait for room that never comes."""
     one = BudgetSettings(800_000, 650_000, fps=10, window_ns=round(window_s * SECOND_NS))
     budget = RollingBudget(one)
     assert budget.most_still_bytes == int(min(window_s, 2.0) * 150_000 / 8)
@@ -232,7 +232,7 @@ def test_the_most_a_still_is_ever_given_is_known(window_s):
     for number in range(120):
         now_ns = START_NS + round(number * SECOND_NS / 10)
         budget.record_base(8125, now_ns=now_ns)
-        rooms.append(budget.still_room(now_ns))
+        rooms.append(budget.still_allowance(now_ns))
     assert max(rooms[round(20 * window_s) :]) <= budget.most_still_bytes
     assert rooms[-1] >= 0.95 * budget.most_still_bytes
 
@@ -244,7 +244,7 @@ def test_memory_is_bounded_and_a_long_window_costs_no_more():
         now_ns = START_NS + round(number * SECOND_NS / 30)
         at_ns = budget.earliest_ns(2_700, now_ns=now_ns)
         budget.record_base(2_700, now_ns=at_ns)
-        budget.still_room(now_ns)
+        budget.still_allowance(now_ns)
     assert len(budget._events) <= 2 * 10 * 30 + 1
     assert len(budget._burst) <= 31
 
@@ -266,7 +266,7 @@ def test_the_base_keeps_its_own_peak_where_frames_bunch_up(jitter: list[int], bu
 
 @dataclass(frozen=True)
 class Flight:
-    """What went over a lumpy base: one coded frame each ``every`` ticks of 15 a second."""
+    """What went over a lumpy base: one coded frame each ``every`` frames of 15 a second."""
 
     run: Run
     still_bytes: int
@@ -275,14 +275,14 @@ class Flight:
 
 
 def fly(one: BudgetSettings, *, every: int, use: float, seconds: int = 20, seed: int = 0) -> Flight:
-    """Stills as large and as many as are admitted, on each tick, beside a base that uses a share of B_v."""
+    """Stills as large and as many as are admitted, on each index, beside a base that uses a share of B_v."""
     rng, run, longest = np.random.default_rng(seed), Run(one), 0
-    for tick in range(seconds * 15):
-        now_ns = START_NS + round(tick * SECOND_NS / 15)
-        if tick % every == 0:
+    for index in range(seconds * 15):
+        now_ns = START_NS + round(index * SECOND_NS / 15)
+        if index % every == 0:
             at_ns = run.base(round(use * one.base_bps / 8 / one.fps * rng.uniform(0.8, 1.2)), now_ns)
             longest = max(longest, at_ns - now_ns)
-        while (room := run.budget.still_room(now_ns)) >= 500:
+        while (room := run.budget.still_allowance(now_ns)) >= 500:
             run.still(min(room, int(rng.integers(500, 1_800))), now_ns)
     sums = {kind: sum(size for _, size, other in run.events if other == kind) for kind in ("still", "base")}
     return Flight(run, sums["still"], sums["base"], longest / SECOND_NS)
@@ -293,12 +293,12 @@ def test_what_the_base_leaves_is_lent_and_no_more(every, use):
     """A quiet scene would leave a third of the link idle while tracks wait for their still."""
     plain = BudgetSettings(300_000, 240_000, fps=15 / every)
     alone = fly(plain, every=every, use=use)
-    lent = fly(replace(plain, borrow_unused=True), every=every, use=use)
+    borrowed = fly(replace(plain, borrow_unused=True), every=every, use=use)
     total = plain.total_bps / 8 * 20
     assert alone.still_bytes + alone.base_bytes < (use * 0.8 + 0.2 + 0.03) * total
-    assert 0.96 * total < lent.still_bytes + lent.base_bytes <= 1.01 * total
-    assert lent.run.fullest(plain.window_ns) <= total_bytes(plain)
-    assert lent.longest_wait_s <= alone.longest_wait_s + 0.07, "the base pays for what it lent"
+    assert 0.96 * total < borrowed.still_bytes + borrowed.base_bytes <= 1.01 * total
+    assert borrowed.run.fullest(plain.window_ns) <= total_bytes(plain)
+    assert borrowed.longest_wait_s <= alone.longest_wait_s + 0.07, "the base pays for what it borrowed"
 
 
 def test_nothing_is_lent_where_the_base_takes_its_share():
@@ -334,18 +334,18 @@ def test_no_window_exceeds_the_total_when_rate_and_share_change_in_flight(one, s
     rng = np.random.default_rng(seed)
     one = replace(one, fps=15.0)
     run, every, base_bps, since = Run(one), 1, one.base_bps, 0
-    for tick in range(45 * (len(changes) + 1)):
-        now_ns = START_NS + round(tick * SECOND_NS / 15)
-        keyframe = tick % 45 == 0
-        if keyframe and tick:
-            share, every = changes[tick // 45 - 1]
-            base_bps, since = round(one.total_bps * share), tick
+    for index in range(45 * (len(changes) + 1)):
+        now_ns = START_NS + round(index * SECOND_NS / 15)
+        keyframe = index % 45 == 0
+        if keyframe and index:
+            share, every = changes[index // 45 - 1]
+            base_bps, since = round(one.total_bps * share), index
             run.budget.set_base(base_bps, 15 / every, now_ns=now_ns)
-        if (tick - since) % every == 0:
+        if (index - since) % every == 0:
             size = base_bps / 8 * every / 15 * rng.gamma(4, 0.25) * (3 if keyframe else 1)
             run.base(int(min(size, total_bytes(one))), now_ns, keyframe=keyframe)
         for _ in range(4):
-            room = run.budget.still_room(now_ns)
+            room = run.budget.still_allowance(now_ns)
             if room < 200:
                 break
             run.still(int(rng.integers(200, room + 1)), now_ns)
@@ -356,17 +356,17 @@ def test_a_new_split_changes_what_stills_get_and_no_frame_waits_for_it():
     """Bits that the scene asks for elsewhere would stay where they were, or pictures would come late."""
     run = Run(BudgetSettings(300_000, 240_000, fps=15))
     sent = {"before": 0, "after": 0}
-    for tick in range(15 * 40):
-        now_ns = START_NS + round(tick * SECOND_NS / 15)
-        if tick == 300:
+    for index in range(15 * 40):
+        now_ns = START_NS + round(index * SECOND_NS / 15)
+        if index == 300:
             run.budget.set_base(200_000, 5.0, now_ns=now_ns)
-        coded = tick < 300 or tick % 3 == 0
+        coded = index < 300 or index % 3 == 0
         if coded:
-            at_ns = run.base(round((240_000 if tick < 300 else 3 * 200_000) / 8 / 15), now_ns)
+            at_ns = run.base(round((240_000 if index < 300 else 3 * 200_000) / 8 / 15), now_ns)
             assert at_ns == now_ns
-        while run.budget.still_room(now_ns) >= 800:
+        while run.budget.still_allowance(now_ns) >= 800:
             run.still(800, now_ns)
-            sent["before" if tick < 300 else "after"] += 800
+            sent["before" if index < 300 else "after"] += 800
     assert sent["before"] * 8 / 20 == pytest.approx(60_000, rel=0.15)
     assert sent["after"] * 8 / 20 == pytest.approx(100_000, rel=0.15)
     assert run.fullest(SECOND_NS) <= 300_000 / 8
@@ -376,12 +376,12 @@ def test_metadata_comes_out_of_what_stills_have():
     """The tracks channel would make every picture wait, because stills had already spent its bytes."""
     one = BudgetSettings(200_000, 160_000, fps=15, metadata_bps=10_000)
     run, sent = Run(one), 0
-    for tick in range(15 * 20):
-        now_ns = START_NS + round(tick * SECOND_NS / 15)
+    for index in range(15 * 20):
+        now_ns = START_NS + round(index * SECOND_NS / 15)
         assert run.base(round(160_000 / 8 / 15), now_ns) == now_ns
-        if tick % 5 == 0:
+        if index % 5 == 0:
             run.status(10_000 // 8 // 3, now_ns)
-        while run.budget.still_room(now_ns) >= 300:
+        while run.budget.still_allowance(now_ns) >= 300:
             run.still(300, now_ns)
             sent += 300
     assert sent * 8 / 20 == pytest.approx(30_000, rel=0.15)

@@ -126,7 +126,7 @@ class World:
     def _frame(self) -> None:
         rate = self.pacer.rate_bps
         wanted = min(self.share * self.pacer.steady_bps, rate)
-        if self.trigger.wants(wanted, self.base_bps, settled=self.pacer.settled, now_ns=self.now_ns):
+        if self.trigger.wants(wanted, self.base_bps, at_ceiling=self.pacer.at_ceiling, now_ns=self.now_ns):
             self.keyframe = True
         self.tokens = min(rate / 8, self.tokens + max(0.0, rate - self.base_bps) / 8 / FPS)
         self.window = [(at, size) for at, size in self.window if at > self.now_ns - S]
@@ -513,17 +513,17 @@ def test_the_least_delay_forgets():
 def test_x265_is_opened_anew_only_where_it_is_worth_it():
     """A keyframe at each small step would cost more than the step."""
     trigger = ReconfigurationTrigger()
-    assert not trigger.wants(105, 100, settled=False, now_ns=0)
-    assert not trigger.wants(110, 100, settled=False, now_ns=1 * S)
-    assert trigger.wants(110, 100, settled=False, now_ns=4 * S)
-    assert trigger.wants(130, 100, settled=False, now_ns=4 * S)
-    assert trigger.wants(79, 100, settled=False, now_ns=4 * S)
+    assert not trigger.wants(105, 100, at_ceiling=False, now_ns=0)
+    assert not trigger.wants(110, 100, at_ceiling=False, now_ns=1 * S)
+    assert trigger.wants(110, 100, at_ceiling=False, now_ns=4 * S)
+    assert trigger.wants(130, 100, at_ceiling=False, now_ns=4 * S)
+    assert trigger.wants(79, 100, at_ceiling=False, now_ns=4 * S)
     trigger.done(4 * S)
-    assert not trigger.wants(50, 100, settled=False, now_ns=5 * S)
-    assert trigger.wants(50, 100, settled=False, now_ns=6 * S)
+    assert not trigger.wants(50, 100, at_ceiling=False, now_ns=5 * S)
+    assert trigger.wants(50, 100, at_ceiling=False, now_ns=6 * S)
     trigger.done(10 * S)
-    assert not trigger.wants(103, 100, settled=True, now_ns=11 * S)
-    assert trigger.wants(103, 100, settled=True, now_ns=15 * S)
+    assert not trigger.wants(103, 100, at_ceiling=True, now_ns=11 * S)
+    assert trigger.wants(103, 100, at_ceiling=True, now_ns=15 * S)
 
 
 def test_the_same_reports_give_the_same_rates():
@@ -553,11 +553,11 @@ def test_the_budget_takes_another_total_at_once():
     for frame in range(20):
         budget.record_base(5_000, now_ns=frame * 100 * MS)
     now_ns = 2 * S
-    assert budget.still_room(now_ns) > 0
+    assert budget.still_allowance(now_ns) > 0
     budget.set_total(440_000, 400_000, 10, now_ns=now_ns)
-    assert 0 < budget.still_room(now_ns) <= 5_000
+    assert 0 < budget.still_allowance(now_ns) <= 5_000
     budget.set_total(200_000, 400_000, 10, now_ns=now_ns)
-    assert budget.still_room(now_ns) == 0
+    assert budget.still_allowance(now_ns) == 0
     assert budget.earliest_ns(5_000, now_ns=now_ns, base=True) > now_ns + 400 * MS
     budget.set_total(800_000, 160_000, 5, now_ns=now_ns)
     assert budget.base_step_bytes == 4_000
@@ -572,7 +572,7 @@ def test_few_frames_where_x265_can_do_no_more():
     assert frame_skip.decimation == 2  # at keyframes only
     assert frame_skip.at_keyframe(10) == 5
     frame_skip.coded(10, keyframe=True, mean_qp=30.0)
-    assert [tick for tick in range(11, 17) if frame_skip.codes(tick)] == [15, 16]
+    assert [index for index in range(11, 17) if frame_skip.codes(index)] == [15, 16]
     least[0] = 1
     assert frame_skip.at_keyframe(20) == 2
 

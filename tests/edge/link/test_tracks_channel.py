@@ -16,7 +16,7 @@ PIXELS = np.zeros((8, 8, 3), np.uint8)
 def seen(
     index: int, *, ages=(0, 0), detected: bool = True, coded: bool = True, fps: float = 15
 ) -> AnalyzedFrame:
-    """Two tracks, last detected so many ticks ago."""
+    """Two tracks, last detected so many frames ago."""
     frame = Frame(index, START_NS + round(index * 1e9 / fps), PIXELS, PIXELS)
     count = len(ages)
     left = 10.0 * np.arange(count) + index

@@ -264,7 +264,7 @@ def test_a_still_of_just_the_room_takes_just_the_room(  # noqa: PLR0917 - hypoth
         parameters=parameters,
         also=tuple(also),
     )
-    room_line = rig.budget.still_room(now_ns)
+    room_line = rig.budget.still_allowance(now_ns)
     room = rig.sender.still_allowance_bytes(now_ns, still=asked)
     before = rig.ledger.line_bytes
     rig.sender.still(rig.sender.envelope(replace(asked, data=bytes(room))), now_ns=now_ns)

@@ -1,4 +1,4 @@
-"""The frame loop in lockstep where not every tick is coded."""
+"""The frame loop in lockstep where not every frame is coded."""
 
 from __future__ import annotations
 

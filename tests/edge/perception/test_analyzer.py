@@ -116,7 +116,7 @@ def test_what_a_cropped_base_does_not_show_is_no_candidate():
 
 
 def sparse(analyzer: Analyzer, *, every: int, hurried: frozenset[int] = frozenset()) -> list:
-    """All ticks, of which only each n-th is coded, as with ``--fps auto``."""
+    """All frames, of which only each n-th is coded, as with ``--fps auto``."""
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
     return [
         analyzer.analyze(
@@ -162,13 +162,13 @@ def test_ticks_that_are_not_coded_still_move_the_tracks():
 
 
 def test_a_hurried_coded_tick_is_made_up_for():
-    """With a slow detector and few coded ticks, detection would be put off until the next coded one."""
+    """With a slow detector and few coded frames, detection would be put off until the next coded one."""
     seen = sparse(make(candidates="source"), every=15, hurried=frozenset({15}))
     assert [one.frame.index for one in seen if one.detected] == [0, 6, 11, 16, 21, 26]
 
 
 def test_with_candidates_of_the_source_the_camera_is_followed_on_the_source():
-    """Tracks would be moved by what the coder left of the picture, and not at all between coded ticks."""
+    """Tracks would be moved by what the coder left of the picture, and not at all between coded frames."""
     given: list[bool] = []
 
     class Watched(ByteTracker):

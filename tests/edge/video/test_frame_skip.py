@@ -1,4 +1,4 @@
-"""Which ticks become frames of the base stream."""
+"""Which source frames become frames of the base stream."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 
 
-def coded(frame_skip: FrameSkip, ticks, *, keyframes=(), qp=40.0) -> list[int]:
-    """The ticks that are coded; at keyframes the cadence may change."""
+def coded(frame_skip: FrameSkip, frames, *, keyframes=(), qp=40.0) -> list[int]:
+    """The frames that are coded; at keyframes the decimation may change."""
     taken = []
-    for tick in ticks:
-        keyframe = tick in keyframes
+    for index in frames:
+        keyframe = index in keyframes
         if keyframe:
-            frame_skip.at_keyframe(tick)
-        if keyframe or frame_skip.codes(tick):
-            frame_skip.coded(tick, keyframe=keyframe, mean_qp=qp(tick) if callable(qp) else qp)
-            taken.append(tick)
+            frame_skip.at_keyframe(index)
+        if keyframe or frame_skip.codes(index):
+            frame_skip.coded(index, keyframe=keyframe, mean_qp=qp(index) if callable(qp) else qp)
+            taken.append(index)
     return taken
 
 
@@ -39,19 +39,19 @@ def test_a_keyframe_may_come_at_any_tick():
     assert coded(FrameSkip(5), range(20), keyframes=(0, 7)) == [0, 5, 7, 12, 17]
 
 
-@given(decimation=st.integers(1, 20), ticks=st.sets(st.integers(0, 300), min_size=1))
-def test_the_rate_is_kept_whatever_is_missed(decimation, ticks):
+@given(decimation=st.integers(1, 20), frames=st.sets(st.integers(0, 300), min_size=1))
+def test_the_rate_is_kept_whatever_is_missed(decimation, frames):
     """More frames than asked for would overspend the budget, fewer would show less than it could."""
-    taken = coded(FrameSkip(decimation), sorted(ticks))
-    slots = [(tick - taken[0]) // decimation for tick in taken]
+    taken = coded(FrameSkip(decimation), sorted(frames))
+    slots = [(index - taken[0]) // decimation for index in taken]
     assert len(set(slots)) == len(slots), "never two frames for one turn"
-    assert set(slots) == {(tick - taken[0]) // decimation for tick in sorted(ticks)}, (
+    assert set(slots) == {(index - taken[0]) // decimation for index in sorted(frames)}, (
         "never none where there was one"
     )
 
 
 def measured(decimation: int = 1) -> MeasuredFrameSkip:
-    """As at 15 ticks a second."""
+    """As at 15 frames a second."""
     return MeasuredFrameSkip(decimation, most_decimation=7, rest_frames=150)
 
 
@@ -102,7 +102,7 @@ def test_the_same_frames_give_the_same_rates():
     for _ in range(2):
         frame_skip = measured()
         runs.append(
-            coded(frame_skip, range(900), keyframes=range(0, 900, 150), qp=lambda tick: 38 + tick / 60)
+            coded(frame_skip, range(900), keyframes=range(0, 900, 150), qp=lambda index: 38 + index / 60)
         )
     assert runs[0] == runs[1]
     assert len(runs[0]) < 900
