@@ -1,6 +1,6 @@
-"""What the edge keeps on disk while its link is away, and how it comes back.
+"""Store-and-forward: what is seen while the link is away is stored, and sent when it is back.
 
-One stage a file: `outage` says when the link is away, `backlog` is what the frame loop asks, `folder` is the disk
-(`entry` one object in it, `segment` one stretch of video, `open_segment` the one being written), `backfill` cuts what
-is kept into pieces. `worker` is the thread of these, `intake` what it is given, `outgoing` the thread that sends.
+For others: `stage` (`BacklogStage`: LIVE, OFFLINE, RETURNING), `outage` (`BaseInFlight`), `disk` (`Folder`) and
+`backfill` (`Chunk`). Inside: `worker` is the thread of the disk, `intake` its queue, `backfill` makes chunks of what
+is stored, `entry` is one stored object and `segment` one stretch of video.
 """

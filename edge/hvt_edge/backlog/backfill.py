@@ -1,8 +1,8 @@
-"""What is kept, piece by piece over the link, until the ground says that it has it. Time is an argument.
+"""What is stored, chunk by chunk over the link, until the ground acknowledges it. Time is an argument.
 
 First the facts of a session that is not the present one, then stills by their worth, then video, newest first; video
-first where somebody asked for it. Of several objects some bytes may be on their way; in memory is the one of which
-pieces are being cut. Where the ground does not get on, the object begins again where the ground left off.
+first where a ground requested it. Of several objects some bytes may be on their way; in memory is the one of which
+chunks are being made. Where the ground does not get on, the object begins again where the ground left off.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Transfer:
     entry: Entry
     total_bytes: int
     since_ns: int
-    """Of the last piece sent or acknowledged."""
+    """Of the last chunk sent or acknowledged."""
     sent_bytes: int = 0
     acknowledged_bytes: int = 0
     tries: int = 0
@@ -75,15 +75,15 @@ class Backfill:
         self._informed: set[int] = set()
         """Sessions whose facts the ground has."""
         self._requested: set[int] = set()
-        """Sessions whose facts it asked for."""
+        """Sessions whose facts it requested."""
         self._refused: set[Key] = set()
-        """What the present ground does not take; another is asked again, and so is any after the next start."""
+        """What the present ground does not take; another is offered it again, and so is any after the next start."""
         self._acknowledged: dict[Key, int] = {}
         """What the present ground has said it has of objects that are not done."""
         self._receiver_id: int | None = None
         self._reported_ns = 0
         self.video_first = False
-        """Somebody asked for the video."""
+        """A ground requested the video."""
         self.acknowledged_bytes = 0
         """That grounds have said they have."""
         self.given_up = 0
@@ -143,7 +143,7 @@ class Backfill:
         self._forget()
 
     def _forget(self) -> None:
-        """Keep nothing of objects that are not here any more."""
+        """Forget objects that are not here any more."""
         self._refused = {key for key in self._refused if self._folder.find(key) is not None}
         here = {
             key: acknowledged_range
@@ -189,7 +189,7 @@ class Backfill:
     # What goes out
 
     def next_chunk(self, most_bytes: int, *, now_ns: int, round_trip_ns: int) -> Chunk | None:
-        """The next piece, of at most so many bytes; None where there is none, or it would be too small."""
+        """The next chunk, of at most so many bytes; None where there is none, or it would be too small."""
         self._begin_again(now_ns - _PATIENCE_NS - round_trip_ns, now_ns)
         while (transfer := self._current(now_ns)) is not None:
             data = self._bytes_of(transfer)
@@ -206,7 +206,7 @@ class Backfill:
         return None
 
     def take_back(self, chunk: Chunk) -> None:
-        """This piece has not been sent after all."""
+        """This chunk has not been sent after all."""
         transfer = self._line.get((chunk.session_id, chunk.kind, chunk.number))
         if transfer is not None:
             transfer.sent_bytes = min(transfer.sent_bytes, chunk.offset)
@@ -241,7 +241,7 @@ class Backfill:
             self._refused.add(transfer.entry.key)
 
     def _current(self, now_ns: int) -> _Transfer | None:
-        """The object of which pieces are cut now: one that is not all on its way, or the next one."""
+        """The object of which chunks are made now: one that is not all on its way, or the next one."""
         for transfer in self._line.values():
             if transfer.sent_bytes < transfer.total_bytes:
                 ahead = transfer.sent_bytes - transfer.acknowledged_bytes

@@ -88,10 +88,10 @@ class Folder:
     """The objects of this session and of those before it, in bounded room. For one thread; counts may be read by any.
 
     Args:
-        path: made when something is kept for the first time.
+        path: made when something is stored for the first time.
         max_bytes: of files, in whole blocks.
         session_id: of this run.
-        info: this session's `Info`, packed; asked when the first thing is kept.
+        info: this session's `Info`, packed; called when the first thing is stored.
         oldest_ns: what was captured before is dropped when the folder is opened.
     """
 
@@ -121,7 +121,7 @@ class Folder:
         self._open: OpenSegment | None = None
         self._oldest_ns = oldest_ns
         self.locked_out = False
-        """Another process has the folder; `enter` asks again."""
+        """Another process has the folder; `enter` tries again."""
         self.evicted_stills = 0
         self.evicted_segments = 0
         self.damaged = 0
@@ -136,12 +136,12 @@ class Folder:
 
     @property
     def stills(self) -> int:
-        """How many are kept."""
+        """How many are stored."""
         return len(self._stills)
 
     @property
     def segments(self) -> int:
-        """How many are kept, without the open one."""
+        """How many are stored, without the open one."""
         return len(self._segments)
 
     @property
@@ -151,13 +151,13 @@ class Folder:
 
     @property
     def span_ns(self) -> int:
-        """Length of the video that is kept."""
+        """Length of the video that is stored."""
         return self._span_ns + (0 if self._open is None else self._open.span_ns)
 
     def enter(self) -> None:
-        """Take over what earlier runs have kept; where another edge has the folder, it is `locked_out`.
+        """Take over what earlier runs have stored; where another edge has the folder, it is `locked_out`.
 
-        It may be a predecessor of this one that is about to end, so whoever keeps or sends asks again.
+        It may be a predecessor of this one that is about to end, so whoever stores or sends tries again.
         Raises OSError.
         """
         said = self.locked_out
@@ -174,12 +174,12 @@ class Folder:
     # Keeping
 
     def add_still(self, number: int, data: bytes, *, utility: float, capture_ns: int) -> None:
-        """Keep a still; ``data`` is `pack_backlog_still`'s. Raises OSError where the disk takes it not."""
+        """Store a still; ``data`` is `pack_backlog_still`'s. Raises OSError where the disk takes it not."""
         if (self._session_id, BacklogKind.STILL, number) in self._entries:
             return
         folder = self._session_folder()
         path = folder / still_name(number, capture_ns, utility)
-        self._make_room(blocks(len(data)))
+        self._evict_for(blocks(len(data)))
         write_whole(path, data)
         self._enter(still_entry(path, self._session_id, number, capture_ns, utility))
 
@@ -197,7 +197,7 @@ class Folder:
                 folder = self._session_folder()
                 path = folder / base_name(unit.frame_index, unit.capture_ns)
                 self._open = segment = OpenSegment(path, unit, parameter_sets)
-            self._make_room(blocks(len(unit.data)))
+            self._evict_for(blocks(len(unit.data)))
             segment.write(unit)
         except av.error.FFmpegError as error:
             raise OSError(error.errno, error.strerror, str(self.path)) from None
@@ -232,7 +232,7 @@ class Folder:
             yield self._entries[session_id, BacklogKind.BASE, number]
 
     def info_of(self, session_id: int) -> Entry | None:
-        """The facts of a session; None where they are not kept."""
+        """The facts of a session; None where they are not here."""
         return self._entries.get((session_id, BacklogKind.INFO, 0))
 
     def find(self, key: Key) -> Entry | None:
@@ -286,7 +286,7 @@ class Folder:
 
     # Room
 
-    def _make_room(self, needed_bytes: int) -> None:
+    def _evict_for(self, needed_bytes: int) -> None:
         while self.disk_bytes + needed_bytes > self._max_bytes and (least := self._least()) is not None:
             if least.kind is BacklogKind.STILL:
                 self.evicted_stills += 1
@@ -350,7 +350,7 @@ class Folder:
         self._lock = lock
 
     def _take_over(self, oldest_ns: int) -> None:
-        """Find what earlier runs have kept; a half-written file is dropped, and what is too old."""
+        """Find what earlier runs have stored; a half-written file is dropped, and what is too old."""
         too_old = 0
         for folder in sorted(self.path.iterdir()):
             if _SESSION.fullmatch(folder.name) is None or not folder.is_dir():
@@ -372,7 +372,7 @@ class Folder:
                 "they are dropped",
                 too_old,
             )
-        self._make_room(0)
+        self._evict_for(0)
 
     def _tidy(self, session_id: int) -> None:
         """Remove the folder of a former session that has nothing left to send."""

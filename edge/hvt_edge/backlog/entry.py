@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 FIRST_STORED = 2**31
-"""Stills that are kept for later have numbers of their own: those that are sent have no holes then."""
+"""Stills that are stored for later have numbers of their own: those that are sent have no holes then."""
 _SECOND_NS = 1_000_000_000
 _HALF_LIFE_NS = 600 * _SECOND_NS
 _LEAST_STRENGTH = -60.0
@@ -52,7 +52,7 @@ Key = tuple[int, BacklogKind, int]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One object that is kept."""
+    """One object that is stored."""
 
     session_id: int
     kind: BacklogKind

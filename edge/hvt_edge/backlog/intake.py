@@ -1,7 +1,7 @@
-"""What the disk thread is given: frames and stills in their order, bounded, and words that are never refused.
+"""What the disk thread is given: frames and stills in their order, bounded, and signals that are never refused.
 
-A disk that is too slow costs frames and stills, and says so. It must not cost a word: a segment that does not end, or
-an outage that the backfill does not hear of, would cost much more. So words are states, not items.
+A disk that is too slow costs frames and stills, and says so. It must not cost a signal: a segment that does not end
+would cost much more. So signals are states, not items.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ class EndSegment:
 
 @dataclass(frozen=True, slots=True)
 class News:
-    """What has happened since it was asked last."""
+    """What has happened since the last `take`."""
 
     interrupted: bool
     """The link went: what was on its way is not."""
     video_first: bool
-    """Somebody asked for the video."""
+    """A ground requested the video."""
     acknowledged_ranges: tuple[tuple[int, AcknowledgedRange], ...]
     """What grounds say they have, with their receiver ids."""
 
 
 class Intake:
-    """From any thread to one. Holds ``most`` frames and stills, and a word for each of them at the most."""
+    """From any thread to one. Holds ``most`` frames and stills, and a signal for each of them at the most."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -81,7 +81,7 @@ class Intake:
     # From any thread
 
     def offer(self, item: IntakeUnit | IntakeStill) -> bool:
-        """Hand over something to be kept; False where there is no room for it."""
+        """Hand over something to be stored; False where there is no space for it."""
         with self._changed:
             if self._closed or self._queued >= self._most:
                 return False
@@ -110,7 +110,7 @@ class Intake:
             self._wake()
 
     def on_acknowledged(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
-        """A ground says what it has; the newest counts, and one that is lost comes again."""
+        """A ground acknowledges what it has; the newest counts, and one that is lost comes again."""
         with self._changed:
             for acknowledged_range in acknowledged_ranges:
                 key = (

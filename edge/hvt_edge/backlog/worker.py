@@ -1,8 +1,8 @@
-"""The thread that the disk belongs to: it writes what is kept, and cuts pieces of it when the link has room for them.
+"""The thread that the disk belongs to: it writes what is stored, and makes chunks of it when the link allows.
 
-What comes to it waits in a bounded line (`intake`). Where that is full the disk is too slow: what comes then is not
-kept, and said once. A disk that is full, cannot be written or is taken out costs one warning and all further keeping;
-what is there already is sent all the same. Pieces leave in a thread of their own (`outgoing`).
+What comes to it waits in a bounded queue (`intake`). Where that is full the disk is too slow: what comes then is not
+stored, and said once. A disk that is full, cannot be written or is taken out costs one warning and all further
+storing; what is there already is sent all the same. Chunks leave in a thread of their own (`ChunkThread`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _CLOSE_S = 5.0
 _LAST_CHUNK_S = 1.0
 """What is being sent when no more is to be sent has so long to go."""
 _TRICKLE_SHARE = 1 / 40
-"""Of the total, where live stills always wait: they must not keep what was admitted before from ever arriving."""
+"""Of the total, where live stills always wait: they must not hold up for ever what was admitted before."""
 _SECOND_NS = 1_000_000_000
 
 
@@ -62,12 +62,12 @@ class StoreNumbers:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing is kept."""
+        """Whether nothing is stored."""
         return not (self.stills or self.segments)
 
 
 class StoreWorker:
-    """Opens the folder, keeps, sends, and leaves the folder in order. `check` and `close` raise an error in it.
+    """Opens the folder, stores, sends, and leaves the folder in order. `check` and `close` raise an error in it.
 
     ``open_folder()`` and everything on disk runs in the thread. ``on_sent(entry)`` is called for each object that a
     ground has whole. `close` waits ``close_s`` for the disk.
@@ -103,7 +103,7 @@ class StoreWorker:
         self._trickle_ns = self._entered_ns = 0
         self._slow = False
         self.failed = False
-        """Nothing is kept any more, and why has been said."""
+        """Nothing is stored any more, and why has been said."""
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="hvt-store", daemon=True)
         self._thread.start()
@@ -117,7 +117,7 @@ class StoreWorker:
             raise error
 
     def offer(self, item: IntakeUnit | IntakeStill) -> bool:
-        """Hand over something to be kept; False where it is not, because the disk is too slow or refuses."""
+        """Hand over something to be stored; False where it is not, because the disk is too slow or refuses."""
         self.check()
         if self.failed:
             return False
@@ -129,11 +129,11 @@ class StoreWorker:
         return True
 
     def on_acknowledged(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
-        """A ground says what it has. One that is not heard comes again."""
+        """A ground acknowledges what it has. One that is lost comes again."""
         self._intake.on_acknowledged(acknowledged_ranges, receiver_id=receiver_id)
 
     def end_segment(self) -> None:
-        """The link is back: what was kept may be sent."""
+        """The link is back: what was stored may be sent."""
         self._intake.end_segment()
 
     def interrupt(self) -> None:
@@ -141,7 +141,7 @@ class StoreWorker:
         self._intake.interrupt()
 
     def video_first(self) -> None:
-        """Somebody asked for the video."""
+        """A ground requested the video."""
         self._intake.request_video()
 
     @property
@@ -151,7 +151,7 @@ class StoreWorker:
 
     @property
     def numbers(self) -> StoreNumbers:
-        """What is kept and what was done."""
+        """What is stored and what was done."""
         folder, backfill = self._folder, self._backfill
         if folder is None or backfill is None:
             return StoreNumbers()
@@ -170,7 +170,7 @@ class StoreWorker:
         )
 
     def send_no_more(self) -> None:
-        """Let nothing go out from now on, so that an account can be closed; what comes is kept all the same."""
+        """Let nothing go out from now on, so that an account can be closed; what comes is stored all the same."""
         self._sending.close(_LAST_CHUNK_S)
 
     def close(self) -> None:
@@ -298,9 +298,8 @@ class StoreWorker:
 class ChunkThread:
     """Sends one chunk at a time in a thread of its own: a link that is full for seconds must not hold up the disk.
 
-     `put` and `take` from one thread; ``on_done()`` is called in its own after each chunk.
-
-    ``send(chunk)`` returns the line bytes, 0 where it was not sent; it may block.
+    `put` and `take` are for one thread; ``on_done()`` is called in its own after each chunk. ``send(chunk)`` returns
+    the line bytes, 0 where it was not sent; it may block.
     """
 
     def __init__(self, send: Callable[[Chunk], int], *, on_done: Callable[[], None]) -> None:

@@ -1,4 +1,4 @@
-"""A crop taken out of its frame, with all that coding it takes: whoever waits for room keeps no whole frames.
+"""A crop taken out of its frame, with all that coding it takes: a pending still holds no whole frames.
 
 A 4K frame takes 25 MB, its crops a few kilobytes each.
 """

@@ -26,7 +26,7 @@ class NoStill:
     """Why no still was made."""
 
     reason: Literal["too_large", "base_good"]
-    """``too_large``: nothing that is better than the base fits the admission (more room may help);
+    """``too_large``: nothing that is better than the base fits the admission (a larger one may help);
     ``base_good``: the base shows it as well as the best quality would, or as well as is requested for."""
 
 

@@ -41,7 +41,7 @@ class StillMaker:
     fallback: StillCodec | None = None
     """Needs no base; must be given where ``codec`` needs one, and is not used where it does not."""
     quality_pct: int = 65
-    """Asked for; less where the admission is smaller, more where the base is already better."""
+    """Requested; less where the admission is smaller, more where the base is already better."""
     fidelity_db: float = 0.0
     """Luma PSNR to reach with the fewest bytes, in place of ``quality_pct``; 0: the quality is fixed."""
     floor_pct: int = 35
@@ -113,7 +113,7 @@ class StillMaker:
         return CropJob(header=header, crop_bgr=crop, base_crop_bgr=seen, alternative=alternative)
 
     def code(self, job: CropJob, *, sequence: int, allowance: Allowance) -> Still | NoStill:
-        """Code a crop so that ``allowance``, asked of the very still that comes out, holds its data."""
+        """Code a crop so that ``allowance``, called with the very still that comes out, holds its data."""
         header = replace(job.header, sequence=sequence)
         if job.base_crop_bgr is None or not self.codec.needs_base:
             made = self._fitted(self.without_base, job, header, allowance)
@@ -143,7 +143,7 @@ class StillMaker:
     def _fitted(
         self, codec: StillCodec, job: CropJob, header: Still, allowance: Allowance
     ) -> tuple[Still, Fitted] | NoStill:
-        """As asked, with this codec, or the best below that for which there is allowance."""
+        """As requested, with this codec, or the best below that is allowed."""
         fitter = self._fitter(codec)
         header = _of_codec(header, codec)
         limit_bytes = allowance(header)

@@ -25,7 +25,7 @@ ALSO_BYTES = 17.0
 """What the header takes for each further track: its id and its box in eighths of a pixel."""
 MOST_ALSO = 15
 _MOST_COMPARED = 96
-"""Of more requests than that only the most wanted are compared with each other: the time it takes stays bounded."""
+"""Of more requests than that only the most useful are compared with each other: the time it takes stays bounded."""
 _LEAST_SAVING_BYTES = 1.0
 
 Crop = tuple[int, int, int, int]
@@ -66,7 +66,7 @@ def group(
     shows more than ``most`` tracks beside its lead, nor a side of more than ``max_side_px`` where it shows several.
     ``overhead_bytes`` is what a still takes on the line beside its payload.
 
-    The lead is the most wanted of its group and comes with ``also`` filled and a score of its own: what all of them
+    The lead is the most useful of its group and comes with ``also`` filled and a score of its own: what all of them
     gain over what the one still costs, if scores are gains per byte; never less than its score alone. Most wanted
     first, ties by the lead's track id. Each request is in exactly one group.
     """
@@ -145,7 +145,7 @@ class _Board:
             savings[:lead, lead] = fresh[:lead]
 
     def groups(self) -> list[list[int]]:
-        """The requests of each still, most wanted first."""
+        """The requests of each still, most useful first."""
         return [sorted(members) for members in self.members if members]
 
     def request(self, members: list[int], requests: Sequence[Request]) -> tuple[Request, list[Request]]:

@@ -1,4 +1,4 @@
-"""From what somebody asks for to the crop of the frame that shows it, or to the sentence that says why not."""
+"""From an on-demand request to the crop of the frame that shows it, or to the sentence that says why not."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Crop = tuple[int, int, int, int]
 
 
 class RefusedError(Exception):
-    """What is asked for cannot be had; the text is one plain sentence for whoever asked."""
+    """What is requested cannot be had; the text is one plain sentence for whoever requested it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class OnDemandRequest:
 
 
 def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
-    """The frame that is asked for, or the nearest that is kept; raises `RefusedError` where it is gone or to come."""
+    """The frame that is requested, or the nearest in the ring; raises `RefusedError` where it is gone or to come."""
     newest = ring.newest
     if newest is None:
         raise RefusedError("there is no frame yet, or none is kept (--ring)")
@@ -65,7 +65,7 @@ def frame_for(request: OnDemandRequest, ring: FrameRing) -> RingFrame:
 def crop_job_for(
     request: OnDemandRequest, frame: RingFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]
 ) -> CropJob:
-    """Take what is asked for out of that frame; raises `RefusedError` where it is not in it."""
+    """Crop what is requested out of that frame; raises `RefusedError` where it is not in it."""
     height, width = frame.source_bgr.shape[:2]
     box: Box
     if request.track_id is not None:

@@ -40,7 +40,7 @@ class OutboxSettings:
     max_pending: int = 8
     """Of the method; those that grounds request have their own bound."""
     max_pending_ns: int = _SECOND_NS
-    """A crop that has waited longer shows a past the operator no longer looks at."""
+    """A crop that has waited longer shows a past the operator no longer needs."""
     max_on_demand_ns: int = 10 * _SECOND_NS
     max_sent: int = 64
     max_sent_bytes: int = 2 * _MIB

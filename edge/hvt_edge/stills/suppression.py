@@ -22,7 +22,7 @@ class Suppression:
     cooldown_s: float = 2.0
     """A track that was sent rests this long; 0 is no rest."""
     min_gain: float = 1.2
-    """Beyond the rest, it must have grown or sharpened by this factor since; 1 asks for nothing."""
+    """Beyond the rest, it must have grown or sharpened by this factor since; 1 demands nothing."""
     gain_s: float = 10.0
     """After this long without a still, it needs no gain any more."""
     avoid_border: bool = True
@@ -64,7 +64,7 @@ class Suppression:
             return "cooldown"
         if self.avoid_border and candidate.touches_border and self._waits_at_border(candidate):
             return "border"
-        # Last, because it may have to look at pixels.
+        # Last, because it may have to read pixels.
         if rested_s < self.gain_s and not self._gained(candidate):
             return "no_gain"
         return None

@@ -37,7 +37,7 @@ def scene(width: int, height: int, *, seed: int = 0) -> np.ndarray:
 
 
 def request_for(box, *, index: int = 0) -> Request:
-    """A wish for a still of one box."""
+    """A request for a still of one box."""
     one = Candidate(
         frame_index=index,
         track_id=4,
@@ -178,18 +178,18 @@ def test_quality_rises_until_the_base_is_beaten():
     """At a good base rate half of the stills would be worse than what the operator already sees."""
     source = scene(1280, 720)
     box = (300.0, 200.0, 420.0, 280.0)
-    rivals = {
+    base_pictures = {
         quality: cv2.imdecode(
             cv2.imencode(".jpg", source, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR
         )
         for quality in (30, 72, 84)
     }
-    made = {quality: make(source, box, base=base) for quality, base in rivals.items()}
+    made = {quality: make(source, box, base=base) for quality, base in base_pictures.items()}
     assert made[30].quality_pct == 65
     assert 72 < made[72].quality_pct < 84 < made[84].quality_pct <= 90
     assert make(source, box, base=source) == NoStill("base_good")
-    assert make(source, box, base=rivals[72], limit=len(made[72].data) - 1) == NoStill("too_large")
-    assert make(source, box, base=rivals[72], limit=len(made[72].data)) == made[72]
+    assert make(source, box, base=base_pictures[72], limit=len(made[72].data) - 1) == NoStill("too_large")
+    assert make(source, box, base=base_pictures[72], limit=len(made[72].data)) == made[72]
 
 
 def test_the_base_gets_its_best_chance():
@@ -373,7 +373,7 @@ def test_a_long_crop_says_its_coded_size_beside_the_codecs_own_parameters():
 
 
 def test_without_a_base_frame_the_fallback_serves():
-    """A still of a tick that was not coded could never be shown, or would never be sent."""
+    """A still of a frame that was not coded could never be shown, or would never be sent."""
     still = make(scene(*SIZE), CAR, maker=BASE_CODED)
     assert (still.codec, still.media_type, still.parameters) == ("jpeg", "image/jpeg", {})
 

@@ -22,8 +22,8 @@ PADDING = 0.15
 COSTS = st.builds(CostEstimate, st.floats(0, 800), st.floats(0, 0.3), st.just(1000.0))  # fixed, a pixel, mean
 
 
-def wish(track_id: int, x: float, y: float, *, side: float = 20, score: float = 1.0) -> Request:
-    """A wish for a still of a square object."""
+def request_for(track_id: int, x: float, y: float, *, side: float = 20, score: float = 1.0) -> Request:
+    """A request for a still of a square object."""
     box = (x, y, x + side, y + side)
     size = coded_size(crop_box(box, padding=PADDING, source_size=SOURCE))
     candidate = Candidate(
@@ -42,7 +42,7 @@ def wish(track_id: int, x: float, y: float, *, side: float = 20, score: float = 
 
 
 @st.composite
-def wishes(draw) -> list[Request]:
+def requests_of(draw) -> list[Request]:
     """A crowd, most wanted first."""
     places = draw(
         st.lists(
@@ -50,7 +50,7 @@ def wishes(draw) -> list[Request]:
         )
     )
     some = [
-        wish(number + 1, x, y, side=min(side, 1280 - x, 720 - y), score=score)
+        request_for(number + 1, x, y, side=min(side, 1280 - x, 720 - y), score=score)
         for number, (x, y, side, score) in enumerate(places)
     ]
     return sorted(some, key=lambda one: (-one.score, one.candidate.track_id))
@@ -74,7 +74,7 @@ def line_bytes(one: Request, cost: CostEstimate, overhead: float) -> float:
 
 
 @settings(max_examples=150, deadline=None)
-@given(some=wishes(), cost=COSTS, overhead=st.floats(0, 300), most=st.integers(0, 15))
+@given(some=requests_of(), cost=COSTS, overhead=st.floats(0, 300), most=st.integers(0, 15))
 def test_sharing_never_costs_more_and_loses_nobody(some, cost, overhead, most):
     """Sharing would waste what it is there to save, or an object would never get its still."""
     groups = joined(some, cost=cost, overhead_bytes=overhead, most=most)
@@ -101,8 +101,8 @@ def test_sharing_never_costs_more_and_loses_nobody(some, cost, overhead, most):
 
 def test_a_car_park_row_shares_and_the_far_one_does_not():
     """Four headers would be paid for four objects that one small crop shows."""
-    row = [wish(number, 100 + 24 * number, 200, score=5 - number) for number in range(1, 5)]
-    far = wish(9, 900, 600, score=0.5)
+    row = [request_for(number, 100 + 24 * number, 200, score=5 - number) for number in range(1, 5)]
+    far = request_for(9, 900, 600, score=0.5)
     (first, others), (second, alone) = joined([*row, far])
     assert first.candidate.track_id == 1
     assert [one.candidate.track_id for one in others] == [2, 3, 4]
@@ -115,10 +115,13 @@ def test_a_car_park_row_shares_and_the_far_one_does_not():
 def test_pixels_between_have_their_price():
     """Two objects at the two ends of the picture would make one huge still."""
     near, pricey = CostEstimate(300, 0.01, 1000), CostEstimate(300, 0.3, 1000)
-    pair = [wish(1, 100, 200), wish(2, 200, 200)]
+    pair = [request_for(1, 100, 200), request_for(2, 200, 200)]
     assert len(joined(pair, cost=near)) == 1
     assert len(joined(pair, cost=pricey)) == 2
-    assert len(joined([wish(1, 100, 200), wish(2, 700, 200)], cost=CostEstimate(300, 0, 1000))) == 2
+    assert (
+        len(joined([request_for(1, 100, 200), request_for(2, 700, 200)], cost=CostEstimate(300, 0, 1000)))
+        == 2
+    )
     assert joined([]) == []
 
 
@@ -156,6 +159,9 @@ def test_the_overhead_that_is_reckoned_with_is_the_real_one():
 def test_a_crowd_takes_bounded_time():
     """A thousand tracks would stop the pictures."""
     rng = np.random.default_rng(3)
-    crowd = [wish(n, float(rng.uniform(0, 1200)), float(rng.uniform(0, 640)), side=8) for n in range(1, 1001)]
+    crowd = [
+        request_for(n, float(rng.uniform(0, 1200)), float(rng.uniform(0, 640)), side=8)
+        for n in range(1, 1001)
+    ]
     groups = joined(crowd)
     assert sum(1 + len(others) for _, others in groups) == 1000

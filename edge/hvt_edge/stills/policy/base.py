@@ -1,6 +1,6 @@
-"""What a method is: a pure function from the candidates of a step to requests for stills, most wanted first.
+"""What a method is: a pure function from the candidates of a step to requests for stills, most useful first.
 
-To add one: a frozen dataclass with its parameters in a file of its own, and one row in `registry`.
+To add one: a frozen dataclass with its parameters in a file beside this one, and one row in `registry`.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Method(Protocol):
         ...
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
-        """The requests of this step, most wanted first, at most one a track; the same for the same input."""
+        """The requests of this step, most useful first, at most one a track; the same for the same input."""
         ...
 
 

@@ -27,9 +27,9 @@ _MOST_LOGIT = 50.0
 
 @dataclass(frozen=True, slots=True)
 class ExpectedGain:
-    """Highest expected gain per byte first, from ``min_gain`` on, as many as ``lookahead`` times the room holds.
+    """Highest expected gain per byte first, from ``min_gain`` on, as many as ``lookahead`` times the allowance holds.
 
-    Requests beyond the room are for neighbours that may share a still, and for the queue.
+    Requests beyond it are for neighbours that may share a still, and for the queue.
     """
 
     bias: float = 0.5
@@ -67,7 +67,7 @@ class ExpectedGain:
     video_only: bool = field(default=False, init=False)
 
     def requests(self, candidates: Sequence[Candidate], step: Step) -> list[Request]:
-        """Best first; always at least the best one, so that it waits for its room."""
+        """Best first; always at least the best one, so that it waits for its allowance."""
         gains = {one.track_id: self.gain(one, step) for one in candidates}
         wanted = ranked(
             (one for one in candidates if gains[one.track_id] >= self.min_gain),
@@ -87,7 +87,7 @@ class ExpectedGain:
         before = faded * self.doubt(candidate, from_source=step.from_source)
         after = (1 - faded) * self._doubt_left(candidate) * self._better(candidate)
         wrong = before + after
-        # Sharpness has to look at pixels: only where it can matter.
+        # Sharpness reads pixels: only where it can matter.
         return wrong * self.use(candidate, from_source=step.from_source) if wrong >= self.min_gain else 0.0
 
     def doubt(self, candidate: Candidate, *, from_source: bool) -> float:

@@ -11,14 +11,16 @@ from typing import Any
 
 from hvt_common.errors import UserError
 from hvt_edge.stills.policy.base import Method
-from hvt_edge.stills.policy.m0 import VideoOnly
-from hvt_edge.stills.policy.m1 import Periodic
-from hvt_edge.stills.policy.m2 import OnStart
-from hvt_edge.stills.policy.m3 import Uncertain
-from hvt_edge.stills.policy.m4 import Small
-from hvt_edge.stills.policy.m5 import Utility
 from hvt_edge.stills.policy.m6 import ExpectedGain
-from hvt_edge.stills.policy.r0 import TracksFirst
+from hvt_edge.stills.policy.paper import (
+    OnStart,
+    Periodic,
+    Small,
+    TracksFirst,
+    Uncertain,
+    Utility,
+    VideoOnly,
+)
 from hvt_edge.stills.policy.selectors import SELECTORS, SelectorMethod
 
 __all__ = ["METHODS", "MethodEntry", "method", "tuning"]
