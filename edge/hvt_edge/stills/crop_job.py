@@ -13,7 +13,7 @@ import numpy as np
 from hvt_common.values import Image, Still
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db
 
-__all__ = ["Alternative", "CropJob", "crop_of", "inner_box"]
+__all__ = ["Alternative", "CropJob", "crop_of", "inner_box", "size_parameters"]
 
 Box = tuple[float, float, float, float]
 Crop = tuple[int, int, int, int]
@@ -98,6 +98,13 @@ def crop_of(source_bgr: Image, crop_px: Crop, size: tuple[int, int]) -> Image:
     if size != (x2 - x1, y2 - y1):
         return np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
     return crop.copy()
+
+
+def size_parameters(crop_px: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:
+    """What the header says of the coded size; nothing where it is the size of the crop."""
+    if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1]):
+        return {}
+    return {"w": size[0], "h": size[1]}
 
 
 def inner_box(box_source_px: Box, crop_px: Crop, size: tuple[int, int]) -> Place:

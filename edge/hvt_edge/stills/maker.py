@@ -14,13 +14,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from hvt_common.values import Frame, Image, Still, View
 from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
-from hvt_common.video.still_codecs import JpegCodec, StillCodec, psnr_y_db
+from hvt_common.video.still_codecs import (
+    CodedCrop,
+    JpegCodec,
+    Parameters,
+    StillCodec,
+    best_fitting,
+    psnr_y_db,
+    smallest_reaching,
+)
 from hvt_edge.perception.crop import PADDING
-from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box
-from hvt_edge.stills.fidelity import Fitted, Fitter, NoStill
+from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box, size_parameters
 from hvt_edge.stills.merging import union_crop
 from hvt_edge.stills.policy.base import Request
 
@@ -31,6 +39,28 @@ Allowance = Callable[[Still], int]
 
 _TRIES = 3
 """Of fitting payload and parameters into one admission: parameters hardly change in size."""
+_QUALITY_STEP_PCT = 5
+_LEAST_PCT, _MOST_PCT = 1, 95
+
+
+@dataclass(frozen=True, slots=True)
+class NoStill:
+    """Why no still was made."""
+
+    reason: Literal["too_large", "base_good"]
+    """``too_large``: nothing that is better than the base fits the admission (a larger one may help);
+    ``base_good``: the base shows it as well as the best quality would, or as well as is requested for."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Fitted:
+    """A coded crop."""
+
+    data: bytes
+    parameters: Parameters
+    quality_pct: int
+    shown_bgr: Image
+    """What the ground will see."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,15 +112,15 @@ class StillMaker:
         if base_bgr is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
             return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
         crop = crop_of(frame.source_bgr, crop_px, size)
-        seen = alternative = None
+        shown = alternative = None
         if base_bgr is not None:
-            seen = base_crop(base_bgr, view=view, crop_source_px=crop_px, size=size)
+            shown = base_crop(base_bgr, view=view, crop_source_px=crop_px, size=size)
             boxes = (one.box_source_px for one in (lead, *request.also))
             places = tuple(inner_box(box, crop_px, size) for box in boxes)
-            alternative = Alternative.of(seen, crop=crop, places=places, min_gain_db=self.min_gain_db)
+            alternative = Alternative.of(shown, crop=crop, places=places, min_gain_db=self.min_gain_db)
             if 0 < self.fidelity_db <= alternative.psnr_y_db:
                 return NoStill("base_good")
-        codec = self.without_base if seen is None else self.codec
+        codec = self.without_base if shown is None else self.codec
         header = Still(
             sequence=0,
             frame_index=frame.index,
@@ -105,12 +135,10 @@ class StillMaker:
             quality_pct=self.quality_pct,
             data=b"",
             media_type=codec.media_type,
-            parameters={}
-            if size == (crop_px[2] - crop_px[0], crop_px[3] - crop_px[1])
-            else {"w": size[0], "h": size[1]},
+            parameters=size_parameters(crop_px, size),
             also=tuple((one.track_id, one.box_source_px) for one in request.also),
         )
-        return CropJob(header=header, crop_bgr=crop, base_crop_bgr=seen, alternative=alternative)
+        return CropJob(header=header, crop_bgr=crop, base_crop_bgr=shown, alternative=alternative)
 
     def code(self, job: CropJob, *, sequence: int, allowance: Allowance) -> Still | NoStill:
         """Code a crop so that ``allowance``, called with the very still that comes out, holds its data."""
@@ -124,31 +152,14 @@ class StillMaker:
             return made if isinstance(made, NoStill) else made[0]
         return (self._cheaper(*built, job, header) if job.base_far_off else None) or built[0]
 
-    def make(
-        self,
-        frame: Frame,
-        request: Request,
-        *,
-        sequence: int,
-        view: View,
-        limit_bytes: int,
-        base_bgr: Image | None = None,
-    ) -> Still | NoStill:
-        """`crop` and `code` in one; ``limit_bytes`` bounds the payload alone."""
-        job = self.crop(frame, request, view=view, base_bgr=base_bgr)
-        if isinstance(job, NoStill):
-            return job
-        return self.code(job, sequence=sequence, allowance=lambda _: limit_bytes)
-
     def _fitted(
         self, codec: StillCodec, job: CropJob, header: Still, allowance: Allowance
-    ) -> tuple[Still, Fitted] | NoStill:
+    ) -> tuple[Still, _Fitted] | NoStill:
         """As requested, with this codec, or the best below that is allowed."""
-        fitter = self._fitter(codec)
         header = _of_codec(header, codec)
         limit_bytes = allowance(header)
         for _ in range(_TRIES):
-            fitted = fitter.best(job, limit_bytes=limit_bytes)
+            fitted = self._best(codec, job, limit_bytes)
             if isinstance(fitted, NoStill):
                 return fitted
             still = _filled(header, fitted)
@@ -158,24 +169,85 @@ class StillMaker:
             limit_bytes = min(limit_bytes, len(still.data)) - excess_bytes
         return NoStill("too_large")
 
-    def _cheaper(self, built: Still, fitted: Fitted, job: CropJob, header: Still) -> Still | None:
+    def _cheaper(self, built: Still, fitted: _Fitted, job: CropJob, header: Still) -> Still | None:
         """The fallback's still, where it shows no less than the one built on the base, in fewer bytes."""
         codec = self.without_base
-        psnr_db = psnr_y_db(fitted.shown_bgr, job.crop_bgr)
-        smaller = self._fitter(codec).smallest(job, psnr_db=psnr_db, limit_bytes=len(built.data))
-        return None if smaller is None else _filled(_of_codec(header, codec), smaller)
+        smaller = _reaching(codec, job, psnr_y_db(fitted.shown_bgr, job.crop_bgr))
+        if smaller is None or len(smaller.data) >= len(built.data) or not _beats_base(smaller, job):
+            return None
+        return _filled(_of_codec(header, codec), smaller)
 
-    def _fitter(self, codec: StillCodec) -> Fitter:
-        return Fitter(
+    def _best(self, codec: StillCodec, job: CropJob, limit_bytes: int) -> _Fitted | NoStill:
+        """The requested fidelity or quality, or the best below that fits; then upwards until the base is beaten."""
+        fitted = _reaching(codec, job, self.fidelity_db) if self.fidelity_db else None
+        if fitted is None:
+            fitted = _at(codec, job, _MOST_PCT if self.fidelity_db else self.quality_pct)
+        if len(fitted.data) > limit_bytes:
+            lower = self._best_fitting(codec, job, limit_bytes, below_pct=fitted.quality_pct)
+            return lower if lower is not None and _beats_base(lower, job) else NoStill("too_large")
+        quality_pct, ceiling_pct = fitted.quality_pct, max(self.ceiling_pct, fitted.quality_pct)
+        while not _beats_base(fitted, job):
+            quality_pct += _QUALITY_STEP_PCT
+            if quality_pct > ceiling_pct:
+                return NoStill("base_good")
+            fitted = _at(codec, job, quality_pct)
+            if len(fitted.data) > limit_bytes:
+                return NoStill("too_large")
+        return fitted
+
+    def _best_fitting(
+        self, codec: StillCodec, job: CropJob, limit_bytes: int, *, below_pct: int
+    ) -> _Fitted | None:
+        """The best quality from the floor to below the requested one that fits."""
+        found = best_fitting(
             codec,
-            quality_pct=self.quality_pct,
-            fidelity_db=self.fidelity_db,
-            floor_pct=1 if codec.needs_base else self.floor_pct,
-            ceiling_pct=self.ceiling_pct,
+            job.crop_bgr,
+            limit_bytes=limit_bytes,
+            low_pct=_LEAST_PCT if codec.needs_base else self.floor_pct,
+            high_pct=below_pct - 1,
+            base_bgr=_base(codec, job),
         )
+        return None if found is None else _decoded(codec, job, *found)
 
 
-def _filled(header: Still, fitted: Fitted) -> Still:
+def _reaching(codec: StillCodec, job: CropJob, psnr_db: float) -> _Fitted | None:
+    """The lowest quality that comes this near to the source; None where none does."""
+    found = smallest_reaching(
+        codec,
+        job.crop_bgr,
+        target_db=psnr_db,
+        low_pct=_LEAST_PCT,
+        high_pct=_MOST_PCT,
+        base_bgr=_base(codec, job),
+    )
+    if found is None:
+        return None
+    coded, quality_pct, shown_bgr, _ = found
+    return _Fitted(coded.data, coded.parameters, quality_pct, shown_bgr)
+
+
+def _at(codec: StillCodec, job: CropJob, quality_pct: int) -> _Fitted:
+    coded = codec.encode(job.crop_bgr, quality_pct=quality_pct, base_bgr=_base(codec, job))
+    return _decoded(codec, job, coded, quality_pct)
+
+
+def _decoded(codec: StillCodec, job: CropJob, coded: CodedCrop, quality_pct: int) -> _Fitted:
+    height, width = job.crop_bgr.shape[:2]
+    shown = codec.decode(
+        coded.data, size=(width, height), parameters=coded.parameters, base_bgr=_base(codec, job)
+    )
+    return _Fitted(coded.data, coded.parameters, quality_pct, shown)
+
+
+def _base(codec: StillCodec, job: CropJob) -> Image | None:
+    return job.base_crop_bgr if codec.needs_base else None
+
+
+def _beats_base(fitted: _Fitted, job: CropJob) -> bool:
+    return job.alternative is None or job.alternative.loses_to(fitted.shown_bgr, crop=job.crop_bgr)
+
+
+def _filled(header: Still, fitted: _Fitted) -> Still:
     return replace(
         header,
         quality_pct=fitted.quality_pct,

@@ -11,7 +11,7 @@ from hvt_common.values import Boxes, Still, View
 from hvt_common.video.base_crop import coded_size
 from hvt_edge.perception.crop import MIN_SIDE_PX, crop_box
 from hvt_edge.perception.frame_ring import FrameRing, RingFrame
-from hvt_edge.stills.crop_job import CropJob, crop_of
+from hvt_edge.stills.crop_job import CropJob, crop_of, size_parameters
 from hvt_edge.stills.maker import StillMaker
 
 __all__ = ["ON_DEMAND", "OnDemandRequest", "RefusedError", "box_of", "crop_job_for", "frame_for", "shrunk"]
@@ -99,7 +99,7 @@ def crop_job_for(
         quality_pct=maker.quality_pct,
         data=b"",
         media_type=codec.media_type,
-        parameters=_size_parameters(crop, size),
+        parameters=size_parameters(crop, size),
     )
     pixels = crop_of(frame.source_bgr, crop, size)
     return CropJob(header=header, crop_bgr=pixels, base_crop_bgr=None, alternative=None)
@@ -124,14 +124,8 @@ def shrunk(job: CropJob, shrink: float) -> CropJob:
     if size == (width, height):
         return job
     pixels = np.asarray(cv2.resize(job.crop_bgr, size, interpolation=cv2.INTER_AREA), np.uint8)
-    parameters = {**job.header.parameters, **_size_parameters(job.header.crop_source_px, size)}
+    parameters = {**job.header.parameters, **size_parameters(job.header.crop_source_px, size)}
     return replace(job, header=replace(job.header, parameters=parameters), crop_bgr=pixels)
-
-
-def _size_parameters(crop: Crop, size: tuple[int, int]) -> dict[str, int | float | str]:
-    if size == (crop[2] - crop[0], crop[3] - crop[1]):
-        return {}
-    return {"w": size[0], "h": size[1]}
 
 
 def _inside(box_xywh_px: tuple[int, int, int, int], size: tuple[int, int]) -> Crop:

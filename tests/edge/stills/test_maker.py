@@ -72,14 +72,9 @@ def make(source, box, *, base=None, limit=100_000, maker=None, view=None, index=
     """One still with the default settings."""
     shape = (source.shape[1], source.shape[0])
     view = view or View.fitted(shape, SIZE, fit="letterbox")
-    return (maker or StillMaker()).make(
-        frame_of(source, index=index),
-        request_for(box, index=index),
-        sequence=9,
-        view=view,
-        limit_bytes=limit,
-        base_bgr=base,
-    )
+    maker = maker or StillMaker()
+    job = maker.crop(frame_of(source, index=index), request_for(box, index=index), view=view, base_bgr=base)
+    return job if isinstance(job, NoStill) else maker.code(job, sequence=9, allowance=lambda _: limit)
 
 
 @given(
@@ -473,7 +468,8 @@ def test_one_still_of_several_beats_the_base_at_each_of_them():
     other = replace(request_for((440.0, 200.0, 560.0, 280.0)).candidate, track_id=7)
     both = replace(lead, also=(other,))
     view = View.fitted(SIZE, SIZE, fit="letterbox")
-    still = StillMaker().make(frame_of(source), both, sequence=0, view=view, limit_bytes=10**6, base_bgr=base)
+    job = StillMaker().crop(frame_of(source), both, view=view, base_bgr=base)
+    still = StillMaker().code(job, sequence=0, allowance=lambda _: 10**6)
     assert still.also == ((7, other.box_source_px),)
     assert still.crop_source_px == (282, 188, 578, 292)
     shown = shown_of(still)
