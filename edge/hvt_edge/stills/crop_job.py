@@ -11,9 +11,21 @@ import cv2
 import numpy as np
 
 from hvt_common.values import Image, Still
+from hvt_common.video.base_crop import coded_size
 from hvt_common.video.still_codecs import StillCodec, psnr_y_db
+from hvt_edge.perception.crop import crop_box
+from hvt_edge.stills.policy.base import Request
+from hvt_edge.stills.policy.cost import CostEstimate
 
-__all__ = ["Alternative", "CropJob", "crop_of", "inner_box", "size_parameters"]
+__all__ = [
+    "Alternative",
+    "CropJob",
+    "crop_of",
+    "expected_bytes",
+    "inner_box",
+    "size_parameters",
+    "union_crop",
+]
 
 Box = tuple[float, float, float, float]
 Crop = tuple[int, int, int, int]
@@ -89,6 +101,28 @@ class CropJob:
         return CropJob(
             header=header, crop_bgr=self.crop_bgr, base_crop_bgr=None, alternative=self.alternative
         )
+
+
+def union_crop(
+    request: Request, *, padding: float, source_size: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """What a still of it shows: the smallest box around the padded crops of all its tracks, source pixels."""
+    crops = [
+        crop_box(one.box_source_px, padding=padding, source_size=source_size)
+        for one in (request.candidate, *request.also)
+    ]
+    x1, y1, x2, y2 = zip(*crops, strict=True)
+    return min(x1), min(y1), max(x2), max(y2)
+
+
+def expected_bytes(
+    request: Request, *, cost: CostEstimate, padding: float, source_size: tuple[int, int]
+) -> float:
+    """Expected payload of a still of this request, of one track or of several."""
+    if not request.also:
+        return cost.of(request.candidate)
+    width, height = coded_size(union_crop(request, padding=padding, source_size=source_size))
+    return cost.of_px(width * height)
 
 
 def crop_of(source_bgr: Image, crop_px: Crop, size: tuple[int, int]) -> Image:

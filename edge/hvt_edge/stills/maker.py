@@ -28,8 +28,7 @@ from hvt_common.video.still_codecs import (
     smallest_reaching,
 )
 from hvt_edge.perception.crop import PADDING
-from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box, size_parameters
-from hvt_edge.stills.merging import union_crop
+from hvt_edge.stills.crop_job import Alternative, CropJob, crop_of, inner_box, size_parameters, union_crop
 from hvt_edge.stills.policy.base import Request
 
 __all__ = ["Allowance", "NoStill", "StillMaker"]

@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.video.base_crop import MAX_SIDE_PX, coded_size
-from hvt_edge.perception.candidates import Candidate
+from hvt_common.video.base_crop import MAX_SIDE_PX
 from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.policy.base import Request
 from hvt_edge.stills.policy.cost import CostEstimate
 
-__all__ = ["ALSO_BYTES", "MOST_ALSO", "expected_bytes", "group", "union_crop"]
+__all__ = ["ALSO_BYTES", "MOST_ALSO", "group"]
 
 ALSO_BYTES = 17.0
 """What the header takes for each further track: its id and its box in eighths of a pixel."""
@@ -29,25 +28,6 @@ _MOST_COMPARED = 96
 _LEAST_SAVING_BYTES = 1.0
 
 Crop = tuple[int, int, int, int]
-
-
-def union_crop(
-    request: Request, *, padding: float, source_size: tuple[int, int]
-) -> tuple[int, int, int, int]:
-    """What a request's still shows: the smallest box around the padded crops of all its tracks, source pixels."""
-    crops = [crop_box(one.box_source_px, padding=padding, source_size=source_size) for one in _shown(request)]
-    x1, y1, x2, y2 = zip(*crops, strict=True)
-    return min(x1), min(y1), max(x2), max(y2)
-
-
-def expected_bytes(
-    request: Request, *, cost: CostEstimate, padding: float, source_size: tuple[int, int]
-) -> float:
-    """Expected payload of a request's still, of one track or of several."""
-    if not request.also:
-        return cost.of(request.candidate)
-    width, height = coded_size(union_crop(request, padding=padding, source_size=source_size))
-    return cost.of_px(width * height)
 
 
 def group(
@@ -186,7 +166,3 @@ class _Board:
         self.bytes[lead] = self._line_bytes(
             px.prod(keepdims=True), np.array([len(self.members[lead])], np.int64)
         )[0]
-
-
-def _shown(request: Request) -> tuple[Candidate, ...]:
-    return (request.candidate, *request.also)

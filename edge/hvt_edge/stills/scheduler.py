@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from hvt_common.values import Still, View
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.perception.candidates import Candidate, TrackMemory
-from hvt_edge.stills.crop_job import CropJob
+from hvt_edge.stills.crop_job import CropJob, expected_bytes
 from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
-from hvt_edge.stills.merging import expected_bytes, group
+from hvt_edge.stills.merging import group
 from hvt_edge.stills.on_demand import OnDemand, OnDemandStill
 from hvt_edge.stills.outbox import AGAIN, Outbox, OutboxStill
 from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Method, Request, Step

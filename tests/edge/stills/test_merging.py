@@ -13,7 +13,8 @@ from hvt_common.protocol.messages import AlsoShown, RoiHeader
 from hvt_common.video.base_crop import coded_size
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.perception.crop import crop_box
-from hvt_edge.stills.merging import ALSO_BYTES, expected_bytes, group, union_crop
+from hvt_edge.stills.crop_job import expected_bytes, union_crop
+from hvt_edge.stills.merging import ALSO_BYTES, group
 from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Request
 from hvt_edge.stills.policy.cost import CostEstimate
 
