@@ -217,9 +217,9 @@ class Edge:
             base_bps=now.base_bps,
             keyframes=stages.keyframes.sent,
             keyframe_requests=stages.keyframes.served,
-            tracks=stages.stills.tracks,
+            tracks=stages.stills.analyzer.tracks,
             encode_ms=counts.encode_ms,
-            perception_ms=stages.stills.perception_ms,
+            perception_ms=stages.stills.analyzer.mean_ms,
             unusable_messages=link.unusable,
             store=None if backlog is None else backlog.numbers,
         )

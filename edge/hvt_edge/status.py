@@ -114,7 +114,7 @@ class StatusReporter:
         return (
             f"{config.edge_id} {self._counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "
             f"{bitrate_text(now.total_bps)}  {now.method}  stills {sent}, {self._stills.pending} pending  "
-            f"tracks {self._stills.tracks}  {link}"
+            f"tracks {self._stills.analyzer.tracks}  {link}"
         )
 
     def _status(self, state: str, at_ns: int) -> Status:
@@ -154,11 +154,11 @@ class StatusReporter:
                 frames_encoded=counts.encoded,
                 frames_dropped=counts.dropped,
                 keyframes=self._keyframes.sent,
-                tracks=stills.tracks,
+                tracks=stills.analyzer.tracks,
                 base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
                 still_queue=stills.pending,
                 encode_ms=counts.encode_ms if measured else 0.0,
-                detect_ms=stills.perception_ms if measured else 0.0,
+                detect_ms=stills.analyzer.mean_ms if measured else 0.0,
                 feedback_age_ms=age_ms if measured else -1,
             ),
         )

@@ -94,6 +94,11 @@ class Backfill:
         """Objects of which something is on its way."""
         return len(self._line)
 
+    @property
+    def cached_bytes(self) -> int:
+        """Of the object in memory."""
+        return 0 if self._data is None else len(self._data[1])
+
     # What comes back
 
     def on_acknowledged(

@@ -124,6 +124,11 @@ class BacklogStage:
         """Whether the link is away."""
         return self.state is State.OFFLINE
 
+    @property
+    def failed(self) -> bool:
+        """Whether the disk refuses, and nothing is stored any more."""
+        return self._worker.failed
+
     def before_frame(self, now_ns: int, *, linked: bool) -> bool:
         """Before each frame: notice that the link went or came; return whether it is away.
 
@@ -131,7 +136,7 @@ class BacklogStage:
         """
         self._worker.check()
         self._linked = linked
-        offline = self._outage.offline(now_ns, linked=linked) and not self._worker.failed
+        offline = self._outage.offline(now_ns, linked=linked) and not self.failed
         if offline and not self.offline:
             self._leave()
         elif self.offline and not offline:

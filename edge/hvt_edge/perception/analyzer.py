@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -9,6 +10,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from hvt_common.inference.detect import Detector
+from hvt_common.runtime.distinct import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
@@ -70,6 +72,20 @@ class Analyzer:
         self._detected_index: int | None = None
         self._coded_index: int | None = None
         self._coded_gap = 1
+        self._track_ids = DistinctIds()
+        self._spent_ns = 0
+        self.frames = 0
+        """How many were analyzed."""
+
+    @property
+    def tracks(self) -> int:
+        """Distinct tracks so far."""
+        return self._track_ids.count
+
+    @property
+    def mean_ms(self) -> float:
+        """Mean time to decode, detect and track, over all frames."""
+        return self._spent_ns / max(1, self.frames) / 1e6
 
     def analyze(
         self,
@@ -88,8 +104,16 @@ class Analyzer:
         for a later frame; decoding never does. ``skipped`` are the units since the frame before, of frames that were
         not analyzed: they are decoded and no more.
         """
+        began_ns = time.perf_counter_ns()
         for one in skipped:
             self._decode(one.frame_index, one)
+        analyzed = self._analyze(frame, unit, hurry=hurry)
+        self._spent_ns += time.perf_counter_ns() - began_ns
+        self.frames += 1
+        self._track_ids.add(analyzed.tracks.ids.tolist())
+        return analyzed
+
+    def _analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool) -> AnalyzedFrame:
         base_bgr = None if unit is None else self._decode(frame.index, unit)
         pixels = frame.base_bgr if self._settings.candidates == "source" else base_bgr
         if hurry or not self._due(frame.index, coded=unit is not None):

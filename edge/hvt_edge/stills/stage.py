@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 from hvt_common.protocol.messages import StillResult
-from hvt_common.runtime.distinct import DistinctIds
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
@@ -36,7 +34,7 @@ class StillStage:
         keyframes: KeyframeRequests,
         reporter: TrackReporter | None = None,
     ) -> None:
-        self._analyzer = analyzer
+        self.analyzer = analyzer
         self._chooser = chooser
         self._outbox = outbox
         self._sender = sender
@@ -44,14 +42,6 @@ class StillStage:
         self._keyframes = keyframes
         self._reporter = reporter
         self._latest_tracks: Tracks | None = None
-        self._track_ids = DistinctIds()
-        self._perception_ns = 0
-        self._steps = 0
-
-    @property
-    def tracks(self) -> int:
-        """Distinct tracks so far."""
-        return self._track_ids.count
 
     @property
     def latest_tracks(self) -> Tracks | None:
@@ -71,11 +61,6 @@ class StillStage:
         """Whether a still is pending, one that a ground requested included."""
         return self._outbox.any_pending
 
-    @property
-    def perception_ms(self) -> float:
-        """Mean time to decode, detect and track, over all frames."""
-        return self._perception_ns / max(1, self._steps) / 1e6
-
     def analyze(
         self,
         frame: Frame,
@@ -88,12 +73,7 @@ class StillStage:
 
         ``skipped`` are units before it, of frames that were not analyzed.
         """
-        began_ns = time.perf_counter_ns()
-        analyzed = self._analyzer.analyze(frame, unit, skipped=skipped, hurry=hurry)
-        self._perception_ns += time.perf_counter_ns() - began_ns
-        self._steps += 1
-        self._track_ids.add(analyzed.tracks.ids.tolist())
-        return analyzed
+        return self.analyzer.analyze(frame, unit, skipped=skipped, hurry=hurry)
 
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills that may go now; return their sequence numbers.

@@ -313,7 +313,8 @@ def test_only_facts_that_are_here_can_be_asked_for(tmp_path):
             for n in range(7, 2000)
         ]
         backfill.on_acknowledged(strangers, receiver_id=1, now_ns=1)
-        assert backfill._requested == {7}
+        sent = [backfill.next_chunk(10_000, now_ns=2, round_trip_ns=RTT) for _ in range(3)]
+        assert [(one.session_id, one.kind) for one in sent if one] == [(7, "info"), (7, "still")]
 
 
 def test_bytes_count_as_arrived_once_whatever_the_link_does(tmp_path):
@@ -353,7 +354,7 @@ def test_memory_holds_one_object(tmp_path):
         rig = Rig(folder)
         rig.run(10, reports=False)
         assert rig.backfill.in_flight == 12, "without a word from the ground no more goes out"
-        assert len(rig.backfill._data[1]) < 200_000
+        assert rig.backfill.cached_bytes < 200_000
 
 
 def test_a_file_that_goes_while_it_is_sent_stops_nothing(tmp_path):

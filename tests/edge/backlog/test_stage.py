@@ -52,7 +52,7 @@ def test_a_silent_ground_is_asked_with_a_frame_a_second_that_nobody_shows(tmp_pa
     """Nobody would notice that the link is back; or the ground would show garbage."""
     rig = Rig(tmp_path / "store")
     rig.play(0, 15, linked=True)
-    rig.backlog._outage.reported(rig.now_ns)
+    rig.backlog.on_feedback(rig.out.ground.report(rig.now_ns), now_ns=rig.now_ns)
     rig.play(15, 120, linked=True)
     headers = rig.out.base
     offline = next(
@@ -65,7 +65,7 @@ def test_a_silent_ground_is_asked_with_a_frame_a_second_that_nobody_shows(tmp_pa
     for probe in probes:
         assert probe.keyframe or probe.sequence == before + 2, "a number is left out"
         before = probe.sequence
-    rig.backlog._outage.reported(rig.now_ns)
+    rig.backlog.on_feedback(rig.out.ground.report(rig.now_ns), now_ns=rig.now_ns)
     rig.play(120, 135, linked=True)
     assert [one.frame_index for one in rig.out.base[-15:]] == list(range(120, 135))
     assert rig.out.base[-15].keyframe
@@ -123,7 +123,7 @@ def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, c
     with caplog.at_level(logging.WARNING):
         rig.play(0, 15, linked=True)
         rig.play(15, 25, linked=False)
-        eventually(lambda: rig.backlog._worker.failed, within_s=10, what="the disk has said no")
+        eventually(lambda: rig.backlog.failed, within_s=10, what="the disk has said no")
         rig.play(25, 60, linked=False)
         rig.play(60, 80, linked=True)
         rig.play(80, 90, linked=False)

@@ -237,8 +237,8 @@ def test_a_track_gets_its_stills_when_they_are_due():
     for one in rig.out.stills:
         np.testing.assert_allclose(one.box_source_px, square_box(one.frame_index), atol=6)
     assert rig.outcomes["sent", "due"] == len(rig.out.stills)
-    assert rig.stage.tracks == 1
-    assert rig.stage.perception_ms > 0
+    assert rig.stage.analyzer.tracks == 1
+    assert rig.stage.analyzer.mean_ms > 0
 
 
 def test_while_a_keyframe_is_due_stills_are_held():
@@ -285,7 +285,7 @@ def test_the_worker_takes_all_frames_in_order_and_finishes(monkeypatch):
             while worker.queued > 1:  # it is not hurried
                 time.sleep(0.001)
             worker.offer(frame, unit)
-    assert rig.stage._steps == 30
+    assert rig.stage.analyzer.frames == 30
     assert [one.frame_index for one in rig.out.stills] == [0, 15]
 
 
@@ -323,4 +323,4 @@ def test_closing_a_busy_worker_is_quick_and_leaves_nothing_running():
         worker.offer(frame, unit)
     worker.close()
     assert not worker._thread.is_alive()
-    assert rig.stage._steps < 16, "what was not in hand was left"
+    assert rig.stage.analyzer.frames < 16, "what was not in hand was left"

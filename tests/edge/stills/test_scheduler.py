@@ -22,6 +22,7 @@ from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.outbox import Outbox, OutboxSettings, OutboxStill
 from hvt_edge.stills.policy.base import Request, Step
+from hvt_edge.stills.policy.cost import CostModel
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
 
@@ -64,6 +65,7 @@ class Rig:
         self.picture, self.memory = picture, TrackMemory()
         self.outcomes: Counter[tuple[str, str]] = Counter()
         view = View.fitted(SIZE, SIZE, fit="letterbox")
+        self.steps: list[tuple[Sequence[Candidate], Step]] = []
         self.outbox = Outbox(OutboxSettings(max_pending=3))
         self.chooser = Chooser(
             method or ByScore(),
@@ -75,6 +77,7 @@ class Rig:
             class_names=("car",),
             settings=ChooserSettings(fps=3, most_bytes=most_bytes, **settings),
             on_outcome=lambda outcome, reason: self.outcomes.update([(outcome, reason)]),
+            observe=lambda candidates, step: self.steps.append((candidates, step)),
         )
         self.number = -1
         self.sent: list[Still] = []
@@ -223,9 +226,9 @@ def test_neighbours_share_a_still_and_all_of_them_count_as_sent():
     alone, pair = rig.sent
     assert (alone.also, [track for track, _ in pair.also]) == ((), [1])
     assert pair.crop_source_px == (16, 17, 74, 45)
-    assert all(rig.memory._histories[track].sent_count == 1 for track in (1, 2, 3))
     assert rig.outcomes == {("sent", "test"): 2}, "one for each still"
     rig.consider(NEIGHBOURS)
+    assert [one.sent_count for one in rig.steps[-1][0]] == [1, 1, 1]
     assert rig.stills(100_000) == []
     assert rig.outcomes["deferred", "cooldown"] == 3
 
@@ -243,9 +246,10 @@ def test_the_cost_of_a_shared_still_is_learnt_by_what_it_codes():
     rig.consider({1: NEIGHBOURS[1], 2: NEIGHBOURS[2]})
     assert rig.stills(100_000) == [2]
     area, size = 58 * 28, len(rig.sent[0].data)
-    sums = rig.chooser._cost_of("jpeg")._sums
-    assert sums.x / sums.one == area
-    assert sums.y / sums.one == size
+    learnt = CostModel.of_codec("jpeg")
+    learnt.observe(area_px=area, size_bytes=size)
+    rig.consider({})
+    assert rig.steps[-1][1].cost == learnt.estimate()
 
 
 def test_the_gate_holds_back_what_the_base_shows_well_before_the_method_chooses():
@@ -298,10 +302,10 @@ def test_a_still_without_its_base_is_sent_once_more_and_only_once():
     ]
     seen = JpegCodec().decode(again.data, size=crop.shape[1::-1])
     assert np.mean((seen.astype(float) - crop) ** 2) < 150
-    assert rig.memory._histories[1].sent_count == 1, "its rest began with the first"
     for sequence in (1, 2):
         rig.outbox.on_undecodable(sequence)
     rig.consider({1: SMALL, 2: box_at(6)}, base=BLURRED)
+    assert [one.sent_count for one in rig.steps[-1][0]] == [1, 1], "its rest began with the first"
     assert rig.stills(100_000) == []
     assert rig.outcomes["sent", "again"] == 1
 
