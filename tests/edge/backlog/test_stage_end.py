@@ -11,6 +11,7 @@ from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.outbox import OutboxStill
 from keeping import STILL, Rig
 from kept import S, add_stills, opened
+from processes import eventually
 
 
 def test_what_nobody_acknowledged_is_kept_when_the_run_ends(tmp_path):
@@ -234,9 +235,15 @@ def test_the_end_of_the_stores_thread_is_noticed_on_a_good_link(tmp_path):
     rig = Rig(tmp_path / "store", info=broken)
     rig.play(0, 7, reports=True)
     rig.store()
-    rig.backlog._worker._thread.join(timeout=10)
-    with pytest.raises(ZeroDivisionError):
-        rig.play(7, 8, linked=True)
+
+    def noticed() -> bool:
+        try:
+            rig.backlog.before_frame(rig.now_ns, linked=True)
+        except ZeroDivisionError:
+            return True
+        return False
+
+    eventually(noticed, within_s=10, what="the error ends the frame loop")
     rig.backlog.close()
 
 
