@@ -109,10 +109,8 @@ class Folder:
         self._session_id = session_id
         self._info = info
         self._lock: BinaryIO | None = None
-        self._stills: list[tuple[float, int, int]] = []
-        """(worth, session, number), least first."""
-        self._segments: list[tuple[int, int, int]] = []
-        """(capture time, session, number), oldest first."""
+        self._ranked: dict[BacklogKind, list[tuple[float, int, int]]] = {kind: [] for kind in BacklogKind}
+        """(`Entry.rank`, session, number) by kind: stills from the least worth, segments from the oldest."""
         self._entries: dict[Key, Entry] = {}
         self._disk_bytes = dict.fromkeys(BacklogKind, 0)
         self._objects: Counter[int] = Counter()
@@ -137,12 +135,12 @@ class Folder:
     @property
     def stills(self) -> int:
         """How many are stored."""
-        return len(self._stills)
+        return len(self._ranked[BacklogKind.STILL])
 
     @property
     def segments(self) -> int:
         """How many are stored, without the open one."""
-        return len(self._segments)
+        return len(self._ranked[BacklogKind.BASE])
 
     @property
     def open_segments(self) -> int:
@@ -223,13 +221,15 @@ class Folder:
 
     def best_stills(self) -> Iterator[Entry]:
         """Most useful first."""
-        for _, session_id, number in reversed(self._stills):
-            yield self._entries[session_id, BacklogKind.STILL, number]
+        return self._best(BacklogKind.STILL)
 
     def newest_segments(self) -> Iterator[Entry]:
         """Newest first."""
-        for _, session_id, number in reversed(self._segments):
-            yield self._entries[session_id, BacklogKind.BASE, number]
+        return self._best(BacklogKind.BASE)
+
+    def _best(self, kind: BacklogKind) -> Iterator[Entry]:
+        for _, session_id, number in reversed(self._ranked[kind]):
+            yield self._entries[session_id, kind, number]
 
     def info_of(self, session_id: int) -> Entry | None:
         """The facts of a session; None where they are not here."""
@@ -262,10 +262,8 @@ class Folder:
         self._disk_bytes[entry.kind] -= entry.disk_bytes
         self._span_ns -= entry.span_ns
         self._objects[entry.session_id] -= entry.kind is not BacklogKind.INFO
-        if entry.kind is BacklogKind.STILL:
-            self._stills.remove((entry.worth, entry.session_id, entry.number))
-        elif entry.kind is BacklogKind.BASE:
-            self._segments.remove((entry.capture_ns, entry.session_id, entry.number))
+        if entry.kind is not BacklogKind.INFO:
+            self._ranked[entry.kind].remove((entry.rank, entry.session_id, entry.number))
         unlink(entry.path)
         self._tidy(entry.session_id)
 
@@ -301,23 +299,20 @@ class Folder:
     def _least(self) -> Entry | None:
         opened = 0 if self._open is None else self._open.disk_bytes
         video_bytes = self._disk_bytes[BacklogKind.BASE] + opened
-        if self._segments and (not self._stills or video_bytes > _VIDEO_SHARE * self._max_bytes):
-            _, session_id, number = self._segments[0]
-            return self._entries[session_id, BacklogKind.BASE, number]
-        if not self._stills:
+        video_first = not self.stills or video_bytes > _VIDEO_SHARE * self._max_bytes
+        kind = BacklogKind.BASE if self.segments and video_first else BacklogKind.STILL
+        if not self._ranked[kind]:
             return None
-        _, session_id, number = self._stills[0]
-        return self._entries[session_id, BacklogKind.STILL, number]
+        _, session_id, number = self._ranked[kind][0]
+        return self._entries[session_id, kind, number]
 
     def _enter(self, entry: Entry) -> None:
         self._entries[entry.key] = entry
         self._disk_bytes[entry.kind] += entry.disk_bytes
         self._span_ns += entry.span_ns
         self._objects[entry.session_id] += entry.kind is not BacklogKind.INFO
-        if entry.kind is BacklogKind.STILL:
-            insort(self._stills, (entry.worth, entry.session_id, entry.number))
-        elif entry.kind is BacklogKind.BASE:
-            insort(self._segments, (entry.capture_ns, entry.session_id, entry.number))
+        if entry.kind is not BacklogKind.INFO:
+            insort(self._ranked[entry.kind], (entry.rank, entry.session_id, entry.number))
 
     # Folders
 

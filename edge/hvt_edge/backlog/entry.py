@@ -67,6 +67,11 @@ class Entry:
     """Of a still: the binary logarithm of its utility, plus its time in half-lives. So the order never changes."""
 
     @property
+    def rank(self) -> float:
+        """What has to go first where the store is full has the least: worth of a still, age of a segment."""
+        return self.worth if self.kind is BacklogKind.STILL else self.capture_ns
+
+    @property
     def key(self) -> Key:
         """What it is called on the link."""
         return self.session_id, self.kind, self.number

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from hvt_edge.perception.candidates import Candidate
 
 __all__ = ["CostEstimate", "CostModel"]
@@ -58,11 +61,11 @@ class CostModel:
         self._memory = memory
         self._mean_memory = mean_memory
         self._mean = prior.mean_bytes
-        self._prior = _Sums()
+        self._prior = self._sums = np.zeros(5)
         for area in _PRIOR_AREAS_PX:
-            size = prior.of_px(area)
-            self._prior = self._prior.plus(area, size, weight=prior_weight / len(_PRIOR_AREAS_PX))
-        self._sums = _Sums()
+            self._prior = self._prior + _weighted(
+                area, prior.of_px(area), prior_weight / len(_PRIOR_AREAS_PX)
+            )
 
     @classmethod
     def of_codec(cls, name: str) -> CostModel:
@@ -74,40 +77,22 @@ class CostModel:
 
     def observe(self, *, area_px: float, size_bytes: int) -> None:
         """A still of that many coded pixels took that many payload bytes."""
-        self._sums = self._sums.faded(self._memory).plus(area_px, float(size_bytes), weight=1.0)
+        self._sums = self._memory * self._sums + _weighted(area_px, float(size_bytes), 1.0)
         self._mean = self._mean_memory * self._mean + (1 - self._mean_memory) * size_bytes
 
     def estimate(self) -> CostEstimate:
         """The line as it stands; neither its height at zero nor its slope is ever negative."""
-        fixed, slope = self._sums.merged(self._prior).line()
+        one, x, y, xx, xy = (self._sums + self._prior).tolist()
+        slope = (one * xy - x * y) / (one * xx - x * x)
+        fixed = (y - slope * x) / one
+        if slope < 0:
+            fixed, slope = y / one, 0.0
+        elif fixed < 0:
+            fixed, slope = 0.0, xy / xx
         return CostEstimate(fixed_bytes=fixed, bytes_per_px=slope, mean_bytes=self._mean)
 
 
-@dataclass(frozen=True, slots=True)
-class _Sums:
-    """Weighted sums of 1, area, size, area², area · size."""
-
-    one: float = 0.0
-    x: float = 0.0
-    y: float = 0.0
-    xx: float = 0.0
-    xy: float = 0.0
-
-    def plus(self, x: float, y: float, *, weight: float) -> _Sums:
-        w = weight / max(y, 1.0) ** 2
-        return _Sums(self.one + w, self.x + w * x, self.y + w * y, self.xx + w * x * x, self.xy + w * x * y)
-
-    def faded(self, share: float) -> _Sums:
-        return _Sums(*(share * value for value in (self.one, self.x, self.y, self.xx, self.xy)))
-
-    def merged(self, other: _Sums) -> _Sums:
-        return _Sums(
-            self.one + other.one, self.x + other.x, self.y + other.y, self.xx + other.xx, self.xy + other.xy
-        )
-
-    def line(self) -> tuple[float, float]:
-        slope = (self.one * self.xy - self.x * self.y) / (self.one * self.xx - self.x * self.x)
-        if slope < 0:
-            return self.y / self.one, 0.0
-        fixed = (self.y - slope * self.x) / self.one
-        return (fixed, slope) if fixed >= 0 else (0.0, self.xy / self.xx)
+def _weighted(area_px: float, size_bytes: float, weight: float) -> npt.NDArray[np.float64]:
+    """(5,): 1, area, size, area², area · size, by weight and relative error."""
+    w, x, y = weight / max(size_bytes, 1.0) ** 2, area_px, size_bytes
+    return np.array((w, w * x, w * y, w * x * x, w * x * y))
