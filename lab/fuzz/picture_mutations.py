@@ -6,7 +6,7 @@ from collections.abc import Callable
 from random import Random
 
 from hvt_common.video.still_codecs import StillError
-from hvt_common.video.still_codecs.avif import av1_data, av1_size, avif_file
+from hvt_common.video.still_codecs.plugins.avif import av1_data, av1_size, avif_file
 from lab.fuzz.mutate import Bytes, Mutator
 
 __all__ = ["inside"]
@@ -82,6 +82,5 @@ _CHANGES: dict[str, _Change] = {
     "jpeg": _jpeg,
     "webp": _webp,
     "avif": _avif,
-    "avif-lite": _av1,
     "jxl": _jxl,
 }

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.av_still import decoded, encoded
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
+from hvt_common.video.still_codecs.contract import (
+    MAX_QP,
+    NO_PARAMETERS,
+    CodedCrop,
+    Parameters,
+    StillError,
+    qp_of,
+)
 from hvt_common.video.still_codecs.h264_syntax import (
     CHROMA_QP_OFFSET,
     cabac_data,
     coded_slice,
     parameter_sets,
 )
-from hvt_common.video.still_codecs.ladder import MAX_QP, qp_of
 from hvt_common.video.still_codecs.yuv420 import padded_size, to_bgr, to_planar
 
 __all__ = ["H264IntraCodec", "split_payload", "x264_options"]
@@ -22,13 +26,12 @@ _SMALL_PX = 128 * 128
 """Most crops; see `x264_options`."""
 
 
-@dataclass(frozen=True, slots=True)
 class H264IntraCodec:
     """The payload is one byte with the QP, then the slice's CABAC data."""
 
-    name: str = field(default="h264-intra", init=False)
-    media_type: str = field(default="application/vnd.hvt.h264-intra", init=False)
-    needs_base: bool = field(default=False, init=False)
+    name = "h264-intra"
+    media_type = "application/vnd.hvt.h264-intra"
+    needs_base = False
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
         """Code a crop; sizes that are no multiple of 16 are filled up with their last row and column."""

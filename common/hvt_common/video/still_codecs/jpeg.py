@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
 
 import cv2
 
@@ -23,16 +22,15 @@ _MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """Whatever ends a scan: stuffing, restarts and fill bytes do not."""
 
 
-@dataclass(frozen=True, slots=True)
 class JpegCodec:
     """Baseline JPEG, 4:2:0, with Huffman tables made for the picture: the paper's setting.
 
     OpenCV with ``OPTIMIZE`` writes what Pillow writes with ``optimize=True`` at the same quality, to the byte count.
     """
 
-    name: str = field(default="jpeg", init=False)
-    media_type: str = field(default="image/jpeg", init=False)
-    needs_base: bool = field(default=False, init=False)
+    name = "jpeg"
+    media_type = "image/jpeg"
+    needs_base = False
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
         """Code a crop of at least one pixel."""

@@ -1,23 +1,19 @@
-"""`avif` and `avif-lite`: AV1 still pictures through OpenCV.
+"""`avif`: AV1 still pictures through OpenCV, as files that any program opens.
 
-An AVIF file has 275 bytes of boxes around a crop of perhaps 700. `avif` is the plain file that any program opens;
-`avif-lite` is its AV1 data alone, and the ground writes the boxes. Either way the decoder gets boxes that were
-written here: nothing from the network but AV1 data reaches it, of one picture whose size has been read.
+The decoder gets AVIF boxes that are written here: nothing from the network but AV1 data reaches it, of one picture
+whose size has been read.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass, field
 
 import cv2
 
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.bits import BitReader
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
-from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
-from hvt_common.video.still_codecs.ladder import on_ladder
+from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError, on_ladder
+from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded, lacking
 
-__all__ = ["AvifCodec", "AvifLiteCodec", "av1_data", "av1_size", "avif_file"]
+__all__ = ["AvifCodec", "av1_data", "av1_size", "avif_file"]
 
 _QUALITY = ((1, 1), (5, 4), (20, 36), (35, 46), (50, 52.5), (65, 59), (80, 68), (90, 81), (97, 94), (100, 98))
 """(quality in percent, libavif's own), at equal Y-PSNR; libavif's 100 is lossless, which is another format."""
@@ -27,13 +23,12 @@ _SPEED = 8
 _TEMPORAL_DELIMITER, _SEQUENCE, _FRAME = 2, 1, 6
 
 
-@dataclass(frozen=True, slots=True)
 class AvifCodec:
     """The payload is an AVIF file with one item."""
 
-    name: str = field(default="avif", init=False)
-    media_type: str = field(default="image/avif", init=False)
-    needs_base: bool = field(default=False, init=False)
+    name = "avif"
+    media_type = "image/avif"
+    needs_base = False
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
         """Code a crop of at least one pixel."""
@@ -49,31 +44,15 @@ class AvifCodec:
         base_bgr: Image | None = None,  # noqa: ARG002
     ) -> Image:
         """The crop again."""
-        return _picture(av1_data(data), size=size)
+        av1 = av1_data(data)
+        if av1_size(av1) != size:
+            raise StillError(f"AV1 picture is not of {size[0]}x{size[1]}")
+        return imdecoded(avif_file(av1, size=size), size=size, what="AVIF")
 
-
-@dataclass(frozen=True, slots=True)
-class AvifLiteCodec:
-    """The payload is the AV1 data of an AVIF file."""
-
-    name: str = field(default="avif-lite", init=False)
-    media_type: str = field(default="application/vnd.hvt.avif-lite", init=False)
-    needs_base: bool = field(default=False, init=False)
-
-    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
-        """Code a crop of at least one pixel."""
-        return CodedCrop(av1_data(AvifCodec().encode(crop_bgr, quality_pct=quality_pct).data))
-
-    def decode(
-        self,
-        data: bytes,
-        *,
-        size: tuple[int, int],
-        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
-        base_bgr: Image | None = None,  # noqa: ARG002
-    ) -> Image:
-        """The crop again."""
-        return _picture(data, size=size)
+    @staticmethod
+    def lacking() -> str | None:
+        """Why it does not work on this machine, or None."""
+        return lacking(".avif")
 
 
 def av1_data(file: bytes) -> bytes:
@@ -135,12 +114,6 @@ def avif_file(data: bytes, *, size: tuple[int, int]) -> bytes:
     place = bytes(4) + b"\x44\x00\x00\x01\x00\x01\x00\x00\x00\x01"
     place = _box(b"iloc", place + start.to_bytes(4, "big") + len(data).to_bytes(4, "big"))
     return kind + _box(b"meta", bytes(4) + fixed + place + rest) + _box(b"mdat", data)
-
-
-def _picture(data: bytes, *, size: tuple[int, int]) -> Image:
-    if av1_size(data) != size:
-        raise StillError(f"AV1 picture is not of {size[0]}x{size[1]}")
-    return imdecoded(avif_file(data, size=size), size=size, what="AVIF")
 
 
 def _box(kind: bytes, body: bytes) -> bytes:

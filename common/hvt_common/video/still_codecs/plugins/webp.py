@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import cv2
 
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
-from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
-from hvt_common.video.still_codecs.ladder import on_ladder
+from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError, on_ladder
+from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded, lacking
 
 __all__ = ["WebpCodec", "webp_size"]
 
@@ -18,13 +15,12 @@ _QUALITY = ((1, 1), (5, 2), (20, 17), (35, 36), (50, 52), (65, 71), (80, 82), (9
 _VP8_START = b"\x9d\x01\x2a"
 
 
-@dataclass(frozen=True, slots=True)
 class WebpCodec:
     """The payload is a WebP file of one ``VP8`` chunk; transparency, animation and lossless are refused."""
 
-    name: str = field(default="webp", init=False)
-    media_type: str = field(default="image/webp", init=False)
-    needs_base: bool = field(default=False, init=False)
+    name = "webp"
+    media_type = "image/webp"
+    needs_base = False
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
         """Code a crop of at least one pixel."""
@@ -43,6 +39,11 @@ class WebpCodec:
         if webp_size(data) != size:
             raise StillError(f"WebP is not of {size[0]}x{size[1]}")
         return imdecoded(data, size=size, what="WebP")
+
+    @staticmethod
+    def lacking() -> str | None:
+        """Why it does not work on this machine, or None."""
+        return lacking(".webp")
 
 
 def webp_size(data: bytes) -> tuple[int, int]:

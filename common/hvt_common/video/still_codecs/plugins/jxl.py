@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
 
 import numpy as np
 
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
-from hvt_common.video.still_codecs.ladder import on_ladder
+from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError, on_ladder
 
-__all__ = ["JxlCodec", "jxl_lacking", "jxl_size"]
+__all__ = ["JxlCodec", "jxl_size"]
 
 _QUALITY = ((1, 1), (5, 2), (20, 27), (35, 50), (50, 63), (65, 71), (80, 81), (90, 88.5), (97, 96), (100, 99))
 """(quality in percent, libjxl's own), at equal Y-PSNR; its 100 is lossless."""
@@ -25,13 +23,12 @@ _MAX_UPSAMPLING = 1
 """As a power of two; below quality 10 libjxl codes at half the size."""
 
 
-@dataclass(frozen=True, slots=True)
 class JxlCodec:
     """The payload is a bare JPEG XL codestream of one frame."""
 
-    name: str = field(default="jxl", init=False)
-    media_type: str = field(default="image/jxl", init=False)
-    needs_base: bool = field(default=False, init=False)
+    name = "jxl"
+    media_type = "image/jxl"
+    needs_base = False
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
         """Code a crop of at least one pixel."""
@@ -67,10 +64,10 @@ class JxlCodec:
             raise StillError(f"JPEG XL of {size[0]}x{size[1]} does not decode")
         return np.ascontiguousarray(np.frombuffer(pixels, np.uint8).reshape(size[1], size[0], 3)[..., ::-1])
 
-
-def jxl_lacking() -> str | None:
-    """Why there is no JPEG XL here, or None."""
-    return None if find_spec(_PLUGIN) else "it comes with the extra hvt[jxl], which is not installed"
+    @staticmethod
+    def lacking() -> str | None:
+        """Why it does not work on this machine, or None."""
+        return None if find_spec(_PLUGIN) else "it comes with the extra hvt[jxl], which is not installed"
 
 
 def jxl_size(data: bytes) -> tuple[int, int]:
