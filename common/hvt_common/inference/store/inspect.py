@@ -14,7 +14,8 @@ from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier
 from hvt_common.inference.detect import OnnxDetector
 from hvt_common.inference.detect_heads import EndToEndHead, UltralyticsHead, YoloxHead
-from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, Port, open_model, opset_versions
+from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, Port, open_model
+from hvt_common.inference.runtimes.onnx_file import opset_versions
 
 __all__ = ["ModelReport", "inspect_model"]
 

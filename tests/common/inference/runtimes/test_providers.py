@@ -65,7 +65,7 @@ def test_auto_takes_the_fastest_that_is_here_and_says_why(
     """Half the speed of a machine would lie idle, or nobody could tell what computes."""
     choice = choose_provider("auto", onnxruntime=onnxruntime, openvino=openvino)
     assert choice.provider == provider
-    assert not choice.asked
+    assert not choice.explicit
     assert re.search(why, choice.why), choice.why
 
 
