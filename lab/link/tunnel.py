@@ -21,7 +21,6 @@ from lab.link.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, comm
 
 __all__ = ["GROUND_HOST", "Flight", "Tunnel", "UnavailableError"]
 
-_CLONE = "/dev/net/tun"
 _TUNSETIFF = 0x400454CA
 _IFF_TUN = 0x0001
 _IFF_NO_PI = 0x1000
@@ -31,7 +30,7 @@ _MOST_PACKETS = 16_384
 """On their way in both directions together: 25 MB at most."""
 _AT_ONCE = 64
 """Taken from one device before the other has its turn."""
-_LOOK_UP_S = 0.05
+_STOP_CHECK_S = 0.05
 """How often the thread looks whether it is to stop, when nothing comes."""
 _IPV4 = 4
 
@@ -43,21 +42,23 @@ class Tunnel(Sides):
 
     Attributes:
         up, down: the pipe from edge to ground, and the one back.
+        devices: the names of the TUN devices, by side.
         left_out: packets that came while as many as may be were on their way.
 
     Raises:
         UnavailableError: iproute2, /dev/net/tun or the rights are missing.
     """
 
-    def __init__(self, script: Script, *, seed: int = 0) -> None:
+    def __init__(self, script: Script, *, seed: int = 0, clone: str = "/dev/net/tun") -> None:
         super().__init__()
+        self._clone = clone
+        self.devices = {side: f"hvt{self._token}{side[0]}" for side in ("edge", "ground")}
         self._script = script
         self._playing = script.still()
         self.up = Pipe(self._playing, seed=f"{seed}-up")
         self.down = Pipe(self._playing, seed=f"{seed}-down")
         self.left_out = 0
-        self._devices: dict[str, int] = {}
-        """File descriptors by side."""
+        self._descriptors: dict[str, int] = {}
 
     def begin(self) -> float:
         """The script begins now; return the Unix time."""
@@ -67,8 +68,8 @@ class Tunnel(Sides):
 
     def _build(self) -> None:
         for side, own, peer in (("edge", EDGE_HOST, GROUND_HOST), ("ground", GROUND_HOST, EDGE_HOST)):
-            space, device = self.names[side], f"hvt{self._token}{side[0]}"
-            self._devices[side] = _device(device)
+            space, device = self.names[side], self.devices[side]
+            self._descriptors[side] = _device(device, clone=self._clone)
             command("ip", "link", "set", "dev", device, "netns", space)
             command("ip", "-n", space, "address", "add", own, "peer", peer, "dev", device)
             command("ip", "-n", space, "link", "set", "dev", device, "mtu", str(_MTU_BYTES), "up")
@@ -76,18 +77,18 @@ class Tunnel(Sides):
 
     def _leave(self) -> None:
         super()._leave()
-        while self._devices:
-            os.close(self._devices.popitem()[1])  # with its descriptor a device goes
+        while self._descriptors:
+            os.close(self._descriptors.popitem()[1])  # with its descriptor a device goes
 
     def _forward(self) -> None:
-        edge, ground = self._devices["edge"], self._devices["ground"]
+        edge, ground = self._descriptors["edge"], self._descriptors["ground"]
         flight = Flight(_MOST_PACKETS)
         # select() takes microseconds; epoll would round every arrival up to the next millisecond.
         with selectors.SelectSelector() as devices:
             devices.register(edge, selectors.EVENT_READ, (self.up, ground))
             devices.register(ground, selectors.EVENT_READ, (self.down, edge))
             while not self._stop.is_set():
-                wait_s = min(_LOOK_UP_S, flight.next_s - time.monotonic())
+                wait_s = min(_STOP_CHECK_S, flight.next_s - time.monotonic())
                 ready = devices.select(max(0.0, wait_s))
                 for key, _ in ready:
                     pipe, to = key.data
@@ -138,12 +139,12 @@ class Flight:
             yield to, packet
 
 
-def _device(name: str) -> int:
+def _device(name: str, *, clone: str) -> int:
     """A new TUN device; its file descriptor, which does not block."""
-    device = os.open(_CLONE, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    device = os.open(clone, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         fcntl.ioctl(device, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _IFF_TUN | _IFF_NO_PI))
     except OSError as error:
         os.close(device)
-        raise OSError(error.errno, error.strerror, _CLONE) from None
+        raise OSError(error.errno, error.strerror, clone) from None
     return device

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.imagenet_names import IMAGENET_NAMES
+from hvt_common.inference.class_names import IMAGENET_NAMES
 from hvt_common.inference.labels import first_synonym, metadata_labels, read_labels
 from hvt_common.inference.letterbox import as_bgr
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model

@@ -134,7 +134,7 @@ class OnnxDetector:
         output = self.model.run(tensor)[self._output_index].astype(np.float32, copy=False)
         found = self.head.decode(output, confidence=self._confidence, input_size=input_size)
         if self.head.suppresses:
-            kept = suppress(
+            selected = suppress(
                 found.boxes_input_px,
                 found.scores,
                 found.class_ids,
@@ -142,11 +142,11 @@ class OnnxDetector:
                 any_class_iou=_TWIN_IOU,
             )
         else:
-            kept = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
-        boxes = letterbox.to_image(found.boxes_input_px[kept])
-        class_ids = found.class_ids[kept]
+            selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
+        boxes = letterbox.to_image(found.boxes_input_px[selected])
+        class_ids = found.class_ids[selected]
         inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & (class_ids < len(self.class_names))
-        return Detections(boxes[inside], found.scores[kept][inside], class_ids[inside])
+        return Detections(boxes[inside], found.scores[selected][inside], class_ids[inside])
 
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
         """(width, height) in pixels that the network gets for an image of this (width, height)."""

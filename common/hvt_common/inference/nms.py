@@ -51,10 +51,10 @@ def suppress(
     span = float(np.abs(boxes_xyxy).max()) * 2 + 1
     apart = rects.copy()
     apart[:, :2] += class_ids[best, None] * span
-    kept = _greedy(apart, iou)
+    selected = _greedy(apart, iou)
     if any_class_iou < 1:
-        kept = kept[_greedy(rects[kept], any_class_iou)]
-    return best[kept[:limit]]
+        selected = selected[_greedy(rects[selected], any_class_iou)]
+    return best[selected[:limit]]
 
 
 def _greedy(rects: npt.NDArray[np.float64], iou: float) -> npt.NDArray[np.intp]:

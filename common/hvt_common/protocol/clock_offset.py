@@ -29,10 +29,10 @@ class ClockOffset:
     and the one before exclude each other a clock was set: those before the step are forgotten.
     """
 
-    def __init__(self, *, window_ns: int = 60_000_000_000, keep: int = 64) -> None:
-        """Samples older than ``window_ns`` before the newest are forgotten; never more than ``keep`` are held."""
+    def __init__(self, *, window_ns: int = 60_000_000_000, max_samples: int = 64) -> None:
+        """Samples older than ``window_ns`` before the newest are dropped, and the oldest beyond ``max_samples``."""
         self._window_ns = window_ns
-        self._samples: deque[_Sample] = deque(maxlen=keep)
+        self._samples: deque[_Sample] = deque(maxlen=max_samples)
 
     def add(self, *, t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> bool:
         """Take one exchange; False if its times contradict each other (a stepped or hostile clock)."""

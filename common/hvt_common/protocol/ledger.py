@@ -1,4 +1,4 @@
-"""The one account of what crosses the line: bytes by channel, rolling windows, and the fate of every still.
+"""The one account of what crosses the line: bytes by channel, rolling windows, and the outcome of every still.
 
 Pure: the time of each message is an argument. Both sides feed it the same numbers (sizes of what was sent, times out
 of the headers) and get the same totals and windows.
@@ -14,6 +14,7 @@ from enum import Enum
 from typing import Literal
 
 __all__ = [
+    "STANDARD_ENCODINGS",
     "Account",
     "Ledger",
     "LedgerSummary",
@@ -37,7 +38,7 @@ class Account(Enum):
 
 
 _MOST_REASONS = 23
-"""Of one fate, each by its own name; a status carries one more."""
+"""Of one outcome, each by its own name; a status carries one more."""
 _MOST_PENDING = 65_536
 
 # Measured between two peers of eclipse-zenoh 1.10 over TCP, with `ss -ti` (bytes_sent) and a veth's tx_bytes. It is
@@ -47,7 +48,7 @@ _FRAMING_BYTES = 12
 _STANDARD_ENCODING_BYTES = 1
 _CUSTOM_ENCODING_BYTES = 4
 _TIMESTAMP_BYTES = 26
-_STANDARD_ENCODINGS = frozenset(
+STANDARD_ENCODINGS = frozenset(
     {
         "application/octet-stream",
         "application/cbor",
@@ -79,7 +80,7 @@ def overhead_bytes(
     framing = _FRAMING_BYTES + len(key) + _varint_bytes(payload_bytes)
     if attachment_bytes:
         framing += 1 + _varint_bytes(attachment_bytes)
-    if encoding in _STANDARD_ENCODINGS:
+    if encoding in STANDARD_ENCODINGS:
         framing += _STANDARD_ENCODING_BYTES
     elif encoding:
         framing += _CUSTOM_ENCODING_BYTES + len(encoding)
@@ -118,7 +119,7 @@ class LedgerSummary:
     total_bps: int
     worst_window_bps: WindowRates
     outcomes: Mapping[str, Mapping[str, int]]
-    """For each fate the number of stills by reason."""
+    """For each outcome the number of stills by reason."""
 
     @property
     def line_bytes(self) -> int:
@@ -182,7 +183,7 @@ class Ledger:
         outcomes[reason if reason in outcomes or len(outcomes) < _MOST_REASONS else "other"] += 1
 
     def outcomes(self, outcome: StillOutcome) -> dict[str, int]:
-        """Number of stills with this fate, by reason."""
+        """Number of stills with this outcome, by reason."""
         return dict(self._outcomes[outcome])
 
     def messages(self, channel: Account) -> int:

@@ -10,7 +10,7 @@ __all__ = ["SteadyClock"]
 
 _log = logging.getLogger(__name__)
 
-_LOOK_NS = 1_000_000_000
+_CHECK_INTERVAL_NS = 1_000_000_000
 _FAR_NS = 10_000_000_000
 
 
@@ -19,7 +19,7 @@ class SteadyClock:
 
     A machine without a battery for its clock starts in the past, and NTP sets it in mid-flight. Every time that HVT
     notes, sends or compares is of such a clock, so that a step of the wall's is no gap in the picture and no delay.
-    The price is that a time that was wrong at the start stays wrong: where the wall has gone ten seconds away from
+    The drawback is that a time that was wrong at the start stays wrong: where the wall has gone ten seconds away from
     it, one warning says so. Nothing is decided by it.
     """
 
@@ -32,21 +32,21 @@ class SteadyClock:
         self._wall_ns = wall_ns
         self._monotonic_ns = monotonic_ns
         self._ahead_ns = wall_ns() - monotonic_ns()
-        self._look_ns: int | None = monotonic_ns() + _LOOK_NS
+        self._next_check_ns: int | None = monotonic_ns() + _CHECK_INTERVAL_NS
         """When to compare next; None once it was said."""
 
     def __call__(self) -> int:
         """Unix nanoseconds, as the wall would show them had nobody set it."""
         monotonic_ns = self._monotonic_ns()
-        if self._look_ns is not None and monotonic_ns >= self._look_ns:
+        if self._next_check_ns is not None and monotonic_ns >= self._next_check_ns:
             self._compare(monotonic_ns)
         return self._ahead_ns + monotonic_ns
 
     def _compare(self, monotonic_ns: int) -> None:
-        self._look_ns = monotonic_ns + _LOOK_NS
+        self._next_check_ns = monotonic_ns + _CHECK_INTERVAL_NS
         off_ns = self._wall_ns() - self._ahead_ns - monotonic_ns
         if abs(off_ns) > _FAR_NS:
-            self._look_ns = None
+            self._next_check_ns = None
             _log.warning(
                 "the clock of this machine was set by %+.0f s (or it slept): all times go on as if it had not been, "
                 "until the next start",

@@ -58,13 +58,13 @@ class Rights:
         """
         if not self.enabled:
             return True
-        asked = zenoh.KeyExpr(key)
+        requested = zenoh.KeyExpr(key)
         said = {
             rule["permission"]
             for rule in self._rules_for(name)
             if flow in (rule.get("flows") or (flow,))
             and message in rule["messages"]
-            and any(zenoh.KeyExpr(one).includes(asked) for one in rule["key_exprs"])
+            and any(zenoh.KeyExpr(one).includes(requested) for one in rule["key_exprs"])
         }
         return "deny" not in said and ("allow" in said or self.default_allow)
 

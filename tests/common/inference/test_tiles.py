@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_common.boxes import iou
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.nms import suppress
@@ -19,7 +18,7 @@ from hvt_common.inference.tiles import (
     tiled,
     warm_up_source,
 )
-from hvt_common.values import Detections
+from hvt_common.values import Detections, iou
 
 MODEL = "yolov5su_visdrone_640.onnx"
 

@@ -2,7 +2,7 @@
 
 A model file comes from outside: `onnx_file` checks it first, and what it declares has bounds. It is read as ONNX
 whatever its name ends in, and no custom operator library is registered. A model that another runtime will run is
-opened by onnxruntime first: that gives the ports and the metadata, and no runtime gets a file that onnxruntime refuses.
+opened by onnxruntime first: that gives ports and metadata, and no runtime gets a file that onnxruntime refuses.
 """
 
 from __future__ import annotations

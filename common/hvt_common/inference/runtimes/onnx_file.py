@@ -1,8 +1,8 @@
 """Checks an ONNX file by walking its protobuf without any library, before a runtime parses it.
 
 A model file comes from outside. It must be a file, not too large, walk as an ONNX protobuf with a graph, and hold all
-its weights: external weights make a runtime open files by the names that stand in the model (ONNX Runtime does so even
-for a model given as bytes, relative to the working folder).
+its weights: external weights make a runtime open files by the names that stand in the model (ONNX Runtime does so
+even for a model given as bytes, relative to the working folder).
 """
 
 from __future__ import annotations
@@ -81,21 +81,24 @@ def opset_versions(path: Path) -> dict[str, int]:
 
 def _check(path: Path, data: mmap.mmap) -> None:
     try:
-        numbers = set()
-        for field, wire_type, _, begin, _ in _fields(data, 0, len(data)):
-            if field not in _MODEL_FIELDS or wire_type not in (0, 2):
-                raise ValueError(f"unknown field {field} of type {wire_type} before byte {begin}")
-            numbers.add(field)
+        fields = set(_model_fields(data))
         location = _external_location(data, 0, len(data), "Model", depth=0)
     except ValueError as error:
         raise UserError(f"model {path} is not an ONNX file, or is cut short ({error})") from error
-    if _GRAPH_FIELD not in numbers:
+    if _GRAPH_FIELD not in fields:
         raise UserError(f"model {path} is not an ONNX file (no graph in it)")
     if location is not None:
         raise UserError(
             f"model {path} cannot be opened: it keeps weights in another file ({location!r:.80}); make it one file: "
             "external_data=False in torch.onnx.export, or onnx.save(onnx.load(OLD), NEW)"
         )
+
+
+def _model_fields(data: _Bytes) -> Iterator[int]:
+    for field, wire_type, _, begin, _ in _fields(data, 0, len(data)):
+        if field not in _MODEL_FIELDS or wire_type not in (0, 2):
+            raise ValueError(f"unknown field {field} of type {wire_type} before byte {begin}")
+        yield field
 
 
 def _external_location(data: _Bytes, start: int, end: int, kind: str, *, depth: int) -> str | None:

@@ -87,6 +87,11 @@ class OpenVinoRunner:
                 " (--provider cpu may)"
             ) from error
 
+    @property
+    def compiled_shapes(self) -> tuple[tuple[int, ...], ...]:
+        """The input shapes without the batch for which the network is compiled now."""
+        return tuple(self._requests)
+
     def _request(self, shape: tuple[int, ...]) -> Any:
         key = shape[1:]
         if key not in self._requests:

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import msgpack
 
 from hvt_common.protocol.messages.envelope import MAX_PAYLOAD_BYTES, Message
-from hvt_common.protocol.messages.fields import I63, U32, U64, Choice, Int, WireError, wire_field
+from hvt_common.protocol.messages.fields import I63, U32, U64, Int, OneOf, WireError, wire_field
 
 __all__ = [
     "MAX_ACKNOWLEDGED_RANGES",
@@ -52,7 +52,7 @@ class BacklogKind(StrEnum):
     """A run of `BacklogUnit`; its number is the frame index of the first."""
 
 
-_KIND = Choice(tuple(BacklogKind))
+_KIND = OneOf(tuple(BacklogKind))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

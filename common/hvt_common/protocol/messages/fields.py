@@ -16,12 +16,12 @@ __all__ = [
     "U32",
     "U64",
     "Blob",
-    "Choice",
     "Flag",
     "Int",
     "Kind",
     "ListOf",
     "MapOf",
+    "OneOf",
     "Real",
     "Scalar",
     "Scaled",
@@ -201,7 +201,7 @@ def fitted_text(text: str, max_bytes: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice(Kind):
+class OneOf(Kind):
     """One of a few words, sent as its position."""
 
     words: tuple[str, ...]

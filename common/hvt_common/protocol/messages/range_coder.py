@@ -13,7 +13,7 @@ from typing import Final, Protocol
 
 from hvt_common.protocol.messages.fields import WireError
 
-__all__ = ["Coder", "Context", "Decoder", "Encoder", "Numbers"]
+__all__ = ["Coder", "Context", "Decoder", "Encoder", "NumberContexts"]
 
 _ONE: Final = 1 << 16
 _SLOWEST: Final = 30
@@ -42,7 +42,7 @@ class Context:
             self.seen += 1
 
 
-class Numbers:
+class NumberContexts:
     """The contexts of one kind of whole number: is it zero, its sign, how many bits it has, the highest of them."""
 
     __slots__ = ("high", "length", "nonzero", "sign")
@@ -65,17 +65,17 @@ class Coder(Protocol):
         """A number below ``2 ** bits`` of which nothing is known."""
         ...
 
-    def unsigned(self, numbers: Numbers, value: int) -> int:
+    def unsigned(self, numbers: NumberContexts, value: int) -> int:
         """A whole number from 0 up to 2^33 - 2."""
         ...
 
-    def signed(self, numbers: Numbers, value: int) -> int:
+    def signed(self, numbers: NumberContexts, value: int) -> int:
         """A whole number of either sign."""
         ...
 
 
 class _Syntax(ABC):
-    """Numbers as decisions; the same for both sides."""
+    """NumberContexts as decisions; the same for both sides."""
 
     __slots__ = ()
 
@@ -85,7 +85,7 @@ class _Syntax(ABC):
     @abstractmethod
     def plain(self, value: int, bits: int) -> int: ...
 
-    def unsigned(self, numbers: Numbers, value: int) -> int:
+    def unsigned(self, numbers: NumberContexts, value: int) -> int:
         """Elias gamma of ``value + 1``: its length in unary and its highest bits as decisions, the rest plain."""
         wanted = (value + 1).bit_length() - 1
         length = 0
@@ -100,7 +100,7 @@ class _Syntax(ABC):
         low = self.plain((value + 1) & ((1 << rest) - 1), rest)
         return ((2 | high) << rest | low) - 1
 
-    def signed(self, numbers: Numbers, value: int) -> int:
+    def signed(self, numbers: NumberContexts, value: int) -> int:
         """Zero or not, the sign, and the distance from zero less one."""
         if not self.bit(numbers.nonzero, int(value != 0)):
             return 0
@@ -129,7 +129,7 @@ class Encoder(_Syntax):
         else:
             self._range = bound
         context.learn(bit)
-        self._renew()
+        self._normalise()
         return bit
 
     def plain(self, value: int, bits: int) -> int:
@@ -138,20 +138,20 @@ class Encoder(_Syntax):
             self._range >>= 1
             if value >> place & 1:
                 self._low += self._range
-            self._renew()
+            self._normalise()
         return value
 
     def finish(self) -> bytes:
         """The shortest bytes that stand for all that was written; the reader takes zeros for what follows."""
-        for kept in range(_WINDOW_BYTES + 1):
-            step = 1 << 8 * (_WINDOW_BYTES - kept)
+        for length in range(_WINDOW_BYTES + 1):
+            step = 1 << 8 * (_WINDOW_BYTES - length)
             value = -(-self._low // step) * step
             if value < self._low + self._range:
                 whole = value.to_bytes(self._shifts + _WINDOW_BYTES, "big")
-                return whole[: self._shifts + kept]
+                return whole[: self._shifts + length]
         raise AssertionError("four bytes always tell one number of 32 bits from the next")
 
-    def _renew(self) -> None:
+    def _normalise(self) -> None:
         while self._range < _TOP:
             self._low <<= 8
             self._range <<= 8
@@ -179,7 +179,7 @@ class Decoder(_Syntax):
         else:
             self._range = bound
         context.learn(read)
-        self._renew()
+        self._normalise()
         return read
 
     def plain(self, value: int, bits: int) -> int:  # noqa: ARG002 - what the encoder would write
@@ -191,7 +191,7 @@ class Decoder(_Syntax):
             if one:
                 self._code -= self._range
             read = read << 1 | one
-            self._renew()
+            self._normalise()
         return read
 
     def finish(self) -> None:
@@ -201,7 +201,7 @@ class Decoder(_Syntax):
         if self._next < len(self._data):
             raise WireError(f"{len(self._data) - self._next} bytes too many after the coded boxes")
 
-    def _renew(self) -> None:
+    def _normalise(self) -> None:
         while self._range < _TOP:
             fresh = self._data[self._next] if self._next < len(self._data) else 0
             if self._next - len(self._data) >= _WINDOW_BYTES:

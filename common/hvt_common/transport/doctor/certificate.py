@@ -64,10 +64,10 @@ class KeyPair:
     certificate: Path
     key: Path
 
-    def read(self, *, listens: bool) -> Certificate:
+    def read(self, *, as_server: bool) -> Certificate:
         """What the other side would see; UserError for files that cannot be used. Says nothing of time or CA."""
         try:
-            said = _shown(self, listens=listens)
+            said = _shown(self, as_server=as_server)
         except ssl.SSLError as error:
             raise UserError(_unusable(self, error)) from None
         return Certificate.of(said)
@@ -111,16 +111,16 @@ def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | N
     connect = json.loads(config.get_json("connect/endpoints")) or []
     if isinstance(connect, dict):
         connect = [one for group in connect.values() for one in group]
-    listens, connects = _any_secured(listen), _any_secured(connect)
-    if not (listens or connects):
+    listening, connecting = _any_secured(listen), _any_secured(connect)
+    if not (listening or connecting):
         return
     if files.root_ca is not None:
         _check_readable(files.root_ca, setting="root_ca_certificate")
         _check_ca(files.root_ca)
-    for pair, in_use, side in ((files.listen, listens, "listen"), (files.connect, connects, "connect")):
+    for pair, in_use, side in ((files.listen, listening, "listen"), (files.connect, connecting, "connect")):
         if pair is not None and in_use:
             _check_pair(pair, side=side, name=name, now_s=now_s)
-    if listens and files.listen is None and not _in_base64(config, "listen"):
+    if listening and files.listen is None and not _in_base64(config, "listen"):
         raise UserError(
             f"listening on {next(one for one in listen if one.startswith(_SECURED))} takes listen_certificate and "
             "listen_private_key in --zenoh-config: hvt-ground keys makes them"
@@ -170,7 +170,7 @@ def _check_pair(pair: KeyPair, *, side: str, name: str | None, now_s: float) -> 
     _check_readable(pair.key, setting=f"{side}_private_key")
     if pair.key.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
         _log.warning("%s: every user of this machine can read this key; chmod 640 %s", pair.key, pair.key)
-    certificate = pair.read(listens=side == "listen")
+    certificate = pair.read(as_server=side == "listen")
     if certificate.not_after_s < now_s:
         raise UserError(
             f"{pair.certificate}: this certificate expired on {dated(certificate.not_after_s)} (it is "
@@ -218,14 +218,14 @@ def _check_ca(path: Path) -> None:
         ) from None
 
 
-def _shown(pair: KeyPair, *, listens: bool) -> dict[str, Any]:
+def _shown(pair: KeyPair, *, as_server: bool) -> dict[str, Any]:
     """The pair shown in a handshake in memory to a side that trusts just this certificate, whatever the date."""
     server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname = False
     client.verify_mode = ssl.CERT_NONE
     for context in (server, client):
         context.load_cert_chain(pair.certificate, pair.key, password=plain_key_only)
-    judge = client if listens else server
+    judge = client if as_server else server
     judge.load_verify_locations(pair.certificate)
     judge.verify_mode = ssl.CERT_REQUIRED
     judge.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME
@@ -238,7 +238,7 @@ def _shown(pair: KeyPair, *, listens: bool) -> dict[str, Any]:
         for end in ends:
             with suppress(ssl.SSLWantReadError):
                 end.do_handshake()
-    return ends[0 if listens else 1].getpeercert() or {}
+    return ends[0 if as_server else 1].getpeercert() or {}
 
 
 def _unusable(pair: KeyPair, error: ssl.SSLError) -> str:

@@ -30,7 +30,7 @@ __all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit", "why_unlink
 
 _log = logging.getLogger(__name__)
 
-_LOOK_S = 1.0
+_CHECK_S = 1.0
 PATIENCE_S = 4.0
 _FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
 """From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
@@ -65,6 +65,7 @@ class LinkWatch:
         served: whether a machine of that name has shown life to us, or we to it: an edge that has appeared, a ground
             that subscribes. Called from the thread.
         patience_s: a link that is merely slow to come, or to be of use, needs no explanation.
+        examine: gives one sentence for each endpoint that this configuration connects to; may block for seconds.
     """
 
     def __init__(
@@ -74,9 +75,11 @@ class LinkWatch:
         *,
         served: Callable[[str], bool],
         patience_s: float = PATIENCE_S,
+        examine: Callable[[zenoh.Config], list[str]] | None = None,
     ) -> None:
         self._session = session
         self._patience_s = patience_s
+        self._examine = examine or visit
         self._config = configure(settings)[0]
         self._file = settings.zenoh_config
         self._edge = settings.name
@@ -84,7 +87,7 @@ class LinkWatch:
         self._rights = Rights.of(self._config)
         self._trouble = ""
         self._said_s = 0.0
-        self._two_links = _asked_for_twice(self._config)
+        self._two_links = _connected_twice(self._config)
         """Places that are called twice."""
         self._had_two: set[str] = set()
         self._halved_s: float | None = None
@@ -125,16 +128,16 @@ class LinkWatch:
     def _run(self) -> None:
         linked_s = time.monotonic()
         next_visit_s, pause_s = linked_s + self._patience_s, _FIRST_PAUSE_S
-        while not self._stop.wait(min(_LOOK_S, self._patience_s)):
+        while not self._stop.wait(min(_CHECK_S, self._patience_s)):
             now_s = time.monotonic()
-            if self._look(now_s):
+            if self._check(now_s):
                 self._trouble = ""
                 next_visit_s, pause_s = now_s + self._patience_s, _FIRST_PAUSE_S
             elif now_s >= next_visit_s:
                 self._explain()
                 next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
 
-    def _look(self, now_s: float) -> bool:
+    def _check(self, now_s: float) -> bool:
         """Whether there is a link; what is wrong with those at its other end is said."""
         with self._using:
             if self._stop.is_set():
@@ -142,8 +145,8 @@ class LinkWatch:
             try:
                 links = self._session.info.links()
                 if links:
-                    self._look_at(self._names(links), now_s)
-                self._look_for_halves(links, now_s)
+                    self._check_names(self._names(links), now_s)
+                self._check_second_link(links, now_s)
             except zenoh.ZError:  # somebody else closed it
                 return True
             return bool(links)
@@ -153,7 +156,7 @@ class LinkWatch:
         routers = {str(zid) for zid in self._session.info.routers_zid()}
         return {link.auth_identifier: str(link.zid) in routers for link in links if link.auth_identifier}
 
-    def _look_for_halves(self, links: list[zenoh.Link], now_s: float) -> None:
+    def _check_second_link(self, links: list[zenoh.Link], now_s: float) -> None:
         """Zenoh does not reopen one link before all are lost, and says nothing of one that is refused."""
         if not self._is_halved(links):
             self._halved_s = None
@@ -182,7 +185,7 @@ class LinkWatch:
         return any(zid in self._had_two | called for zid in standing.keys() - twice)
 
     def _explain(self) -> None:
-        reasons = visit(self._config)
+        reasons = self._examine(self._config)
         if self._stop.is_set() or not reasons:
             return
         trouble = "; ".join(reasons)
@@ -192,7 +195,7 @@ class LinkWatch:
             _log.warning("no link: %s", trouble)
         self._trouble = trouble
 
-    def _look_at(self, names: dict[str, bool], now_s: float) -> None:
+    def _check_names(self, names: dict[str, bool], now_s: float) -> None:
         if not self._rights.enabled:
             return
         for name, router in names.items():
@@ -250,7 +253,7 @@ def visit(config: zenoh.Config) -> list[str]:
         return [str(error)]
 
 
-def _asked_for_twice(config: zenoh.Config) -> set[str]:
+def _connected_twice(config: zenoh.Config) -> set[str]:
     places = Counter(map(_bare, _connects_to(config)))
     return {place for place, count in places.items() if count > 1}
 

@@ -93,7 +93,7 @@ def _connected(place: _Place) -> socket.socket:
 
 def _plain(place: _Place, protocol: str) -> str:
     with closing(_connected(place)) as tcp:
-        if _speaks_tls(tcp, place):
+        if _is_tls(tcp, place):
             return (
                 f"this is a TLS port, and plain {protocol} does not get in: connect to tls/… with the keys of this "
                 "machine in --zenoh-config"
@@ -101,7 +101,7 @@ def _plain(place: _Place, protocol: str) -> str:
     return "somebody listens there, but no Zenoh link comes of it: is it the other side of HVT?"
 
 
-def _speaks_tls(tcp: socket.socket, place: _Place) -> bool:
+def _is_tls(tcp: socket.socket, place: _Place) -> bool:
     context = _blind_context()
     try:
         with context.wrap_socket(tcp, server_hostname=place.host):
@@ -160,7 +160,7 @@ def _their_certificate(place: _Place, files: TlsFiles, error: ssl.SSLCertVerific
             f"its certificate was not signed by the CA in {files.root_ca or 'this system'} (a CA of the same name "
             "may still be another): both sides need the ca.pem of one fleet"
         )
-    seen = _seen(place, files)
+    seen = _shown_certificate(place, files)
     whose = f" of {seen.name!r}" if seen is not None and seen.name else ""
     if code == _EXPIRED:
         when = f" on {dated(seen.not_after_s)}" if seen is not None else ""
@@ -179,7 +179,7 @@ def _their_certificate(place: _Place, files: TlsFiles, error: ssl.SSLCertVerific
     return f"its certificate is not accepted ({error.verify_message})"
 
 
-def _seen(place: _Place, files: TlsFiles) -> Certificate | None:
+def _shown_certificate(place: _Place, files: TlsFiles) -> Certificate | None:
     """The other side's certificate, whatever its host and date say; it must be of our CA all the same."""
     context = _context(files)
     context.check_hostname = False

@@ -5,8 +5,8 @@ network. It reads the dimensions in the header before it decodes a block, and ra
 input.
 
 All codecs share one scale of quality: at the same percentage a still is about as good as JPEG at that quality, so
-that a setting (``--jpeg-quality 65``), a floor and a ceiling keep their meaning when the codec changes. Each codec has a
-ladder from it to its own measure: the mean Y-PSNR of 26 crops of drone_carpark, linear between the rows.
+that a setting (``--jpeg-quality 65``), a floor and a ceiling keep their meaning when the codec changes. Each codec
+has a ladder from it to its own measure: the mean Y-PSNR of 26 crops of drone_carpark, linear between the rows.
 """
 
 from __future__ import annotations

@@ -12,25 +12,19 @@ import zenoh
 
 from flight import Flight
 from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.transport.doctor import duplicate_edge as same_id
-from hvt_common.transport.doctor.duplicate_edge import living_edge
+from hvt_common.transport.duplicate_edge import living_edge
 from hvt_common.transport.session import open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 
 KEYS = EdgeKeys("uav-1")
+PATIENCE = 12.0
+"""Who is there answers at once, but on a busy machine."""
 
 
 @pytest.fixture(scope="module")
 def info() -> bytes:
     """What an edge says of itself."""
     return Flight(1).info().pack()
-
-
-@pytest.fixture(autouse=True)
-def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who is there answers at once, but on a busy machine."""
-    for name in ("_ANSWER_S", "_WITHIN_S"):
-        monkeypatch.setattr(same_id, name, 12 * getattr(same_id, name))
 
 
 @pytest.fixture
@@ -76,17 +70,18 @@ def edge(
 def test_an_edge_that_goes_on_is_found(ground, endpoint, info):
     """Two drones would fight for one screen."""
     settings = LinkSettings("edge", connect=(endpoint,), name="uav-1")
-    assert living_edge(settings, KEYS) is None
+    assert living_edge(settings, KEYS, patience=PATIENCE) is None
     with edge(ground, endpoint, info):
         found = living_edge(settings, KEYS)
     assert found is not None
     assert found.pack() == info
 
 
-def test_an_edge_that_says_goodbye_does_not_refuse_its_successor(ground, endpoint, info, monkeypatch):
+def test_an_edge_that_says_goodbye_does_not_refuse_its_successor(ground, endpoint, info):
     """A service that restarts its edge would find it gone for good: exit code 2, because of the one it replaces."""
-    # A busy machine may take long to leave; who has left is waited for no longer.
-    monkeypatch.setattr(same_id, "_LEAVING_S", 12 * same_id._LEAVING_S)
     with edge(ground, endpoint, info, leaves_after=2) as left:
-        assert living_edge(LinkSettings("edge", connect=(endpoint,), name="uav-1"), KEYS) is None
+        assert (
+            living_edge(LinkSettings("edge", connect=(endpoint,), name="uav-1"), KEYS, patience=PATIENCE)
+            is None
+        )
         assert left.is_set()

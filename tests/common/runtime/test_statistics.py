@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import pickle
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.runtime.latency import LatencyStats
+from hvt_common.runtime.statistics import DistinctIds, LatencyStats
 
 latencies = st.lists(st.floats(0, 1e6, allow_nan=False), min_size=1, max_size=200)
 
@@ -89,10 +90,10 @@ def test_absurd_latencies_neither_crash_nor_move_the_median():
 def test_memory_does_not_grow():
     """A ground would grow by every frame it ever showed."""
     stats = LatencyStats()
-    before = stats._counts.nbytes
+    before = len(pickle.dumps(stats))
     for value in range(10_000):
         stats.add(value * 37.0)
-    assert stats._counts.nbytes == before < 20_000
+    assert len(pickle.dumps(stats)) < before + 100 < 20_000
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -106,3 +107,24 @@ def test_a_percentile_lies_within_0_and_100():
     """A mistyped percentile would read as a plausible number."""
     with pytest.raises(ValueError, match="0…100"):
         filled([1.0]).percentile(101)
+
+
+@given(st.lists(st.lists(st.integers(0, 40), max_size=5)))
+def test_each_distinct_id_counts_once(groups):
+    """The summary would count a track once a frame."""
+    ids, seen = DistinctIds(), set()
+    for group in groups:
+        assert ids.add(group) == len(set(group) - seen)
+        seen |= set(group)
+        assert ids.count == len(seen)
+
+
+def test_memory_is_bounded_and_old_ids_count_as_seen():
+    """An hour of flight would fill the memory; or a still replayed after minutes would count again."""
+    ids = DistinctIds(remember=10)
+    for number in range(1_000):
+        assert ids.add([number, number - 1]) == (1 if number else 2)
+    assert ids.count == 1_001
+    assert len(pickle.dumps(ids)) < 500
+    assert ids.add([3, 999, -5]) == 0
+    assert ids.add([1_000]) == 1

@@ -90,19 +90,19 @@ def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
         previous, current, corners, np.empty_like(corners), winSize=window, maxLevel=_FLOW_LEVELS
     )
-    kept = found.ravel() == 1
-    if np.count_nonzero(kept) < _LEAST_INLIERS:
+    tracked = found.ravel() == 1
+    if np.count_nonzero(tracked) < _LEAST_INLIERS:
         return None
     affine, inliers = cast(
         "tuple[Affine | None, _Gray]",
         cv2.estimateAffinePartial2D(
-            corners[kept], moved[kept], method=cv2.RANSAC, ransacReprojThreshold=_RANSAC_PX
+            corners[tracked], moved[tracked], method=cv2.RANSAC, ransacReprojThreshold=_RANSAC_PX
         ),
     )
     if affine is None:
         return None
     agreeing = np.count_nonzero(inliers)
-    if agreeing < max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * np.count_nonzero(kept)):
+    if agreeing < max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * np.count_nonzero(tracked)):
         return None
     return np.asarray(affine, np.float64)
 

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is
 PROGRAM = """
 import threading
 import numpy as np, psutil
-from hvt_common.runtime.allocator import limit_malloc_arenas
+from hvt_common.runtime.process import limit_malloc_arenas
 if {asked}:
     limit_malloc_arenas()
 np.ones(1 << 22, np.uint8)  # the first that is freed teaches glibc that frames are common

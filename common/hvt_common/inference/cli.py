@@ -13,8 +13,8 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.inference.store import embedded_models, resolve_model
 from hvt_common.inference.store.manifest import ModelEntry
-from hvt_common.inference.store.resolve import embedded_models, resolve_model
 from hvt_common.inference.store.store import Store, file_digest
 
 __all__ = ["main"]
@@ -125,10 +125,10 @@ def _fetch(arguments: argparse.Namespace) -> int:
 def _with_progress(store: Store, entry: ModelEntry, bar: Progress) -> Path:
     task = bar.add_task(entry.name, total=entry.size_bytes)
 
-    def waiting() -> None:
+    def say_waits() -> None:
         bar.console.print(f"another process fetches {entry.name}; waiting for it")
 
-    path = store.fetch(entry.name, progress=lambda held: bar.update(task, completed=held), waiting=waiting)
+    path = store.fetch(entry.name, progress=lambda held: bar.update(task, completed=held), on_wait=say_waits)
     bar.update(task, completed=entry.size_bytes)
     return path
 
@@ -160,7 +160,7 @@ def _add(arguments: argparse.Namespace) -> int:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from hvt_common.inference.store.inspect import inspect_model  # noqa: PLC0415  (the other commands open no model)
+    from hvt_common.inference.inspect import inspect_model  # noqa: PLC0415  (the other commands open no model)
 
     report = inspect_model(
         resolve_model(arguments.file), provider=arguments.provider, threads=arguments.threads

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from hvt_common.camera_motion import CameraMotion
 from hvt_common.tracking import kalman
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_common.tracking.camera_motion import CameraMotion
 from hvt_common.values import Detections
 
 WIDTH, HEIGHT = 640, 360

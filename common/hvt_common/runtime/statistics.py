@@ -1,17 +1,13 @@
-"""Percentiles of a latency in bounded memory, however long a run is.
-
-A histogram whose bins grow by 1 % (log-spaced, 0.01 ms to 1000 s, about 15 kB). A percentile read from it is
-the usual one, interpolated between order statistics, with each order statistic replaced by the centre of its
-bin: at most 0.5 % off, or 0.01 ms where that is more. The maximum and the count are exact.
-"""
+"""Statistics in bounded memory, however long a run is: percentiles of a latency, and the number of distinct ids."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
-__all__ = ["LatencyStats"]
+__all__ = ["DistinctIds", "LatencyStats"]
 
 _LOWEST_MS = 0.01
 _HIGHEST_MS = 1e6
@@ -20,7 +16,12 @@ _BINS = math.ceil(math.log(_HIGHEST_MS / _LOWEST_MS) / _LOG_RATIO) + 1
 
 
 class LatencyStats:
-    """p50, p95, max and any other percentile of the latencies added so far."""
+    """p50, p95, max and any other percentile of the latencies added so far.
+
+    A histogram whose bins grow by 1 % (log-spaced, 0.01 ms to 1000 s, about 15 kB). A percentile is interpolated
+    between order statistics, each replaced by the centre of its bin: at most 0.5 % off, or 0.01 ms where that is
+    more. The maximum and the count are exact.
+    """
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, np.int64)
@@ -86,6 +87,30 @@ class LatencyStats:
             return self._max_ms
         centre_ms = _LOWEST_MS * math.exp((index - 0.5) * _LOG_RATIO) if index else 0.0
         return min(max(centre_ms, self._min_ms), self._max_ms)
+
+
+class DistinctIds:
+    """Counts distinct ids that mostly grow, such as those of tracks and messages.
+
+    The newest ``remember`` of them are known one by one; older ones count as known.
+    """
+
+    def __init__(self, *, remember: int = 10_000) -> None:
+        self._remember = remember
+        self._known: set[int] = set()
+        self._floor: int | None = None
+        self.count = 0
+
+    def add(self, ids: Iterable[int]) -> int:
+        """Take ids; return how many of them are new."""
+        new = {one for one in ids if self._floor is None or one > self._floor} - self._known
+        self.count += len(new)
+        self._known |= new
+        if len(self._known) > 2 * self._remember:
+            ordered = sorted(self._known)
+            self._floor = ordered[-self._remember - 1]
+            self._known = set(ordered[-self._remember :])
+        return len(new)
 
 
 def _bin(latency_ms: float) -> int:
