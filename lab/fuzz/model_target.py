@@ -27,4 +27,4 @@ def _seeds() -> list[bytes]:
     return [small.read_bytes(), colour_classifier(scratch() / "seed.onnx").read_bytes()]
 
 
-TARGETS = (Target("model-file", _model, _seeds, share=8, short=150, most_bytes=2000),)
+TARGETS = (Target("model-file", _model, _seeds, share=8, short=200, most_bytes=2000),)

@@ -1,4 +1,4 @@
-"""Mutations that get past the checksum: of raw bytes, of the values in a sealed message, and of parts of an input.
+"""Mutations that get past the checksum: of raw bytes, of the values in a message, and of parts of an input.
 
 `Bytes` is whatever mutates plain bytes: libFuzzer's own mutator where atheris drives, `plain` in the short tests.
 """
@@ -14,7 +14,7 @@ import msgpack
 
 from lab.fuzz.parts import joined, parted
 
-__all__ = ["Bytes", "Mutator", "each_part", "plain", "sealed_values"]
+__all__ = ["Bytes", "Mutator", "changed_values", "each_part", "plain"]
 
 Bytes = Callable[[bytes], bytes]
 Mutator = Callable[[bytes, Random, Bytes], bytes]
@@ -83,22 +83,24 @@ def each_part(*mutators: Mutator | None) -> Mutator:
     return mutated
 
 
-def sealed_values(data: bytes, rng: Random, raw: Bytes) -> bytes:
+def changed_values(data: bytes, rng: Random, raw: Bytes) -> bytes:
     """A message with another value somewhere, or other bytes; most often with the checksum that belongs to it."""
     dice = rng.random()
     if dice < 0.1:
         return raw(data)
     if dice < 0.4:
-        return resealed(raw(data[:-_CRC_BYTES]))
+        return with_checksum(raw(data[:-_CRC_BYTES]))
     try:
         values = msgpack.unpackb(data, raw=False, strict_map_key=False)
         changed = _changed(values[:-1], rng, raw)
-        return resealed(msgpack.packb([*changed, 2**32 - 1], unicode_errors="surrogatepass")[:-_CRC_BYTES])
+        return with_checksum(
+            msgpack.packb([*changed, 2**32 - 1], unicode_errors="surrogatepass")[:-_CRC_BYTES]
+        )
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException):
-        return resealed(raw(data[:-_CRC_BYTES]))
+        return with_checksum(raw(data[:-_CRC_BYTES]))
 
 
-def resealed(body: bytes, payload: bytes = b"") -> bytes:
+def with_checksum(body: bytes, payload: bytes = b"") -> bytes:
     """A message's bytes up to its checksum, and the checksum."""
     return body + b"\xce" + zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")
 

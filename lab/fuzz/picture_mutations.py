@@ -74,8 +74,8 @@ def _leb128(number: int) -> bytes:
 
 
 def _jxl(data: bytes, rng: Random, raw: Bytes) -> bytes:
-    kept = rng.choice((10, 12, 16, 24))
-    return data[:kept] + raw(data[kept:])
+    length = rng.choice((10, 12, 16, 24))
+    return data[:length] + raw(data[length:])
 
 
 _CHANGES: dict[str, _Change] = {

@@ -21,7 +21,7 @@ from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import ROI
-from lab.fuzz.mutate import each_part, sealed_values
+from lab.fuzz.mutate import changed_values, each_part
 from lab.fuzz.parts import joined, parted
 from lab.fuzz.picture_mutations import inside
 
@@ -152,7 +152,7 @@ TARGETS = (
         "still-received",
         _received,
         _received_seeds,
-        mutate=each_part(sealed_values, None),
+        mutate=each_part(changed_values, None),
         share=20,
         short=400,
         most_bytes=40_000,
@@ -163,7 +163,7 @@ TARGETS = (
         _base_seeds,
         mutate=each_part(None),
         share=15,
-        short=100,
+        short=200,
         most_bytes=20_000,
     ),
 )
