@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import atexit
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from random import Random
+from tempfile import mkdtemp
 
 from lab.fuzz.mutate import Bytes, Mutator
 
-__all__ = ["CannotStartError", "Target", "checked_seeds", "raw_bytes"]
+__all__ = ["CannotStartError", "Target", "checked_seeds", "raw_bytes", "scratch"]
 
 
 def raw_bytes(data: bytes, rng: Random, raw: Bytes) -> bytes:
@@ -53,3 +58,11 @@ def checked_seeds(target: Target) -> list[bytes]:
     if not seeds:
         raise CannotStartError(f"target {target.name} cannot start: it has no seeds")
     return seeds
+
+
+@cache
+def scratch() -> Path:
+    """A folder for the files that targets write, the same each time; gone when the process ends."""
+    folder = Path(mkdtemp(prefix="hvt-fuzz-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder

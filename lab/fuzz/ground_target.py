@@ -15,10 +15,8 @@ from hvt_common.transport.inbox import Received
 from hvt_ground.session.receiver import EdgeReceiver
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from lab.fuzz.contract import Target
-from lab.fuzz.mutate import Bytes, changed_values, with_checksum
-from lab.fuzz.parts import joined, parted
-from lab.fuzz.scratch import scratch
+from lab.fuzz.contract import Target, scratch
+from lab.fuzz.mutate import Bytes, changed_values, joined, parted, with_checksum
 
 __all__ = ["TARGETS"]
 

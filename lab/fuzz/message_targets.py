@@ -35,8 +35,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_units,
 )
 from lab.fuzz.contract import Target
-from lab.fuzz.mutate import Bytes, changed_values, each_part, plain, with_checksum
-from lab.fuzz.parts import joined, parted
+from lab.fuzz.mutate import Bytes, changed_values, each_part, joined, parted, plain, with_checksum
 
 __all__ = ["ROI", "TARGETS", "feedback"]
 

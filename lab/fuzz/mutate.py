@@ -12,8 +12,6 @@ from typing import Any
 
 import msgpack
 
-from lab.fuzz.parts import joined, parted
-
 __all__ = ["Bytes", "Mutator", "changed_values", "each_part", "plain"]
 
 Bytes = Callable[[bytes], bytes]
@@ -21,6 +19,7 @@ Mutator = Callable[[bytes, Random, Bytes], bytes]
 """(input, dice, mutator of plain bytes) → input."""
 
 _CRC_BYTES = 5
+_MOST_PARTS = 8
 _NUMBERS = (-(2**63), -(2**31), -32768, -1, 0, 1, 2, 15, 16, 63, 255, 256, 2047, 2048, 32767, 65536)
 _LARGE = (2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**53, 2**63 - 1, 2**63, 2**64 - 1)
 _REALS = (0.0, -0.0, 0.5, -1.0, 1e-310, 1e300, 1.8e308, float("inf"), float("-inf"), float("nan"))
@@ -164,3 +163,19 @@ _REPLACEMENTS: Sequence[Callable[[Random], Any]] = (
     lambda rng: rng.randbytes(rng.choice((1, 16, 300))),
     _nested,
 )
+
+
+def joined(parts: Sequence[bytes]) -> bytes:
+    """One input: each part behind its length in three bytes."""
+    return b"".join(len(part).to_bytes(3, "big") + part for part in parts)
+
+
+def parted(data: bytes, *, least: int = 1) -> list[bytes]:
+    """The parts of any input whatever; missing ones are empty, and a length too long ends with the input."""
+    found: list[bytes] = []
+    at = 0
+    while at + 3 <= len(data) and len(found) < _MOST_PARTS:
+        end = at + 3 + int.from_bytes(data[at : at + 3], "big")
+        found.append(data[at + 3 : end])
+        at = end
+    return found + [b""] * (least - len(found))

@@ -21,8 +21,7 @@ from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import ROI
-from lab.fuzz.mutate import changed_values, each_part
-from lab.fuzz.parts import joined, parted
+from lab.fuzz.mutate import changed_values, each_part, joined, parted
 from lab.fuzz.picture_mutations import inside
 
 __all__ = ["CODECS", "TARGETS"]

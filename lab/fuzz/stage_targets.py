@@ -16,8 +16,7 @@ from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_ground.link.reassemble import REORDER_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
-from lab.fuzz.mutate import changed_values, each_part
-from lab.fuzz.parts import joined, parted
+from lab.fuzz.mutate import changed_values, each_part, joined, parted
 
 __all__ = ["TARGETS"]
 

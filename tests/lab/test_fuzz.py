@@ -19,8 +19,7 @@ import pytest
 from hvt_common.protocol.messages import Status
 from lab.fuzz.__main__ import main
 from lab.fuzz.contract import CannotStartError, Target, checked_seeds
-from lab.fuzz.mutate import changed_values, plain, with_checksum
-from lab.fuzz.parts import joined, parted
+from lab.fuzz.mutate import changed_values, joined, parted, plain, with_checksum
 from lab.fuzz.table import PLANTED, TARGETS
 
 ROOT = Path(__file__).resolve().parents[2]

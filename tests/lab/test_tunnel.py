@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from lab.link.carriers.pipe import DATAGRAM_HEADER_BYTES, Pipe
+from lab.link.carriers.tunnel import GROUND_HOST, Flight, Tunnel, UnavailableError
 from lab.link.laboratory import Run, run
-from lab.link.measures import measures
-from lab.link.pipe import DATAGRAM_HEADER_BYTES, Pipe
-from lab.link.script import LinkState, Piece, Script, load_scenario
-from lab.link.tunnel import GROUND_HOST, Flight, Tunnel, UnavailableError
+from lab.link.measures.outcome import measures
+from lab.link.script import LinkState, Phase, Script, load_scenario
 from pictures import write_scene
 from processes import eventually
 
@@ -96,7 +96,7 @@ UTTERED_BYTES = 100 + DATAGRAM_HEADER_BYTES
 
 def script(*pieces: tuple[float, LinkState], lasts_s: float = 60.0) -> Script:
     """A script by hand."""
-    return Script(tuple(Piece(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=64_000)
+    return Script(tuple(Phase(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=64_000)
 
 
 @contextmanager

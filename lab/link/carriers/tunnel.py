@@ -1,6 +1,6 @@
 """Two network namespaces whose packets pass through a program: the kernel's own TCP on the whole script.
 
-Each side has a TUN device. One thread takes every IP packet that leaves one side, asks `link.pipe` when and whether
+Each side has a TUN device. One thread takes every IP packet that leaves one side, asks `pipe` when and whether
 it arrives, and hands it to the other side then: rate, queue, delay, jitter, loss, reordering and darkness come from
 the script and its seed, with no help from the kernel's netem. To TCP a full queue is a loss, as at any router.
 """
@@ -15,9 +15,9 @@ import struct
 import time
 from collections.abc import Iterator
 
-from lab.link.pipe import Pipe
+from lab.link.carriers.pipe import Pipe
+from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
 from lab.link.script import Script
-from lab.link.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
 
 __all__ = ["GROUND_HOST", "Flight", "Tunnel", "UnavailableError"]
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from lab.link.rows import row
+from lab.link.measures.resources import Sample, more_at_the_end, slope_mb_per_hour
+from lab.link.measures.rows import row
+from lab.link.measures.store_left import StoreLeft
+from lab.link.measures.timing import Arrival
 from lab.link.script import Script
-from lab.link.store_left import StoreLeft
-from lab.link.timing import Arrival
-from lab.link.watch import Sample, more_at_the_end, slope_mb_per_hour
 
 __all__ = ["ALWAYS", "SOAK", "WARM", "Outcome", "measures", "rate_over_time", "rows"]
 
@@ -25,9 +25,9 @@ _RESOURCES: Mapping[str, Callable[[Sample], float]] = {
 }
 KINDS = ("base", "roi", "tracks", "backlog-still", "backlog-base", "backlog-info")
 """Of messages that the budget is for."""
-KEPT_FROM = 2**31
+STORED_FROM = 2**31
 """Number of the first still that was not sent but kept (`hvt_edge.stills.scheduler`)."""
-NOTHING_KEPT = StoreLeft(0, 0)
+NOTHING_STORED = StoreLeft(0, 0)
 ALWAYS: Mapping[str, str] = {
     f"{name}, {what}": bar
     for name in ("edge", "ground")
@@ -78,7 +78,7 @@ class Outcome:
     """None: it had to be killed."""
     said: Mapping[str, str]
     """Standard error of both."""
-    kept: StoreLeft = NOTHING_KEPT
+    stored: StoreLeft = NOTHING_STORED
     """What was still in the edge's store."""
 
     @property
@@ -114,10 +114,10 @@ def rows(outcome: Outcome, bars: Mapping[str, str]) -> list[dict[str, Any]]:
     """One row a measure: scenario, measure, value, bar, holds."""
     warm = WARM if outcome.script.lasts_s >= _LEAST_WARM_S else {}
     soak = SOAK if outcome.script.lasts_s >= _LEAST_SOAK_S else {}
-    found, asked = measures(outcome), {**ALWAYS, **warm, **soak, **bars}
-    for measure in asked:
+    found, wanted = measures(outcome), {**ALWAYS, **warm, **soak, **bars}
+    for measure in wanted:
         found.setdefault(measure, None)
-    return [row(outcome.scenario, measure, value, asked.get(measure)) for measure, value in found.items()]
+    return [row(outcome.scenario, measure, value, wanted.get(measure)) for measure, value in found.items()]
 
 
 def rate_over_time(
@@ -277,18 +277,18 @@ def _accounts(outcome: Outcome) -> dict[str, float | int | None]:
 
 
 def _stills_lost(outcome: Outcome) -> int:
-    """Numbers that are nowhere: stills that are sent count from 0, those that are kept from `KEPT_FROM`."""
+    """Numbers that are nowhere: stills that are sent count from 0, those that are kept from `STORED_FROM`."""
     came = {one.sequence for one in outcome.arrivals if one.kind == "roi"}
     came |= {one.sequence for one in outcome.arrivals if one.kind == "backlog-still" and one.shown}
-    have = came | outcome.kept.stills
+    reached = came | outcome.stored.stills
     lost = 0
-    for first, end in ((0, KEPT_FROM), (KEPT_FROM, 2**32)):
-        numbers = {one for one in have if first <= one < end}
+    for first, end in ((0, STORED_FROM), (STORED_FROM, 2**32)):
+        numbers = {one for one in reached if first <= one < end}
         lost += max(numbers, default=first - 1) + 1 - first - len(numbers)
     sent = outcome.edge["stills"]["reasons"]["sent"] if outcome.edge else {}
     live = sum(count for reason, count in sent.items() if reason != "stored")
     # The last ones leave no hole: they are missing in the edge's own count.
-    return max(lost, live - sum(one < KEPT_FROM for one in have))
+    return max(lost, live - sum(one < STORED_FROM for one in reached))
 
 
 def _processes(outcome: Outcome) -> dict[str, float | int | None]:

@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lab.link.measures import Outcome, rate_over_time
-from lab.link.timing import Arrival
+from lab.link.measures.outcome import Outcome, rate_over_time
+from lab.link.measures.timing import Arrival
 
 __all__ = ["draw"]
 
-# Okabe and Ito: told apart by eyes of every kind, and here also by line and marker.
+# Okabe and Ito: readable with any colour vision, and here also by line and marker.
 _LINK, _BASE, _STILLS, _DARK = "#000000", "#0072B2", "#D55E00", "#BBBBBB"
 _COLUMNS = 3
 _LEGEND = {1: 3, 2: 5, 3: 5}
@@ -65,14 +65,16 @@ def _rates(axes: Axes, outcome: Outcome) -> None:
     """The link's rate, and what was sent in each second, of all that came."""
     script, at_s = outcome.script, np.linspace(0, outcome.script.lasts_s, _SAMPLES)
     states = [script.at(float(t_s)) for t_s in at_s]
-    wire_field = [0.0 if one.dark or one.loss >= 1 else one.rate_bps * (1 - one.loss) / 1e3 for one in states]
-    axes.plot(at_s, wire_field, color=_LINK, lw=1, drawstyle="steps-post", label="link carries")
+    capacity_kbps = [
+        0.0 if one.dark or one.loss >= 1 else one.rate_bps * (1 - one.loss) / 1e3 for one in states
+    ]
+    axes.plot(at_s, capacity_kbps, color=_LINK, lw=1, drawstyle="steps-post", label="link carries")
     sent = rate_over_time(outcome, of=lambda one: one.send_s)
     stills = rate_over_time(outcome, of=lambda one: one.send_s, kinds=("roi", "backlog-still"))
     at_s = np.arange(len(sent) + 1)
     axes.stairs(np.array(sent) / 1e3, at_s, color=_BASE, lw=1.4, label="sent")
     axes.stairs(np.array(stills) / 1e3, at_s, color=_STILLS, lw=1, ls="--", label="of it stills")
-    axes.set_ylim(0, 1.12 * max(piece.state.rate_bps for piece in script.pieces) / 1e3)
+    axes.set_ylim(0, 1.12 * max(phase.state.rate_bps for phase in script.phases) / 1e3)
 
 
 def _delays(axes: Axes, outcome: Outcome) -> None:

@@ -1,16 +1,16 @@
 """Two network namespaces joined by a veth that plays a script: the kernel's own TCP on a shaped link.
 
 Rate by tc's tbf (with the script's queue), loss by iptables' statistic match, darkness by taking the link down. The
-kernel's netem is often not there, so delay, jitter and reordering are left out: `link.tunnel` has them. Which packets
-of a random loss are lost is drawn by the kernel; bursts come from the script and its seed.
+kernel's netem is often not there, so delay, jitter and reordering are left out: `tunnel` has them. Which packets of a
+random loss are lost is drawn by the kernel; bursts come from the script and its seed.
 """
 
 from __future__ import annotations
 
 import time
 
+from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
 from lab.link.script import LinkState, Script
-from lab.link.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
 
 __all__ = ["GROUND_HOST", "Namespaces", "UnavailableError"]
 
@@ -58,10 +58,10 @@ class Namespaces(Sides):
         self._state = self._script.still().at(0)
 
     def _play(self, began_s: float) -> None:
-        for piece in self._script.pieces:
-            if self._stop.wait(max(0.0, began_s + piece.start_s - time.monotonic())):
+        for phase in self._script.phases:
+            if self._stop.wait(max(0.0, began_s + phase.start_s - time.monotonic())):
                 return
-            self._apply(piece.state)
+            self._apply(phase.state)
 
     def _apply(self, state: LinkState) -> None:
         before, self._state = self._state, state

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 import psutil
 
-__all__ = ["WARM_UP", "Sample", "Watch", "more_at_the_end", "slope_mb_per_hour"]
+__all__ = ["WARM_UP", "ResourceSampler", "Sample", "more_at_the_end", "slope_mb_per_hour"]
 
 _EVERY_S = 0.25
 _MOST_SAMPLES = 20_000
@@ -36,7 +36,7 @@ class Sample:
     threads: int
 
 
-class Watch:
+class ResourceSampler:
     """A context manager; `samples` by the name of the process, at most 20 000 each (every second one is dropped)."""
 
     def __init__(self, pids: Mapping[str, int]) -> None:
@@ -88,8 +88,8 @@ class Watch:
 def slope_mb_per_hour(samples: list[Sample]) -> float | None:
     """Of resident memory after the warm-up, by Theil and Sen; None of too few samples.
 
-    The median of the slopes between all pairs of points: what is taken for a moment (a recording that is folded) or
-    once (a library that loads late) does not bend it. The points are medians of equal parts of the time.
+    The median of the slopes between all pairs of points: what is taken for a moment (a recording that is
+    compacted) or once (a library that loads late) does not bend it. Points are medians of equal parts of the time.
     """
     late = samples[int(WARM_UP * len(samples)) :]
     if len(late) < 8:

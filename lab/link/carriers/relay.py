@@ -1,8 +1,8 @@
 """A bad link between two programs of one machine, for where network namespaces are not to be had.
 
 ``with Relay(script, protocol="tcp", target_port=7447) as relay:`` listens on ``relay.port`` of loopback and passes on
-to the target what `link.pipe` lets through, in a thread of its own. Before `Relay.begin` the link is as in the
-script's first moment and loses nothing. By hand: ``python -m lab.link.relay SCENARIO --target 7447``.
+to the target what `pipe` lets through, in a thread of its own. Before `Relay.begin` the link is as in the
+script's first moment and loses nothing. By hand: ``python -m lab.link.carriers.relay SCENARIO --target 7447``.
 
 Memory is bounded: one queue of the script's size a direction, and for each of at most 32 connections what is in
 flight. Where the queue is full, TCP is not read (back-pressure to the sender's socket), UDP is dropped.
@@ -24,7 +24,14 @@ from types import TracebackType
 from typing import Literal, Self
 
 from hvt_common.errors import exit_with_sentence
-from lab.link.pipe import DATAGRAM_HEADER_BYTES, SEGMENT_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
+from lab.link.carriers.pipe import (
+    DATAGRAM_HEADER_BYTES,
+    SEGMENT_BYTES,
+    SEGMENT_HEADER_BYTES,
+    Pipe,
+    Segment,
+    Stream,
+)
 from lab.link.script import LENGTHS, Script, load_scenario
 
 __all__ = ["Protocol", "Relay"]
@@ -208,7 +215,7 @@ async def _offer(source: socket.socket, flight: _Flight, pipe: Pipe) -> None:
 
 def _admitted_s(pipe: Pipe, stream: Stream, size_bytes: int) -> float:
     now_s = time.monotonic()
-    return max(stream.may_send_s(now_s), pipe.room_s(size_bytes, now_s))
+    return max(stream.may_send_s(now_s), pipe.fits_at_s(size_bytes, now_s))
 
 
 async def _deliver(sink: socket.socket, flight: _Flight) -> None:
@@ -305,7 +312,7 @@ def _datagram_socket() -> socket.socket:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """``python -m lab.link.relay SCENARIO --target PORT``."""
+    """``python -m lab.link.carriers.relay SCENARIO --target PORT``."""
     return exit_with_sentence(_by_hand, program="link.relay", argv=argv)
 
 
@@ -319,12 +326,18 @@ def _by_hand(argv: Sequence[str] | None) -> int:
     parser.add_argument("--protocol", choices=["tcp", "udp"], default="tcp")
     parser.add_argument("--length", choices=LENGTHS, default="full")
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args(argv)
-    script = load_scenario(asked.scenario).script(asked.length, seed=asked.seed)
+    arguments = parser.parse_args(argv)
+    script = load_scenario(arguments.scenario).script(arguments.length, seed=arguments.seed)
     with Relay(
-        script, protocol=asked.protocol, target_port=asked.target, port=asked.port, seed=asked.seed
+        script,
+        protocol=arguments.protocol,
+        target_port=arguments.target,
+        port=arguments.port,
+        seed=arguments.seed,
     ) as relay:
-        print(f"listening on {asked.protocol}/127.0.0.1:{relay.port}; Enter begins the script", flush=True)
+        print(
+            f"listening on {arguments.protocol}/127.0.0.1:{relay.port}; Enter begins the script", flush=True
+        )
         sys.stdin.readline()
         relay.begin()
         with contextlib.suppress(KeyboardInterrupt):

@@ -75,7 +75,7 @@ class Pipe:
             self._queued_bytes -= self._queue.popleft()[1]
         return self._queued_bytes
 
-    def room_s(self, size_bytes: int, now_s: float) -> float:
+    def fits_at_s(self, size_bytes: int, now_s: float) -> float:
         """The first moment at which so many bytes fit into the queue."""
         excess = self.queued_bytes(now_s) + size_bytes - self.script.queue_bytes
         at_s = now_s
