@@ -9,7 +9,6 @@ is a kind of its own.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable
 from importlib.resources import files
 
 __all__ = [
@@ -17,7 +16,6 @@ __all__ = [
     "IMAGENET_NAMES",
     "MOVING",
     "VISDRONE_NAMES",
-    "ids_of_kinds",
     "kind_of",
     "same_kind",
 ]
@@ -53,11 +51,3 @@ def same_kind(name: str, wanted: str) -> bool:
     """Whether both words mean the same kind; what moves may be anything."""
     kinds = kind_of(name), kind_of(wanted)
     return kinds[0] == kinds[1] or MOVING in kinds
-
-
-def ids_of_kinds(class_names: Iterable[str], wanted: Iterable[str]) -> frozenset[int]:
-    """The indices of those class names that are of any wanted kind."""
-    words = tuple(wanted)
-    return frozenset(
-        index for index, name in enumerate(class_names) if any(same_kind(name, word) for word in words)
-    )

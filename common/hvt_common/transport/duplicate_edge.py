@@ -18,7 +18,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import Info, WireError
 from hvt_common.transport.session import query
-from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 
 __all__ = ["living_edge", "refuse_duplicate_edge"]
 
@@ -72,7 +72,7 @@ def living_edge(settings: LinkSettings, keys: EdgeKeys, *, patience: float = 1.0
 
 def _attempt(settings: LinkSettings, keys: EdgeKeys, patience: float) -> Info | None:
     config, _ = configure(replace(settings, listen=()))
-    if not json.loads(config.get_json("connect/endpoints")):
+    if not connect_endpoints(config):
         return None
     for path, value in _CONFIG.items():
         config.insert_json5(path, json.dumps(value))

@@ -16,7 +16,7 @@ import zenoh
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
 
-__all__ = ["DEFAULT_ENDPOINT", "LinkSettings", "configure", "without_build_paths"]
+__all__ = ["DEFAULT_ENDPOINT", "LinkSettings", "configure", "connect_endpoints", "without_build_paths"]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -155,18 +155,28 @@ def _mentions(said: dict[str, Any], path: str) -> bool:
     return True
 
 
+def _value(said: dict[str, Any], path: str) -> Any:
+    """What the user's file says at this path; None for nothing."""
+    value: Any = said
+    for part in path.split("/"):
+        value = value.get(part) if isinstance(value, dict) else None
+    return value
+
+
 def _endpoints(said: dict[str, Any], side: str) -> tuple[str, ...]:
     """The endpoints of a file: a list, or one list for each of Zenoh's modes."""
-    section = said.get(side)
-    listed = section.get("endpoints") if isinstance(section, dict) else None
-    groups = listed.values() if isinstance(listed, dict) else [listed or []]
+    listed = _value(said, f"{side}/endpoints")
+    groups = listed.values() if isinstance(listed, dict) else [listed]
     return tuple(str(endpoint) for group in groups if isinstance(group, list) for endpoint in group)
 
 
+def connect_endpoints(config: zenoh.Config) -> tuple[str, ...]:
+    """The endpoints that a configuration connects to."""
+    return _endpoints({"connect": {"endpoints": json.loads(config.get_json("connect/endpoints"))}}, "connect")
+
+
 def _max_links(said: dict[str, Any]) -> int:
-    value: Any = said
-    for part in _MAX_LINKS.split("/"):
-        value = value.get(part) if isinstance(value, dict) else None
+    value = _value(said, _MAX_LINKS)
     return value if isinstance(value, int) else 1
 
 
@@ -225,10 +235,7 @@ def _is_loopback(host: str) -> bool:
 
 def _has_keys(said: dict[str, Any], endpoint: str) -> bool:
     """Whether whoever connects must show a certificate."""
-    value: Any = said
-    for part in ("transport", "link", "tls", "enable_mtls"):
-        value = value.get(part) if isinstance(value, dict) else None
-    return value is True and endpoint.startswith(("tls/", "quic/"))
+    return _value(said, "transport/link/tls/enable_mtls") is True and endpoint.startswith(("tls/", "quic/"))
 
 
 def without_build_paths(text: str) -> str:

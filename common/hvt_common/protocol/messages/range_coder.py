@@ -9,7 +9,7 @@ decoder takes no notice of it and returns the one it reads. So a syntax is writt
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final, Protocol
+from typing import Final
 
 from hvt_common.protocol.messages.fields import WireError
 
@@ -54,39 +54,24 @@ class NumberContexts:
         self.high = [Context() for _ in range(_LONGEST_PREFIX)]
 
 
-class Coder(Protocol):
-    """What `Encoder` and `Decoder` have in common."""
-
-    def bit(self, context: Context, bit: int) -> int:
-        """One decision, 0 or 1."""
-        ...
-
-    def plain(self, value: int, bits: int) -> int:
-        """A number below ``2 ** bits`` of which nothing is known."""
-        ...
-
-    def unsigned(self, numbers: NumberContexts, value: int) -> int:
-        """A whole number from 0 up to 2^33 - 2."""
-        ...
-
-    def signed(self, numbers: NumberContexts, value: int) -> int:
-        """A whole number of either sign."""
-        ...
-
-
-class _Syntax(ABC):
-    """NumberContexts as decisions; the same for both sides."""
+class Coder(ABC):
+    """Numbers as decisions; the same for both sides."""
 
     __slots__ = ()
 
     @abstractmethod
-    def bit(self, context: Context, bit: int) -> int: ...
+    def bit(self, context: Context, bit: int) -> int:
+        """Code one decision, 0 or 1."""
 
     @abstractmethod
-    def plain(self, value: int, bits: int) -> int: ...
+    def plain(self, value: int, bits: int) -> int:
+        """Code a number below ``2 ** bits`` of which nothing is known, highest bit first."""
 
     def unsigned(self, numbers: NumberContexts, value: int) -> int:
-        """Elias gamma of ``value + 1``: its length in unary and its highest bits as decisions, the rest plain."""
+        """A whole number from 0 up to 2^33 - 2, as Elias gamma of ``value + 1``.
+
+        Its length in unary and its highest bits are decisions, the rest is plain.
+        """
         wanted = (value + 1).bit_length() - 1
         length = 0
         while self.bit(numbers.length[length], int(length < wanted)):
@@ -109,7 +94,7 @@ class _Syntax(ABC):
         return -size if negative else size
 
 
-class Encoder(_Syntax):
+class Encoder(Coder):
     """Writes decisions; `finish` gives the bytes."""
 
     __slots__ = ("_low", "_range", "_shifts")
@@ -121,7 +106,6 @@ class Encoder(_Syntax):
         self._shifts = 0
 
     def bit(self, context: Context, bit: int) -> int:
-        """Write one decision."""
         bound = (self._range >> 16) * context.zero
         if bit:
             self._low += bound
@@ -133,7 +117,6 @@ class Encoder(_Syntax):
         return bit
 
     def plain(self, value: int, bits: int) -> int:
-        """Write ``bits`` bits, highest first."""
         for place in range(bits - 1, -1, -1):
             self._range >>= 1
             if value >> place & 1:
@@ -158,7 +141,7 @@ class Encoder(_Syntax):
             self._shifts += 1
 
 
-class Decoder(_Syntax):
+class Decoder(Coder):
     """Reads decisions; whatever the bytes, it ends with values or a `WireError`."""
 
     __slots__ = ("_code", "_data", "_next", "_range")
@@ -170,7 +153,6 @@ class Decoder(_Syntax):
         self._range = _FULL
 
     def bit(self, context: Context, bit: int) -> int:  # noqa: ARG002 - what the encoder would write
-        """Read one decision."""
         bound = (self._range >> 16) * context.zero
         read = int(self._code >= bound)
         if read:
@@ -183,7 +165,6 @@ class Decoder(_Syntax):
         return read
 
     def plain(self, value: int, bits: int) -> int:  # noqa: ARG002 - what the encoder would write
-        """Read ``bits`` bits, highest first."""
         read = 0
         for _ in range(bits):
             self._range >>= 1

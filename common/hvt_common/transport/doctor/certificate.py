@@ -6,6 +6,7 @@ side would see. So neither side needs a package for certificates.
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import logging
 import ssl
@@ -19,12 +20,13 @@ from typing import Any
 import zenoh
 
 from hvt_common.errors import UserError
+from hvt_common.transport.zenoh_config import connect_endpoints
 
-__all__ = ["Certificate", "KeyPair", "TlsFiles", "check_own_keys", "dated", "plain_key_only"]
+__all__ = ["NO_CHECK_TIME", "Certificate", "KeyPair", "TlsFiles", "check_own_keys", "dated", "plain_key_only"]
 
 _log = logging.getLogger(__name__)
 
-_NO_CHECK_TIME = ssl.VerifyFlags(0x200000)
+NO_CHECK_TIME = ssl.VerifyFlags(0x200000)
 """X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which ``ssl`` passes on but does not name."""
 _SOON_S = 30 * 86_400.0
 _SECURED = ("tls/", "quic/")
@@ -108,10 +110,7 @@ def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | N
         now_s: Unix time.
     """
     files = TlsFiles.of(config)
-    connect = json.loads(config.get_json("connect/endpoints")) or []
-    if isinstance(connect, dict):
-        connect = [one for group in connect.values() for one in group]
-    listening, connecting = _any_secured(listen), _any_secured(connect)
+    listening, connecting = _any_secured(listen), _any_secured(connect_endpoints(config))
     if not (listening or connecting):
         return
     if files.root_ca is not None:
@@ -129,8 +128,6 @@ def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | N
 
 def dated(time_s: float) -> str:
     """A moment as people read it, UTC."""
-    import datetime as dt  # noqa: PLC0415
-
     return dt.datetime.fromtimestamp(time_s, dt.UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
@@ -228,7 +225,7 @@ def _shown(pair: KeyPair, *, as_server: bool) -> dict[str, Any]:
     judge = client if as_server else server
     judge.load_verify_locations(pair.certificate)
     judge.verify_mode = ssl.CERT_REQUIRED
-    judge.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME
+    judge.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN | NO_CHECK_TIME
     to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
     ends = (
         client.wrap_bio(to_client, to_server, server_side=False),

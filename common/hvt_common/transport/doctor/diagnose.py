@@ -7,7 +7,6 @@ permission is dropped. So a thread looks now and then whether links stand and wh
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import threading
@@ -24,9 +23,9 @@ from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.doctor.certificate import TlsFiles
 from hvt_common.transport.doctor.probe import why_no_link
 from hvt_common.transport.rights import Rights
-from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 
-__all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit", "why_unlinked"]
+__all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit"]
 
 _log = logging.getLogger(__name__)
 
@@ -37,11 +36,6 @@ _FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
 _SAY_AGAIN_S = 300.0
 _MAX_NAMES = 256
 """Names that are remembered. Each takes a certificate of the CA, so a fleet of that size comes first."""
-
-
-def why_unlinked(settings: LinkSettings) -> list[str]:
-    """One sentence for each endpoint that we would connect to. Blocks for some seconds an endpoint."""
-    return visit(configure(settings)[0])
 
 
 def control_unanswered(edge: str, *, who: str = "this ground") -> str:
@@ -248,21 +242,16 @@ def visit(config: zenoh.Config) -> list[str]:
     """One sentence for each endpoint that this configuration connects to. Blocks for some seconds an endpoint."""
     try:
         files = TlsFiles.of(config)
-        return [why_no_link(endpoint, files) for endpoint in dict.fromkeys(map(_bare, _connects_to(config)))]
+        return [
+            why_no_link(endpoint, files) for endpoint in dict.fromkeys(map(_bare, connect_endpoints(config)))
+        ]
     except UserError as error:
         return [str(error)]
 
 
 def _connected_twice(config: zenoh.Config) -> set[str]:
-    places = Counter(map(_bare, _connects_to(config)))
+    places = Counter(map(_bare, connect_endpoints(config)))
     return {place for place, count in places.items() if count > 1}
-
-
-def _connects_to(config: zenoh.Config) -> list[str]:
-    endpoints = json.loads(config.get_json("connect/endpoints")) or []
-    return (
-        [one for group in endpoints.values() for one in group] if isinstance(endpoints, dict) else endpoints
-    )
 
 
 def _bare(endpoint: str) -> str:

@@ -11,6 +11,7 @@ has a ladder from it to its own measure: the mean Y-PSNR of 26 crops of drone_ca
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ __all__ = [
     "NO_PARAMETERS",
     "BaseMissingError",
     "CodedCrop",
+    "IntraCodec",
     "Parameters",
     "StillCodec",
     "StillError",
@@ -122,3 +124,32 @@ def on_ladder(rows: tuple[tuple[int, float], ...], quality_pct: int) -> float:
     at = min(bisect_right([row[0] for row in rows], quality_pct), len(rows) - 1)
     (low, start), (high, end) = rows[at - 1], rows[at]
     return start + (end - start) * (quality_pct - low) / (high - low)
+
+
+class IntraCodec(ABC):
+    """A `StillCodec` that needs no base and no parameters: a crop to bytes, and back."""
+
+    name: str
+    media_type: str
+    needs_base = False
+
+    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
+        """See `StillCodec`."""
+        return CodedCrop(self._encoded(crop_bgr, quality_pct))
+
+    def decode(
+        self,
+        data: bytes,
+        *,
+        size: tuple[int, int],
+        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
+        base_bgr: Image | None = None,  # noqa: ARG002
+    ) -> Image:
+        """See `StillCodec`."""
+        return self._decoded(data, size)
+
+    @abstractmethod
+    def _encoded(self, crop_bgr: Image, quality_pct: int) -> bytes: ...
+
+    @abstractmethod
+    def _decoded(self, data: bytes, size: tuple[int, int]) -> Image: ...

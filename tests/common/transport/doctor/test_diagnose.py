@@ -18,7 +18,7 @@ import zenoh
 from fleet_keys import EXPIRED, Fleet
 from hvt_common.errors import UserError
 from hvt_common.transport.doctor.certificate import KeyPair, TlsFiles
-from hvt_common.transport.doctor.diagnose import LinkWatch, why_unlinked
+from hvt_common.transport.doctor.diagnose import LinkWatch, visit
 from hvt_common.transport.doctor.probe import why_no_link
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.session import open_session
@@ -127,7 +127,7 @@ def test_keys_that_vanish_during_a_flight_are_a_sentence(fleet: Fleet, tmp_path:
     with _server(b"") as port:
         settings = other.settings("uav-1", "edge", connect=(f"tls/127.0.0.1:{port}",))
         (other.folder / "uav-1.key").unlink()
-        assert why_unlinked(settings) == [
+        assert visit(configure(settings)[0]) == [
             "the keys of this machine can no longer be read (No such file or directory)"
         ]
 
@@ -135,7 +135,7 @@ def test_keys_that_vanish_during_a_flight_are_a_sentence(fleet: Fleet, tmp_path:
 def test_two_links_to_one_place_are_explained_once(free_port: int) -> None:
     """The two endpoints by priority would say the same sentence twice."""
     endpoints = tuple(f"tcp/127.0.0.1:{free_port}?prio={prio}#so_sndbuf=8192" for prio in ("1-3", "4-7"))
-    (said,) = why_unlinked(LinkSettings("edge", connect=endpoints))
+    (said,) = visit(configure(LinkSettings("edge", connect=endpoints))[0])
     assert said.startswith(f"tcp/127.0.0.1:{free_port}: nobody")
 
 

@@ -10,7 +10,7 @@ import cv2
 
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.bits import BitReader
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError, on_ladder
+from hvt_common.video.still_codecs.contract import IntraCodec, StillError, on_ladder
 from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded, lacking
 
 __all__ = ["AvifCodec", "av1_data", "av1_size", "avif_file"]
@@ -23,27 +23,17 @@ _SPEED = 8
 _TEMPORAL_DELIMITER, _SEQUENCE, _FRAME = 2, 1, 6
 
 
-class AvifCodec:
+class AvifCodec(IntraCodec):
     """The payload is an AVIF file with one item."""
 
     name = "avif"
     media_type = "image/avif"
-    needs_base = False
 
-    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
-        """Code a crop of at least one pixel."""
+    def _encoded(self, crop_bgr: Image, quality_pct: int) -> bytes:
         flags = [cv2.IMWRITE_AVIF_QUALITY, round(on_ladder(_QUALITY, quality_pct))]
-        return CodedCrop(imencoded(".avif", crop_bgr, [*flags, cv2.IMWRITE_AVIF_SPEED, _SPEED]))
+        return imencoded(".avif", crop_bgr, [*flags, cv2.IMWRITE_AVIF_SPEED, _SPEED])
 
-    def decode(
-        self,
-        data: bytes,
-        *,
-        size: tuple[int, int],
-        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
-        base_bgr: Image | None = None,  # noqa: ARG002
-    ) -> Image:
-        """The crop again."""
+    def _decoded(self, data: bytes, size: tuple[int, int]) -> Image:
         av1 = av1_data(data)
         if av1_size(av1) != size:
             raise StillError(f"AV1 picture is not of {size[0]}x{size[1]}")

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError, on_ladder
+from hvt_common.video.still_codecs.contract import IntraCodec, StillError, on_ladder
 
 __all__ = ["JxlCodec", "jxl_size"]
 
@@ -23,15 +23,13 @@ _MAX_UPSAMPLING = 1
 """As a power of two; below quality 10 libjxl codes at half the size."""
 
 
-class JxlCodec:
+class JxlCodec(IntraCodec):
     """The payload is a bare JPEG XL codestream of one frame."""
 
     name = "jxl"
     media_type = "image/jxl"
-    needs_base = False
 
-    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
-        """Code a crop of at least one pixel."""
+    def _encoded(self, crop_bgr: Image, quality_pct: int) -> bytes:
         encoder = import_module(_PLUGIN).Encoder(
             mode="RGB",
             lossless=False,
@@ -43,17 +41,9 @@ class JxlCodec:
             num_threads=0,
         )
         rgb = np.ascontiguousarray(crop_bgr[..., ::-1])
-        return CodedCrop(encoder(rgb.tobytes(), rgb.shape[1], rgb.shape[0], jpeg_encode=False))
+        return bytes(encoder(rgb.tobytes(), rgb.shape[1], rgb.shape[0], jpeg_encode=False))
 
-    def decode(
-        self,
-        data: bytes,
-        *,
-        size: tuple[int, int],
-        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
-        base_bgr: Image | None = None,  # noqa: ARG002
-    ) -> Image:
-        """The crop again."""
+    def _decoded(self, data: bytes, size: tuple[int, int]) -> Image:
         if jxl_size(data) != size:
             raise StillError(f"JPEG XL is not of {size[0]}x{size[1]}")
         try:

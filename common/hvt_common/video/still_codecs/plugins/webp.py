@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError, on_ladder
+from hvt_common.video.still_codecs.contract import IntraCodec, StillError, on_ladder
 from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded, lacking
 
 __all__ = ["WebpCodec", "webp_size"]
@@ -15,27 +15,17 @@ _QUALITY = ((1, 1), (5, 2), (20, 17), (35, 36), (50, 52), (65, 71), (80, 82), (9
 _VP8_START = b"\x9d\x01\x2a"
 
 
-class WebpCodec:
+class WebpCodec(IntraCodec):
     """The payload is a WebP file of one ``VP8`` chunk; transparency, animation and lossless are refused."""
 
     name = "webp"
     media_type = "image/webp"
-    needs_base = False
 
-    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
-        """Code a crop of at least one pixel."""
+    def _encoded(self, crop_bgr: Image, quality_pct: int) -> bytes:
         quality = round(on_ladder(_QUALITY, quality_pct))
-        return CodedCrop(imencoded(".webp", crop_bgr, [cv2.IMWRITE_WEBP_QUALITY, quality]))
+        return imencoded(".webp", crop_bgr, [cv2.IMWRITE_WEBP_QUALITY, quality])
 
-    def decode(
-        self,
-        data: bytes,
-        *,
-        size: tuple[int, int],
-        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
-        base_bgr: Image | None = None,  # noqa: ARG002
-    ) -> Image:
-        """The crop again."""
+    def _decoded(self, data: bytes, size: tuple[int, int]) -> Image:
         if webp_size(data) != size:
             raise StillError(f"WebP is not of {size[0]}x{size[1]}")
         return imdecoded(data, size=size, what="WebP")
