@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sized
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -288,7 +289,7 @@ class MapOf(Kind):
         return f"map ≤ {self.max_items}: str ≤ {self.key_bytes} B to {self.inner.describe()}"
 
 
-def _check_size(raw: Any, wanted: type, name: str, most: int) -> None:
+def _check_size(raw: Any, wanted: type[Sized], name: str, most: int) -> None:
     if not isinstance(raw, wanted):
         raise WireError(f"{type(raw).__name__} in place of a {name}")
     if len(raw) > most:
