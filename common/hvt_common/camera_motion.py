@@ -110,7 +110,7 @@ def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
 def _by_ecc(previous: _Gray, current: _Gray) -> Affine | None:
     """The affine map that maximises the enhanced correlation coefficient (Evangelidis and Psarakis, 2008).
 
-    ECC only finds optima nearby, so it starts from the translation that phase correlation sees.
+    ECC only finds optima nearby, so it starts from the translation found by phase correlation.
     """
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ECC_STEPS, _ECC_PRECISION)
     everywhere = np.full_like(previous, 255)

@@ -42,7 +42,7 @@ _USUAL_SIDE = 224
 
 
 class Classifier(Protocol):
-    """Says what crops show."""
+    """Classifies crops."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -90,7 +90,7 @@ def open_classifier(
 class OnnxClassifier:
     """A network from one image to one row of scores; arguments as of `open_classifier`.
 
-    Construction runs the network once on grey noise: that tells logits (softmax is applied) from probabilities
+    Construction runs the network once on noise, to distinguish logits (softmax is applied) from probabilities
     (each row sums to one).
 
     Raises:
@@ -121,7 +121,7 @@ class OnnxClassifier:
         return posteriors
 
     def _prepared(self, crop_bgr: Image) -> npt.NDArray[Any]:
-        """One crop as the network wants it, without the batch axis."""
+        """The network's input for one crop, without the batch axis."""
         crop = as_bgr(crop_bgr)
         shrinks = crop.shape[1] >= self._size[0] and crop.shape[0] >= self._size[1]
         resized = cv2.resize(crop, self._size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)

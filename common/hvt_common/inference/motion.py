@@ -2,17 +2,18 @@
 
 Each image is compared with the last few, brought into its own coordinates by the camera's motion:
 
-1. The camera's motion since the last call (`CameraMotion`) is chained, so that each kept image can be warped onto the
-   new one.
-2. A pixel differs from a kept image by as much as it lies outside the values of its 3x3 neighbourhood there (tolerant
-   difference): a misalignment of a pixel, or the ringing of a coarse quantiser along an edge, costs nothing.
-3. The lower median over the kept images counts: an object differs from most of them, the ground that it has just left
-   only from a few, so nothing trails behind and no background model is learnt. A region must also differ, in part,
-   from all kept images but one: the place that a parked object has left is gone after two more calls.
+1. The camera's motion since the last call (`CameraMotion`) is chained, so that each stored image can be warped onto
+   the new one.
+2. A pixel differs from a stored image by as much as it lies outside the values of its 3x3 neighbourhood there
+   (tolerant difference): a misalignment of a pixel, or the ringing of a coarse quantiser along an edge, costs
+   nothing.
+3. The lower median over the stored images counts: an object differs from most of them, the ground that it has just
+   left only from a few, so nothing trails behind and no background model is learnt. A region must also differ, in
+   part, from all stored images but one: the place that a parked object has left is gone after two more calls.
 4. The threshold follows the noise of these very differences (median absolute deviation, Rousseeuw and Croux 1993), so
    coding noise stays below it; closing, connected components and merging make boxes.
 
-It is meant to be called on every n-th frame, three to five times a second, and sees what moves by about its own size
+It is meant to be called on every n-th frame, three to five times a second, and finds what moves by about its own size
 within the calls it remembers. Limits: it is silent in its first calls, a shadow belongs to its object, parallax of
 tall things near a fast camera looks like motion, and what has stood still for a second or two is not seen.
 """
@@ -50,7 +51,7 @@ class MotionSettings:
     memory_calls: int = 6
     """So many earlier images are compared with."""
     least_calls: int = 2
-    """Silent until so many images are kept."""
+    """Silent until so many images are stored."""
     max_side_px: int = 1280
     """A larger image is first scaled down to this longer side."""
     noise_factor: float = 6.0
@@ -58,7 +59,7 @@ class MotionSettings:
     least_difference: float = 9.0
     """… and so many grey levels of 255."""
     seed_share: float = 0.2
-    """Share of a region that must differ from all kept images but one."""
+    """Share of a region that must differ from all stored images but one."""
     join_px: int = 7
     """Parts nearer than this become one region."""
     near_share: float = 0.3
@@ -118,7 +119,7 @@ class MotionDetector:
         self._camera.reset()
 
     def _move_history(self, step: Affine) -> None:
-        """Chain the camera's last step onto the maps of all kept images."""
+        """Chain the camera's last step onto the maps of all stored images."""
         moved = [(gray, _compose(step, affine)) for gray, affine in self._history]
         self._history.clear()
         self._history.extend(moved)
@@ -140,7 +141,7 @@ class MotionDetector:
         return boxes[sure], confidences[sure]
 
     def _differences(self, gray: _Gray) -> tuple[_Gray, _Gray]:
-        """The second smallest and the lower median of the differences to the kept images, smoothed."""
+        """The second smallest and the lower median of the differences to the stored images, smoothed."""
         rank = (len(self._history) - 1) // 2
         smallest = [np.full(gray.shape, 255, np.uint8) for _ in range(rank + 1)]
         for earlier, affine in self._history:

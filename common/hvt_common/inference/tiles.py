@@ -1,9 +1,8 @@
-"""Small objects: a detector on the whole picture and on overlapping tiles of it, its answers made one list.
+"""Tiled detection of small objects: the whole picture and overlapping tiles of it, merged into one list.
 
-A network of 640 pixels sees a picture of 1920 at a third of its size, and an object of 12 pixels in four. On tiles it
-sees it larger, at the price of a run for each tile. What lies whole in one tile may be cut in the next: boxes that
-touch a border inside the picture count only where no other box covers them (the idea of slicing aided inference,
-Akyon et al., ICIP 2022).
+A network of 640 pixels gets a picture of 1920 at a third of its size, and an object of 12 pixels in four. Tiles
+enlarge it, at the cost of a run for each. Boxes that touch a tile's border inside the picture may be truncated:
+they count only where no other box covers them (slicing aided inference, Akyon et al., ICIP 2022).
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ MOST_RUNS: Final = 7
 """Runs of the detector at one decision step that ``auto`` may take: the whole picture and at most six tiles."""
 OVERLAP: Final = 0.1
 """Share of a tile that the next one shows too: objects up to that size lie whole in one of them, and the whole
-picture shows the larger ones well enough. With 0.2 small objects are seen smaller: F1 .61 instead of .64."""
+picture shows the larger ones well enough. With 0.2 small objects get fewer pixels: F1 .61 instead of .64."""
 
 _MOST_TILES: Final = 64
 _SMALL_PX: Final = 12
@@ -57,7 +56,7 @@ _ACROSS: Final = 0.7
 
 @runtime_checkable
 class _Sized(Protocol):
-    """A network: it keeps nothing from one picture to the next, and says how large it sees one."""
+    """A network: stateless, with a known input size for each picture."""
 
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]: ...
 
@@ -77,7 +76,7 @@ def parse_tiles(text: str) -> Grid | Literal["auto", "off"]:
 
 
 def tiled(detector: Detector, tiles: str) -> Detector:
-    """The detector as ``--tiles`` wants it.
+    """The detector with the tiles of ``--tiles``.
 
     Raises:
         UserError: ``tiles`` makes no sense, or the detector remembers pictures and cannot be given tiles.
@@ -236,15 +235,15 @@ def _outermost(boxes: Boxes, class_ids: npt.NDArray[np.int32]) -> npt.NDArray[np
 
 
 def _uncovered(partial: Boxes, others: Boxes) -> npt.NDArray[np.intp]:
-    """Of cut boxes, best first, those that neither the others nor a better piece cover by half."""
+    """Of truncated boxes, best first, those that neither the others nor a better one cover by half."""
     free = np.flatnonzero(~(_shared_of_smaller(partial, others) > _COVERED).any(axis=1))
     return free[_first_come(_shared_of_smaller(partial[free], partial[free]) > _COVERED)]
 
 
 def _joined(partial: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, npt.NDArray[np.intp]]:
-    """Cut boxes, best first, put together: (M, 4) boxes and (M,) index of the best piece of each.
+    """Truncated boxes, best first, joined by object: (M, 4) boxes and (M,) index of the best part of each.
 
-    Pieces of one object overlap where their tiles do, and agree across the cut in where the object lies.
+    Parts of one object overlap where their tiles do, and agree in extent along the tile border.
     """
     if not len(partial):
         return partial, np.empty(0, np.intp)

@@ -51,11 +51,11 @@ class Channel(StrEnum):
 
 
 class Direction(Enum):
-    """Who speaks."""
+    """Who sends."""
 
     EDGE_TO_GROUND = "edge to ground"
     GROUND_TO_EDGE = "ground to edge"
-    GROUND_QUERIES = "ground asks, edge answers"
+    GROUND_QUERIES = "ground queries, edge answers"
     PRESENCE = "liveliness token of the edge"
 
 
@@ -94,7 +94,7 @@ DELIVERIES: Mapping[Channel, Delivery] = MappingProxyType(
         Channel.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "TrackStep", "DATA_LOW", "DROP"),
         Channel.BACKLOG: Delivery(
             Direction.EDGE_TO_GROUND,
-            "a chunk of what was kept while the link was away; attachment BacklogHeader",
+            "a chunk of what was stored while the link was down; attachment BacklogHeader",
             "BACKGROUND",
             "BLOCK",
         ),
@@ -139,7 +139,7 @@ def check_edge_pattern(pattern: str) -> str:
 def selector(channel: Channel, *, edges: str = "*") -> str:
     """The Zenoh key expression of one channel for all edges that ``edges`` matches, such as ``hvt/uav-$*/base``.
 
-    The pattern travels to the sender, so edges that nobody asked for cost no line bytes.
+    The sender applies the pattern, so edges that are not selected cost no line bytes.
     """
     pattern = re.sub(r"\*+", "*", check_edge_pattern(edges))
     chunk = pattern if pattern == "*" else pattern.replace("*", "$*")

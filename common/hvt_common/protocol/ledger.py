@@ -1,7 +1,7 @@
-"""The one account of what crosses the line: bytes by channel, rolling windows, and the outcome of every still.
+"""The ledger of the link: bytes by channel, rolling windows, and the outcome of every still.
 
-Pure: the time of each message is an argument. Both sides feed it the same numbers (sizes of what was sent, times out
-of the headers) and get the same totals and windows.
+Pure: the time of each message is an argument. Both sides count the same sizes and the times of the headers, and get
+    the same totals and windows.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Account(Enum):
     BASE = "base"
     ROI = "roi"
     BACKLOG = "backlog"
-    """What was kept while the link was away, and sent afterwards."""
+    """What was stored while the link was down, and sent afterwards."""
     META = "meta"
     """Status, info, feedback and tracks."""
 
@@ -178,7 +178,7 @@ class Ledger:
         self._enter(at_ns, channel, line)
 
     def record_outcome(self, outcome: StillOutcome, reason: str) -> None:
-        """Note what became of a still and why. Some come from the network: of many, the later are ``other``."""
+        """Count the outcome of a still by its reason; reasons beyond 23, which the network may send, are ``other``."""
         outcomes = self._outcomes[outcome]
         outcomes[reason if reason in outcomes or len(outcomes) < _MOST_REASONS else "other"] += 1
 
@@ -210,7 +210,7 @@ class Ledger:
 
     @property
     def worst_window_bps(self) -> WindowRates:
-        """The fullest windows so far. May be asked for while another thread counts."""
+        """The fullest windows so far. Safe to read while another thread counts."""
         windows = self._windows.copy()
         for entry in tuple(self._pending):
             windows.add(*entry)
@@ -264,7 +264,7 @@ _SUMS = (*(channel.value for channel in Account), "total")
 
 @dataclass(slots=True)
 class _Windows:
-    """Rolling sums over messages that come in order of time; the worst of each is kept."""
+    """Rolling sums over messages in order of time, and the largest of each."""
 
     window_ns: int
     entries: deque[tuple[int, str, int]] = field(default_factory=deque)
@@ -283,7 +283,7 @@ class _Windows:
             self.worst[name] = max(self.worst[name], self.sums[name])
 
     def copy(self) -> _Windows:
-        """One that goes on by itself. Each part is copied in one step, which no other thread can interrupt."""
+        """An independent copy. Each part is copied in one step, which no other thread can interrupt."""
         return _Windows(self.window_ns, self.entries.copy(), self.sums.copy(), self.worst.copy())
 
     def restart(self) -> None:

@@ -111,7 +111,7 @@ def weak_confidence(confidence: float) -> float:
 
 
 class ByteTracker:
-    """Follows objects through consecutive frames of one camera at ``fps`` frames a second.
+    """Tracks objects through consecutive frames of one camera at ``fps`` frames a second.
 
     Call `update` for a frame that was searched for objects and `predict` for one that was not, with rising frame
     indices. Frames left out altogether are stepped over; an interruption longer than the lost buffer ends
@@ -313,7 +313,7 @@ class ByteTracker:
         self._table.append(born)
 
     def _duplicates(self, living: _Mask) -> _Mask:
-        """Of a tracked and a lost track at the same place, the one with the shorter past."""
+        """Of a tracked and a lost track at the same place, the younger one."""
         table = self._table
         duplicate = np.zeros(len(table), bool)
         present = (living & (table.phase != LOST)).nonzero()[0]

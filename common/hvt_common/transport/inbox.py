@@ -41,7 +41,7 @@ class ReceivedQueue(Protocol):
 class Inbox:
     """A bounded queue between Zenoh's callbacks and one of our threads; putting never blocks.
 
-    It is bounded in messages and in bytes: a payload may have megabytes. ``overflow`` says what gives way when it is
+    It is bounded in messages and in bytes: a payload may have megabytes. ``overflow`` says what is dropped when it is
     full: ``newest`` for the base stream (what is queued stays whole up to a gap), ``oldest`` where the latest value
     wins. A message that is larger than the whole inbox never enters. With a ``share`` below 1 no key may take more
     than that of it: a flood under one does not keep the others out.
@@ -88,7 +88,7 @@ class Inbox:
             return self._take() if self._items else None
 
     def close(self) -> None:
-        """Wake whoever waits; what is queued can still be taken."""
+        """Wake the waiting thread; what is queued can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

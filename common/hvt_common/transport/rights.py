@@ -1,6 +1,6 @@
-"""What our own Zenoh configuration lets whom do: its access control, read as Zenoh reads it.
+"""The access control of our own Zenoh configuration, read as Zenoh reads it.
 
-Zenoh drops what is not allowed without a word. Who knows its own rules can at least say so.
+Zenoh drops silently what is not allowed; with its own rules a side can say so.
 """
 
 from __future__ import annotations

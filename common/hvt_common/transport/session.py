@@ -1,7 +1,7 @@
-"""A Zenoh session as HVT wants it, and the few things publish and subscribe do with it.
+"""HVT's Zenoh session: opening it, publishers, subscribers, queries.
 
-Peers connect to named endpoints only: no multicast, no gossip, no shared memory (byte counts would lie), loopback
-unless told otherwise. Callbacks of Zenoh never block: they copy into an `Inbox`, which has a bound.
+Peers connect to named endpoints only: no multicast, no gossip, no shared memory (byte counts would be wrong),
+loopback by default. Callbacks of Zenoh never block: they copy into an `Inbox`, which has a bound.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> s
         return f"cannot listen on {endpoint}: this machine has no such address"
     if nobody := re.search(r"Unable to connect to any of \[(.+)\]", text):
         endpoints = ", ".join(re.findall(r"\(([^()]+)\)", nobody[1])) or nobody[1]
-        if "tls/" in endpoints:  # somebody may well answer, and refuse
+        if "tls/" in endpoints:  # the other side may answer, and refuse
             return "no link: " + "; ".join(visit(config))
         return f"nobody answers at {endpoints}: start a ground or a router there, or connect to where one is"
     where = f"cannot listen on {endpoint}" if listen else "cannot open the Zenoh session"

@@ -203,7 +203,7 @@ def _session(
 
 
 def _check_ports(path: Path, session: ort.InferenceSession) -> None:
-    """Refuse a model whose ports nobody could feed or read."""
+    """Refuse a model whose ports are out of bounds."""
     for side, ports in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
         if not 1 <= len(ports) <= _MOST_PORTS:
             raise UserError(f"model {path} has {len(ports)} {side}; 1 to {_MOST_PORTS} are accepted")

@@ -28,7 +28,7 @@ __all__ = [
 
 WIRE_VERSION = 3
 MAX_PAYLOAD_BYTES = 4 * 2**20
-"""No access unit and no still is larger; a larger one is not looked at."""
+"""No access unit and no still is larger; a larger payload is refused unread."""
 
 _CRC_BYTES = 5
 _CRC_TAG = 0xCE

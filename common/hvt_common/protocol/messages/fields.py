@@ -1,7 +1,7 @@
 """The kinds of field a message may have. Each one checks the same bounds when it packs and when it parses.
 
 `Kind.encode` takes one of our own values and raises ValueError when it is out of bounds: that is a bug here.
-`Kind.decode` takes whatever MessagePack held and raises `WireError`: that is somebody else's bad message.
+`Kind.decode` takes what MessagePack held and raises `WireError`: that is a bad message of the other side.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ I63 = 2**63 - 1
 
 
 class WireError(Exception):
-    """A message that cannot be used; the text says what was wrong with it. Count it, skip it, go on."""
+    """A message that cannot be used; the text says why. Count it and skip it."""
 
 
 class Kind(ABC):

@@ -1,4 +1,4 @@
-"""What the edge says about itself: `Info` when asked, `Status` once a second."""
+"""Reports of the edge: `Info` as answer to a query, `Status` once a second."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class Status(Message):
     base_bytes: int = wire_field(_COUNT)
     roi_bytes: int = wire_field(_COUNT)
     backlog_bytes: int = wire_field(_COUNT)
-    """Pieces of what was kept while the link was away."""
+    """Chunks of store-and-forward."""
     meta_bytes: int = wire_field(_COUNT)
     overhead_bytes: int = wire_field(_COUNT)
     base_messages: int = wire_field(_COUNT)

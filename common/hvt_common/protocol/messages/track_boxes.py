@@ -1,4 +1,4 @@
-"""How the boxes of a track step become bytes: prediction with constant velocity, what is left range-coded.
+"""Codes the boxes of a track step: prediction with constant velocity, the residual range-coded.
 
 Both sides hold the same list of `CodedTrack` in whole numbers and bring it forward in the same way, so that nothing
 drifts apart. Positions and sizes count 1/16 of a base pixel; each track has a step of its own for either axis, a
@@ -240,7 +240,7 @@ class _Walk:
     def _born(
         self, before: CodedTrack, common: tuple[int, int], goal: CodedTrack | None, *, moving: bool
     ) -> CodedTrack:
-        """A new track; its numbers are told by how they differ from the one ``before`` it."""
+        """A new track; its numbers are coded as differences from the track ``before`` it."""
         coder, to = self._coder, goal or before
         track_id = (
             before.track_id + 1 + coder.unsigned(self._id, to.track_id - before.track_id - 1 if goal else 0)

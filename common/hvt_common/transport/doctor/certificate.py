@@ -1,7 +1,6 @@
-"""Our own keys as the Zenoh configuration names them, and whether they are fit for use: checked before the start.
+"""Checks, before the start, the keys that the Zenoh configuration names.
 
-Certificates are read by Python's own ``ssl``: a TLS handshake in memory, both ends of it here, shows what the other
-side would see. So neither side needs a package for certificates.
+Python's own ``ssl`` reads the certificates, by a TLS handshake in memory: no package for certificates is needed.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class Certificate:
 
     @classmethod
     def of(cls, said: dict[str, Any]) -> Certificate:
-        """From what ``SSLSocket.getpeercert`` tells."""
+        """From the answer of ``SSLSocket.getpeercert``."""
         names = [value for group in said.get("subject", ()) for key, value in group if key == "commonName"]
         return cls(
             name=names[0] if names else "",
@@ -101,7 +100,7 @@ class TlsFiles:
 
 
 def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float) -> None:
-    """Raise UserError for keys with which nobody would let us in; warn of what will soon be, or may be, a fault.
+    """Raise UserError for keys that no other side would accept; warn of what will soon be, or may be, a fault.
 
     Args:
         config: the configuration in use.
@@ -132,7 +131,7 @@ def dated(time_s: float) -> str:
 
 
 def plain_key_only() -> str:
-    """For ``load_cert_chain``: without it an encrypted key would ask for its password on the terminal, for ever."""
+    """For ``load_cert_chain``: an encrypted key would wait for a password on the terminal, for ever."""
     raise _EncryptedKeyError
 
 

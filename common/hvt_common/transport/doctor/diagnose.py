@@ -1,8 +1,7 @@
-"""Says in plain words why there is no link, and who is linked without the rights to be of use.
+"""Explains why there is no link, and which peer is linked without the rights that it needs.
 
-Zenoh tells a program nothing of this: a connection that is refused is tried again for ever, a message without
-permission is dropped. So a thread looks now and then whether links stand and whose they are, and visits the endpoints
-(`probe`) where none does.
+Zenoh reports neither: a refused connection is retried for ever, a message without permission is dropped. So a thread
+checks the links and their peers, and probes the endpoints (`probe`) where there is no link.
 """
 
 from __future__ import annotations
@@ -39,9 +38,9 @@ _MAX_NAMES = 256
 
 
 def control_unanswered(edge: str, *, who: str = "this ground") -> str:
-    """What to tell a user whose question on ``control`` came to nothing while the edge is there.
+    """The sentence for a request on ``control`` without an answer, while the edge is present.
 
-    The edge itself, or a ground or a router on the way, may have dropped it: all of them check.
+    The edge itself, or a ground or a router on the way, may have dropped it: all of them check rights.
     """
     return (
         f"{edge} does not answer on control: {who} may lack the right to command it (hvt-ground keys list shows who "
@@ -51,7 +50,7 @@ def control_unanswered(edge: str, *, who: str = "this ground") -> str:
 
 
 class LinkWatch:
-    """A context manager with a thread of its own, which looks after one session until it closes.
+    """Watches the links of one session, in a thread of its own; a context manager.
 
     Args:
         session: the session that was opened with these settings.
@@ -90,7 +89,7 @@ class LinkWatch:
         self._named: set[str] = set()
         self._stop = threading.Event()
         self._using = threading.Lock()
-        """Held while the session is asked: it must not be closed under our hands."""
+        """Held while the session is used, so that it is not closed meanwhile."""
         self._thread = threading.Thread(target=self._run, name="hvt-link-watch", daemon=True)
 
     @property
@@ -114,7 +113,7 @@ class LinkWatch:
         self._stop.set()
         with self._using:
             pass
-        # A visit in progress asks nothing of the session and ends by itself, within seconds: nobody waits for it.
+        # A probe in progress does not use the session and ends by itself within seconds: it is not waited for.
         self._thread.join(0.1)
 
     # The thread
@@ -141,7 +140,7 @@ class LinkWatch:
                 if links:
                     self._check_names(self._names(links), now_s)
                 self._check_second_link(links, now_s)
-            except zenoh.ZError:  # somebody else closed it
+            except zenoh.ZError:  # closed elsewhere
                 return True
             return bool(links)
 

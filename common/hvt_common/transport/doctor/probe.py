@@ -1,7 +1,6 @@
-"""Why an endpoint does not let us in, in one sentence: a short visit beside Zenoh, which says "Timeout" at most.
+"""Probes an endpoint beside Zenoh and explains in one sentence why it gives no link.
 
-A probe connects, shakes hands with the very files that Zenoh uses, hears whether the other side sends an alert, and
-leaves. It sends nothing of HVT's.
+A probe connects, does the TLS handshake with the files that Zenoh uses, waits for an alert, and leaves.
 """
 
 from __future__ import annotations

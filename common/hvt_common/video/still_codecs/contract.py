@@ -59,7 +59,7 @@ class CodedCrop:
 
 
 class StillCodec(Protocol):
-    """What the edge and the ground ask of a codec."""
+    """What the edge and the ground need of a codec."""
 
     @property
     def name(self) -> str:

@@ -2,7 +2,7 @@
 
 A third party's codec is an entry point of the group ``hvt.still_codecs``: its name is the codec's name on the wire,
 its object satisfies `contract.StillCodec`, or is called without arguments to give one. A third party's package is
-imported when its codec is requested by name, so that a broken plug-in hinders nobody who does not use it.
+imported when its codec is requested by name, so that a broken plug-in matters only where it is used.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _faults(name: str, codec: object) -> str | None:
     return f"it has no {' and no '.join(missing)}" if missing else None
 
 
-@cache  # unknown names come from the network too, and a look at all packages takes tens of milliseconds
+@cache  # unknown names come from the network too, and a search of all packages takes tens of milliseconds
 def installed_codecs() -> dict[str, tuple[EntryPoint, ...]]:
     """The entry points of third parties by name; more than one where two packages bring the same name."""
     # One installed package can be found twice, by two paths of sys.path: same value, same codec.

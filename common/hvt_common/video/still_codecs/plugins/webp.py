@@ -47,5 +47,5 @@ def webp_size(data: bytes) -> tuple[int, int]:
         raise StillError("not a whole WebP of one lossy picture")
     if data[20] & 1 or data[23:26] != _VP8_START:
         raise StillError("WebP is malformed: no keyframe")
-    # The two bits above the 14 ask a player to enlarge; a still is shown as it is.
+    # The two bits above the 14 tell a player to enlarge; they are ignored.
     return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(data[28:30], "little") & 0x3FFF
