@@ -178,7 +178,7 @@ class Ledger:
         self._enter(at_ns, channel, line)
 
     def record_outcome(self, outcome: StillOutcome, reason: str) -> None:
-        """Count the outcome of a still by its reason; reasons beyond 23, which the network may send, are ``other``."""
+        """Count the outcome of a still by reason; reasons beyond 23, which the network may send, are ``other``."""
         outcomes = self._outcomes[outcome]
         outcomes[reason if reason in outcomes or len(outcomes) < _MOST_REASONS else "other"] += 1
 
