@@ -27,7 +27,6 @@ __all__ = [
     "parse_tiles",
     "tile_boxes",
     "tiled",
-    "warm_up_source",
 ]
 
 Grid = tuple[int, int]
@@ -89,15 +88,6 @@ def tiled(detector: Detector, tiles: str) -> Detector:
             return detector
         raise UserError(f"tiles {tiles} need a detector that is a network; 'motion' compares whole pictures")
     return TiledDetector(detector, grid=grid)
-
-
-def warm_up_source(detector: Detector, source_size: tuple[int, int]) -> None:
-    """Run a network once on a picture of this (width, height), with its tiles: a runtime may compile for each shape.
-
-    A detector that remembers pictures, such as ``motion``, is left alone.
-    """
-    if isinstance(detector, (TiledDetector, _Sized)):
-        detector.detect(np.zeros((source_size[1], source_size[0], 3), np.uint8))
 
 
 def auto_grid(

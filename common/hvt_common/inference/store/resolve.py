@@ -35,10 +35,9 @@ def resolve_model(
     """The file of a model that is named or that is a file already; a model of the cache is checked first.
 
     Args:
-        spec: The name of an embedded model, of a model of the cache, or the path of a file. What has a folder or a
-            suffix in it is a path.
+        spec: The name of an embedded model, of one of the cache, or a path: what has a folder or a suffix in it.
         role: What the user calls it, for the sentence.
-        words: Words that mean no model and are handled before, for the sentence.
+        words: Further accepted words, for the sentence.
         store: The cache; else the usual one.
 
     Raises:

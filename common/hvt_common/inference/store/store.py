@@ -119,11 +119,8 @@ class Store:
     ) -> Path:
         """Get a model from its first address that gives it; nothing is done where it is there and right.
 
-        Args:
-            name: A name of `entries`.
-            progress: Gets the bytes held so far.
-            on_wait: Called once where another process is fetching the same model; then this one waits for it.
-            pauses_s: Seconds to wait after each try that brought nothing.
+        ``progress`` gets the bytes held so far. ``on_wait`` is called once where another process is fetching the same
+        model; then this one waits for it. ``pauses_s`` are the seconds after each try that brought nothing.
 
         Raises:
             UserError: No address gives the pinned file, or the folder cannot be written.
@@ -150,10 +147,7 @@ class Store:
     def add(self, file: Path, *, name: str, sha256: str | None = None) -> Path:
         """Copy a file that was brought by hand into the folder, if it is the pinned one.
 
-        Args:
-            file: An ONNX file.
-            name: A name of `entries`, or a new one.
-            sha256: Must be given for a new name, and pins it; for a built-in name it must agree with the manifest.
+        ``sha256`` must be given for a new name, and pins it; for a built-in name it must agree with the manifest.
 
         Raises:
             UserError: Another file than pinned, a missing pin, or the folder cannot be written.
