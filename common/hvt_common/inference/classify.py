@@ -70,10 +70,12 @@ def open_classifier(
 ) -> Classifier:
     """Open an ONNX classifier.
 
-    Args: spec: The name of a model (see `resolve_model`), or the path of an ONNX file. labels: Class names, one a
-    line; else those of the metadata, ImageNet's (1000 or 1001), or "class 0" and so on. 1000 names fit a model of
-    1001 classes (a background comes first), and the reverse. Of synonyms separated by commas the first is shown.
-    threads: CPU threads of the network. provider: One of `providers.PROVIDERS`.
+    Args:
+        spec: The name of a model (see `resolve_model`), or the path of an ONNX file.
+        labels: Class names, one a line; else those of the metadata, ImageNet's, or "class 0" and so on. 1000 names
+            fit a model of 1001 classes (a background comes first), and the reverse. The first synonym is shown.
+        threads: CPU threads of the network.
+        provider: One of `providers.PROVIDERS`.
 
     Raises:
         UserError: No such model, not a classifier, metadata or labels that do not fit.
