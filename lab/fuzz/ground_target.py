@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from random import Random
 from typing import NamedTuple
@@ -23,6 +23,7 @@ __all__ = ["TARGETS"]
 _CHANNELS = ("base", "roi", "tracks", "status", "backlog")
 _ATTACHED = ("base", "roi", "backlog")
 _PACES = ("realtime", "lockstep")
+_PATIENCE_S = 12.0
 _UNHARMED = 2
 """So many access units come unharmed before the rest."""
 
@@ -73,6 +74,13 @@ def _opened(info: Info, receiver: EdgeReceiver) -> GroundSession:
     )
 
 
+def _until(true: Callable[[], bool]) -> None:
+    """Wait, on a busy machine too: the receiver itself drops what it has not read within its time to close."""
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not true() and time.monotonic() < deadline_s:
+        time.sleep(0.001)
+
+
 def _session(data: bytes) -> None:
     pace, *messages = parted(data, least=1)
     port = Port()
@@ -84,7 +92,9 @@ def _session(data: bytes) -> None:
         port.inbox.put(Received(key, one.payload, one.attachment, "", time.time_ns()))
     with patch("hvt_ground.sinks.rerun.recorder.add_footer"):  # a process of its own for each input
         receiver = EdgeReceiver(port, open_session=_opened)  # type: ignore[arg-type]
+        _until(lambda: len(port.inbox) == 0 or receiver.error is not None)
         receiver.close()
+        _until(lambda: bool(receiver.done) or receiver.error is not None)
     if receiver.error is not None:
         raise receiver.error
     assert receiver.done, "the unharmed messages alone are a session"
