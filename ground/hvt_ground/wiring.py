@@ -7,11 +7,11 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Literal, cast
 
+from hvt_common.camera_motion import CameraMotion
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import Detector, open_detector, warm_up
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
-from hvt_common.tracking.camera_motion import CameraMotion
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
 from hvt_ground.events.camera_path import CameraPath

@@ -17,8 +17,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.pki.roster import Ground, Roster, Router
-from lab.fuzz.contract import Target
-from lab.fuzz.scratch import scratch
+from lab.fuzz.contract import Target, scratch
 
 __all__ = ["TARGETS"]
 
@@ -169,10 +168,10 @@ TARGETS = (
             b"once = true\n",
         ],
         share=10,
-        short=150,
+        short=200,
         most_bytes=1000,
     ),
-    Target("zenoh-file", _zenoh, lambda: list(_ZENOH), share=8, short=150, most_bytes=1000),
+    Target("zenoh-file", _zenoh, lambda: list(_ZENOH), share=8, short=200, most_bytes=1000),
     Target(
         "endpoint",
         _endpoint,

@@ -13,7 +13,7 @@ import zenoh
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, Feedback, WireError
 from hvt_common.transport.doctor.diagnose import LinkWatch
-from hvt_common.transport.doctor.duplicate_edge import refuse_same_id
+from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.session import declare_publisher, open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
@@ -72,7 +72,7 @@ class ZenohLink:
     def __init__(self, settings: LinkSettings, *, edge_id: str, clock: Callable[[], int]) -> None:
         self._keys = EdgeKeys(edge_id)
         self._clock = clock
-        refuse_same_id(settings, self._keys)
+        refuse_duplicate_edge(settings, self._keys)
         self._listener: EdgeListener | None = None
         self._stack = ExitStack()
         self._session = self._stack.enter_context(open_session(settings))

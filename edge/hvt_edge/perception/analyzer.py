@@ -10,7 +10,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from hvt_common.inference.detect import Detector
-from hvt_common.runtime.distinct import DistinctIds
+from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder

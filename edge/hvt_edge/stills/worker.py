@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Self
 
 from hvt_common.protocol.messages import StillResult
-from hvt_common.runtime.priority import lower_priority
+from hvt_common.runtime.process import lower_priority
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.stills.stage import StillStage
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Protocol
 
-from hvt_common.runtime.priority import lower_priority
+from hvt_common.runtime.process import lower_priority
 from hvt_common.values import Tracks
 from hvt_ground.perception.pipeline import Picture, ReceivedStill
 
