@@ -304,6 +304,6 @@ class BacklogStage:
         # While a keyframe is to come nothing else takes its space; after the last frame none comes.
         if not self._link.has_subscriber() or not (self._finishing or not self._keyframes.due(now_ns)):
             return None
-        if self._link.stills_pending():
+        if not self._finishing and self._link.stills_pending():  # after the last frame none goes any more
             return ChunkAllowance(min(_TRICKLE_BYTES, self._link.allowance_bytes(now_ns, 0.0)), trickle=True)
         return ChunkAllowance(self._link.allowance_bytes(now_ns, 0.0 if self._finishing else _RESERVE))

@@ -68,6 +68,22 @@ def test_frames_and_stills_lost_at_the_end_of_a_clip_come_as_what_was_kept(tmp_p
     assert ("sent", "stored") not in rig.outcomes, "it counted when it was sent"
 
 
+def test_a_still_that_is_pending_at_the_end_does_not_hold_up_what_was_stored(tmp_path):
+    """It will not be sent any more, and the store would only trickle until the run gives up."""
+    rig = Rig(tmp_path / "store")
+    rig.play(0, 21, reports=True)
+    rig.play(21, 45, linked=False)
+    rig.linked = True
+    rig.outbox.offer(
+        OutboxStill(CropJob(STILL, np.zeros((4, 4, 3), np.uint8), None, None), None, 1.0, rig.now_ns)
+    )
+    rig.finish()
+    assert rig.backlog.numbers.empty
+    sizes = [len(data) for _, data in rig.out.backlog]
+    assert max(sizes) > 1400, "no trickle"
+    rig.close()
+
+
 def test_an_outage_at_the_end_of_a_clip_is_waited_out(tmp_path):
     """What was kept last would stay on the drone until its next start."""
     rig = Rig(tmp_path / "store")
