@@ -14,8 +14,8 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_con
 from hvt_common.tracking.camera_motion import CameraMotion
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Event
+from hvt_ground.events import Event
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader

@@ -24,7 +24,7 @@ from hvt_common.protocol.messages import (
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
 from hvt_ground.config import GroundConfig
-from hvt_ground.events.events import Event, Overlay, Refinement
+from hvt_ground.events import Event, Overlay, Refinement
 from hvt_ground.perception.pipeline import Picture, ReceivedStill
 from hvt_ground.perception.worker import LockstepWorker, Read, See, Step
 from hvt_ground.session.session import GroundSession

@@ -18,7 +18,7 @@ from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View
-from hvt_ground.events.events import Overlay, Refinement
+from hvt_ground.events import Overlay, Refinement
 from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.stills.classify import Decoded, object_crops
 from hvt_ground.perception.stills.refine import Refiner, Shown

@@ -27,7 +27,7 @@ from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
-from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import Decoded, Reading, Readings

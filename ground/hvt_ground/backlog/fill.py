@@ -13,7 +13,7 @@ from hvt_common.protocol.messages import BacklogUnit, Info
 from hvt_common.values import Image
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.video import BacklogVideo
-from hvt_ground.events.events import Event, Overlay, VideoSample
+from hvt_ground.events import Event, Overlay, VideoSample
 from hvt_ground.link.sequence_window import SequenceWindow
 
 __all__ = ["Arrived", "BacklogFill", "Work"]

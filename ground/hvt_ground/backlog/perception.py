@@ -17,10 +17,10 @@ from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import Image
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Event, Overlay
-from hvt_ground.events.history import History
+from hvt_ground.events import Event, Overlay
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner

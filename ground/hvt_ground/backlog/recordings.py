@@ -18,7 +18,7 @@ from pathlib import Path
 from hvt_common.protocol.messages import Info
 from hvt_ground.backlog.fill import BacklogFill, Work
 from hvt_ground.backlog.perception import BacklogPerception
-from hvt_ground.events.events import Notice
+from hvt_ground.events import Notice
 from hvt_ground.link.sequence_window import SequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.sinks.rerun.recorder import Recorder

@@ -14,10 +14,10 @@ from hvt_common.runtime.distinct import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.tracking.camera_motion import CameraMotion
 from hvt_common.values import Image, Tracks, View
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Event, Overlay
-from hvt_ground.events.history import History
+from hvt_ground.events import Event, Overlay
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fused, Fusion
+from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, Shown

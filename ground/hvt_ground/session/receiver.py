@@ -27,10 +27,9 @@ from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.delivery import BacklogDelivery
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
-from hvt_ground.link.duplicates import DuplicatePublishers
-from hvt_ground.link.pre_session import PreSessionBuffer
+from hvt_ground.link.other_sessions import DuplicatePublishers, PreSessionBuffer
 from hvt_ground.link.reassemble import Arrival, Counters, Reassembler
-from hvt_ground.link.uptime import Uptime
+from hvt_ground.link.statistics import Uptime
 from hvt_ground.session.receiver_report import Reports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort

@@ -27,10 +27,10 @@ from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.fill import Arrived, BacklogFill, Work
 from hvt_ground.backlog.perception import BacklogPerception
-from hvt_ground.events.events import Event, Notice, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Traffic, VideoSample
 from hvt_ground.link.reassemble import Counters
+from hvt_ground.link.sequence_window import StillSequenceWindow
 from hvt_ground.perception.pipeline import Picture, Pipeline, ReceivedStill
-from hvt_ground.perception.stills.numbers import StillSequenceWindow
 from hvt_ground.perception.worker import LockstepWorker, PerceptionWorker, RealtimeWorker
 from hvt_ground.sinks.rerun.recorder import Recorder
 from hvt_ground.sinks.timing import SessionTiming

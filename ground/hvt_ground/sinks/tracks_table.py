@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_ground.events.events import Event, Overlay
+from hvt_ground.events import Event, Overlay
 
 __all__ = ["COLUMNS", "TrackTable"]
 

@@ -244,7 +244,7 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, monkeypatch, compact_bytes):
     """Rows that come late would be lost or doubled where the journal is written again, or when the file is closed."""
     monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.COMPACT_BYTES", compact_bytes)
-    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd.footer._MOST_GROWTH", 10)
+    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd_file._MOST_GROWTH", 10)
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(25))
         rig.base(*range(65, 90))

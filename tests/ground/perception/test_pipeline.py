@@ -14,7 +14,7 @@ from hvt_common.values import Detections, Posterior, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import still_codec
-from hvt_ground.events.events import Notice, Overlay, Refinement
+from hvt_ground.events import Notice, Overlay, Refinement
 from hvt_ground.perception.pipeline import Picture, Pipeline, ReceivedStill
 from hvt_ground.perception.stills.classify import Reading, Readings
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Origin
+from hvt_ground.events import Origin
+from hvt_ground.perception.fusion.camera_path import CameraPath
 
 __all__ = ["Entity", "Vote", "Witness"]
 

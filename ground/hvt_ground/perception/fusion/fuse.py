@@ -41,7 +41,7 @@ import numpy.typing as npt
 from hvt_common.boxes import iou
 from hvt_common.tracking.association import assign
 from hvt_common.values import Detections, Tracks
-from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, Witness
 from hvt_ground.perception.fusion.object_list import Fused, Rules, far_boxes, list_entities
 

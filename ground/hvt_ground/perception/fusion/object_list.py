@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from hvt_common.boxes import iou
 from hvt_common.values import Tracks
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Origin
+from hvt_ground.events import Origin
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.entity import Entity, Witness
 
 __all__ = ["Fused", "Rules", "far_boxes", "list_entities"]

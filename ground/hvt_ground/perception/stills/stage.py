@@ -12,9 +12,9 @@ from hvt_common.protocol.messages import Flags, RoiHeader, StillResult, fitted_t
 from hvt_common.values import Image, Posterior, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.still_codecs import BaseMissingError, StillError, psnr_y_db, still_codec
-from hvt_ground.events.events import Event, Notice, Refinement
-from hvt_ground.events.history import FilledLog, History
+from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.fusion.fuse import Fusion
+from hvt_ground.perception.history import FilledLog, History
 from hvt_ground.perception.stills.classify import Box, Decoded, Reading, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
 from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillSeen

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from hvt_ground.events.events import Overlay
+from hvt_ground.events import Overlay
 from hvt_ground.sinks.rerun.overlay_encoding import LayerUpdate, OverlayEncoder
 
 __all__ = ["BacklogOverlays", "Timed"]

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
@@ -21,9 +20,9 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.rerun.rrd.release import send_blueprint
+from hvt_ground.sinks.rerun.sdk import send_blueprint, viewer_environment, viewer_program
 
-__all__ = ["LiveSink", "LiveView", "free_port", "listening", "viewer_environment", "viewer_program"]
+__all__ = ["LiveSink", "LiveView", "free_port", "listening"]
 
 log = logging.getLogger(__name__)
 
@@ -160,19 +159,6 @@ class LiveSink:
         if recording is not None:
             recording.disconnect()
         return False
-
-
-def viewer_program() -> Path:
-    """The viewer that came with the SDK; `UserError` where the installation lacks it."""
-    program = Path(rr.__file__).parent.parent / "rerun_cli" / ("rerun.exe" if os.name == "nt" else "rerun")
-    if not program.is_file():
-        raise UserError(f"the Rerun viewer is missing at {program}: install rerun-sdk from its wheel")
-    return program
-
-
-def viewer_environment() -> dict[str, str]:
-    """The environment for the viewer. ``CI`` keeps its analytics off without touching the user's own settings."""
-    return {**os.environ, "CI": "1", "RUST_LOG": os.environ.get("RUST_LOG", "error")}
 
 
 def listening(port: int) -> bool:

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from hvt_ground.events.events import Origin, Overlay
+from hvt_ground.events import Origin, Overlay
 
 __all__ = [
     "CENTRE_STEP_PX",

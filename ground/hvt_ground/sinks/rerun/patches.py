@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_ground.events.events import Overlay, Refinement
+from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.rerun.gallery import Placement
 
 __all__ = ["FRESH_NS", "PATCHES", "Moved", "Patches"]

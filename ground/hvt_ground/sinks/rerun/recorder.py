@@ -18,18 +18,20 @@ import numpy as np
 from rerun.chunk import Chunk
 
 from hvt_common.units import bitrate_text
-from hvt_ground.events.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.backlog_overlays import BacklogOverlays
 from hvt_ground.sinks.rerun.blueprint import Front
 from hvt_ground.sinks.rerun.live_view import LiveSink
 from hvt_ground.sinks.rerun.overlay_encoding import LAYERS, Identity, Layer, LayerUpdate, OverlayEncoder
 from hvt_ground.sinks.rerun.palette import AMBER, GREY, VERMILLION, Rgb
-from hvt_ground.sinks.rerun.rrd.file import RrdEncoder, RrdFile
-from hvt_ground.sinks.rerun.rrd.footer import add_footer
-from hvt_ground.sinks.rerun.rrd.size_limit import TABLE_BYTES, SizeLimit
-from hvt_ground.sinks.rerun.rrd.tables import (
+from hvt_ground.sinks.rerun.rrd_file import RrdEncoder, RrdFile, add_footer
+from hvt_ground.sinks.rerun.static_data import class_chunk, static_chunks
+from hvt_ground.sinks.rerun.stills import At, EventRow, StillRows
+from hvt_ground.sinks.rerun.tables import (
+    TABLE_BYTES,
     CodedIdentity,
+    SizeLimit,
     Table,
     Text,
     box_columns,
@@ -43,8 +45,6 @@ from hvt_ground.sinks.rerun.rrd.tables import (
     told_identity_columns,
     video_columns,
 )
-from hvt_ground.sinks.rerun.static_data import class_chunk, static_chunks
-from hvt_ground.sinks.rerun.stills import At, EventRow, StillRows
 
 __all__ = ["APPLICATION_ID", "COMPACT_BYTES", "Recorder", "RecorderSettings"]
 

@@ -20,7 +20,8 @@ from rerun.experimental import ViewerClient
 
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.units import parse_size
-from hvt_ground.sinks.rerun.live_view import free_port, listening, viewer_environment, viewer_program
+from hvt_ground.sinks.rerun.live_view import free_port, listening
+from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 
 __all__ = ["main", "screenshot"]
 

@@ -20,7 +20,7 @@ from hvt_ground.sinks.rerun.palette import (
     class_colour,
     dimmed,
 )
-from hvt_ground.sinks.rerun.rrd.tables import static_chunk
+from hvt_ground.sinks.rerun.tables import static_chunk
 
 __all__ = ["class_chunk", "static_chunks"]
 

@@ -9,16 +9,17 @@ from typing import Any
 
 import rerun as rr
 
-from hvt_ground.events.events import Overlay, Refinement
+from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.backlog_stills import BacklogGallery, Put, Shown
 from hvt_ground.sinks.rerun.gallery import HOLD_S, SLOTS, Gallery, placed
 from hvt_ground.sinks.rerun.palette import GREY, Rgb, class_colour
 from hvt_ground.sinks.rerun.patches import Patches
-from hvt_ground.sinks.rerun.rrd.size_limit import SizeLimit
-from hvt_ground.sinks.rerun.rrd.tables import (
+from hvt_ground.sinks.rerun.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
+from hvt_ground.sinks.rerun.tables import (
     Captions,
     Picture,
+    SizeLimit,
     Text,
     caption_columns,
     hidden_picture_columns,
@@ -27,7 +28,6 @@ from hvt_ground.sinks.rerun.rrd.tables import (
     place_columns,
     text_columns,
 )
-from hvt_ground.sinks.rerun.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
 
 __all__ = ["At", "EventRow", "StillRows"]
 

@@ -7,7 +7,7 @@ import pytest
 
 from flight import tracks_at
 from hvt_common.values import Detections, Tracks
-from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 
 A = (100.0, 100.0, 140.0, 130.0)

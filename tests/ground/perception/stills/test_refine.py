@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.values import Posterior, Tracks
-from hvt_ground.events.history import History
+from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher, Wanted, iou_matrix
 from hvt_ground.perception.stills.refine import MAX_HELD, MAX_TRACK_POSTERIORS, Refiner, StillSeen
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_ground.events.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun.gallery import CANVAS, SLOTS, Gallery, frame_of, placed
 from hvt_ground.sinks.rerun.live_view import LiveView, free_port, listening
 from hvt_ground.sinks.rerun.overlay_encoding import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
@@ -329,14 +329,14 @@ def test_a_footer_makes_a_recording_that_verifies(
 ) -> None:
     """Tools that index recordings refuse a file without a footer; a short flight must not grow by one."""
     from hvt_ground.sinks.rerun.live_view import viewer_program
-    from hvt_ground.sinks.rerun.rrd.footer import add_footer
+    from hvt_ground.sinks.rerun.rrd_file import add_footer
 
     path = tmp_path / "copy.rrd"
     path.write_bytes(Path(recording.reader.path).read_bytes())
     plain_bytes = path.stat().st_size
     assert not add_footer(path)
     assert path.stat().st_size == plain_bytes
-    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd.footer._MOST_GROWTH", 10)
+    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd_file._MOST_GROWTH", 10)
     assert add_footer(path)
     subprocess.run([viewer_program(), "rrd", "verify", path], check=True, capture_output=True)
     assert Recording(path).video() == recording.video()

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_ground.events.events import Overlay, Refinement, VideoSample
+from hvt_ground.events import Overlay, Refinement, VideoSample
 from hvt_ground.sinks.rerun.gallery import Placement
 from hvt_ground.sinks.rerun.overlay_encoding import ORIGINS, TOLD_MARK
 from hvt_ground.sinks.rerun.patches import FRESH_NS, PATCHES, Moved, Patches

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.perception.fusion.camera_path import CameraPath
 
 BOX = np.array([[100.0, 100.0, 120.0, 110.0]])
 

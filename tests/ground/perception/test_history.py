@@ -7,7 +7,7 @@ import pytest
 
 from flight import tracks_at
 from hvt_common.values import Tracks
-from hvt_ground.events.history import FilledLog, History
+from hvt_ground.perception.history import FilledLog, History
 
 
 def picture(value, *, height=4, width=6):

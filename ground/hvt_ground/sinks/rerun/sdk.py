@@ -1,7 +1,7 @@
 """What the Rerun SDK does not let go of by itself: each recording would leave four threads and two megabytes behind.
 
 A ground opens a recording for each session and each return after a long outage, so this has to be flat over weeks.
-Measured with rerun-sdk 0.41 (which pyproject pins); `tests/ground/sinks/rerun/test_rrd_release.py` holds it to
+Measured with rerun-sdk 0.41 (which pyproject pins); `tests/ground/sinks/rerun/test_sdk.py` holds it to
 that. The names it takes for that are the SDK's own and may go with another version: then its public way is taken, and
 a long-lived ground grows, but starts and records.
 """
@@ -9,16 +9,20 @@ a long-lived ground grows, but starts and records.
 from __future__ import annotations
 
 import logging
+import os
+from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
+
+from hvt_common.errors import UserError
 
 try:
     import rerun_bindings as bindings
 except ImportError:
     bindings = None  # type: ignore[assignment]
 
-__all__ = ["release_recordings", "send_blueprint"]
+__all__ = ["release_recordings", "send_blueprint", "viewer_environment", "viewer_program"]
 
 _log = logging.getLogger(__name__)
 
@@ -51,3 +55,16 @@ def release_recordings() -> None:
         bindings.flush_and_cleanup_orphaned_recordings()
     except AttributeError as error:
         _log.debug("this Rerun SDK has other names inside (%s): recordings are not freed", error)
+
+
+def viewer_program() -> Path:
+    """The viewer that came with the SDK; `UserError` where the installation lacks it."""
+    program = Path(rr.__file__).parent.parent / "rerun_cli" / ("rerun.exe" if os.name == "nt" else "rerun")
+    if not program.is_file():
+        raise UserError(f"the Rerun viewer is missing at {program}: install rerun-sdk from its wheel")
+    return program
+
+
+def viewer_environment() -> dict[str, str]:
+    """The environment for the viewer. ``CI`` keeps its analytics off without touching the user's own settings."""
+    return {**os.environ, "CI": "1", "RUST_LOG": os.environ.get("RUST_LOG", "error")}

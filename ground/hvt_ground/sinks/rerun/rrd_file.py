@@ -7,13 +7,15 @@ appended at once as a chunk of its own (the *journal*, at the end of the file), 
 become `COMPACT_BYTES`, the same rows are written again as one chunk a table, over the journal (*folding*).
 
 What is on disk is a plain RRD stream without a footer: the SDK keeps a footer's manifest in memory for as long as
-it records (a footer costs 1.6 kB a chunk, too). `rrd_footer` adds one at the end.
+it records (a footer costs 1.6 kB a chunk, too). `add_footer` adds one at the end.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import struct
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -24,13 +26,26 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.rerun.rrd.release import release_recordings, send_blueprint
+from hvt_ground.sinks.rerun.sdk import (
+    release_recordings,
+    send_blueprint,
+    viewer_environment,
+    viewer_program,
+)
 
-__all__ = ["RrdEncoder", "RrdFile"]
+__all__ = ["RrdEncoder", "RrdFile", "add_footer"]
+
+_log = logging.getLogger(__name__)
 
 _STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
 _END = 0
+_LARGEST_BYTES = 64 * 2**20
+"""About ten minutes at 800 kbps. The tool holds the file in memory, and Ctrl-C is answered within three seconds; a
+larger recording opens without a footer just as well."""
+_PATIENCE_S = 2.0
+_MOST_GROWTH = 1.12
+"""A footer takes some 70 kB, whatever the length of the flight: too much for one of a few seconds."""
 
 
 class RrdEncoder:
@@ -139,3 +154,27 @@ def _created(path: Path) -> int:
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
     except OSError as error:
         raise UserError(f"recording {path} cannot be created: {error.strerror}") from error
+
+
+def add_footer(path: Path) -> bool:
+    """Rewrite the file with a footer, whole or not at all; False where that was not done.
+
+    The SDK's own program does it (60 ms for 1.3 MB); it also gathers the video's chunks by keyframe.
+    """
+    if path.stat().st_size > _LARGEST_BYTES:
+        return False
+    scratch = path.with_name(path.name + ".part")
+    command = [str(viewer_program()), "rrd", "optimize", str(path), "-o", str(scratch)]
+    try:
+        subprocess.run(  # noqa: S603 - the SDK's own program, no shell
+            command, env=viewer_environment(), capture_output=True, check=True, timeout=_PATIENCE_S
+        )
+        if scratch.stat().st_size > _MOST_GROWTH * path.stat().st_size:
+            scratch.unlink()
+            return False
+        scratch.replace(path)
+    except (OSError, subprocess.SubprocessError) as error:
+        _log.info("%s stays without a footer: %s", path, error)
+        scratch.unlink(missing_ok=True)
+        return False
+    return True
