@@ -34,8 +34,8 @@ from hvt_ground.wiring import Models, backlog_path, make_backlog_perception, mak
 
 __all__ = ["Ground"]
 
-_TICK_S = 0.1
-_CLOCK_EVERY_TICKS = 200
+_POLL_S = 0.1
+_CLOCK_EVERY_POLLS = 200
 
 
 class Ground:
@@ -84,7 +84,7 @@ class Ground:
                 self._timing = stack.enter_context(closing(TimingTable(config.timing)))
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
-            watch = stack.enter_context(LinkWatch(session, settings, served=link.sees))
+            watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
             self._say_where(line)
             try:
@@ -128,16 +128,16 @@ class Ground:
     # Serving
 
     def _serve(self, link: GroundLink, line: StatusLine, watch: LinkWatch) -> None:
-        ticks = 0
-        while not self._stop.wait(_TICK_S):
+        frames = 0
+        while not self._stop.wait(_POLL_S):
             self._attend(link.ports(), line, watch)
             for receiver in self._receivers.values():
                 if receiver.error is not None:
                     raise receiver.error
-            ticks += 1
-            if ticks % 10 == 0:
+            frames += 1
+            if frames % 10 == 0:
                 line.show(self._status_text() or ("no link" if watch.trouble else "no edge yet"))
-            if ticks % _CLOCK_EVERY_TICKS == 0:
+            if frames % _CLOCK_EVERY_POLLS == 0:
                 self._refresh_clocks()
             if self._config.once and self._all_ended():
                 return
@@ -210,8 +210,8 @@ class Ground:
         stamp = time.strftime("%Y%m%d-%H%M%S")
         path = backlog_path(config.record, edge=info.edge, stamp=stamp, taken=self._paths)
         settings = replace(self._recorder_settings(info, path), clocked=False, live_url=None)
-        look = make_backlog_perception(config, models, info=info)
-        return BacklogRecording(info, path=path, recorder=Recorder(settings), look=look)
+        perception = make_backlog_perception(config, models, info=info)
+        return BacklogRecording(info, path=path, recorder=Recorder(settings), perception=perception)
 
     def _recorder_settings(self, info: Info, path: Path) -> RecorderSettings:
         config = self._config
@@ -235,10 +235,12 @@ class Ground:
         )
 
     def _open_tables(self, info: Info, stamp: str) -> list[TrackTable]:
-        wish = self._config.tracks
-        if wish is None:
+        target = self._config.tracks
+        if target is None:
             return []
-        return [TrackTable(output_path(wish, suffix=".csv", edge=info.edge, stamp=stamp, taken=self._paths))]
+        return [
+            TrackTable(output_path(target, suffix=".csv", edge=info.edge, stamp=stamp, taken=self._paths))
+        ]
 
     def _session_timing(self, info: Info, receiver: EdgeReceiver) -> SessionTiming | None:
         if self._timing is None:

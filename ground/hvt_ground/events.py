@@ -37,7 +37,7 @@ class VideoSample:
 class Overlay:
     """The ground's tracks at one frame, as parallel arrays ordered by track id.
 
-    A tick that the base stream left out may have one too: what the edge reported, and the others predicted.
+    A frame that the base stream left out may have one too: what the edge reported, and the others predicted.
     """
 
     frame_index: int

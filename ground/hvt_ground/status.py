@@ -26,7 +26,7 @@ def summary(
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog
     came = session.stills_received + backlog.stills
-    waiting = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
+    deferred = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
     return {
         "edge": info.edge,
         "session": f"{info.session_id:016x}",
@@ -49,7 +49,7 @@ def summary(
         "worst_window_bps": {"base": worst.base, "roi": worst.roi, "total": worst.total},
         "stills": {
             "received": session.stills_received,
-            "deferred": waiting,
+            "deferred": deferred,
             "dropped": sum(session.stills_dropped.values()),
             "unread": unread,
             "reasons": {

@@ -117,12 +117,12 @@ class ModelPool:
 def make_pipeline(
     config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]
 ) -> Pipeline:
-    """The eyes of one session."""
+    """The pipeline of one session."""
     detector, classifier = models.take(info.edge)
     reader = _reader(config, detector, classifier, info=info)
     motion = cast('Literal["off", "flow", "ecc"]', config.camera_motion)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
-    path = CameraPath(ahead_ticks=max(1, round(info.fps)))
+    path = CameraPath(ahead_frames=max(1, round(info.fps)))
     parts = PipelineParts(
         detector=detector,
         tracker=_tracker(config, info),
@@ -174,20 +174,20 @@ def _reader(
     return NoReader()
 
 
-def output_path(wish: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:
+def output_path(target: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:
     """Where a file of one session goes, and note it in ``taken``.
 
     ``wish`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file is
     written anew, but each session of this process gets one of its own: the first takes the name, others have the
     edge's id in it. A file that nobody named is never overwritten.
     """
-    if wish is None or wish.is_dir() or wish.suffix != suffix:
-        first = (wish or Path()) / f"hvt-{edge}-{stamp}{suffix}"
+    if target is None or target.is_dir() or target.suffix != suffix:
+        first = (target or Path()) / f"hvt-{edge}-{stamp}{suffix}"
         further = first
     else:
-        first, further = wish, wish.with_name(f"{wish.stem}-{edge}{suffix}")
+        first, further = target, target.with_name(f"{target.stem}-{edge}{suffix}")
     count, path = 1, first
-    while path in taken or (path != wish and path.exists()):
+    while path in taken or (path != target and path.exists()):
         path = (
             further
             if count == 1 and further != first
@@ -198,15 +198,15 @@ def output_path(wish: Path | None, *, suffix: str, edge: str, stamp: str, taken:
     return path
 
 
-def backlog_path(wish: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
+def backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
     """Where goes what was kept of a session that is over, beside the recording of the one that is open.
 
     Never over another file: its edge has forgotten what is in there.
     """
-    if wish is not None and wish.suffix == ".rrd" and not wish.is_dir():
-        first = wish.with_name(f"{wish.stem}-{edge}-backlog.rrd")
+    if target is not None and target.suffix == ".rrd" and not target.is_dir():
+        first = target.with_name(f"{target.stem}-{edge}-backlog.rrd")
     else:
-        first = (wish or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"
+        first = (target or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"
     count, path = 1, first
     while path in taken or path.exists():
         count += 1

@@ -68,7 +68,7 @@ class _Receiver(EdgeReceiver):
     def take(self, item: Received) -> None:
         """One message, as the thread would have it."""
         self._handle(item)
-        self._keep_house()
+        self._housekeep()
 
     def end(self) -> None:
         """The edge is gone."""

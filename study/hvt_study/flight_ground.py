@@ -25,8 +25,8 @@ from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event, Overlay, Refinement
-from hvt_ground.perception.pipeline import Picture, ReceivedStill
-from hvt_ground.perception.worker import LockstepWorker, Read, See, Step
+from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
+from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_ground.session.session import GroundSession
 from hvt_ground.wiring import Models, make_pipeline
 from hvt_study.flight_record import FlightRecord, Watch
@@ -71,12 +71,12 @@ class SharedModels(Models):
 class _Worker(LockstepWorker):
     """Sees at once; stills that come within one tick are read together, as in real time."""
 
-    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
-        super().__init__(see, step, read, name=name)
+    def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
+        super().__init__(analyze, step, read, name=name)
         self._worker = InlineExecutor()
         self._gathered: list[ReceivedStill] = []
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: DecodedFrame) -> None:
         self.read_gathered()
         super().picture(picture)
 
@@ -101,7 +101,7 @@ class _Session(GroundSession):
 
     def __init__(self, info: Info, **named: Any) -> None:
         super().__init__(info, recorder=None, recording=None, **named)
-        self._inline = _Worker(self._see, self._step, self._read, name=info.edge)
+        self._inline = _Worker(self._analyze, self._step, self._read, name=info.edge)
         self._worker = self._inline
 
     def read_stills(self) -> None:

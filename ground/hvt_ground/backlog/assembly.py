@@ -1,8 +1,8 @@
-"""Puts together again what an edge kept while the link was away: pieces in, whole objects and acknowledgements out.
+"""Puts together again what an edge kept while the link was away: chunks in, whole objects and acknowledgements out.
 
-Pure, and bounded whatever comes. Of an object is held what has come without a hole from its beginning: a piece beyond
+Pure, and bounded whatever comes. Of an object is held what has come without a hole from its beginning: a chunk beyond
 that is not kept, and the edge hears how far it got. Where room is short the object that has waited longest for its
-next piece goes; its edge begins it again. What has been delivered is remembered, so that a repetition is acknowledged
+next chunk goes; its edge begins it again. What has been delivered is remembered, so that a repetition is acknowledged
 and nothing more.
 
 An object is acknowledged when it is where it belongs, and not before: its edge forgets it then. While it is being
@@ -103,12 +103,12 @@ class BacklogAssembly:
         return len(self._open)
 
     def chunk(self, header: BacklogHeader, payload: bytes, *, may_finish: bool = True) -> bytes | None:
-        """Take a piece; the object's bytes where it is the last one that was missing, to be `settle`d later.
+        """Take a chunk; the object's bytes where it is the last one that was missing, to be `settle`d later.
 
-        With ``may_finish`` False a piece that would complete its object is not taken, and will come again.
+        With ``may_finish`` False a chunk that would complete its object is not taken, and will come again.
 
         Raises:
-            WireError: the piece cannot be one.
+            WireError: the chunk cannot be one.
         """
         _check(header, payload)
         key = _key(header)
@@ -122,7 +122,7 @@ class BacklogAssembly:
             return None
         fresh = payload[len(entry.data) - header.offset :] if header.offset <= len(entry.data) else b""
         finishes = len(entry.data) + len(fresh) == header.total_bytes
-        if fresh and (may_finish or not finishes) and self._make_room(key, len(fresh)):
+        if fresh and (may_finish or not finishes) and self._make_space(key, len(fresh)):
             entry.data += fresh
         if len(entry.data) == header.total_bytes:
             entry.handed, whole = True, bytes(entry.data)
@@ -194,7 +194,7 @@ class BacklogAssembly:
         self._open.move_to_end(key)
         return entry
 
-    def _make_room(self, key: BacklogKey, more_bytes: int) -> bool:
+    def _make_space(self, key: BacklogKey, more_bytes: int) -> bool:
         """Whether there is room for so much more of this object, which may cost others theirs."""
         while len(self._open) > self._max_objects or self.size_bytes + more_bytes > self._max_bytes:
             victim = next((one for one, entry in self._open.items() if one != key and not entry.handed), None)
@@ -241,11 +241,11 @@ def _info(session_id: int, data: bytes, *, edge: str) -> Info:
 
 
 def _still(session_id: int, number: int, data: bytes) -> StoredStill:
-    kept = parse_backlog_still(data)
-    header = RoiHeader.parse(kept.attachment, kept.payload)
+    stored = parse_backlog_still(data)
+    header = RoiHeader.parse(stored.attachment, stored.payload)
     if header.session_id != session_id or header.sequence != number:
         raise WireError(f"past still {number} is another one inside")
-    return StoredStill(replace(header, flags=header.flags | Flags.STORED), kept.payload, kept.encoding)
+    return StoredStill(replace(header, flags=header.flags | Flags.STORED), stored.payload, stored.encoding)
 
 
 def _check(header: BacklogHeader, payload: bytes) -> None:

@@ -1,8 +1,6 @@
-"""What an edge kept while the link was away, from the pieces that come to the recordings that they belong to.
+"""What an edge kept while the link was away, from the chunks that come to the recordings that they belong to.
 
 Whole objects of the session that is open go into that one, those of a session before into a recording of its own.
-Video is decoded in the receiving thread when nothing comes, stills are read by the eyes when there is nothing to see:
-the picture of now goes first.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ class BacklogDelivery:
     Args:
         edge: its id.
         recordings: where what is of another session goes; None refuses it.
-        assembly: puts pieces together.
+        assembly: puts chunks together.
     """
 
     def __init__(
@@ -83,7 +81,7 @@ class BacklogDelivery:
                 self._infos.popitem(last=False)
 
     def chunk(self, header: BacklogHeader, payload: bytes, *, session: GroundSession) -> bool:
-        """Take a piece while ``session`` is open; True where it completes its object, which is handed on.
+        """Take a chunk while ``session`` is open; True where it completes its object, which is handed on.
 
         Raises:
             WireError: it cannot be one, or the object that it completes is unusable.
@@ -96,7 +94,7 @@ class BacklogDelivery:
             known = own or header.session_id in self._infos
             if not (known or is_info):
                 self._assembly.want_info(header.session_id)
-            may_finish = is_info or (known and session.has_room)
+            may_finish = is_info or (known and session.accepts_jobs)
             whole = self._assembly.chunk(header, payload, may_finish=may_finish)
         if whole is None:
             return False
@@ -154,11 +152,11 @@ class BacklogDelivery:
         try:
             content = backlog_content(key, whole, edge=self._edge)
         except WireError:
-            self._settle(key, usable=False)
+            self._update(key, usable=False)
             raise
         if isinstance(content, Info):
             self.learn(content)
-            self._settle(key, usable=True)
+            self._update(key, usable=True)
         elif isinstance(content, StoredStill):
             self._still(key, content, session)
         else:
@@ -169,7 +167,7 @@ class BacklogDelivery:
         own = key[0] == session.info.session_id
         work = session.stored_still(still) if own else self._still_elsewhere(self._infos[key[0]], still)
         if work is None:
-            self._settle(key, usable=True)
+            self._update(key, usable=True)
         else:
             session.later(self._settling(key, work))
 
@@ -191,7 +189,7 @@ class BacklogDelivery:
                 return None
             return (
                 yield from recording.fill.fill(
-                    units, boxes=lambda work: session.at_leisure(recordings.kept(recording, work))
+                    units, boxes=lambda work: session.at_leisure(recordings.stored(recording, work))
                 )
             )
 
@@ -199,9 +197,9 @@ class BacklogDelivery:
         """The work, and then its acknowledgement."""
         with self._lock:
             self._working += 1
-            return self._settled_after(key, work, session=self._sessions)
+            return self._then_settle(key, work, session=self._sessions)
 
-    def _settled_after(self, key: BacklogKey, work: Work, *, session: int) -> Work:
+    def _then_settle(self, key: BacklogKey, work: Work, *, session: int) -> Work:
         usable = yield from work
         with self._lock:
             if session == self._sessions:
@@ -212,7 +210,7 @@ class BacklogDelivery:
                     self._assembly.settle(key, usable=usable)
         return usable
 
-    def _settle(self, key: BacklogKey, *, usable: bool) -> None:
+    def _update(self, key: BacklogKey, *, usable: bool) -> None:
         with self._lock:
             self._assembly.settle(key, usable=usable)
 

@@ -16,7 +16,7 @@ from hvt_ground.backlog.video import BacklogVideo
 from hvt_ground.events import Event, Overlay, VideoSample
 from hvt_ground.link.sequence_window import SequenceWindow
 
-__all__ = ["Arrived", "BacklogFill", "Work"]
+__all__ = ["BacklogFill", "BacklogTotals", "Work"]
 
 _SECOND_NS = 1_000_000_000
 _LONGEST_S = 1.0
@@ -27,7 +27,7 @@ Work = Generator[None, None, bool | None]
 
 
 @dataclass(slots=True)
-class Arrived:
+class BacklogTotals:
     """How much came of what was kept."""
 
     stills: int = 0
@@ -71,17 +71,19 @@ class BacklogFill:
         look: finds boxes in the video; None leaves it without.
     """
 
-    def __init__(self, info: Info, *, log: Callable[[Event], None], look: BacklogPerception | None) -> None:
+    def __init__(
+        self, info: Info, *, log: Callable[[Event], None], perception: BacklogPerception | None
+    ) -> None:
         self._info = info
         self._log = log
-        self._look = look
-        self._tick_ns = round(_SECOND_NS / info.fps)
+        self._perception = perception
+        self._frame_ns = round(_SECOND_NS / info.fps)
         self._video = BacklogVideo(base_size=info.base_size)
         self._lock = threading.Lock()
         self._frames = SequenceWindow()
-        self.arrived = Arrived()
+        self.arrived = BacklogTotals()
         """Since the start."""
-        self._news = Arrived()
+        self._news = BacklogTotals()
 
     def live(self, frame_index: int, data: bytes, *, keyframe: bool, after_gap: bool) -> None:
         """Note a unit that came over the link at once and was decoded."""
@@ -95,10 +97,10 @@ class BacklogFill:
             self.arrived.add_still(frame_index, capture_ns)
             self._news.add_still(frame_index, capture_ns)
 
-    def take_news(self) -> Arrived:
+    def take_news(self) -> BacklogTotals:
         """Return and forget what has come since the last call."""
         with self._lock:
-            news, self._news = self._news, Arrived()
+            news, self._news = self._news, BacklogTotals()
             return news
 
     def fill(self, units: Sequence[BacklogUnit], *, boxes: Callable[[Work], bool]) -> Work:
@@ -114,7 +116,7 @@ class BacklogFill:
                 last = shown[0]
                 logged.add(last.frame_index)
             yield
-        if self._look is not None and logged:
+        if self._perception is not None and logged:
             boxes(self._watch(units, logged))
         return True
 
@@ -132,21 +134,21 @@ class BacklogFill:
 
     def _watch(self, units: Sequence[BacklogUnit], frames: AbstractSet[int]) -> Work:
         """Log boxes for those frames of a stretch."""
-        assert self._look is not None, "nobody watches without"
+        assert self._perception is not None, "nobody watches without"
         last: BacklogUnit | None = None
-        with self._look.watch(self._log) as watch:
+        with self._perception.watch(self._log) as tracker:
             for shown in self._video.pictures(units):
                 if shown is not None and shown[1] is not None and shown[0].frame_index in frames:
                     last, image = shown[0], shown[1]
-                    watch.see(last.frame_index, last.capture_ns, image)
+                    tracker.analyze(last.frame_index, last.capture_ns, image)
                 yield
         if last is not None:
             self._take_off(last)
         return True
 
     def _note_frame(self, unit: BacklogUnit, before: BacklogUnit | None) -> None:
-        ticks = 1 if before is None else unit.frame_index - before.frame_index
-        lasts_s = min(ticks / self._info.fps, _LONGEST_S)
+        frames = 1 if before is None else unit.frame_index - before.frame_index
+        lasts_s = min(frames / self._info.fps, _LONGEST_S)
         with self._lock:
             self.arrived.add_frame(unit.frame_index, unit.capture_ns, lasts_s=lasts_s)
             self._news.add_frame(unit.frame_index, unit.capture_ns, lasts_s=lasts_s)
@@ -163,7 +165,7 @@ class BacklogFill:
         self._log(
             Overlay(
                 frame_index=last.frame_index + 1,
-                capture_ns=last.capture_ns + self._tick_ns,
+                capture_ns=last.capture_ns + self._frame_ns,
                 track_ids=np.empty(0, np.int64),
                 boxes_base_px=np.empty((0, 4), np.float32),
                 base_classes=(),

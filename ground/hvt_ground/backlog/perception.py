@@ -24,9 +24,9 @@ from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner
-from hvt_ground.perception.stills.stage import Moment, StillStage
+from hvt_ground.perception.stills.stage import Progress, StillStage
 
-__all__ = ["FIRST_TRACK_ID", "BacklogPerception", "ModelCheckout", "Watch"]
+__all__ = ["FIRST_TRACK_ID", "BacklogPerception", "ModelCheckout", "StretchTracker"]
 
 FIRST_TRACK_ID = 1_000_001
 """Tracks of kept video are others than those of the session, and told apart by their numbers."""
@@ -42,7 +42,7 @@ class ModelCheckout(Protocol):
         ...
 
 
-class Watch:
+class StretchTracker:
     """Detects and tracks along one stretch of video."""
 
     def __init__(
@@ -56,7 +56,7 @@ class Watch:
         self._detected: int | None = None
         self.next_id = first_id
 
-    def see(self, frame_index: int, capture_ns: int, image_bgr: Image) -> None:
+    def analyze(self, frame_index: int, capture_ns: int, image_bgr: Image) -> None:
         """Take the next frame; frames rise."""
         if self._detected is None or frame_index - self._detected >= self._detect_every:
             self._detected = frame_index
@@ -90,7 +90,7 @@ class BacklogPerception:
         models: lends detector and classifier.
         tracker_of: makes a tracker for one stretch.
         reader_of: makes of detector and classifier what names stills.
-        detect_every: ticks from one detection to the next, at least.
+        detect_every: frames from one detection to the next, at least.
     """
 
     def __init__(
@@ -110,10 +110,10 @@ class BacklogPerception:
         self._next_id = FIRST_TRACK_ID
 
     @contextmanager
-    def watch(self, emit: Emit) -> Iterator[Watch]:
+    def watch(self, emit: Emit) -> Iterator[StretchTracker]:
         """What follows one stretch of video."""
         with self._models.checkout() as (detector, _):
-            watch = Watch(
+            watch = StretchTracker(
                 detector,
                 self._tracker_of(),
                 first_id=self._next_id,
@@ -137,13 +137,13 @@ class BacklogPerception:
                     "replace", fps=info.fps, detector_classes=names, classifier_classes=reader.class_names
                 ),
                 history=History(),
-                fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_ticks=1)),
+                fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_frames=1)),
                 view=info.view,
                 wants_base=False,
-                gap_ticks=1,
+                gap_frames=1,
                 emit=emit,
             )
             header = still.header
-            moment = Moment(header.frame_index, header.capture_ns, picture_index=header.frame_index)
+            moment = Progress(header.frame_index, header.capture_ns, picture_index=header.frame_index)
             stage.take([still], moment)
             stage.end(moment)

@@ -34,19 +34,21 @@ _CLOSE_S = 1.0
 class BacklogRecording:
     """One session's. `still` is for the thread that sees, `fill` for the one that receives."""
 
-    def __init__(self, info: Info, *, path: Path | None, recorder: Recorder, look: BacklogPerception) -> None:
+    def __init__(
+        self, info: Info, *, path: Path | None, recorder: Recorder, perception: BacklogPerception
+    ) -> None:
         self.info = info
         self.path = path
         self._recorder = recorder
-        self._look = look
+        self._perception = perception
         self._stills = SequenceWindow()
-        self.fill = BacklogFill(info, log=recorder.log, look=look)
+        self.fill = BacklogFill(info, log=recorder.log, perception=perception)
 
     def still(self, still: ReceivedStill) -> Work:
         """Decode, name and log one, once."""
         if self._stills.add([still.header.sequence]):
             self.fill.note_still(still.header.frame_index, still.header.capture_ns)
-            self._look.read(still, emit=self._recorder.log)
+            self._perception.read(still, emit=self._recorder.log)
         yield
         return True
 
@@ -117,7 +119,7 @@ class BacklogRecordings:
             if held is not None:
                 self._release(held)
 
-    def kept(self, recording: BacklogRecording, work: Work) -> Work:
+    def stored(self, recording: BacklogRecording, work: Work) -> Work:
         """The work, for which a recording that is in use now stays open until it is done, or `release_all`."""
         with self._lock:
             held = next(one for one in self._open.values() if one.recording is recording)
@@ -146,7 +148,7 @@ class BacklogRecordings:
             if held is None:
                 if self._stop_ns is not None or self._left <= 0:
                     return None
-                self._make_room()
+                self._make_space()
                 self._left -= 1
                 held = self._open[info.session_id] = _Open(self._open_one(info))
                 if held.recording.path is not None:
@@ -165,7 +167,7 @@ class BacklogRecordings:
         finally:
             self._release(held)
 
-    def _make_room(self) -> None:
+    def _make_space(self) -> None:
         unused = [session_id for session_id, held in self._open.items() if not held.users]
         for session_id in unused[: max(0, len(self._open) + 1 - self._most)]:
             self._close_later(self._open.pop(session_id))

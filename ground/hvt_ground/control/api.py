@@ -39,7 +39,7 @@ from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 __all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedStill"]
 
 _ANSWER_S = 2.0
-_LOOK_S = 0.3
+_POLL_S = 0.3
 _OUTCOME_S = 2.0
 """So often the edge is asked what became of a still that does not come."""
 _INBOX_MESSAGES = 64
@@ -108,15 +108,15 @@ class RemoteEdge:
     where it says no.
     """
 
-    def __init__(self, session: zenoh.Session, edge: str, *, asker: Requester | None = None) -> None:
+    def __init__(self, session: zenoh.Session, edge: str, *, requester: Requester | None = None) -> None:
         self.name = edge
         self._session = session
         self._keys = EdgeKeys(edge)
-        self._asker = asker or Requester()
+        self._requester = requester or Requester()
 
     def info(self) -> Info:
         """What the edge says of its session."""
-        answer = self._ask(Channel.INFO, b"")
+        answer = self._query(Channel.INFO, b"")
         if answer is None:
             raise UserError(self._absent())
         return self._parsed(Info.parse, answer)
@@ -195,7 +195,7 @@ class RemoteEdge:
         self._check_may_command()
         answer = self._commanded(command, arguments or {})
         if answer is None:
-            present = self._ask(Channel.INFO, b"") is not None
+            present = self._query(Channel.INFO, b"") is not None
             raise UserError(control_unanswered(self.name, who="this key") if present else self._absent())
         return answer
 
@@ -203,20 +203,20 @@ class RemoteEdge:
         self, inbox: Inbox, answer: ControlAnswer, *, until_s: float, timeout_s: float
     ) -> tuple[RoiHeader, Received]:
         """The still of that number; in between the edge is asked whether it is still to come."""
-        ask_s = time.monotonic() + _OUTCOME_S
+        query_s = time.monotonic() + _OUTCOME_S
         while (now_s := time.monotonic()) < until_s:
-            item = inbox.get(timeout_s=min(_LOOK_S, until_s - now_s))
+            item = inbox.get(timeout_s=min(_POLL_S, until_s - now_s))
             header = None if item is None else _header(item)
             if item is not None and header is not None and _is_answer(header, answer):
                 return header, item
-            if now_s >= ask_s:
+            if now_s >= query_s:
                 try:
                     self._commanded(Command.STILL_OUTCOME, {"ask": answer.still_request})
                 except RefusedError:
                     raise
                 except UserError:
                     pass  # an answer that cannot be used, as no answer: the still itself may come all the same
-                ask_s = now_s + _OUTCOME_S
+                query_s = now_s + _OUTCOME_S
         raise UserError(
             f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: "
             "the budget or the link is full"
@@ -228,7 +228,7 @@ class RemoteEdge:
             question = ControlRequest(session_id=0, command=command, arguments=arguments).pack()
         except ValueError as error:
             raise UserError(f"{command}: {error}") from None
-        data = self._ask(Channel.CONTROL, question)
+        data = self._query(Channel.CONTROL, question)
         if data is None:
             return None
         answer = self._parsed(ControlAnswer.parse, data)
@@ -237,10 +237,10 @@ class RemoteEdge:
         return answer
 
     def _check_may_command(self) -> None:
-        if refusal := self._asker.refusal(self.name):
+        if refusal := self._requester.refusal(self.name):
             raise UserError(refusal)
 
-    def _ask(self, row: Channel, question: bytes) -> bytes | None:
+    def _query(self, row: Channel, question: bytes) -> bytes | None:
         try:
             return ask(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
         except zenoh.ZError:
@@ -263,10 +263,10 @@ class EdgeClient:
     """The edges that can be reached from one place; a context manager. ``client["uav-1"]`` is one of them."""
 
     def __init__(
-        self, session: zenoh.Session, *, asker: Requester | None = None, stack: ExitStack | None = None
+        self, session: zenoh.Session, *, requester: Requester | None = None, stack: ExitStack | None = None
     ) -> None:
         self._session = session
-        self._asker = asker
+        self._requester = requester
         self._stack = stack or ExitStack()
 
     @classmethod
@@ -278,7 +278,7 @@ class EdgeClient:
         """
         stack = ExitStack()
         settings = LinkSettings(role="asker", connect=endpoints, zenoh_config=zenoh_config)
-        return cls(stack.enter_context(open_session(settings)), asker=Requester.of(settings), stack=stack)
+        return cls(stack.enter_context(open_session(settings)), requester=Requester.of(settings), stack=stack)
 
     def nobody(self) -> str:
         """What to tell a user where `names` is empty."""
@@ -291,7 +291,7 @@ class EdgeClient:
         return sorted({key[0] for key in keys if key is not None})
 
     def __getitem__(self, edge: str) -> RemoteEdge:
-        return RemoteEdge(self._session, edge, asker=self._asker)
+        return RemoteEdge(self._session, edge, requester=self._requester)
 
     def close(self) -> None:
         """Leave the link."""

@@ -14,7 +14,7 @@ keyframe never waits: what is missing before it no longer matters.
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
 `ADOPTION_INTERVAL_NS`: late units of the old session or a flood of invented ids cannot make the picture jump to
 and fro. Where the present session still goes on `DUPLICATE_AFTER_NS` after another was first heard, that is no
-restart but a second edge of the same name: a *rival*, which is shown only when the first has been silent for
+restart but a second edge of the same name: a *duplicate*, which is shown only when the first has been silent for
 `DUPLICATE_SILENCE_NS`. A session that was left may come back, but only beyond where it had been. One that the edge
 does not know (`Reassembler.disown`) is nobody's, and the one before it goes on.
 
@@ -31,7 +31,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, fields, replace
 from typing import Generic, Literal, Protocol, TypeVar
 
-__all__ = ["AccessUnitHeader", "Arrival", "Counters", "Reassembler", "Verdict"]
+__all__ = ["AccessUnitHeader", "Arrival", "Reassembler", "StreamCounters", "Verdict"]
 
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
 """What to do with an access unit:
@@ -118,7 +118,7 @@ class Arrival(Generic[H]):
 
 
 @dataclass(slots=True)
-class Counters:
+class StreamCounters:
     """Totals since the start, over all sessions. Units still waiting behind a hole are in ``received`` only."""
 
     received: int = 0
@@ -139,10 +139,13 @@ class Counters:
     """Adopted; one that starts afresh after numbers that could not be believed counts again."""
     keyframe_requests: int = 0
 
-    def since(self, before: Counters) -> Counters:
+    def since(self, before: StreamCounters) -> StreamCounters:
         """What was counted after ``before`` was copied."""
-        return Counters(
-            **{one.name: getattr(self, one.name) - getattr(before, one.name) for one in fields(Counters)}
+        return StreamCounters(
+            **{
+                one.name: getattr(self, one.name) - getattr(before, one.name)
+                for one in fields(StreamCounters)
+            }
         )
 
 
@@ -153,7 +156,7 @@ class Reassembler(Generic[H]):
     """
 
     def __init__(self) -> None:
-        self.counters = Counters()
+        self.counters = StreamCounters()
         self._session: Hashable = None
         self._adopted_ns: int | None = None
         self._left: OrderedDict[Hashable, int] = OrderedDict()  # session id → the sequence it had reached

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
 
-__all__ = ["REPORT_LINE_BYTES", "Measured", "ReceptionStatistics", "Uptime"]
+__all__ = ["REPORT_LINE_BYTES", "LinkMeasurement", "ReceptionStatistics", "Uptime"]
 
 _MS = 1_000_000
 _SECOND_NS = 1_000_000_000
@@ -29,7 +29,7 @@ _MISSED_NS = 6 * _SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class LinkMeasurement:
     """What a report says of the link."""
 
     base_sequence: int
@@ -83,7 +83,7 @@ class ReceptionStatistics:
             self._note(size_bytes, arrived_ns)
 
     def backlog(self, *, size_bytes: int, arrived_ns: int) -> None:
-        """A piece of what was kept while the link was away has arrived."""
+        """A chunk of what was kept while the link was away has arrived."""
         with self._lock:
             self._note(size_bytes, arrived_ns)
 
@@ -114,7 +114,7 @@ class ReceptionStatistics:
             return _MOST_NS
         return min(_MOST_NS, max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving))))
 
-    def take(self, now_ns: int) -> Measured:
+    def take(self, now_ns: int) -> LinkMeasurement:
         """What to report now; delays begin anew."""
         with self._lock:
             delays = list(self._delays_ms)
@@ -122,7 +122,7 @@ class ReceptionStatistics:
             self._news = False
             self._reported_ns = now_ns
             held_us = max(0, now_ns - self._arrived_ns) // 1000 if self._base_sequence >= 0 else 0
-            return Measured(
+            return LinkMeasurement(
                 base_sequence=self._base_sequence,
                 base_held_us=min(held_us, _HELD_US),
                 still_sequence=self._still_sequence,
@@ -179,8 +179,8 @@ class Uptime:
         self._arrived_ns, self._handled_ns = arrived_ns, now_ns
         return self._lived_ns
 
-    def at(self, now_ns: int, *, waiting: bool) -> int:
+    def at(self, now_ns: int, *, pending: bool) -> int:
         """Return the time now; with messages ``waiting`` it is still that of the last one taken up."""
         if self._arrived_ns is None:
             return now_ns
-        return self._lived_ns + (0 if waiting else max(0, now_ns - self._handled_ns))
+        return self._lived_ns + (0 if pending else max(0, now_ns - self._handled_ns))

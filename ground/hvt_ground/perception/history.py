@@ -3,7 +3,7 @@
 A still arrives after its frame: it is matched to the tracks of that very frame and shown beside (or pasted
 into) the decoded picture of it. Tracks are small and kept for `track_frames`. Pictures are large: 1280x720 BGR
 is 2.7 MB, so the default bound of 96 MiB is 36 frames, 2.4 s at 15 fps. Where the edge codes fewer frames than there
-are ticks, the same 36 reach back further. They are kept just as given, without a lossy detour, because a residual
+are frames, the same 36 reach back further. They are kept just as given, without a lossy detour, because a residual
 still must be applied to exactly the pixels that the edge had.
 """
 
@@ -115,11 +115,11 @@ class History:
         share = (frame_index - before) / (after - before)
         return _between(self._tracks[before], self._tracks[after], frame_index, share=share)
 
-    def rename_track(self, kept_id: int, gone_id: int) -> None:
+    def rename_track(self, survivor_id: int, merged_id: int) -> None:
         """Two tracks have turned out to be one: where only the second is listed it gets the id of the first."""
         for index, tracks in self._tracks.items():
-            if gone_id in tracks.ids and kept_id not in tracks.ids:
-                ids = np.where(tracks.ids == gone_id, kept_id, tracks.ids)
+            if merged_id in tracks.ids and survivor_id not in tracks.ids:
+                ids = np.where(tracks.ids == merged_id, survivor_id, tracks.ids)
                 self._tracks[index] = replace(tracks, ids=ids)
 
     def clear(self) -> None:
@@ -153,7 +153,7 @@ def _between(before: Tracks, after: Tracks, frame_index: int, *, share: float) -
 
 
 class FilledLog:
-    """The tracks of a `History`, those between two frames filled in: a still may be of a tick without a picture."""
+    """The tracks of a `History`, those between two frames filled in: a still may be of a frame without a picture."""
 
     def __init__(self, history: History, *, within: int) -> None:
         self._history = history

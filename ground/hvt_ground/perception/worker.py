@@ -16,17 +16,17 @@ from typing import Protocol
 
 from hvt_common.runtime.priority import lower_priority
 from hvt_common.values import Tracks
-from hvt_ground.perception.pipeline import Picture, ReceivedStill
+from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 
 __all__ = ["LockstepWorker", "PerceptionWorker", "RealtimeWorker"]
 
-_WAITING_PICTURES = 24
+_MOST_PICTURES = 24
 """How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
 _BEHIND_PICTURES = 1
 _STILLS_AT_ONCE = 16
-_WAITING_STILLS = 256
-_WAITING_STILL_BYTES = 32 * 2**20
-_WAITING_STEPS = 8
+_MOST_STILLS = 256
+_MOST_STILL_BYTES = 32 * 2**20
+_MOST_STEPS = 8
 """Reports of the edge's tracks: the newest count, each says all."""
 _LATER = 4096
 """Pieces of work that can wait."""
@@ -35,16 +35,16 @@ _AT_LEISURE = 8
 _LATER_S = 0.25
 """On a machine that never comes to rest it still gets one step in so long."""
 _STEP_LAG = 2
-"""In lockstep a step counts from so many ticks on. It is sent right before the next access unit, which may overtake
+"""In lockstep a step counts from so many frames on. It is sent right before the next access unit, which may overtake
 it by microseconds: this is what makes the order the same in every run."""
 _FINISH_S = 1.5
 _LEAVE_S = 1.0
 _AHEAD = 2
 
-See = Callable[[Picture, bool], None]
+Analyze = Callable[[DecodedFrame, bool], None]
 """Called with a picture, and whether to hurry."""
 Step = Callable[[Tracks, int], None]
-"""Called with what the edge tracked at one tick, and that tick's capture time."""
+"""Called with what the edge tracked at one frame, and that frame's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
 Work = Generator[None, None, object]
 """Done step by step."""
@@ -63,12 +63,12 @@ class PerceptionWorker(Protocol):
         """Nothing waits, and nothing is in hand."""
         ...
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: DecodedFrame) -> None:
         """Hand over a decoded frame."""
         ...
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
-        """Hand over what the edge tracked at one tick."""
+        """Hand over what the edge tracked at one frame."""
         ...
 
     def still(self, still: ReceivedStill) -> None:
@@ -84,7 +84,7 @@ class PerceptionWorker(Protocol):
         ...
 
     @property
-    def has_room(self) -> bool:
+    def accepts_jobs(self) -> bool:
         """Whether `later` takes another."""
         ...
 
@@ -100,15 +100,15 @@ class PerceptionWorker(Protocol):
 class RealtimeWorker:
     """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still."""
 
-    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
-        self._see = see
+    def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
+        self._analyze = analyze
         self._step = step
         self._read = read
         self.untracked = 0
         self.dropped: Counter[str] = Counter()
-        self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
-        self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
-        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
+        self._pictures: queue.Queue[DecodedFrame] = queue.Queue(_MOST_PICTURES)
+        self._stills: queue.Queue[ReceivedStill] = queue.Queue(_MOST_STILLS)
+        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
         self._later: deque[Work] = deque()
         self._leisure: deque[Work] = deque()
         self._later_s = 0.0
@@ -128,14 +128,14 @@ class RealtimeWorker:
         return not (self._has_news() or self._later or self._leisure or self._in_hand)
 
     @property
-    def has_room(self) -> bool:
+    def accepts_jobs(self) -> bool:
         """Whether `later` takes another."""
         return len(self._later) < _LATER
 
     def _has_news(self) -> bool:
         return bool(self._steps) or not (self._pictures.empty() and self._stills.empty())
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: DecodedFrame) -> None:
         """Queue a frame; where the queue is full the oldest goes untracked."""
         while True:
             try:
@@ -156,9 +156,9 @@ class RealtimeWorker:
 
     def still(self, still: ReceivedStill) -> None:
         """Queue a still; where the queue is full it is dropped."""
-        waiting_bytes = sum(len(one.data) for one in tuple(self._stills.queue))
+        queued_bytes = sum(len(one.data) for one in tuple(self._stills.queue))
         try:
-            if waiting_bytes + len(still.data) <= _WAITING_STILL_BYTES:
+            if queued_bytes + len(still.data) <= _MOST_STILL_BYTES:
                 self._stills.put_nowait(still)
             else:
                 self.dropped["overflow"] += 1
@@ -168,7 +168,7 @@ class RealtimeWorker:
 
     def later(self, work: Work) -> bool:
         """Queue work that can wait."""
-        if not self.has_room:
+        if not self.accepts_jobs:
             return False
         self._later.append(work)
         self._wake.set()
@@ -213,9 +213,9 @@ class RealtimeWorker:
         except BaseException as error:  # noqa: BLE001 - handed to the receiving thread, which ends the process
             self._error = error
         finally:
-            for waiting in (self._later, self._leisure):
-                while waiting:  # whatever one in the middle holds is let go of here
-                    waiting.popleft().close()
+            for pending in (self._later, self._leisure):
+                while pending:  # whatever one in the middle holds is let go of here
+                    pending.popleft().close()
 
     def _work_off(self) -> None:
         """See all pictures that came before the stills taken here, then the edge's tracks, then read the stills."""
@@ -230,7 +230,7 @@ class RealtimeWorker:
                 picture = self._pictures.get_nowait()
             except queue.Empty:
                 break
-            self._see(picture, self._pictures.qsize() > _BEHIND_PICTURES)
+            self._analyze(picture, self._pictures.qsize() > _BEHIND_PICTURES)
         while self._steps and not self._given_up.is_set():
             self._step(*self._steps.popleft())
         if stills:
@@ -241,28 +241,28 @@ class RealtimeWorker:
 
     def _work_later(self) -> None:
         """Do what can wait, until something comes that cannot."""
-        while (waiting := self._later or self._leisure) and not self._given_up.is_set():
+        while (pending := self._later or self._leisure) and not self._given_up.is_set():
             if self._has_news() and time.monotonic() - self._later_s < _LATER_S:
                 return
             try:
-                next(waiting[0])
+                next(pending[0])
             except StopIteration:
-                waiting.popleft()
+                pending.popleft()
             self._later_s = time.monotonic()
 
 
 class LockstepWorker:
     """Sees one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
 
-    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
-        self._see = see
+    def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
+        self._analyze = analyze
         self._step = step
         self._read = read
         self.untracked = 0
         self.dropped: Counter[str] = Counter()
         self._pending: deque[Future[None]] = deque()
         self._early: list[ReceivedStill] = []
-        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
+        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
         self._newest_frame = -1
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-sight-{name}")
 
@@ -271,18 +271,18 @@ class LockstepWorker:
         """Nothing waits, and nothing is in hand."""
         return all(future.done() for future in self._pending)
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: DecodedFrame) -> None:
         """See a frame, and read the stills of it that overtook it on the link."""
         self._take_steps(before=picture.frame_index - _STEP_LAG + 1)
         self._newest_frame = picture.frame_index
-        self._submit(self._worker.submit(self._see, picture, False))
+        self._submit(self._worker.submit(self._analyze, picture, False))
         known = [one for one in self._early if one.header.frame_index <= self._newest_frame]
         if known:
             self._early = [one for one in self._early if one.header.frame_index > self._newest_frame]
             self._submit(self._worker.submit(self._read, known))
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
-        """Take in a report of tracks before the frame that comes so many ticks later."""
+        """Take in a report of tracks before the frame that comes so many frames later."""
         self._steps.append((tracks, capture_ns))
 
     def still(self, still: ReceivedStill) -> None:
@@ -291,12 +291,12 @@ class LockstepWorker:
             self._submit(self._worker.submit(self._read, [still]))
             return
         self._early.append(still)
-        if len(self._early) > _WAITING_STILLS:
+        if len(self._early) > _MOST_STILLS:
             self._early.pop(0)
             self.dropped["overflow"] += 1
 
     @property
-    def has_room(self) -> bool:
+    def accepts_jobs(self) -> bool:
         """Always: it is done before the next is seen."""
         return True
 

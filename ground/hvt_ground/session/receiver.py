@@ -28,7 +28,7 @@ from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.delivery import BacklogDelivery
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
 from hvt_ground.link.other_sessions import DuplicatePublishers, PreSessionBuffer
-from hvt_ground.link.reassemble import Arrival, Counters, Reassembler
+from hvt_ground.link.reassemble import Arrival, Reassembler, StreamCounters
 from hvt_ground.link.statistics import Uptime
 from hvt_ground.session.receiver_report import Reports
 from hvt_ground.session.session import GroundSession
@@ -42,10 +42,10 @@ _SECOND_NS = 1_000_000_000
 _ENDED_PATIENCE_NS = 2 * _SECOND_NS
 """How long the rest of a session may take to arrive after its edge has said that it ended."""
 _INFO_TRIES = 3
-_HEARD_NS = 2 * _SECOND_NS
+_SILENT_NS = 2 * _SECOND_NS
 """A keyframe is asked for only while the edge is heard."""
 _TELL_NS = 3 * _SECOND_NS
-"""After so long without another piece the log says how much came of what was kept."""
+"""After so long without another chunk the log says how much came of what was kept."""
 _DRAIN_NS = _SECOND_NS
 """How long what has already arrived is still taken in when the ground stops."""
 
@@ -92,12 +92,12 @@ class EdgeReceiver:
         """What was kept while the link was away."""
         self._reports = Reports(port, clock=self._clock, clock_offset=self.clock_offset, backlog=self.backlog)
         self._backlog_ns: int | None = None
-        """When the last piece of it came, of which nothing has been told yet."""
+        """When the last chunk of it came, of which nothing has been told yet."""
         self._worked_ns = 0
         self._stop_ns = 0
-        self._counted = Counters()
+        self._counted = StreamCounters()
         """The counters when the session before ended."""
-        self._heard_ns = time.monotonic_ns()
+        self._last_message_ns = time.monotonic_ns()
         self._time = Uptime()
         """That the reassembly goes by."""
         self._stop = threading.Event()
@@ -130,7 +130,7 @@ class EdgeReceiver:
                 if item is not None:
                     self._handle(item)
                 self._work_on_backlog(came=item is not None)
-                self._keep_house()
+                self._housekeep()
             self._end_session()
             self.backlog.close()
         except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
@@ -151,7 +151,7 @@ class EdgeReceiver:
         return len(self.port.inbox) == 0 or time.monotonic_ns() - self._stop_ns > _DRAIN_NS
 
     def _handle(self, item: Received) -> None:
-        self._heard_ns = time.monotonic_ns()
+        self._last_message_ns = time.monotonic_ns()
         at_ns = self._time.handle(arrived_ns=item.received_ns, now_ns=self._clock())
         parsed = parse_key(item.key)
         row = parsed[1] if parsed else None
@@ -266,7 +266,7 @@ class EdgeReceiver:
         return header.frame_index > session.newest_index
 
     def _begin_session(self, session_id: int) -> None:
-        info = self._ask_info(session_id)
+        info = self._query_info(session_id)
         if info is None and self.session is not None and self.refresh_clock() is not None:
             self.reassembler.disown()
             self._skip("base", WireError(f"the edge does not know of a session {session_id:016x}"))
@@ -283,7 +283,7 @@ class EdgeReceiver:
         for still in self._early.take_stills():
             self._still(*still)
 
-    def _ask_info(self, session_id: int) -> Info | None:
+    def _query_info(self, session_id: int) -> Info | None:
         for _ in range(_INFO_TRIES):
             if (info := self.refresh_clock(session_id)) is not None:
                 return info
@@ -299,14 +299,16 @@ class EdgeReceiver:
         session = self.session
         if session_id is None and session is not None:
             session_id = session.info.session_id
-        answer = self.port.ask_info(session_id)
+        answer = self.port.query_info(session_id)
         if answer is None:
             return None
-        info, asked_ns, heard_ns = answer
+        info, requested_ns, answered_ns = answer
         if info.edge != self.port.edge:  # it names files and keys: another's name is nobody's
             self._skip("info", WireError(f"the edge says that it is {info.edge!r:.40}"))
             return None
-        self.clock_offset.add(t0_ns=asked_ns, t1_ns=info.received_ns, t2_ns=info.answered_ns, t3_ns=heard_ns)
+        self.clock_offset.add(
+            t0_ns=requested_ns, t1_ns=info.received_ns, t2_ns=info.answered_ns, t3_ns=answered_ns
+        )
         if info.software != __version__:
             _log.info("%s runs version %s, this is %s", self.port.edge, info.software, __version__)
         return info
@@ -337,10 +339,10 @@ class EdgeReceiver:
         if self.session is not None:
             self._report(self.session)
 
-    def _keep_house(self) -> None:
+    def _housekeep(self) -> None:
         now_ns = time.monotonic_ns()
-        at_ns = self._time.at(self._clock(), waiting=len(self.port.inbox) > 0)
-        if now_ns - self._heard_ns < _HEARD_NS and self.reassembler.wants_keyframe(at_ns):
+        at_ns = self._time.at(self._clock(), pending=len(self.port.inbox) > 0)
+        if now_ns - self._last_message_ns < _SILENT_NS and self.reassembler.wants_keyframe(at_ns):
             self.reassembler.keyframe_requested(at_ns)
             self.port.request_keyframe()
             if self.session is not None:
@@ -371,7 +373,7 @@ class EdgeReceiver:
                 one >= other for one, other in zip(acknowledged_range, wanted, strict=True)
             )
             return (whole and self.backlog.idle) or now_ns - self._ended_ns > _ENDED_PATIENCE_NS
-        return not self.port.present.is_set() and now_ns - self._heard_ns > self._patience_ns
+        return not self.port.present.is_set() and now_ns - self._last_message_ns > self._patience_ns
 
     def _report(self, session: GroundSession) -> None:
         counters = self.reassembler.counters.since(self._counted)

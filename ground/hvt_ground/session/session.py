@@ -1,4 +1,4 @@
-"""One session of one edge at the ground: account, decoder, eyes and recording, from its first keyframe to its end."""
+"""One session of one edge: account, decoder, perception and sinks, from its first keyframe to its end."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from hvt_common.runtime.latency import LatencyStats
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
-from hvt_ground.backlog.fill import Arrived, BacklogFill, Work
+from hvt_ground.backlog.fill import BacklogFill, BacklogTotals, Work
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.events import Event, Notice, Traffic, VideoSample
-from hvt_ground.link.reassemble import Counters
+from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
-from hvt_ground.perception.pipeline import Picture, Pipeline, ReceivedStill
+from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import LockstepWorker, PerceptionWorker, RealtimeWorker
 from hvt_ground.sinks.rerun.recorder import Recorder
 from hvt_ground.sinks.timing import SessionTiming
@@ -51,7 +51,7 @@ class GroundSession:
 
     In lockstep it sees in the receiving thread instead: nothing is skipped, and the same input gives the same tracks.
 
-    ``pipeline_of(emit)`` builds the eyes. ``report()`` is called when there is something for the edge to hear.
+    ``pipeline_of(emit)`` builds perception. ``report()`` is called when there is something for the edge to hear.
     ``backlog_perception`` finds boxes in video that was kept while the link was away.
     """
 
@@ -87,7 +87,7 @@ class GroundSession:
         self.last_frame_index = -1
         """The last frame that was decoded, tracked and drawn."""
         self.last_status: Status | None = None
-        self.counters = Counters()
+        self.counters = StreamCounters()
         """What the reassembly counted in this session; filled in when it ends."""
         self._keys = EdgeKeys(info.edge)
         self._decoder = BaseDecoder(size=info.base_size)
@@ -105,9 +105,9 @@ class GroundSession:
         self._results: list[StillResult] = []
         self._results_lock = threading.Lock()
         self._still_window = StillSequenceWindow()
-        self._backlog = BacklogFill(info, log=self._log_backlog, look=backlog_perception)
+        self._backlog = BacklogFill(info, log=self._log_backlog, perception=backlog_perception)
         worker = LockstepWorker if self.lockstep else RealtimeWorker
-        self._worker: PerceptionWorker = worker(self._see, self._step, self._read, name=info.edge)
+        self._worker: PerceptionWorker = worker(self._analyze, self._step, self._read, name=info.edge)
 
     # What the receiving thread brings
 
@@ -146,7 +146,7 @@ class GroundSession:
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
         reference_ns = item.received_ns if self.lockstep else self._to_local_ns(header.capture_ns)
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
-        self._worker.picture(Picture(header.frame_index, header.capture_ns, reference_ns, image))
+        self._worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, image))
         self._traffic(at_ns)
         return True
 
@@ -171,7 +171,7 @@ class GroundSession:
         self._worker.still(still)
 
     def tracks(self, step: TrackStep, item: Received) -> None:
-        """Take what the edge tracked at one tick; one that is not newer than the last is ignored.
+        """Take what the edge tracked at one frame; one that is not newer than the last is ignored.
 
         Raises:
             WireError: its boxes make no sense.
@@ -213,17 +213,17 @@ class GroundSession:
     # What was kept while the link was away
 
     @property
-    def backlog(self) -> Arrived:
+    def backlog(self) -> BacklogTotals:
         """How much of it has come."""
         return self._backlog.arrived
 
     @property
-    def has_room(self) -> bool:
+    def accepts_jobs(self) -> bool:
         """Whether `later` takes more."""
-        return self._worker.has_room
+        return self._worker.accepts_jobs
 
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
-        """Count a piece, of whichever session; ``delivered``: with it an object was whole, and is of use."""
+        """Count a chunk, of whichever session; ``delivered``: with it an object was whole, and is of use."""
         self._count(Channel.BACKLOG, Account.BACKLOG, item, at_ns=header.send_ns)
         if self._timing is not None:
             self._timing.message(
@@ -235,7 +235,7 @@ class GroundSession:
             )
 
     def stored_still(self, still: ReceivedStill) -> Work | None:
-        """What the eyes are to do with a still of this session; None where it has come before, on whichever way."""
+        """What perception are to do with a still of this session; None where it has come before, on whichever way."""
         if not self._still_window.is_new_stored(still.header.sequence):
             return None
         return self._read_stored(still)
@@ -245,7 +245,7 @@ class GroundSession:
         return self._backlog.fill(units, boxes=self.at_leisure)
 
     def later(self, work: Work) -> bool:
-        """Let the eyes do it, as far as the picture of now leaves them time; False where too much waits already."""
+        """Let perception do it, as far as the picture of now leaves them time; False where too much waits already."""
         return self._worker.later(work)
 
     def at_leisure(self, work: Work) -> bool:
@@ -318,36 +318,36 @@ class GroundSession:
         """Raise what went wrong while seeing."""
         self._worker.raise_error()
 
-    # Seeing, in the thread of the eyes
+    # Seeing, in the thread of perception
 
-    def _see(self, picture: Picture, hurry: bool) -> None:  # noqa: FBT001 - called by the eyes only
-        self.pipeline.see(picture, hurry=hurry)
+    def _analyze(self, picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - called by perception only
+        self.pipeline.analyze(picture, hurry=hurry)
         self.last_frame_index = picture.frame_index
         self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
-        self._hear_results()
+        self._collect_results()
         if self.lockstep:
             self._report()
 
     def _step(self, tracks: Tracks, capture_ns: int) -> None:
         self.pipeline.edge_step(tracks, capture_ns=capture_ns)
-        self._hear_results()
+        self._collect_results()
 
     def _read(self, stills: Sequence[ReceivedStill]) -> None:
         self.pipeline.read(stills)
         if self._timing is not None:
             self._timing.read(one.header.sequence for one in stills)
-        self._hear_results()
+        self._collect_results()
         self._report()
 
     def _read_stored(self, still: ReceivedStill) -> Work:
         self.pipeline.read([still])
         self._backlog.note_still(still.header.frame_index, still.header.capture_ns)
-        self._hear_results()
+        self._collect_results()
         self._report()
         yield
         return True
 
-    def _hear_results(self) -> None:
+    def _collect_results(self) -> None:
         with self._results_lock:
             self._results = (self._results + self.pipeline.take_results())[-_MOST_RESULTS:]
 

@@ -6,7 +6,7 @@ The columns, in this order (times are Unix nanoseconds, 0 where there is none):
 - ``sequence``: the message's own number; ``frame_index``: of the frame it is about, -1 where it is about none
 - ``capture_ns``, ``send_ns``: by the edge's clock; ``received_ns``, ``shown_ns``: by this one
 - ``shown_ns``: when it was decoded and recorded (base), read by the classifier (roi), or taken in; 0: never, or
-  a piece of the past that did not complete an object, or one of no use
+  a chunk of the past that did not complete an object, or one of no use
 - ``line_bytes``: what it cost on the line, headers of Zenoh, TCP and IP included
 - ``clock_offset_ns``: the edge's clock less this one, as known then: the delay of a message is
   ``received_ns - (capture_ns - clock_offset_ns)``

@@ -22,11 +22,11 @@ from hvt_common.protocol.messages import (
 )
 from hvt_ground.backlog import BacklogAssembly, StoredStill, backlog_content
 from hvt_ground.link.sequence_window import SequenceWindow
-from hvt_ground.sinks.rerun.backlog_stills import BacklogGallery, Shown
+from hvt_ground.sinks.rerun.backlog_stills import BacklogGallery, CaptionRow
 
 
 def header(offset: int = 0, total: int = 10, *, kind="still", number=3, session=7) -> BacklogHeader:
-    """Of a piece."""
+    """Of a chunk."""
     return BacklogHeader(
         session_id=session, kind=kind, number=number, offset=offset, total_bytes=total, send_ns=0
     )
@@ -212,13 +212,13 @@ chunk_of = st.tuples(
 )
 
 
-@given(told=st.lists(chunk_of, max_size=40))
+@given(reported=st.lists(chunk_of, max_size=40))
 @settings(max_examples=60, deadline=None)
-def test_whatever_comes_it_stays_within_bounds(told):
+def test_whatever_comes_it_stays_within_bounds(reported):
     """A hostile sender would crash the ground or make it grow."""
     assembly = BacklogAssembly(max_objects=3, max_bytes=MAX_BACKLOG_BYTES + QUARTER, remember=2)
     fullest, heard = 0, {}
-    for number, begins, length, total, may_finish, then in told:
+    for number, begins, length, total, may_finish, then in reported:
         offset = heard.get(number, 0) if begins is None else begins * QUARTER
         try:
             whole = assembly.chunk(
@@ -279,7 +279,7 @@ def test_no_more_than_the_bound_is_held_to_the_byte():
 )
 @settings(max_examples=150, deadline=None)
 def test_an_edge_that_follows_the_acknowledgements_gets_everything_across(data, cuts, seed):
-    """Lost, doubled or reordered pieces would leave an object unfinished for ever."""
+    """Lost, doubled or reordered chunks would leave an object unfinished for ever."""
     assembly, chance = BacklogAssembly(), random.Random(seed)
     size = max(1, len(data) // (len(cuts) + 1))
     at, whole = 0, None
@@ -403,13 +403,13 @@ class Replay:
         return True
 
 
-@given(told=st.lists(st.tuples(st.booleans(), st.integers(0, 60), st.integers(0, 2)), max_size=30))
+@given(reported=st.lists(st.tuples(st.booleans(), st.integers(0, 60), st.integers(0, 2)), max_size=30))
 @settings(max_examples=300, deadline=None)
-def test_pictures_and_captions_agree_at_every_moment(told):
+def test_pictures_and_captions_agree_at_every_moment(reported):
     """The gallery would show a lorry under the words of a bus."""
     gallery, replay = BacklogGallery(("",) * 3, hold_ns=2), Replay(3)
     now, newest, taken = ("",) * 3, 0, set()
-    for live, number, slot in told:
+    for live, number, slot in reported:
         # Stills of now come in their order, those of the past at any time between them.
         frame = newest + 1 + number % 5 if live else number
         if frame in taken or (not live and frame > newest):
@@ -417,8 +417,8 @@ def test_pictures_and_captions_agree_at_every_moment(told):
         taken.add(frame)
         if live:
             newest, now = frame, (*now[:slot], f"live {frame}", *now[slot + 1 :])
-            gallery.note(slot, Shown(frame, frame, now))
-            replay.write(slot, frame, f"live {frame}", [Shown(frame, frame, now)])
+            gallery.note(slot, CaptionRow(frame, frame, now))
+            replay.write(slot, frame, f"live {frame}", [CaptionRow(frame, frame, now)])
             continue
         put = gallery.put(frame, frame, f"late {frame}")
         if put is not None:
@@ -431,8 +431,8 @@ def test_pictures_and_captions_agree_at_every_moment(told):
 def test_an_old_still_holds_its_slot_for_a_while_only_where_one_is_free():
     """Pairs would flicker by, or an old one would push out what is shown now."""
     gallery = BacklogGallery(("", ""), hold_ns=10)
-    gallery.note(0, Shown(0, 0, ("a", "")))
-    gallery.note(0, Shown(100, 100, ("b", "")))
+    gallery.note(0, CaptionRow(0, 0, ("a", "")))
+    gallery.note(0, CaptionRow(100, 100, ("b", "")))
     put = gallery.put(50, 50, "x")
     assert (put.slot, put.stays) == (0, False)
     assert gallery.put(55, 55, "y").slot == 1

@@ -111,7 +111,9 @@ class Rig:
 
     def _open_backlog(self, info: Info) -> BacklogRecording:
         path = self.folder / f"backlog-{next(self._backlog_numbers)}.rrd"
-        return BacklogRecording(info, path=path, recorder=Recorder(settings(info, path)), look=look_of(info))
+        return BacklogRecording(
+            info, path=path, recorder=Recorder(settings(info, path)), perception=look_of(info)
+        )
 
     def put(self, *items: Received) -> None:
         """What Zenoh's callback does, and then all of it is handled and seen."""
@@ -119,7 +121,9 @@ class Rig:
         for item in items:
             self.inbox.put(item)
         self._wait_for(lambda: self.inbox.handled)
-        self._wait_for(lambda: self.receiver.backlog.idle)  # the receiving thread hands boxes on to the eyes
+        self._wait_for(
+            lambda: self.receiver.backlog.idle
+        )  # the receiving thread hands boxes on to perception
         for session in self.opened:
             self._wait_for(lambda one=session: one.idle)
 
@@ -164,7 +168,7 @@ def flight() -> Flight:
 
 
 def backlog(flight: Flight, kind: str, number: int, data: bytes, **cut) -> list[Received]:
-    """An object of the flight in pieces."""
+    """An object of the flight in chunks."""
     return chunks(flight.session_id, kind, number, data, **cut)
 
 
@@ -242,7 +246,7 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 
 @pytest.mark.parametrize("compact_bytes", [6_000, 1 << 30])
 def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, monkeypatch, compact_bytes):
-    """Rows that come late would be lost or doubled where the journal is written again, or when the file is closed."""
+    """Rows that come late would be lost or doubled where the append log is compacted, or when the file is closed."""
     monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.COMPACT_BYTES", compact_bytes)
     monkeypatch.setattr("hvt_ground.sinks.rerun.rrd_file._MOST_GROWTH", 10)
     with Rig(tmp_path, flight) as rig:
@@ -362,9 +366,9 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(20))
         rig.put(*chunks(sid, "still", 3, still, chunk_bytes=200))
-        asked = rig.acknowledged_ranges()
-        assert AcknowledgedRange(session_id=sid, kind="info", number=0, acknowledged_bytes=0) in asked
-        assert not any(one.kind == "still" and one.acknowledged_bytes == len(still) for one in asked)
+        requested = rig.acknowledged_ranges()
+        assert AcknowledgedRange(session_id=sid, kind="info", number=0, acknowledged_bytes=0) in requested
+        assert not any(one.kind == "still" and one.acknowledged_bytes == len(still) for one in requested)
         assert list(tmp_path.glob("backlog-*")) == []
         rig.put(*chunks(sid, "info", 0, info_object(former)))
         rig.put(*chunks(sid, "still", 3, still, chunk_bytes=200))
@@ -442,7 +446,7 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
     def open_one(info: Info) -> Slow:
         path = tmp_path / f"{len(made)}.rrd"
         recorder = Recorder(settings(info, path))
-        made.append(Slow(info, path=path, recorder=recorder, look=look_of(info), may_end=may_end))
+        made.append(Slow(info, path=path, recorder=recorder, perception=look_of(info), may_end=may_end))
         return made[-1]
 
     recordings = BacklogRecordings(open_one, most=2)
@@ -454,7 +458,7 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
         return True
 
     with recordings.using(formers[0].info()) as first:
-        waiting = recordings.kept(first, boxes())
+        waiting = recordings.stored(first, boxes())
     for former in formers[1:]:
         with recordings.using(former.info()) as other:
             assert other is made[-1]
@@ -483,7 +487,7 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
 
 
 def test_damaged_and_foreign_pieces_are_counted_and_skipped(flight, tmp_path):
-    """One bad piece would end the ground."""
+    """One bad chunk would end the ground."""
     with Rig(tmp_path, flight) as rig:
         rig.put(*backlog(flight, "still", 0, still_object(flight, 1, 0)))  # no session is open yet
         assert rig.receiver.unusable == 1
@@ -580,8 +584,8 @@ def test_what_a_session_left_unread_comes_again_and_is_shown(flight, tmp_path):
         wait_for(lambda: rig.receiver.backlog._working == 2)
         rig.inbox.put(flight.status(base=25, state="ended"))
         wait_for(lambda: rig.receiver.done and rig.receiver.backlog.idle, timeout_s=15)
-        told = [one for report in rig.port.reports for one in report.backlog]
-        assert full(flight, "still", 4, still) not in told
+        reported = [one for report in rig.port.reports for one in report.backlog]
+        assert full(flight, "still", 4, still) not in reported
         may_read.set()
         second = Flight(10)
         rig.port.flight = rig.flight = second

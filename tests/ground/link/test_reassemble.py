@@ -244,7 +244,7 @@ def beside(ground, count, *, interval_ns=FRAME_NS, first=4):
 
 
 def test_a_second_edge_of_one_id_is_noticed_and_waits_until_the_first_is_silent(running):
-    """In each pause of the first the operator would look through another drone's eyes, and never be told."""
+    """In each pause of the first the operator would look through another drone's perception, and never be told."""
     end = beside(running, 40)
     assert [unit.duplicate for unit in running.out if unit.header.session_id == 2][-20:] == [True] * 20
     assert not any(unit.duplicate for unit in running.out if unit.header.session_id == 1)

@@ -120,7 +120,7 @@ def test_a_still_that_comes_with_what_was_kept_is_missed_no_more():
 
 
 def test_pieces_of_the_past_are_reported_on_as_often_as_anything():
-    """An edge that hears nothing of its pieces sends them again."""
+    """An edge that hears nothing of its chunks sends them again."""
     reception_statistics = ReceptionStatistics()
     reception_statistics.take(0)
     for number in range(100):
@@ -149,7 +149,7 @@ def test_what_is_missing_is_bounded():
     assert len(missing(reception_statistics)) == MAX_MISSING_STILLS
 
 
-class Moment(int):
+class Progress(int):
     """A time that somebody reckons with just when a still comes in another thread."""
 
     reception_statistics: ReceptionStatistics
@@ -173,7 +173,7 @@ def test_a_still_may_come_while_a_report_is_made():
     reception_statistics = ReceptionStatistics()
     reception_statistics.base(header(0), size_bytes=500, arrived_ns=0)
     reception_statistics.still(4, size_bytes=900, arrived_ns=0)
-    now = Moment(S)
+    now = Progress(S)
     now.reception_statistics, now.threads = reception_statistics, []
     assert reception_statistics.take(now).missing_stills == (0, 1, 2, 3)
     assert now.threads

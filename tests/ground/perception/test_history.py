@@ -105,7 +105,7 @@ def test_what_is_learned_later_is_put_where_it_belongs():
 
 
 def test_between_two_frames_tracks_lie_on_a_line():
-    """Where the base leaves ticks out, stills of them would refine nothing; or something far away."""
+    """Where the base leaves frames out, stills of them would refine nothing; or something far away."""
     history = History()
     history.add_tracks(listed(0, {1: 0.0, 2: 90.0}))
     history.add_tracks(listed(4, {1: 8.0, 3: 50.0}))
@@ -120,7 +120,7 @@ def test_between_two_frames_tracks_lie_on_a_line():
 
 
 def test_a_tick_without_a_picture_has_the_one_before_it():
-    """Re-detection would have no surroundings for a still of such a tick."""
+    """Re-detection would have no surroundings for a still of such a frame."""
     history = History()
     history.add_frame(4, picture(4))
     history.add_frame(9, picture(9))

@@ -197,11 +197,11 @@ def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
         assert session.frames_decoded == 3 + 10
         assert session.frames_received == 28
         assert session.last_frame_index == 29
-        asked = rig.port.keyframe_requests
+        requested = rig.port.keyframe_requests
         time.sleep(0.4)
-        assert rig.port.keyframe_requests == asked, "what is shown again is not asked for"
+        assert rig.port.keyframe_requests == requested, "what is shown again is not asked for"
     content = summary(rig.receiver.done[0], unusable=rig.receiver.unusable)
-    assert (content["gaps"], content["lost"], content["keyframe_requests"]) == (1, 2, asked)
+    assert (content["gaps"], content["lost"], content["keyframe_requests"]) == (1, 2, requested)
     assert (content["frames"], content["frames_decoded"]) == (28, 13)
 
 
@@ -353,11 +353,11 @@ def test_a_session_ends_when_all_of_it_has_arrived(flight, monkeypatch):
         wait_for(lambda: rig.receiver.done)
         (session,) = rig.receiver.done
         assert (session.frames_received, session.stills_received) == (6, 1)
-        asked = rig.port.asked
+        requested = rig.port.requested
         rig.put(flight.base(20), flight.still(3, 1))  # a keyframe after the end does not begin it again
         rig.settle()
         assert rig.receiver.idle
-        assert rig.port.asked == asked
+        assert rig.port.requested == requested
 
 
 def test_a_session_whose_rest_is_lost_ends_after_two_seconds(flight):
@@ -390,7 +390,7 @@ def test_a_lost_answer_does_not_lose_the_flight(flight):
     """Where the link loses the one answer to ``info``, nothing of the whole flight would be shown."""
     with Rig() as rig:
         rig.put(*bases(flight, 0, 1, 2))  # nobody answers yet
-        wait_for(lambda: rig.port.asked >= 3)
+        wait_for(lambda: rig.port.requested >= 3)
         rig.settle()
         assert rig.receiver.session is None
         rig.port.flight = flight

@@ -6,7 +6,7 @@ from flight import Flight, pipeline_of
 from hvt_common.protocol.messages import Info
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.config import GroundConfig, check
-from hvt_ground.perception.pipeline import Picture, Pipeline
+from hvt_ground.perception.pipeline import DecodedFrame, Pipeline
 from hvt_ground.wiring import Models, make_pipeline
 
 
@@ -15,7 +15,7 @@ def test_pictures_are_let_go_of():
     flight, decoder, pipeline = Flight(6), BaseDecoder(), pipeline_of(lambda _event: None)
     for unit in flight.units:
         image = decoder.decode(unit.data)
-        pipeline.see(Picture(unit.frame_index, unit.capture_ns, unit.capture_ns, image), hurry=False)
+        pipeline.analyze(DecodedFrame(unit.frame_index, unit.capture_ns, unit.capture_ns, image), hurry=False)
     assert pipeline._history.size_bytes > 0
     pipeline.end()
     assert pipeline._history.size_bytes == 0
@@ -34,7 +34,7 @@ def test_the_next_session_gets_the_same_models():
 
 
 def eyes_of(config: GroundConfig) -> tuple[Models, Pipeline, Info]:
-    """The eyes of a session of an edge."""
+    """The pipeline of a session of an edge."""
     models, info = Models(config), Flight(1).info()
     return models, make_pipeline(config, models, info=info, emit=lambda _event: None), info
 

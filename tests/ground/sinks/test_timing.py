@@ -70,7 +70,7 @@ def test_a_still_has_its_line_when_it_was_read_or_never_will_be(tmp_path):
     one.read([1])
     assert [(row["sequence"], row["shown_ns"]) for row in lines(tmp_path / "t.csv")] == [("1", "3000")]
     one.close()
-    one.read([2])  # eyes that did not come back in time
+    one.read([2])  # perception that did not come back in time
     assert [(row["sequence"], row["shown_ns"]) for row in lines(tmp_path / "t.csv")][1:] == [
         ("0", "0"),
         ("2", "0"),

@@ -3,7 +3,7 @@
 Evidence is the IoU of the still's box with the track's box at that frame, and what earlier stills have shown:
 a track that this edge track was matched to before gains 0.10, one that belongs to another edge track loses
 0.25. Evidence of at least the threshold is needed. So two objects that stand close do not exchange their
-stills when the ground misses one of them for a moment, and yet a clear overlap corrects an old belief.
+stills when the ground misses one of them for a moment, and yet a clear overlap corrects an old posterior.
 
 Several stills of one frame are assigned together, one to one, for the greatest sum. If a free track fits
 nearly as well as the chosen one and is not merely a second box on the same object, the still is ambiguous and
@@ -25,7 +25,7 @@ from scipy.optimize import linear_sum_assignment
 
 from hvt_common.values import Boxes, Tracks
 
-__all__ = ["Candidate", "Matcher", "Wanted", "iou_matrix"]
+__all__ = ["Matcher", "StillToMatch", "TrackMatch", "iou_matrix"]
 
 KNOWN_BONUS = 0.10
 OTHERS_PENALTY = 0.25
@@ -39,7 +39,7 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class StillToMatch:
     """A still for which a track is wanted."""
 
     key: Hashable
@@ -50,7 +50,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class TrackMatch:
     """What was found for a still: row ``row`` of ``tracks``, or nothing (``tracks`` is None)."""
 
     tracks: Tracks | None = None
@@ -78,8 +78,13 @@ class Matcher:
         self._claims: OrderedDict[int, dict[int, int]] = OrderedDict()  # frame → ground track → edge track
 
     def match(
-        self, wanted: Sequence[Wanted], tracks: Tracks, *, later: Iterable[Tracks], class_names: Sequence[str]
-    ) -> dict[Hashable, Candidate]:
+        self,
+        wanted: Sequence[StillToMatch],
+        tracks: Tracks,
+        *,
+        later: Iterable[Tracks],
+        class_names: Sequence[str],
+    ) -> dict[Hashable, TrackMatch]:
         """A `Candidate` for each key of ``wanted``, all of which are stills of the frame of ``tracks``.
 
         ``later`` are the tracks of the following frames, in order, as far as a late confirmation counts.
@@ -104,26 +109,26 @@ class Matcher:
         known = self._ground_of.get(edge_track_id)
         return None if known is None else known[0]
 
-    def merge(self, kept_id: int, gone_id: int) -> None:
+    def merge(self, survivor_id: int, merged_id: int) -> None:
         """Two ground tracks have turned out to be one, which goes on under the first id."""
         for edge_id, (ground_id, frame_index) in self._ground_of.items():
-            if ground_id == gone_id:
-                self._ground_of[edge_id] = (kept_id, frame_index)
-        owner = self._edge_of.pop(gone_id, None)
+            if ground_id == merged_id:
+                self._ground_of[edge_id] = (survivor_id, frame_index)
+        owner = self._edge_of.pop(merged_id, None)
         if owner is not None:
-            self._edge_of.setdefault(kept_id, owner)
+            self._edge_of.setdefault(survivor_id, owner)
 
     def _assign(
         self,
-        groups: Sequence[Sequence[Wanted]],
+        groups: Sequence[Sequence[StillToMatch]],
         tracks: Tracks,
         rows: npt.NDArray[np.intp],
         frame_index: int,
         class_names: Sequence[str],
-    ) -> dict[Hashable, Candidate]:
+    ) -> dict[Hashable, TrackMatch]:
         """One to one among the tracks in ``rows``, by the key of each group's first; finds are remembered."""
         heads = [group[0] for group in groups]
-        found = {head.key: Candidate() for head in heads}
+        found = {head.key: TrackMatch() for head in heads}
         if not heads or not len(rows):
             return found
         boxes = tracks.boxes_xyxy_px[rows]
@@ -133,15 +138,15 @@ class Matcher:
         for r, c in chosen.items():
             taken = [column for row, column in chosen.items() if row != r]
             if _ambiguous(preference[r], c, taken, boxes):
-                found[heads[r].key] = Candidate(ambiguous=True)
+                found[heads[r].key] = TrackMatch(ambiguous=True)
                 continue
-            found[heads[r].key] = Candidate(tracks, int(rows[c]))
+            found[heads[r].key] = TrackMatch(tracks, int(rows[c]))
             self._remember(heads[r].edge_track_id, int(tracks.ids[rows[c]]), frame_index)
         return found
 
     def _preference(
         self,
-        heads: Sequence[Wanted],
+        heads: Sequence[StillToMatch],
         tracks: Tracks,
         rows: npt.NDArray[np.intp],
         frame_index: int,
@@ -197,8 +202,8 @@ def iou_matrix(boxes_a_px: Boxes, boxes_b_px: Boxes) -> Floats:
     return iou
 
 
-def _by_edge_track(wanted: Sequence[Wanted]) -> list[list[Wanted]]:
-    groups: dict[tuple[str, Hashable], list[Wanted]] = {}
+def _by_edge_track(wanted: Sequence[StillToMatch]) -> list[list[StillToMatch]]:
+    groups: dict[tuple[str, Hashable], list[StillToMatch]] = {}
     for want in wanted:
         of_track = want.edge_track_id >= 0
         groups.setdefault(("track", want.edge_track_id) if of_track else ("still", want.key), []).append(want)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from hvt_common.values import Posterior
 
-__all__ = ["Outcome", "ResolvedStill", "Shown", "StillSeen"]
+__all__ = ["Outcome", "ResolvedStill", "ShownClasses", "StillSeen"]
 
 Outcome = Literal["matched", "superseded", "no track", "ambiguous", "frame lost", "late", "overflow", "ended"]
 """What became of a still:
@@ -86,7 +86,7 @@ class ResolvedStill(Generic[P]):
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class ShownClasses:
     """Classes of N tracks, parallel to the `Tracks` they were asked for; fields of `events.Overlay`."""
 
     base_classes: tuple[str, ...]

@@ -15,37 +15,37 @@ from hvt_common.video.still_codecs import BaseMissingError, StillError, psnr_y_d
 from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.fusion.fuse import Fusion
 from hvt_ground.perception.history import FilledLog, History
-from hvt_ground.perception.stills.classify import Box, Decoded, Reading, StillReader
+from hvt_ground.perception.stills.classify import Box, DecodedStill, ObjectReading, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
 from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillSeen
 
-__all__ = ["Carried", "Moment", "StillStage"]
+__all__ = ["Progress", "StillContext", "StillStage"]
 
 SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
-_MOST_SPOILT, _SPOILT_TICKS = 32, 150
-"""After so many undecodable stills in so many ticks the next are dropped unseen until the time is over."""
+_MOST_SPOILT, _SPOILT_FRAMES = 32, 150
+"""After so many undecodable stills in so many frames the next are dropped unseen until the time is over."""
 MAX_PENDING = 64
 """Stills that wait for their base frame; beyond, the oldest is read without it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class Progress:
     """How far the ground is."""
 
     frame_index: int = 0
-    """The newest tick of which anything is known; what happens now is shown there."""
+    """The newest frame of which anything is known; what happens now is shown there."""
     capture_ns: int = 0
     picture_index: int = -1
     """The newest decoded frame; -1 before the first."""
 
 
 @dataclass(frozen=True, slots=True)
-class Carried:
+class StillContext:
     """What a still brings along while it waits for its track, for one of the objects that it shows."""
 
     received: ReceivedStill
-    decoded: Decoded
+    decoded: DecodedStill
     track_id: int
     """The edge's."""
     box_base_px: Box
@@ -64,62 +64,62 @@ class StillStage:
         fusion: learns where stills show objects.
         view: between source and base pixels.
         wants_base: whether ``reader`` looks at the base frame; then all stills wait for theirs, not only residuals.
-        gap_ticks: how many ticks the base stream may leave out and still say where tracks were between.
+        gap_ticks: how many frames the base stream may leave out and still say where tracks were between.
         emit: takes the events.
     """
 
     def __init__(
         self,
         reader: StillReader,
-        refiner: Refiner[Carried],
+        refiner: Refiner[StillContext],
         *,
         history: History,
         fusion: Fusion,
         view: View,
         wants_base: bool,
-        gap_ticks: int,
+        gap_frames: int,
         emit: Callable[[Event], None],
     ) -> None:
         self._reader = reader
         self._refiner = refiner
         self._history = history
-        self._log = FilledLog(history, within=gap_ticks)
-        self._gap_ticks = gap_ticks
+        self._log = FilledLog(history, within=gap_frames)
+        self._gap_frames = gap_frames
         self._fusion = fusion
         self._view = view
         self._wants_base = wants_base
         self._emit = emit
-        self._waiting: list[ReceivedStill] = []
+        self._pending: list[ReceivedStill] = []
         self._results: list[StillResult] = []
         self._spoilt: deque[int] = deque(maxlen=_MOST_SPOILT)
-        """When the last ones came that could not be decoded, in ticks."""
+        """When the last ones came that could not be decoded, in frames."""
         self.dropped: Counter[str] = Counter()
         """Stills of which nothing could be made, by reason."""
         self.outcomes: Counter[str] = Counter()
         """What became of each object in the others."""
 
-    def take(self, stills: Sequence[ReceivedStill], now: Moment) -> None:
+    def take(self, stills: Sequence[ReceivedStill], now: Progress) -> None:
         """Take stills in the order in which they came; those whose base frame may still come wait for it."""
-        self._waiting += stills
-        self.look_again(now)
+        self._pending += stills
+        self.update(now)
 
-    def look_again(self, now: Moment) -> None:
+    def update(self, now: Progress) -> None:
         """Read what need not wait any longer, and settle what can be: call it after each picture and each step."""
-        ready = [still for still in self._waiting if not self._may_wait(still.header, now)]
+        ready = [still for still in self._pending if not self._may_wait(still.header, now)]
         if ready:
-            self._waiting = [still for still in self._waiting if self._may_wait(still.header, now)]
-        surplus = len(self._waiting) - MAX_PENDING
+            self._pending = [still for still in self._pending if self._may_wait(still.header, now)]
+        surplus = len(self._pending) - MAX_PENDING
         if surplus > 0:
-            ready, self._waiting = ready + self._waiting[:surplus], self._waiting[surplus:]
+            ready, self._pending = ready + self._pending[:surplus], self._pending[surplus:]
         self._read(ready, now)
         for resolved in self._refiner.settle(
             self._log, now_frame=now.frame_index, known_as=self._fusion.known_as
         ):
             self._resolved(resolved, now)
 
-    def end(self, now: Moment) -> None:
+    def end(self, now: Progress) -> None:
         """The session is over: what still waits is given out as it is."""
-        ready, self._waiting = self._waiting, []
+        ready, self._pending = self._pending, []
         self._read(ready, now)
         for resolved in self._refiner.end():
             self._resolved(resolved, now)
@@ -131,14 +131,14 @@ class StillStage:
 
     # From bytes to readings
 
-    def _may_wait(self, header: RoiHeader, now: Moment) -> bool:
-        """Whether its picture may yet come. A residual is nothing without it; others wait for the next tick only."""
+    def _may_wait(self, header: RoiHeader, now: Progress) -> bool:
+        """Whether its picture may yet come. A residual is nothing without it; others wait for the next frame only."""
         if header.frame_index <= now.picture_index:
             return False
         return needs_base(header) or (self._wants_base and header.frame_index >= now.frame_index)
 
-    def _read(self, stills: Sequence[ReceivedStill], now: Moment) -> None:
-        by_frame: dict[int, list[tuple[ReceivedStill, Decoded]]] = {}
+    def _read(self, stills: Sequence[ReceivedStill], now: Progress) -> None:
+        by_frame: dict[int, list[tuple[ReceivedStill, DecodedStill]]] = {}
         for still in stills:
             decoded = self._decode(still, now)
             if decoded is not None:
@@ -146,7 +146,7 @@ class StillStage:
         for frame_index, pairs in by_frame.items():
             # Of an outage there may be no picture, and the last one before it is not the same place any more.
             stored = any(still.header.flags & Flags.STORED for still, _ in pairs)
-            base_bgr = self._history.frame_before(frame_index, within=0 if stored else self._gap_ticks)
+            base_bgr = self._history.frame_before(frame_index, within=0 if stored else self._gap_frames)
             readings = self._reader.read([decoded for _, decoded in pairs], base_bgr)
             for (still, decoded), objects in zip(pairs, readings.objects, strict=True):
                 self._offer(still, decoded, objects, base_bgr, now)
@@ -155,15 +155,15 @@ class StillStage:
                 if known is not None:
                     self._fusion.take_found(readings.found, known=known)
 
-    def _out_of_patience(self, now: Moment) -> bool:
+    def _out_of_patience(self, now: Progress) -> bool:
         """Whether so many stills could not be decoded lately that somebody sends them on purpose.
 
         Each costs a line in the recording and, from libjpeg, one on stderr.
         """
         spoilt = self._spoilt
-        return len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_TICKS
+        return len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_FRAMES
 
-    def _decode(self, still: ReceivedStill, now: Moment) -> Decoded | None:
+    def _decode(self, still: ReceivedStill, now: Progress) -> DecodedStill | None:
         header = still.header
         if self._out_of_patience(now):
             self.dropped["undecodable"] += 1
@@ -185,24 +185,24 @@ class StillStage:
                 self._answer(header, track_id, None)
             return None
         boxes = [self._to_base(box) for _, box in _shown(header)]
-        return Decoded(image, header.crop_source_px, boxes[0], header.frame_index, tuple(boxes[1:]))
+        return DecodedStill(image, header.crop_source_px, boxes[0], header.frame_index, tuple(boxes[1:]))
 
     # From readings to tracks
 
     def _offer(
         self,
         still: ReceivedStill,
-        decoded: Decoded,
-        objects: Sequence[Reading],
+        decoded: DecodedStill,
+        objects: Sequence[ObjectReading],
         base_bgr: Image | None,
-        now: Moment,
+        now: Progress,
     ) -> None:
         header = still.header
-        crop = None if base_bgr is None else _cut(base_bgr, header.crop_source_px, view=self._view)
+        crop = None if base_bgr is None else _base_crop_at(base_bgr, header.crop_source_px, view=self._view)
         news = self._news(decoded)
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
-            wire_field = Carried(still, decoded, track_id, box, reading.box_base_px, crop)
+            wire_field = StillContext(still, decoded, track_id, box, reading.box_base_px, crop)
             self._answer(header, track_id, reading.posterior)
             if reading.posterior is None:
                 self.outcomes["unread"] += 1
@@ -225,7 +225,7 @@ class StillStage:
             for resolved in self._refiner.offer(seen, now_frame=now.frame_index):
                 self._resolved(resolved, now)
 
-    def _news(self, decoded: Decoded) -> float:
+    def _news(self, decoded: DecodedStill) -> float:
         """How much a still shows that the base did not, 0…1.
 
         A detector that names the same pixels twice has not seen them twice. On a base near the source the many
@@ -241,7 +241,7 @@ class StillStage:
         nearness_db = psnr_y_db(seen, decoded.image_bgr)
         return float(np.clip((SAME_DB - nearness_db) / (SAME_DB - OTHER_DB), 0.0, 1.0))
 
-    def _resolved(self, resolved: ResolvedStill[Carried], now: Moment) -> None:
+    def _resolved(self, resolved: ResolvedStill[StillContext], now: Progress) -> None:
         self.outcomes[resolved.outcome] += 1
         wire_field, track_id = resolved.still.wire_field, resolved.track_id
         if track_id is not None:
@@ -254,8 +254,8 @@ class StillStage:
 
     def _refinement(
         self,
-        wire_field: Carried,
-        now: Moment,
+        wire_field: StillContext,
+        now: Progress,
         track_id: int | None,
         before: str,
         after: str,
@@ -306,7 +306,7 @@ class StillStage:
             )
         )
 
-    def _name_track(self, still: StillSeen[Carried], ground_track_id: int) -> None:
+    def _name_track(self, still: StillSeen[StillContext], ground_track_id: int) -> None:
         """Add the track that a still refined to its answer, if that has not been reported yet."""
         for place, result in enumerate(self._results):
             if (result.still_sequence, result.track_id) == (still.sequence, still.edge_track_id):
@@ -316,7 +316,7 @@ class StillStage:
         x1, y1, x2, y2 = self._view.to_base(np.array([box_source_px], np.float32))[0].tolist()
         return x1, y1, x2, y2
 
-    def _notice(self, now: Moment, text: str) -> None:
+    def _notice(self, now: Progress, text: str) -> None:
         self._emit(Notice(now.frame_index, now.capture_ns, "warning", text))
 
 
@@ -328,7 +328,7 @@ def _shown(header: RoiHeader) -> list[tuple[int, Box]]:
     ]
 
 
-def _cut(base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View) -> Image | None:
+def _base_crop_at(base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View) -> Image | None:
     """The same padded box of the base frame, whole pixels, clipped; None where nothing of it is inside."""
     x1, y1, x2, y2 = view.to_base(np.array([crop_source_px], np.float32))[0]
     height, width = base_bgr.shape[:2]

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from hvt_ground.events import Overlay
 from hvt_ground.sinks.rerun.overlay_encoding import LayerUpdate, OverlayEncoder
 
-__all__ = ["BacklogOverlays", "Timed"]
+__all__ = ["BacklogOverlays", "TimedUpdate"]
 
-Timed = tuple[int, int, LayerUpdate]
+TimedUpdate = tuple[int, int, LayerUpdate]
 """Frame index, capture time, and what to write there."""
 
 _MOST_HOLES = 256
@@ -37,8 +37,8 @@ class BacklogOverlays:
     """Of one recording. Not safe for threads.
 
     Args:
-        fps: ticks a second.
-        least_s: shorter holes are none: the base stream leaves out ticks, and boxes go on.
+        fps: frames a second.
+        least_s: shorter holes are none: the base stream leaves out frames, and boxes go on.
     """
 
     def __init__(self, *, fps: float, least_s: float = 1.0) -> None:
@@ -66,13 +66,13 @@ class BacklogOverlays:
         """Credit what came of kept video, as `OverlayEncoder.earn`."""
         self._credit_bytes += received_bytes
 
-    def encode(self, overlay: Overlay, *, with_origins: bool) -> list[Timed]:
+    def encode(self, overlay: Overlay, *, with_origins: bool) -> list[TimedUpdate]:
         """What to write for an overlay of kept video; nothing where it lies in no hole."""
         frame = overlay.frame_index
         hole = next((one for one in self._holes if one.before < frame and _ends_after(one, frame)), None)
         if hole is None:
             return []
-        timed: list[Timed] = []
+        timed: list[TimedUpdate] = []
         if hole.after is not None and not hole.said:
             hole.said = True
             timed += [(hole.after, hole.capture_ns, update) for update in hole.screen]

@@ -10,7 +10,7 @@ from bisect import bisect_right, insort
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-__all__ = ["BacklogGallery", "Put", "Shown"]
+__all__ = ["BacklogGallery", "CaptionRow", "Put"]
 
 T = TypeVar("T")
 
@@ -19,7 +19,7 @@ _MOST_ROWS = 4096
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Shown(Generic[T]):
+class CaptionRow(Generic[T]):
     """The captions from one moment on."""
 
     frame_index: int
@@ -32,7 +32,7 @@ class Put(Generic[T]):
     """What to write for a still."""
 
     slot: int
-    rows: tuple[Shown[T], ...]
+    rows: tuple[CaptionRow[T], ...]
     """Captions: its own, and later ones once more."""
     stays: bool
     """Nothing came into the slot later: it is what is shown there now."""
@@ -49,11 +49,11 @@ class BacklogGallery(Generic[T]):
     def __init__(self, empty: tuple[T, ...], *, hold_ns: int) -> None:
         self._empty = empty
         self._hold_ns = hold_ns
-        self._rows: list[Shown[T]] = []
+        self._rows: list[CaptionRow[T]] = []
         self._slots: list[list[tuple[int, int]]] = [[] for _ in empty]
         """(frame index, capture time) of what was put into each, in their order."""
 
-    def note(self, slot: int, row: Shown[T]) -> None:
+    def note(self, slot: int, row: CaptionRow[T]) -> None:
         """A still was put into a slot; all captions as they are now."""
         insort(self._rows, row)
         insort(self._slots[slot], (row.frame_index, row.capture_ns))
@@ -70,14 +70,14 @@ class BacklogGallery(Generic[T]):
         if slot is None:
             return None
         until = self._after(slot, frame_index)
-        at = bisect_right(self._rows, Shown(frame_index, 0, ()))
+        at = bisect_right(self._rows, CaptionRow(frame_index, 0, ()))
         before = self._rows[at - 1].captions if at else self._empty
-        rows = [Shown(frame_index, capture_ns, _with(before, slot, caption))]
+        rows = [CaptionRow(frame_index, capture_ns, _with(before, slot, caption))]
         for place in range(at, len(self._rows)):
             later = self._rows[place]
             if until is not None and later.frame_index >= until:
                 break
-            self._rows[place] = Shown(
+            self._rows[place] = CaptionRow(
                 later.frame_index, later.capture_ns, _with(later.captions, slot, caption)
             )
             rows.append(self._rows[place])

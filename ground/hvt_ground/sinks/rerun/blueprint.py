@@ -17,9 +17,9 @@ __all__ = [
     "OVERFLOW",
     "PATCHES",
     "REFINED",
+    "REPORTED",
     "SESSION",
     "STILLS",
-    "TOLD",
     "TRACKS",
     "TRACK_COUNT",
     "VIDEO",
@@ -30,7 +30,7 @@ __all__ = [
 VIDEO = "/base/video"
 TRACKS = "/base/tracks"
 REFINED = "/base/refined"
-TOLD = "/base/told"
+REPORTED = "/base/reported"
 PATCHES = "/base/patches"
 STILLS = "/stills"
 CAPTIONS = "/stills/captions"
@@ -85,7 +85,7 @@ def _videos(base_size: tuple[int, int], front: Front) -> rrb.Tabs:
     return rrb.Tabs(
         _video(base_size, "Base stream and tracks", without=(f"{PATCHES}/**",)),
         # Boxes say which objects a still has spoken on; thin and without words, for the picture is the matter.
-        _video(base_size, "Enhanced: stills in their places", without=(TRACKS, TOLD), bare=REFINED),
+        _video(base_size, "Enhanced: stills in their places", without=(TRACKS, REPORTED), bare=REFINED),
         active_tab=0 if front == "tracks" else 1,
     )
 

@@ -113,7 +113,7 @@ class LiveSink:
     def __init__(self, url: str, *, application_id: str, recording_id: str, name: str) -> None:
         self._url = url
         self._port = int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
-        self._next_look = 0.0
+        self._next_check_s = 0.0
         self._application_id = application_id
         self._recording: rr.RecordingStream | None = rr.RecordingStream(
             application_id, recording_id=recording_id, send_properties=False
@@ -149,9 +149,9 @@ class LiveSink:
     def _viewer_there(self) -> bool:
         """Look once a second: the SDK would keep what it cannot send, and slow every call."""
         now = time.monotonic()
-        if now < self._next_look:
+        if now < self._next_check_s:
             return True
-        self._next_look = now + 1.0
+        self._next_check_s = now + 1.0
         if listening(self._port):
             return True
         log.warning("live view at %s is gone; the recording goes on", self._url)

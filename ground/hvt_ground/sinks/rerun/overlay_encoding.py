@@ -2,8 +2,8 @@
 
 A recording answers "what was here at frame N" with the latest value of every component, so a value that did not
 change need not be written again. Tracks are in three layers: those that the base stream shows and whose class rests
-on it alone, those that the ground was only told of, and those that a still has spoken on. Each layer has *geometry*
-(centres and half sizes), *identity* (ids and classes), *labels* and *confidences*; each is written when it changed.
+on it alone, those known from reports only, and those that a still has spoken on. Each layer has *geometry* (centres
+and half sizes), *identity* (ids and classes), *labels* and *confidences*; each is written when it changed.
 
 Geometry is held against jitter: a box keeps the place that is on screen until it has moved more than
 `CENTRE_STEP_PX` or grown more than `HALF_SIZE_STEP_PX`, and is then put on the nearest half pixel. Equal numbers in
@@ -25,7 +25,7 @@ __all__ = [
     "HALF_SIZE_STEP_PX",
     "LAYERS",
     "ORIGINS",
-    "TOLD_MARK",
+    "REPORTED_MARK",
     "Geometry",
     "Identity",
     "Layer",
@@ -38,14 +38,14 @@ CENTRE_STEP_PX = 0.75
 HALF_SIZE_STEP_PX = 1.0
 CONFIDENCE_STEP_PCT = 5
 
-Layer = Literal["tracks", "told", "refined"]
-LAYERS: tuple[Layer, ...] = ("tracks", "told", "refined")
+Layer = Literal["tracks", "reported", "refined"]
+LAYERS: tuple[Layer, ...] = ("tracks", "reported", "refined")
 
 ORIGINS: tuple[Origin, ...] = ("base", "edge", "edge+base", "still")
 """Origins by the number that stands for them in a recording."""
 
-TOLD_MARK = "○"
-_TOLD: tuple[Origin, ...] = ("edge", "still")
+REPORTED_MARK = "○"
+_REPORTED: tuple[Origin, ...] = ("edge", "still")
 
 _BOX_BYTES = 16  # two centres and two half sizes, float32
 _ROW_BYTES = 40  # row id, two times, offsets
@@ -130,7 +130,7 @@ class OverlayEncoder:
         self._limit = float(credit_bytes)
         self._credit = float(credit_bytes)
         self._newest_frame = -1
-        self._told_of = with_origins
+        self._with_origins = with_origins
         self._shown = _Shown(
             np.empty(0, np.int64),
             np.empty((0, 2), np.float32),
@@ -144,9 +144,9 @@ class OverlayEncoder:
             self._written = {layer: _unknown(layer, with_origins=with_origins) for layer in LAYERS}
 
     @property
-    def told_of(self) -> bool:
+    def with_origins(self) -> bool:
         """Whether origins are written: a track was not of the base stream."""
-        return self._told_of
+        return self._with_origins
 
     @property
     def screen(self) -> tuple[LayerUpdate, ...]:
@@ -165,9 +165,9 @@ class OverlayEncoder:
         if overlay.frame_index < self._newest_frame:
             return []
         self._newest_frame = overlay.frame_index
-        self._told_of = self._told_of or any(origin != "base" for origin in overlay.origins)
+        self._with_origins = self._with_origins or any(origin != "base" for origin in overlay.origins)
         shown = _held(self._shown, overlay)
-        wanted = [_layer(layer, overlay, shown, with_origins=self._told_of) for layer in LAYERS]
+        wanted = [_layer(layer, overlay, shown, with_origins=self._with_origins) for layer in LAYERS]
         updates = [_difference(self._written[update.layer], update) for update in wanted]
         updates = [update for update in updates if not update.empty]
         if not self._affordable(updates):
@@ -234,10 +234,10 @@ def _layer(layer: Layer, overlay: Overlay, shown: _Shown, *, with_origins: bool)
     """Everything about one layer."""
     labelled = layer == "refined"
     origins = overlay.origins or ("base",) * len(overlay.track_ids)
-    told = np.array([origin in _TOLD for origin in origins], np.bool_)
+    reported = np.array([origin in _REPORTED for origin in origins], np.bool_)
     of_layer = {
-        "tracks": ~overlay.refined & ~told,
-        "told": ~overlay.refined & told,
+        "tracks": ~overlay.refined & ~reported,
+        "reported": ~overlay.refined & reported,
         "refined": overlay.refined,
     }
     chosen = np.flatnonzero(of_layer[layer])
@@ -252,7 +252,7 @@ def _layer(layer: Layer, overlay: Overlay, shown: _Shown, *, with_origins: bool)
         identity.classes_before,
         identity.classes_after,
         percent,
-        told[chosen].tolist(),
+        reported[chosen].tolist(),
         strict=True,
     )
     return LayerUpdate(
@@ -289,9 +289,9 @@ def _alike(old: Geometry | None, new: Geometry | None) -> bool:
     )
 
 
-def _label(track_id: int, before: str, after: str, confidence_pct: int, told: bool) -> str:  # noqa: FBT001
+def _label(track_id: int, before: str, after: str, confidence_pct: int, reported: bool) -> str:  # noqa: FBT001
     """``17 ✓`` where the still agreed with the base stream, ``17 car → van .93`` where it did not."""
-    mark = f" {TOLD_MARK}" if told else ""
+    mark = f" {REPORTED_MARK}" if reported else ""
     if before == after:
         return f"{track_id} ✓{mark}"
     return f"{track_id} {before} → {after} {confidence_text(confidence_pct)}{mark}"

@@ -27,22 +27,22 @@ from hvt_ground.sinks.rerun.overlay_encoding import LAYERS, Identity, Layer, Lay
 from hvt_ground.sinks.rerun.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun.rrd_file import RrdEncoder, RrdFile, add_footer
 from hvt_ground.sinks.rerun.static_data import class_chunk, static_chunks
-from hvt_ground.sinks.rerun.stills import At, EventRow, StillRows
+from hvt_ground.sinks.rerun.stills import RowTime, StillRows, TableRow
 from hvt_ground.sinks.rerun.tables import (
     TABLE_BYTES,
     CodedIdentity,
+    LogText,
     SizeLimit,
     Table,
-    Text,
     box_columns,
     confidence_columns,
     identity_columns,
     label_columns,
     line_columns,
     origin_columns,
+    reported_columns,
+    reported_identity_columns,
     text_columns,
-    told_columns,
-    told_identity_columns,
     video_columns,
 )
 
@@ -52,12 +52,16 @@ log = logging.getLogger(__name__)
 
 APPLICATION_ID = "hvt"
 COMPACT_BYTES = 3 << 19
-"""Payload of the journal at which it is folded; a fold costs some 50 kB, and this much is held in memory."""
+"""Payload of the append log at which it is compacted: a compaction costs some 50 kB, and this much is in memory."""
 
 DIMMED = 0.75
 """Brightness of the boxes that no still has spoken on, beside those one has."""
 
-_LAYER_PATHS: dict[Layer, str] = {"tracks": names.TRACKS, "told": names.TOLD, "refined": names.REFINED}
+_LAYER_PATHS: dict[Layer, str] = {
+    "tracks": names.TRACKS,
+    "reported": names.REPORTED,
+    "refined": names.REFINED,
+}
 _NOTICE_COLOURS: dict[str, Rgb] = {"info": GREY, "warning": AMBER, "error": VERMILLION}
 _NOTICE_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 
@@ -102,8 +106,8 @@ class Recorder:
         self._lock = threading.Lock()
         self._overlays = OverlayEncoder()
         self._backlog_overlays = BacklogOverlays(fps=settings.fps)
-        self._room = SizeLimit()
-        self._stills = StillRows(self._room)
+        self._size_limit = SizeLimit()
+        self._stills = StillRows(self._size_limit)
         self._class_ids: dict[str, int] = {}
         self._classes_written: dict[Layer, int] = dict.fromkeys(LAYERS, 0)
         self._contexts: dict[Layer, Chunk] = {}
@@ -151,7 +155,7 @@ class Recorder:
             self._write(chunks)
 
     def close(self, *, footer: bool = True) -> None:
-        """Fold what is left and close the file and the viewer's connection; a second call does nothing.
+        """Compact what is left and close the file and the viewer's connection; a second call does nothing.
 
         Without ``footer`` none is added, which may take seconds.
         """
@@ -217,19 +221,21 @@ class Recorder:
         if chunks and self._file is not None:
             self._file.compact(self._encoder.chunks(chunks))
 
-    def _row(self, path: str, columns: Any, event: Event | At, value: Any, *, size_bytes: int = 64) -> Chunk:
-        """Add a row to the table of this entity and these columns; ``size_bytes``: its cost once folded, about."""
+    def _row(
+        self, path: str, columns: Any, event: Event | RowTime, value: Any, *, size_bytes: int = 64
+    ) -> Chunk:
+        """Add a row to the table of this entity and these columns; ``size_bytes``: its cost once compacted, about."""
         key = (path, columns.__name__)
         table = self._tables.get(key)
         if table is None:
             table = self._tables[key] = Table(path, columns)
         if not table:
-            self._room.logged_bytes += TABLE_BYTES
+            self._size_limit.logged_bytes += TABLE_BYTES
         self._pending_bytes += size_bytes
-        self._room.logged_bytes += size_bytes
+        self._size_limit.logged_bytes += size_bytes
         return table.add(event.frame_index, event.capture_ns, value)
 
-    def _rows(self, rows: Sequence[EventRow], event: Event) -> list[Chunk]:
+    def _rows(self, rows: Sequence[TableRow], event: Event) -> list[Chunk]:
         return [
             self._row(row.path, row.columns, row.at or event, row.value, size_bytes=row.size_bytes)
             for row in rows
@@ -242,7 +248,7 @@ class Recorder:
             log.debug("frame %d left out of the recording: not decodable there", sample.frame_index)
             return []
         size = len(sample.data)
-        self._room.received_bytes += size
+        self._size_limit.received_bytes += size
         if sample.stored:
             self._backlog_overlays.earn(size)
         else:
@@ -268,7 +274,7 @@ class Recorder:
     def _backlog_overlay(self, overlay: Overlay) -> list[Chunk]:
         """Patches stay away: they ride on tracks of now."""
         chunks = []
-        timed = self._backlog_overlays.encode(overlay, with_origins=self._overlays.told_of)
+        timed = self._backlog_overlays.encode(overlay, with_origins=self._overlays.with_origins)
         for frame_index, capture_ns, update in timed:
             chunks += self._layer(replace(overlay, frame_index=frame_index, capture_ns=capture_ns), update)
         return chunks
@@ -277,7 +283,7 @@ class Recorder:
         path, chunks = _LAYER_PATHS[update.layer], []
         if update.geometry is not None:
             size = 6 * len(update.geometry.centres_px)
-            columns = told_columns if update.layer == "told" else box_columns
+            columns = reported_columns if update.layer == "reported" else box_columns
             chunks.append(self._row(path, columns, overlay, update.geometry, size_bytes=size))
         if update.identity is not None:
             chunks += self._identity(overlay, update.layer, update.identity)
@@ -304,7 +310,7 @@ class Recorder:
             )
             chunks.append(self._contexts[layer])
         size = 2 * len(identity.track_ids)
-        columns = told_identity_columns if layer == "told" else identity_columns
+        columns = reported_identity_columns if layer == "reported" else identity_columns
         chunks.append(self._row(_LAYER_PATHS[layer], columns, overlay, coded, size_bytes=size))
         return chunks
 
@@ -312,9 +318,9 @@ class Recorder:
         return self._class_ids.setdefault(name, len(self._class_ids))
 
     def _refinement(self, refinement: Refinement) -> list[Chunk]:
-        before = self._room.received_bytes
+        before = self._size_limit.received_bytes
         rows = self._stills.refinement(refinement)
-        self._overlays.earn(self._room.received_bytes - before)
+        self._overlays.earn(self._size_limit.received_bytes - before)
         return self._rows(rows, refinement)
 
     def _traffic(self, traffic: Traffic) -> list[Chunk]:
@@ -335,7 +341,7 @@ class Recorder:
         return chunks
 
     def _notice(self, notice: Notice) -> list[Chunk]:
-        text = Text(notice.text, _NOTICE_LEVELS[notice.level], _NOTICE_COLOURS[notice.level])
+        text = LogText(notice.text, _NOTICE_LEVELS[notice.level], _NOTICE_COLOURS[notice.level])
         return [self._row(names.EVENTS, text_columns, notice, text, size_bytes=len(notice.text))]
 
 

@@ -3,8 +3,8 @@
 Rerun stores chunks: a table of rows of one entity. A chunk costs about 1.3 kB before its first value and a quarter
 of a kB for each further column, as much as half an access unit at 300 kbps; so rows must be gathered. A recording
 that gathers in memory loses what it gathered when the process is killed. `RrdFile` does both: each row is
-appended at once as a chunk of its own (the *journal*, at the end of the file), and when the journal's rows have
-become `COMPACT_BYTES`, the same rows are written again as one chunk a table, over the journal (*folding*).
+appended at once as a chunk of its own (the *append log*, at the end of the file), and when the append log's rows have
+become `COMPACT_BYTES`, the same rows are written again as one chunk a table, over the append log (*compaction*).
 
 What is on disk is a plain RRD stream without a footer: the SDK keeps a footer's manifest in memory for as long as
 it records (a footer costs 1.6 kB a chunk, too). `add_footer` adds one at the end.
@@ -94,7 +94,7 @@ class RrdEncoder:
 
 
 class RrdFile:
-    """The file: folded messages, then the journal. Each call has written its bytes when it returns."""
+    """The file: compacted messages, then the append log. Each call has written its bytes when it returns."""
 
     def __init__(self, path: Path) -> None:
         """Create or overwrite ``path``; `UserError` where that cannot be."""
@@ -104,11 +104,11 @@ class RrdFile:
         self.size_bytes = 0
 
     def append(self, data: bytes) -> None:
-        """Add to the journal; `UserError` when the disk refuses."""
+        """Add to the append log; `UserError` when the disk refuses."""
         self._write(data, at=self.size_bytes)
 
     def compact(self, data: bytes) -> None:
-        """Replace the journal by ``data``, which says the same in fewer bytes, and begin a new journal."""
+        """Replace the append log by ``data``, which says the same in fewer bytes, and begin a new append log."""
         self._write(data, at=self._compacted_bytes)
         self._compacted_bytes = self.size_bytes
 

@@ -83,8 +83,8 @@ def _without_menu(png: bytes) -> bytes:
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise UserError("the headless viewer returned no picture")
-    _, cut = cv2.imencode(".png", picture[_MENU_PX:])
-    return cut.tobytes()
+    _, cropped = cv2.imencode(".png", picture[_MENU_PX:])
+    return cropped.tobytes()
 
 
 def _wait_until_listening(process: subprocess.Popen[bytes], port: int) -> None:

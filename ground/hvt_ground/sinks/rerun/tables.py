@@ -22,11 +22,11 @@ __all__ = [
     "Captions",
     "CodedIdentity",
     "Columns",
-    "Line",
-    "Picture",
+    "LogText",
+    "PlacedJpeg",
+    "PlotValues",
     "SizeLimit",
     "Table",
-    "Text",
     "box_columns",
     "caption_columns",
     "confidence_columns",
@@ -38,10 +38,10 @@ __all__ = [
     "patch_columns",
     "picture_columns",
     "place_columns",
+    "reported_columns",
+    "reported_identity_columns",
     "static_chunk",
     "text_columns",
-    "told_columns",
-    "told_identity_columns",
     "video_columns",
 ]
 
@@ -52,7 +52,7 @@ Columns = Iterable[rr.ComponentColumn]
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class PlacedJpeg:
     """A JPEG with a place."""
 
     data: bytes
@@ -69,7 +69,7 @@ class CodedIdentity:
 
 
 @dataclass(frozen=True, slots=True)
-class Text:
+class LogText:
     """A line of the event log."""
 
     text: str
@@ -80,13 +80,13 @@ class Text:
 Captions = tuple[tuple[str, Rgb], ...]
 """Text and colour for each slot of the gallery; an empty text hides its frame."""
 
-Line = tuple[float, ...]
+PlotValues = tuple[float, ...]
 """One value for each line of a plot."""
 
 
 @dataclass(slots=True)
 class Table(Generic[T]):
-    """Rows of one entity that share their columns, gathered until they are folded."""
+    """Rows of one entity that share their columns, gathered until they are compacted."""
 
     path: str
     columns: Callable[[Sequence[T]], Columns]
@@ -95,7 +95,7 @@ class Table(Generic[T]):
     _values: list[T] = field(default_factory=list)
 
     def add(self, frame: int, capture_ns: int, value: T) -> Chunk:
-        """Keep a row; returns it as a chunk of its own, for the journal.
+        """Keep a row; returns it as a chunk of its own, for the append log.
 
         Times come from the wire and are reckoned on from there: what no timestamp can hold is held at its end.
         """
@@ -146,7 +146,7 @@ def video_columns(samples: Sequence[bytes]) -> Columns:
     return rr.VideoStream.columns(sample=list(samples))
 
 
-def told_columns(rows: Sequence[Geometry]) -> Columns:
+def reported_columns(rows: Sequence[Geometry]) -> Columns:
     """Ellipses in the boxes of the layer of tracks that the base stream does not show, a row."""
     return rr.Ellipses2D.columns(
         centers=np.concatenate([row.centres_px for row in rows]),
@@ -167,7 +167,7 @@ def identity_columns(rows: Sequence[CodedIdentity]) -> Columns:
     return _identity_columns(rows, rr.Boxes2D)
 
 
-def told_identity_columns(rows: Sequence[CodedIdentity]) -> Columns:
+def reported_identity_columns(rows: Sequence[CodedIdentity]) -> Columns:
     """The same of the layer that is drawn as ellipses."""
     return _identity_columns(rows, rr.Ellipses2D)
 
@@ -175,11 +175,11 @@ def told_identity_columns(rows: Sequence[CodedIdentity]) -> Columns:
 def _identity_columns(rows: Sequence[CodedIdentity], shape: type[rr.Boxes2D | rr.Ellipses2D]) -> Columns:
     lengths = [len(row.track_ids) for row in rows]
     drawn = shape.columns(class_ids=np.array([i for row in rows for i in row.after], np.uint16))
-    told = rr.AnyValues.columns(
+    reported = rr.AnyValues.columns(
         track_id=pa.array([i for row in rows for i in row.track_ids], pa.uint32()),
         class_before=pa.array([i for row in rows for i in row.before], pa.uint16()),
     )
-    return [*drawn.partition(lengths), *told.partition(lengths)]
+    return [*drawn.partition(lengths), *reported.partition(lengths)]
 
 
 def label_columns(rows: Sequence[tuple[str, ...]]) -> Columns:
@@ -200,7 +200,7 @@ def confidence_columns(rows: Sequence[tuple[int, ...]]) -> Columns:
     return rr.AnyValues.columns(confidence_pct=percent).partition([len(row) for row in rows])
 
 
-def picture_columns(rows: Sequence[Picture]) -> Columns:
+def picture_columns(rows: Sequence[PlacedJpeg]) -> Columns:
     """One picture a row, with its place in the gallery."""
     places = place_columns([row.place for row in rows])
     return [*hidden_picture_columns([row.data for row in rows]), *places]
@@ -215,7 +215,7 @@ def place_columns(rows: Sequence[Placement]) -> rr.ComponentColumnList:
     )
 
 
-def patch_columns(rows: Sequence[Picture | None]) -> Columns:
+def patch_columns(rows: Sequence[PlacedJpeg | None]) -> Columns:
     """One picture a row, with its place on the base picture; None takes it off."""
     there = [row for row in rows if row is not None]
     lengths = [int(row is not None) for row in rows]
@@ -236,7 +236,7 @@ def caption_columns(rows: Sequence[Captions]) -> Columns:
     ).partition([len(row) for row in rows])
 
 
-def text_columns(rows: Sequence[Text]) -> Columns:
+def text_columns(rows: Sequence[LogText]) -> Columns:
     """One line of the event log a row."""
     return rr.TextLog.columns(
         text=[row.text for row in rows],
@@ -245,7 +245,7 @@ def text_columns(rows: Sequence[Text]) -> Columns:
     )
 
 
-def line_columns(rows: Sequence[Line]) -> Columns:
+def line_columns(rows: Sequence[PlotValues]) -> Columns:
     """The values of one plot's lines a row."""
     return rr.Scalars.columns(scalars=np.array(rows, np.float64).ravel()).partition(
         [len(row) for row in rows]
@@ -261,7 +261,7 @@ FIXED_BYTES = 77_000
 """About what the blueprint and the static values cost."""
 
 TABLE_BYTES = 2_000
-"""About what a table costs in each fold before its first row: a chunk and its columns."""
+"""About what a table costs in each compaction before its first row: a chunk and its columns."""
 
 _HEAD_START_BYTES = 30_000
 """Beyond the ratio, so that the first pictures of a flight are shown."""
@@ -273,7 +273,7 @@ class SizeLimit:
     def __init__(self) -> None:
         self.received_bytes = 0
         self.logged_bytes = FIXED_BYTES
-        """About, once folded."""
+        """About, once compacted."""
 
     def has(self, size_bytes: int, *, ratio: float) -> bool:
         """Whether the recording stays below ``ratio`` times the bytes received with so much more in it."""

@@ -24,7 +24,7 @@ class Ground:
     """A fusion with our tracks of every frame."""
 
     def __init__(self, *, own=("car", "bus"), edge=("car", "bus"), **options) -> None:
-        self.path = CameraPath(ahead_ticks=15)
+        self.path = CameraPath(ahead_frames=15)
         self.names, places = unified_names(own, edge)
         self.fusion = Fusion(fps=15, edge_classes=places, path=self.path, **options)
 
@@ -137,7 +137,7 @@ def test_between_steps_a_track_moves_on_with_its_own_velocity(ground):
     ground.step(5, {70: moved(A, 20)})
     assert brief(ground.own(8, {}))[1][1] == whole(moved(A, 32))
     late = Ground()
-    for index in range(9):  # the same, but the step comes three frames after its tick
+    for index in range(9):  # the same, but the step comes three frames after its frame
         late.own(index, {})
     late.step(0, {70: A})
     late.step(5, {70: moved(A, 20)})
@@ -288,7 +288,7 @@ def test_two_that_turn_out_to_be_one_are_told(ground):
 
 
 def test_looking_ahead_changes_nothing(ground):
-    """What a study asks for at one tick would change what is shown at the next."""
+    """What a study asks for at one frame would change what is shown at the next."""
     ground.own(0, {1: A})
     ground.step(0, {70: A, 71: B})
     before = brief(ground.fusion.listed(tracks_at(1, {1: A})))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from hvt_common.values import Posterior, Tracks
 from hvt_ground.perception.history import History
-from hvt_ground.perception.stills.match import Matcher, Wanted, iou_matrix
+from hvt_ground.perception.stills.match import Matcher, StillToMatch, iou_matrix
 from hvt_ground.perception.stills.refine import MAX_HELD, MAX_TRACK_POSTERIORS, Refiner, StillSeen
 
 DETECTOR = ("car", "van", "person")
@@ -155,8 +155,8 @@ def test_a_close_neighbour_that_has_its_own_edge_track_is_left_alone(ground):
     assert brief(ground.offer(still(3, 30, A, edge=70))) == [(3, "matched", 2)], "a clear overlap corrects"
 
 
-FIRST = Wanted(key=0, edge_track_id=70, box_base_px=A, class_name="car")
-OTHER = Wanted(key=1, edge_track_id=71, box_base_px=A_NEAR, class_name="car")
+FIRST = StillToMatch(key=0, edge_track_id=70, box_base_px=A, class_name="car")
+OTHER = StillToMatch(key=1, edge_track_id=71, box_base_px=A_NEAR, class_name="car")
 
 
 def rows(matcher, frame_index, boxes, *wanted):
@@ -182,7 +182,7 @@ def test_a_track_that_its_owner_has_left_is_free():
 
 
 def test_an_older_still_does_not_overrule_what_a_newer_one_showed():
-    """A late still from before an exchange of ids would bring the old belief back."""
+    """A late still from before an exchange of ids would bring the old posterior back."""
     matcher = Matcher(iou=0.5, owned_frames=1000)
     assert rows(matcher, 9, {2: A}, FIRST) == [0]
     assert rows(matcher, 5, {1: A}, FIRST) == [0]

@@ -216,7 +216,7 @@ def test_a_keyframe_without_parameter_sets_does_not_begin_a_recording(
 def test_folding_changes_nothing_but_the_size(
     events: list[Event], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The journal is rewritten while recording; a row lost or doubled there would be lost for good."""
+    """The append log is rewritten while recording; a row lost or doubled there would be lost for good."""
     plain, compacted = tmp_path / "plain.rrd", tmp_path / "folded.rrd"
     sizes: list[int] = []
     for path, limit in ((plain, 1 << 40), (compacted, 20_000)):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun import sdk
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from processes import eventually
 from rrd import Recording
 
