@@ -14,7 +14,17 @@ import numpy.typing as npt
 
 from hvt_common.values import Boxes, Image
 
-__all__ = ["Event", "Notice", "Origin", "Overlay", "Refinement", "Traffic", "VideoSample"]
+__all__ = [
+    "Event",
+    "MessageTiming",
+    "Notice",
+    "Origin",
+    "Overlay",
+    "Refinement",
+    "StillsRead",
+    "Traffic",
+    "VideoSample",
+]
 
 Origin = Literal["base", "edge", "edge+base", "still"]
 """Who knows of a track: the ground's own tracker on the base stream, the edge's report, both, or (``still``) nobody
@@ -124,4 +134,33 @@ class Notice:
     text: str
 
 
-Event = VideoSample | Overlay | Refinement | Traffic | Notice
+@dataclass(frozen=True, slots=True)
+class MessageTiming:
+    """When a message was captured, sent, received and handled; Unix nanoseconds, 0 where there is none."""
+
+    kind: str
+    """The channel; of a backlog chunk with what it is of, as ``backlog-still``."""
+    sequence: int
+    frame_index: int
+    """-1 where it is about no frame."""
+    capture_ns: int
+    send_ns: int
+    received_ns: int
+    handled_ns: int | None
+    """0: nothing was made of it; None: a `StillsRead` will tell."""
+    line_bytes: int
+    clock_offset_ns: int
+    """The edge's clock less this one."""
+
+
+@dataclass(frozen=True, slots=True)
+class StillsRead:
+    """The stills of these numbers were read by the classifier."""
+
+    sequences: tuple[int, ...]
+    at_ns: int
+
+
+FrameEvent = VideoSample | Overlay | Refinement | Traffic | Notice
+"""What a recording shows, at the frame and capture time that it carries."""
+Event = FrameEvent | MessageTiming | StillsRead

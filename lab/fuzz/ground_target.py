@@ -12,7 +12,8 @@ from unittest.mock import patch
 from flight import SIZE, Flight, Port, pipeline_of
 from hvt_common.protocol.messages import Info, TrackStepEncoder
 from hvt_common.transport.inbox import Received
-from hvt_ground.session.receiver import EdgeReceiver
+from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from lab.fuzz.contract import Target
@@ -59,23 +60,7 @@ def _flight(pace: str) -> Flight:
     return flight
 
 
-class _Receiver(EdgeReceiver):
-    """The receiver without its thread."""
-
-    def _run(self) -> None:
-        return
-
-    def take(self, item: Received) -> None:
-        """One message, as the thread would have it."""
-        self._handle(item)
-        self._housekeep()
-
-    def end(self) -> None:
-        """The edge is gone."""
-        self._end_session()
-
-
-def _opened(info: Info, receiver: EdgeReceiver) -> GroundSession:
+def _opened(info: Info, reports: ReceiverReports) -> GroundSession:
     settings = RecorderSettings(
         path=scratch() / "flight.rrd",
         edge_id="uav-1",
@@ -86,12 +71,10 @@ def _opened(info: Info, receiver: EdgeReceiver) -> GroundSession:
     )
     return GroundSession(
         info,
-        recorder=Recorder(settings),
-        recording=settings.path,
+        sinks=[Recorder(settings)],
         pipeline_of=pipeline_of,
-        to_local_ns=receiver.clock_offset.to_local_ns,
         clock=time.time_ns,
-        report=receiver.report_now,
+        reports=reports,
     )
 
 
@@ -100,19 +83,20 @@ def _session(data: bytes) -> None:
     flight = _flight(_PACES[len(pace) % len(_PACES)])
     port = Port()
     port.flight = flight
-    receiver = _Receiver(port, open_session=_opened)  # type: ignore[arg-type]
-    receiver.port.present.set()
+    port.present.set()
+    edge = EdgeSessions(port, open_session=_opened)  # type: ignore[arg-type]
     for index in range(_HEARD):
-        receiver.take(flight.base(index))
+        edge.handle(flight.base(index))
+        edge.housekeep(pending=False)
     for one in map(_Said.parse, messages):
         key = f"hvt/uav-1/{one.row}"
-        receiver.take(Received(key, one.payload, one.attachment, "", time.time_ns()))
-    session = receiver.session
+        edge.handle(Received(key, one.payload, one.attachment, "", time.time_ns()))
+        edge.housekeep(pending=False)
+    session = edge.session
     if session is not None:
         assert len(session.take_results(10_000)) < 5000
     with patch("hvt_ground.sinks.rerun.recorder.add_footer"):  # a process of its own for each input
-        receiver.end()
-    receiver.stop()
+        edge.close()
 
 
 def _changed(data: bytes, rng: Random, raw: Bytes) -> bytes:

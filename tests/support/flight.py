@@ -265,6 +265,7 @@ class Port:
         self.inbox = Inbox(capacity=1024, overflow="newest")
         self.present = threading.Event()
         self.present.set()
+        self.used = threading.Event()
         self.flight: Flight | None = None
         """Who answers; None is silence."""
         self.requested = 0

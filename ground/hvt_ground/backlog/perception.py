@@ -1,14 +1,12 @@
-"""Looks at what was kept of one session: boxes in stretches of its video, and stills of one that is over.
+"""Analyzes what was stored of one session: boxes in stretches of its video, and stills of one that is over.
 
-With the models of now, borrowed while it looks, for it is done in the thread that sees: neither the tracks of now nor
-a detector's memory are touched.
+Neither the tracks of the open session nor a detector's memory are touched.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
 
 import numpy as np
 
@@ -21,25 +19,18 @@ from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.history import History
+from hvt_ground.perception.models import ModelSet
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
 
-__all__ = ["FIRST_TRACK_ID", "BacklogPerception", "ModelCheckout", "StretchTracker"]
+__all__ = ["FIRST_TRACK_ID", "BacklogPerception", "StretchTracker"]
 
 FIRST_TRACK_ID = 1_000_001
 """Tracks of kept video are others than those of the session, and told apart by their numbers."""
 
 Emit = Callable[[Event], None]
-
-
-class ModelCheckout(Protocol):
-    """Where models come from."""
-
-    def checkout(self) -> AbstractContextManager[tuple[Detector, Classifier | None]]:
-        """A set that may be used meanwhile, by turns with what else is done in the thread that sees."""
-        ...
 
 
 class StretchTracker:
@@ -87,7 +78,7 @@ class BacklogPerception:
 
     Args:
         info: of the session.
-        models: lends detector and classifier.
+        checkout: gives the models for the time of a job.
         tracker_of: makes a tracker for one stretch.
         reader_of: makes of detector and classifier what names stills.
         detect_every: frames from one detection to the next, at least.
@@ -97,23 +88,23 @@ class BacklogPerception:
         self,
         info: Info,
         *,
-        models: ModelCheckout,
+        checkout: Callable[[], AbstractContextManager[ModelSet]],
         tracker_of: Callable[[], ByteTracker],
         reader_of: Callable[[Detector, Classifier | None], StillReader],
         detect_every: int,
     ) -> None:
         self._info = info
-        self._models = models
+        self._checkout = checkout
         self._tracker_of = tracker_of
         self._reader_of = reader_of
         self._detect_every = detect_every
         self._next_id = FIRST_TRACK_ID
 
     @contextmanager
-    def watch(self, emit: Emit) -> Iterator[StretchTracker]:
-        """What follows one stretch of video."""
-        with self._models.checkout() as (detector, _):
-            watch = StretchTracker(
+    def track(self, emit: Emit) -> Iterator[StretchTracker]:
+        """Give a tracker for one stretch of video, with the models meanwhile."""
+        with self._checkout() as (detector, _):
+            tracker = StretchTracker(
                 detector,
                 self._tracker_of(),
                 first_id=self._next_id,
@@ -121,14 +112,14 @@ class BacklogPerception:
                 emit=emit,
             )
             try:
-                yield watch
+                yield tracker
             finally:
-                self._next_id = watch.next_id
+                self._next_id = tracker.next_id
 
     def read(self, still: ReceivedStill, *, emit: Emit) -> None:
         """Decode, name and give out a still of a session that is over: no track of it is here to be matched."""
         info = self._info
-        with self._models.checkout() as (detector, classifier):
+        with self._checkout() as (detector, classifier):
             reader = self._reader_of(detector, classifier)
             names, edge_classes = unified_names(detector.class_names, info.class_names)
             stage = StillStage(

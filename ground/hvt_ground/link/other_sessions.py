@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from hvt_common.protocol.messages import RoiHeader, Status
-from hvt_common.transport.inbox import Received
+from hvt_ground.link.packets import StatusPacket, StillPacket
 
 __all__ = ["DuplicatePublishers", "PreSessionBuffer"]
 
@@ -19,28 +18,25 @@ class PreSessionBuffer:
     """Holds the first report and the newest stills that came while no session was open."""
 
     def __init__(self) -> None:
-        self._status: tuple[Status, Received] | None = None
-        self._stills: deque[tuple[RoiHeader, Received]] = deque(maxlen=_MOST_STILLS)
+        self._status: StatusPacket | None = None
+        self._stills: deque[StillPacket] = deque(maxlen=_MOST_STILLS)
 
-    def status(self, status: Status, item: Received) -> None:
+    def status(self, packet: StatusPacket) -> None:
         """Note a report, if it is the first of its session: it may overtake the keyframe that begins it."""
-        if status.sequence == 0:
-            self._status = (status, item)
+        if packet.status.sequence == 0:
+            self._status = packet
 
-    def still(self, header: RoiHeader, item: Received) -> None:
+    def still(self, packet: StillPacket) -> None:
         """Note a still; of many the oldest goes."""
-        self._stills.append((header, item))
+        self._stills.append(packet)
 
-    def take_status(self) -> tuple[Status, Received] | None:
-        """Hand out the report, once."""
-        status, self._status = self._status, None
-        return status
-
-    def take_stills(self) -> list[tuple[RoiHeader, Received]]:
-        """Hand out the stills, once, in the order in which they came."""
-        stills = list(self._stills)
+    def take(self) -> list[StatusPacket | StillPacket]:
+        """Hand them out, once: the report, then the stills in the order in which they came."""
+        packets: list[StatusPacket | StillPacket] = [] if self._status is None else [self._status]
+        packets += self._stills
+        self._status = None
         self._stills.clear()
-        return stills
+        return packets
 
 
 class DuplicatePublishers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Iterable
 
@@ -48,36 +49,36 @@ class SequenceWindow:
 
 
 class StillSequenceWindow:
-    """For the receiving thread."""
+    """Which stills have come: each is shown once, and counted as often as it crossed. Safe for threads."""
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._seen = SequenceWindow()
         self._sent_ns: dict[int, int] = {}
         """Sequence → when a still was sent of which no second copy has come."""
 
     def is_new(self, sequence: int, *, send_ns: int) -> bool:
         """Whether a still on ``roi`` has not come before."""
-        if not self._seen.add([sequence]):
-            return False
-        self._note(sequence, send_ns)
-        return True
+        with self._lock:
+            if not self._seen.add([sequence]):
+                return False
+            self._sent_ns[sequence] = send_ns
+            while len(self._sent_ns) > _MOST_SENT:
+                del self._sent_ns[next(iter(self._sent_ns))]
+            return True
 
     def is_copy(self, sequence: int, *, send_ns: int) -> bool:
         """Whether one that is not new is the copy that the edge sent for want of an acknowledgement; once.
 
-        What bears the time of the first is somebody's who repeats what he heard. Of one that came with what was kept,
-        the first on ``roi`` is such a copy.
+        What bears the time of the first is a replay. Of one that came with the backlog, the first on ``roi`` is such
+        a copy.
         """
-        if send_ns <= self._sent_ns.get(sequence, send_ns):
-            return False
-        del self._sent_ns[sequence]
-        return True
+        with self._lock:
+            if send_ns <= self._sent_ns.get(sequence, send_ns):
+                return False
+            del self._sent_ns[sequence]
+            return True
 
     def is_new_stored(self, sequence: int) -> bool:
-        """Whether a still that was kept has not come before."""
+        """Whether a still of the backlog has not come before."""
         return self.is_new(sequence, send_ns=_NEVER_NS)
-
-    def _note(self, sequence: int, send_ns: int) -> None:
-        self._sent_ns[sequence] = send_ns
-        while len(self._sent_ns) > _MOST_SENT:
-            del self._sent_ns[next(iter(self._sent_ns))]

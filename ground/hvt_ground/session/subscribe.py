@@ -47,8 +47,8 @@ class EdgePort:
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self.present = threading.Event()
         """Set while the edge's liveliness token is there."""
-        self.in_use: Callable[[], bool] = lambda: False
-        """Whether there is more to this edge than messages under its name: a session, or one that has ended."""
+        self.used = threading.Event()
+        """Set once there is more to this edge than messages under its name: a session."""
         self._unanswered = 0
         self._session = session
         self._keys = EdgeKeys(edge)
@@ -199,7 +199,7 @@ class GroundLink:
     def _make_space(self) -> bool:
         """Leave one that is not there and never was more than a name."""
         for edge, port in self._ports.items():
-            if not port.present.is_set() and not port.in_use():
+            if not port.present.is_set() and not port.used.is_set():
                 del self._ports[edge]
                 port.close()
                 return True

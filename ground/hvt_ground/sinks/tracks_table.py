@@ -31,8 +31,8 @@ class TrackTable:
         self._writer.writerow(COLUMNS)
 
     def log(self, event: Event) -> None:
-        """Append the tracks of an overlay."""
-        if not isinstance(event, Overlay):
+        """Append the tracks of an overlay; one of the backlog would not be in the order of frames."""
+        if not isinstance(event, Overlay) or event.stored:
             return
         origins = event.origins or ("base",) * len(event.track_ids)
         for row, track_id in enumerate(event.track_ids.tolist()):
@@ -53,6 +53,6 @@ class TrackTable:
                 )
             )
 
-    def close(self) -> None:
+    def close(self, *, quickly: bool = False) -> None:  # noqa: ARG002 - it is always quick
         """Write what is buffered."""
         self._file.close()

@@ -43,11 +43,11 @@ def test_what_looks_at_the_past_uses_the_models_of_now():
     """The first still of an outage would stop the picture for as long as it takes to load a network."""
     models, pipeline, info = eyes_of(check(GroundConfig()))
     for _ in range(2):  # twice at a time: a stretch of video waits while a still is read
-        with models.pool(info.edge).checkout() as (detector, classifier):
+        with models.checkout(info.edge) as (detector, classifier):
             assert detector is pipeline._parts.detector
-            with models.pool(info.edge).checkout() as again:
+            with models.checkout(info.edge) as again:
                 assert again == (detector, classifier)
-    with models.pool("uav-9").checkout() as other:
+    with models.checkout("uav-9") as other:
         assert other[0] is not detector, "another edge's is used by another thread"
     pipeline.end()
     assert {id(models.take()[0]), id(models.take()[0])} == {id(detector), id(other[0])}
@@ -56,7 +56,7 @@ def test_what_looks_at_the_past_uses_the_models_of_now():
 def test_a_detector_of_motion_does_not_see_the_past():
     """The picture of now would be compared with one of an hour ago: all of it moves."""
     models, pipeline, info = eyes_of(check(GroundConfig(detector="motion", classifier="none")))
-    with models.pool(info.edge).checkout() as (detector, classifier):
+    with models.checkout(info.edge) as (detector, classifier):
         assert isinstance(detector, type(pipeline._parts.detector))
         assert detector is not pipeline._parts.detector
         assert classifier is None

@@ -70,7 +70,7 @@ def test_edges_that_are_there_or_have_flown_keep_their_place(link):
     invent(outsider, 1)
     eventually(lambda: "ghost-0" in served(ground), within_s=20, what="one more")
     (ghost,) = [port for port in ground.ports() if port.edge == "ghost-0"]
-    ghost.in_use = lambda: True
+    ghost.used.set()
     with outsider.liveliness().declare_token("hvt/late/alive"):
         eventually(lambda: ground.foreign == 1, within_s=20, what="it is refused")
     assert "late" not in served(ground)

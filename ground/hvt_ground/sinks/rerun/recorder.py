@@ -18,7 +18,7 @@ import numpy as np
 from rerun.chunk import Chunk
 
 from hvt_common.units import bitrate_text
-from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.backlog_overlays import BacklogOverlays
 from hvt_ground.sinks.rerun.blueprint import Front
@@ -152,12 +152,14 @@ class Recorder:
                     chunks = self._traffic(event)
                 case Notice():
                     chunks = self._notice(event)
+                case _:
+                    return
             self._write(chunks)
 
-    def close(self, *, footer: bool = True) -> None:
+    def close(self, *, quickly: bool = False) -> None:
         """Compact what is left and close the file and the viewer's connection; a second call does nothing.
 
-        Without ``footer`` none is added, which may take seconds.
+        ``quickly`` adds no footer, which may take seconds.
         """
         with self._lock:
             if self._closed:
@@ -168,7 +170,7 @@ class Recorder:
             finally:
                 if self._file is not None:
                     self._file.close()
-                    if footer:
+                    if not quickly:
                         add_footer(self._file.path)
                 self._encoder.close()
                 if self._live is not None:
@@ -222,7 +224,7 @@ class Recorder:
             self._file.compact(self._encoder.chunks(chunks))
 
     def _row(
-        self, path: str, columns: Any, event: Event | RowTime, value: Any, *, size_bytes: int = 64
+        self, path: str, columns: Any, event: FrameEvent | RowTime, value: Any, *, size_bytes: int = 64
     ) -> Chunk:
         """Add a row to the table of this entity and these columns; ``size_bytes``: its cost once compacted, about."""
         key = (path, columns.__name__)
@@ -235,7 +237,7 @@ class Recorder:
         self._size_limit.logged_bytes += size_bytes
         return table.add(event.frame_index, event.capture_ns, value)
 
-    def _rows(self, rows: Sequence[TableRow], event: Event) -> list[Chunk]:
+    def _rows(self, rows: Sequence[TableRow], event: FrameEvent) -> list[Chunk]:
         return [
             self._row(row.path, row.columns, row.at or event, row.value, size_bytes=row.size_bytes)
             for row in rows
