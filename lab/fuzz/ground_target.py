@@ -95,7 +95,7 @@ def _session(data: bytes) -> None:
     session = edge.session
     if session is not None:
         assert len(session.take_results(10_000)) < 5000
-    with patch("hvt_ground.sinks.rerun.recorder.add_footer"):  # a process of its own for each input
+    with patch("hvt_ground.sinks.rerun.rrd_file.add_footer"):  # a process of its own for each input
         edge.close()
 
 

@@ -22,7 +22,6 @@ from hvt_common.protocol.messages import (
 )
 from hvt_ground.backlog import BacklogAssembly, StoredStill, backlog_content
 from hvt_ground.link.sequence_window import SequenceWindow
-from hvt_ground.sinks.rerun.backlog_stills import BacklogGallery, CaptionRow
 
 
 def header(offset: int = 0, total: int = 10, *, kind="still", number=3, session=7) -> BacklogHeader:
@@ -373,68 +372,3 @@ def test_forged_numbers_neither_fill_the_memory_nor_silence_those_that_come():
     assert all(number in seen for number in range(40)), "what goes on is remembered"
     assert seen.add([39]) == 0
     assert seen.add([2**32 - 1]) == 1
-
-
-# Its place in the gallery
-
-
-class Replay:
-    """What a viewer shows of the gallery: the latest row of each before a moment."""
-
-    def __init__(self, slots: int) -> None:
-        self.slots = slots
-        self.pictures: dict[tuple[int, int], str] = {}
-        self.captions: dict[int, tuple[str, ...]] = {}
-
-    def write(self, slot: int, frame: int, name: str, rows) -> None:
-        """Log a pair."""
-        self.pictures[slot, frame] = name
-        for row in rows:
-            self.captions[row.frame_index] = row.captions
-
-    def agrees(self, frame: int) -> bool:
-        """Whether each picture stands over its own words."""
-        known = [at for at in self.captions if at <= frame]
-        captions = self.captions[max(known)] if known else ("",) * self.slots
-        for slot in range(self.slots):
-            shown = [at for of, at in self.pictures if of == slot and at <= frame]
-            if captions[slot] != (self.pictures[slot, max(shown)] if shown else ""):
-                return False
-        return True
-
-
-@given(reported=st.lists(st.tuples(st.booleans(), st.integers(0, 60), st.integers(0, 2)), max_size=30))
-@settings(max_examples=300, deadline=None)
-def test_pictures_and_captions_agree_at_every_moment(reported):
-    """The gallery would show a lorry under the words of a bus."""
-    gallery, replay = BacklogGallery(("",) * 3, hold_ns=2), Replay(3)
-    now, newest, taken = ("",) * 3, 0, set()
-    for live, number, slot in reported:
-        # Stills of now come in their order, those of the past at any time between them.
-        frame = newest + 1 + number % 5 if live else number
-        if frame in taken or (not live and frame > newest):
-            continue
-        taken.add(frame)
-        if live:
-            newest, now = frame, (*now[:slot], f"live {frame}", *now[slot + 1 :])
-            gallery.note(slot, CaptionRow(frame, frame, now))
-            replay.write(slot, frame, f"live {frame}", [CaptionRow(frame, frame, now)])
-            continue
-        put = gallery.put(frame, frame, f"late {frame}")
-        if put is not None:
-            replay.write(put.slot, frame, f"late {frame}", put.rows)
-            if put.stays:
-                now = (*now[: put.slot], f"late {frame}", *now[put.slot + 1 :])
-    assert all(replay.agrees(frame) for frame in range(newest + 2))
-
-
-def test_an_old_still_holds_its_slot_for_a_while_only_where_one_is_free():
-    """Pairs would flicker by, or an old one would push out what is shown now."""
-    gallery = BacklogGallery(("", ""), hold_ns=10)
-    gallery.note(0, CaptionRow(0, 0, ("a", "")))
-    gallery.note(0, CaptionRow(100, 100, ("b", "")))
-    put = gallery.put(50, 50, "x")
-    assert (put.slot, put.stays) == (0, False)
-    assert gallery.put(55, 55, "y").slot == 1
-    assert gallery.put(57, 57, "z") is None
-    assert gallery.put(95, 95, "z").slot == 1

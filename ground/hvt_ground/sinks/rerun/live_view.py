@@ -22,7 +22,7 @@ from rerun.chunk import Chunk
 from hvt_common.errors import UserError
 from hvt_ground.sinks.rerun.sdk import send_blueprint, viewer_environment, viewer_program
 
-__all__ = ["LiveSink", "LiveView", "free_port", "listening"]
+__all__ = ["LiveRecording", "LiveView", "free_port", "listening"]
 
 log = logging.getLogger(__name__)
 
@@ -107,8 +107,11 @@ class LiveView:
             time.sleep(0.05)
 
 
-class LiveSink:
-    """Sends one recording to a viewer. Trouble there costs one warning, then nothing is sent any more."""
+class LiveRecording:
+    """One recording in a viewer. Trouble there costs one warning, then nothing is sent any more."""
+
+    live = True
+    size_bytes = 0
 
     def __init__(self, url: str, *, application_id: str, recording_id: str, name: str) -> None:
         self._url = url
@@ -123,20 +126,22 @@ class LiveSink:
         self._recording.connect_grpc(url)
         self._recording.send_recording_name(name)
 
-    def blueprint(self, blueprint: rrb.Blueprint) -> bytes:
+    def open(self, screen: rrb.Blueprint, chunks: Sequence[Chunk]) -> None:
         """Show the recording on this screen."""
         if self._recording is not None:
-            send_blueprint(self._recording, blueprint, application_id=self._application_id)
-        return b""
+            send_blueprint(self._recording, screen, application_id=self._application_id)
+        self.write(chunks)
 
-    def chunks(self, chunks: Sequence[Chunk]) -> bytes:
+    def write(self, chunks: Sequence[Chunk]) -> None:
         """Send, while the viewer is there."""
         if self._recording is not None and self._viewer_there():
             self._recording.send_chunks(chunks)
-        return b""
 
-    def close(self) -> None:
-        """Send what is under way and disconnect; a viewer that is gone is not waited for."""
+    def compact(self, chunks: Sequence[Chunk]) -> None:
+        """A viewer has them already."""
+
+    def close(self, *, quickly: bool) -> None:  # noqa: ARG002 - a viewer that is gone is not waited for
+        """Send what is under way and disconnect."""
         recording, self._recording = self._recording, None
         if recording is None:
             return
@@ -147,11 +152,11 @@ class LiveSink:
         recording.disconnect()
 
     def _viewer_there(self) -> bool:
-        """Look once a second: the SDK would keep what it cannot send, and slow every call."""
-        now = time.monotonic()
-        if now < self._next_check_s:
+        """Check once a second: the SDK would keep what it cannot send, and slow every call."""
+        now_s = time.monotonic()
+        if now_s < self._next_check_s:
             return True
-        self._next_check_s = now + 1.0
+        self._next_check_s = now_s + 1.0
         if listening(self._port):
             return True
         log.warning("live view at %s is gone; the recording goes on", self._url)

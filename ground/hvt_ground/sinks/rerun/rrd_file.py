@@ -18,8 +18,6 @@ import struct
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -33,7 +31,7 @@ from hvt_ground.sinks.rerun.sdk import (
     viewer_program,
 )
 
-__all__ = ["RrdEncoder", "RrdFile", "add_footer"]
+__all__ = ["RrdFile", "add_footer"]
 
 _log = logging.getLogger(__name__)
 
@@ -48,10 +46,18 @@ _MOST_GROWTH = 1.12
 """A footer takes some 70 kB, whatever the length of the flight: too much for one of a few seconds."""
 
 
-class RrdEncoder:
-    """Turns chunks into the messages of an RRD stream of one recording, LZ4-compressed by the SDK."""
+class RrdFile:
+    """A recording on disk; each call has written its bytes when it returns.
 
-    def __init__(self, *, application_id: str, recording_id: str, name: str) -> None:
+    Raises:
+        UserError: the file cannot be created, or (later) written any further.
+    """
+
+    live = False
+
+    def __init__(self, path: Path, *, application_id: str, recording_id: str, name: str) -> None:
+        self._path = path
+        self._file = _created(path)
         self._application_id = application_id
         self._recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
         # Rows are timed by frame and capture time; the SDK's own two timelines would cost bytes and mean nothing.
@@ -59,72 +65,46 @@ class RrdEncoder:
         self._recording.set_log_tick_enabled(False)
         self._stream = rr.binary_stream(self._recording)
         self._recording.send_recording_name(name)
-        self.header = b""
-        """The twelve bytes every RRD stream begins with; known after the first message."""
+        self._compacted_bytes = 0
+        self._size_bytes = 0
 
-    def blueprint(self, blueprint: rrb.Blueprint) -> bytes:
-        """The blueprint, made active when the recording is opened."""
-        send_blueprint(self._recording, blueprint, application_id=self._application_id)
-        return self._messages()
+    @property
+    def size_bytes(self) -> int:
+        """The size of the file so far."""
+        return self._size_bytes if self._file >= 0 else self._path.stat().st_size
 
-    def chunks(self, chunks: Sequence[Chunk]) -> bytes:
-        """The chunks as messages, in order."""
+    def open(self, screen: rrb.Blueprint, chunks: Sequence[Chunk]) -> None:
+        """Begin with the screen, made active when the recording is opened, and what holds for all of it."""
+        send_blueprint(self._recording, screen, application_id=self._application_id)
         self._recording.send_chunks(chunks)
-        return self._messages()
+        stream = self._stream.read() or b""
+        self._write(stream[:_STREAM_HEADER_BYTES] + _messages(stream), at=0)
+        self._compacted_bytes = self._size_bytes
 
-    def close(self) -> None:
-        """Release the SDK's stream; nothing is lost, since every call returned its bytes."""
+    def write(self, chunks: Sequence[Chunk]) -> None:
+        """Append chunks to the log at the end of the file."""
+        self._write(self._encoded(chunks), at=self._size_bytes)
+
+    def compact(self, chunks: Sequence[Chunk]) -> None:
+        """Replace the append log by ``chunks``, which say the same in fewer bytes, and begin a new one."""
+        self._write(self._encoded(chunks), at=self._compacted_bytes)
+        self._compacted_bytes = self._size_bytes
+
+    def close(self, *, quickly: bool) -> None:
+        """Close the file, with a footer unless ``quickly``, and release the SDK's stream."""
+        os.close(self._file)
+        self._file = -1
+        if not quickly:
+            add_footer(self._path)
         self._recording.disconnect()
         self._stream.read()  # its own farewell, or the SDK warns that it was dropped
         del self._stream, self._recording
         release_recordings()
 
-    def _messages(self) -> bytes:
-        """What the SDK encoded since the last call, without the stream's header and footer."""
-        stream = self._stream.read() or b""
-        self.header = self.header or stream[:_STREAM_HEADER_BYTES]
-        end = at = _STREAM_HEADER_BYTES
-        while at < len(stream):
-            kind, length = _MESSAGE_HEADER.unpack_from(stream, at)
-            if kind == _END:
-                break
-            at += _MESSAGE_HEADER.size + length
-            end = at
-        return stream[_STREAM_HEADER_BYTES:end]
-
-
-class RrdFile:
-    """The file: compacted messages, then the append log. Each call has written its bytes when it returns."""
-
-    def __init__(self, path: Path) -> None:
-        """Create or overwrite ``path``; `UserError` where that cannot be."""
-        self.path = path
-        self._file = _created(path)
-        self._compacted_bytes = 0
-        self.size_bytes = 0
-
-    def append(self, data: bytes) -> None:
-        """Add to the append log; `UserError` when the disk refuses."""
-        self._write(data, at=self.size_bytes)
-
-    def compact(self, data: bytes) -> None:
-        """Replace the append log by ``data``, which says the same in fewer bytes, and begin a new append log."""
-        self._write(data, at=self._compacted_bytes)
-        self._compacted_bytes = self.size_bytes
-
-    def close(self) -> None:
-        """Close the file; a second call does nothing."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def _encoded(self, chunks: Sequence[Chunk]) -> bytes:
+        """The chunks as messages, LZ4-compressed by the SDK."""
+        self._recording.send_chunks(chunks)
+        return _messages(self._stream.read() or b"")
 
     def _write(self, data: bytes, *, at: int) -> None:
         try:
@@ -133,13 +113,25 @@ class RrdFile:
                 written = os.pwrite(self._file, data, end)
                 end += written
                 data = data[written:]
-            if end < self.size_bytes:
+            if end < self._size_bytes:
                 os.ftruncate(self._file, end)
         except OSError as error:
             raise UserError(
-                f"recording {self.path} cannot be written any further: {error.strerror}"
+                f"recording {self._path} cannot be written any further: {error.strerror}"
             ) from error
-        self.size_bytes = end
+        self._size_bytes = end
+
+
+def _messages(stream: bytes) -> bytes:
+    """What the SDK encoded, without the stream's header and footer."""
+    end = at = _STREAM_HEADER_BYTES
+    while at < len(stream):
+        kind, length = _MESSAGE_HEADER.unpack_from(stream, at)
+        if kind == _END:
+            break
+        at += _MESSAGE_HEADER.size + length
+        end = at
+    return stream[_STREAM_HEADER_BYTES:end]
 
 
 def _created(path: Path) -> int:

@@ -10,7 +10,7 @@ from rerun.chunk import Chunk
 
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.gallery import SLOTS, frame_of
-from hvt_ground.sinks.rerun.overlay_encoding import REPORTED_MARK
+from hvt_ground.sinks.rerun.overlays import REPORTED_MARK
 from hvt_ground.sinks.rerun.palette import (
     BASE_LINE,
     BUDGET_LINE,

@@ -13,7 +13,7 @@ import pytest
 
 from hvt_ground.events import Overlay, Refinement, VideoSample
 from hvt_ground.sinks.rerun.gallery import Placement
-from hvt_ground.sinks.rerun.overlay_encoding import ORIGINS, REPORTED_MARK
+from hvt_ground.sinks.rerun.overlays import ORIGINS, REPORTED_MARK
 from hvt_ground.sinks.rerun.patches import FRESH_NS, PATCHES, Moved, Patches
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from recorded_feed import START_NS, STEP_NS, coded, drawn_frames
