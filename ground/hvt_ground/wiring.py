@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import chain
+from itertools import count as count_from
 from pathlib import Path
 from typing import Literal, cast
 
@@ -179,25 +181,16 @@ def _reader(
 def output_path(target: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:
     """Where a file of one session goes, and note it in ``taken``.
 
-    ``wish`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file is
-    written anew, but each session of this process gets one of its own: the first takes the name, others have the
+    ``target`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file
+    is written anew, but each session of this process gets one of its own: the first takes the name, others have the
     edge's id in it. A file that nobody named is never overwritten.
     """
     if target is None or target.is_dir() or target.suffix != suffix:
-        first = (target or Path()) / f"hvt-{edge}-{stamp}{suffix}"
-        further = first
+        first = further = (target or Path()) / f"hvt-{edge}-{stamp}{suffix}"
     else:
         first, further = target, target.with_name(f"{target.stem}-{edge}{suffix}")
-    count, path = 1, first
-    while path in taken or (path != target and path.exists()):
-        path = (
-            further
-            if count == 1 and further != first
-            else further.with_name(f"{further.stem}-{count}{suffix}")
-        )
-        count += 1
-    taken.add(path)
-    return path
+    names = [first] if further == first else [first, further]
+    return _take(names, taken, number=len(names), may_exist=target)
 
 
 def _backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
@@ -206,12 +199,16 @@ def _backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path
     Never over another file: its edge has forgotten what is in there.
     """
     if target is not None and target.suffix == ".rrd" and not target.is_dir():
-        first = target.with_name(f"{target.stem}-{edge}-backlog.rrd")
-    else:
-        first = (target or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"
-    count, path = 1, first
-    while path in taken or path.exists():
-        count += 1
-        path = first.with_name(f"{first.stem}-{count}.rrd")
+        return _take([target.with_name(f"{target.stem}-{edge}-backlog.rrd")], taken, number=2)
+    return _take([(target or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"], taken, number=2)
+
+
+def _take(names: list[Path], taken: set[Path], *, number: int, may_exist: Path | None = None) -> Path:
+    """The first that is free of the names and of the last one with a number from ``number`` on; it is taken."""
+    last = names[-1]
+    numbered = (last.with_name(f"{last.stem}-{count}{last.suffix}") for count in count_from(number))
+    path = next(
+        one for one in chain(names, numbered) if one not in taken and (one == may_exist or not one.exists())
+    )
     taken.add(path)
     return path

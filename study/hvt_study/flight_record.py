@@ -41,7 +41,7 @@ class Watch:
         parts = pipeline._parts  # noqa: SLF001 - events say neither raw detections nor confidences without refinement
         self._detector = _WatchedDetector(parts.detector)
         self._refiner = _WatchedRefiner(parts.refiner)
-        refiner = cast("Refiner[Any]", self._refiner)
+        refiner = cast("Refiner", self._refiner)
         pipeline._parts = replace(parts, detector=self._detector, refiner=refiner)  # noqa: SLF001
 
     @property
@@ -77,7 +77,7 @@ class _WatchedDetector:
 
 
 class _WatchedRefiner:
-    def __init__(self, refiner: Refiner[Any]) -> None:
+    def __init__(self, refiner: Refiner) -> None:
         self._refiner = refiner
         self.listed: Tracks | None = None
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -29,11 +29,11 @@ from hvt_common.protocol.channels import Channel, EdgeKeys, parse_key, selector
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, Info, RoiHeader, WireError
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.rights import Rights
 from hvt_common.transport.session import ask, open_session, subscribe
-from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.values import Image
 from hvt_common.video.still_codecs import StillError
-from hvt_ground.control.unanswered import Requester, who_is_seen_by_way_of
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 
 __all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedStill"]
@@ -99,6 +99,48 @@ def check_suffix(path: Path) -> None:
     """Raise `UserError` for a picture format that is not written."""
     if path.suffix.lower() not in _SUFFIXES:
         raise UserError(f"{path} is not a picture that can be written: name it {', '.join(_SUFFIXES)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Requester:
+    """What our own file lets us do."""
+
+    file: Path | None = None
+    rights: Rights = field(default_factory=Rights)
+
+    @classmethod
+    def of(cls, settings: LinkSettings) -> Requester:
+        """From the settings of the session; `UserError` where they cannot be used."""
+        return cls(settings.zenoh_config, Rights.of(configure(settings)[0]))
+
+    def refusal(self, edge: str) -> str:
+        """Why ``control`` of this edge need not be tried; empty where our own file allows it."""
+        key = EdgeKeys(edge).key(Channel.CONTROL)
+        if self.rights.allow_somebody(flow="egress", message="query", key=key):
+            return ""
+        if self.rights.allow_somebody(flow="egress", message="query", key=EdgeKeys(edge).key(Channel.INFO)):
+            return (
+                f"{self.file} lets us watch {edge}, not command it: a key that hvt-ground keys add-ground makes "
+                "without --watch-only may"
+            )
+        return (
+            f"{self.file} does not name {edge}: hvt-ground keys list shows who may watch it, and a file that was "
+            "written before the edge was added has to be copied again"
+        )
+
+
+def _link_hint(session: zenoh.Session) -> str:
+    """Where an edge that does not show itself may be stopped: what stands at the other end of our links, by its key.
+
+    Empty where there are no keys. An asker has one link.
+    """
+    names = sorted({link.auth_identifier for link in session.info.links() if link.auth_identifier})
+    if not names:
+        return ""
+    return (
+        f"; {names[0]}, to which we are linked, passes on only what its file lets our key see (hvt-ground keys list; "
+        f"a {names[0]}.json5 from before our key was made does not name it)"
+    )
 
 
 class RemoteEdge:
@@ -249,7 +291,7 @@ class RemoteEdge:
     def _absent(self) -> str:
         return (
             f"edge {self.name!r} does not answer: is it flying, and does this link reach it?"
-            f"{who_is_seen_by_way_of(self._session)}"
+            f"{_link_hint(self._session)}"
         )
 
     def _parsed(self, parse: Callable[[bytes], _Answer], data: bytes) -> _Answer:
@@ -282,7 +324,7 @@ class EdgeClient:
 
     def nobody(self) -> str:
         """What to tell a user where `names` is empty."""
-        return f"no edge is there{who_is_seen_by_way_of(self._session)}"
+        return f"no edge is there{_link_hint(self._session)}"
 
     def names(self) -> list[str]:
         """The edges that are there now."""

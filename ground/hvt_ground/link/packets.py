@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hvt_common.protocol.messages import BacklogHeader, BaseHeader, RoiHeader, Status, TrackStep
+from hvt_common.protocol.messages import BacklogHeader, RoiHeader, Status, TrackStep
 from hvt_common.transport.inbox import Received
 from hvt_ground.link.reassemble import Arrival
 
@@ -15,7 +15,7 @@ __all__ = ["BacklogPacket", "BasePacket", "Packet", "StatusPacket", "StillPacket
 class BasePacket:
     """An access unit that the reassembly has judged, with its own bytes even if it waited behind a hole."""
 
-    arrival: Arrival[BaseHeader]
+    arrival: Arrival
     item: Received
     on_time: bool
     """It did not wait: the time of ``item`` is its own."""

@@ -21,7 +21,7 @@ from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
-from hvt_ground.perception.stills.stage import Progress, StillContext, StillStage
+from hvt_ground.perception.stills.stage import Progress, StillStage
 
 __all__ = ["DecodedFrame", "Pipeline", "PipelineParts", "ReceivedStill"]
 
@@ -41,8 +41,8 @@ def _history_bytes(base_size: tuple[int, int]) -> int:
     return min(_MOST_HISTORY_BYTES, _HISTORY_FRAMES * 3 * base_size[0] * base_size[1])
 
 
-def _lent_nothing() -> None:
-    """What there is to release where nothing was lent."""
+def _release_nothing() -> None:
+    """Models that nobody else takes need no release."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +63,14 @@ class PipelineParts:
     detector: Detector
     tracker: ByteTracker
     reader: StillReader
-    refiner: Refiner[StillContext]
+    refiner: Refiner
     """Over the unified names of the fused list."""
     fusion: Fusion
     path: CameraPath
     """The one that ``fusion`` moves boxes by."""
     camera: CameraMotion | None
     """None where the camera's motion is not followed."""
-    release: Callable[[], None] = _lent_nothing
+    release: Callable[[], None] = _release_nothing
     """Called when the session has ended: its models may serve another."""
 
 
@@ -101,7 +101,8 @@ class Pipeline:
         self._frame_ns = _SECOND_NS / fps
         self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
-        self._history = History(max_bytes=_history_bytes(view.base_size))
+        gap_frames = max(1, round(_GAP_S * fps))
+        self._history = History(max_bytes=_history_bytes(view.base_size), gap_frames=gap_frames)
         self._stills = StillStage(
             parts.reader,
             parts.refiner,
@@ -109,7 +110,7 @@ class Pipeline:
             fusion=parts.fusion,
             view=view,
             wants_base=wants_base,
-            gap_frames=max(1, round(_GAP_S * fps)),
+            gap_frames=gap_frames,
             emit=emit,
         )
         self._detected_frame: int | None = None
@@ -199,7 +200,7 @@ class Pipeline:
         The frame must not lie before the newest decoded frame (`ValueError`). Nothing known is an empty list.
         """
         if frame_index < self._now.picture_index:
-            raise ValueError(f"tick {frame_index} lies before the newest frame, {self._now.picture_index}")
+            raise ValueError(f"frame {frame_index} lies before the newest frame, {self._now.picture_index}")
         fused = self._parts.fusion.listed(self._own_at(frame_index))
         shown = self._parts.refiner.preview(fused.tracks)
         return _overlay(fused, shown, self._capture_ns(frame_index))

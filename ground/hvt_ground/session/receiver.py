@@ -49,7 +49,7 @@ class Receiver:
     def __init__(self, edge: str, *, clock: Callable[[], int]) -> None:
         self._edge = edge
         self._clock = clock
-        self._reassembler: Reassembler[BaseHeader] = Reassembler()
+        self._reassembler: Reassembler = Reassembler()
         self._duplicates = DuplicatePublishers(edge)
         self._uptime = Uptime()
         self._last_message_ns = time.monotonic_ns()
@@ -131,7 +131,7 @@ class Receiver:
             self.skip(row, WireError(f"it belongs to the session {session_id:016x}, which is not shown"))
 
 
-def _base_packet(arrival: Arrival[BaseHeader], item: Received) -> BasePacket:
+def _base_packet(arrival: Arrival, item: Received) -> BasePacket:
     if arrival.payload is item.payload:
         return BasePacket(arrival, item, on_time=True)
     attachment = arrival.header.pack(arrival.payload)

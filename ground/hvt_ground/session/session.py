@@ -141,15 +141,7 @@ class GroundSession:
                 header, size_bytes=item.size_bytes, arrived_ns=item.received_ns, delay_ms=delay_ms
             )
         good = self._access_unit(header, item, decode=decode, starts_run=packet.arrival.starts_run)
-        self._time(
-            Channel.BASE,
-            item,
-            sequence=header.sequence,
-            frame_index=header.frame_index,
-            capture_ns=header.capture_ns,
-            send_ns=header.send_ns,
-            handled=good and decode,
-        )
+        self._time(Channel.BASE, item, header, handled=good and decode)
         return good
 
     def _access_unit(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
@@ -184,15 +176,7 @@ class GroundSession:
                 self._account(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
             return
         self._account(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
-        self._time(
-            Channel.ROI,
-            item,
-            sequence=header.sequence,
-            frame_index=header.frame_index,
-            capture_ns=header.capture_ns,
-            send_ns=header.send_ns,
-            handled=None,
-        )
+        self._time(Channel.ROI, item, header, handled=None)
         self.stills_received += 1
         self.ledger.record_outcome("received", header.reason)
         self.worker.still(ReceivedStill(header, item.payload, media_type))
@@ -212,15 +196,7 @@ class GroundSession:
         self._account(Channel.TRACKS, Account.META, item, at_ns=step.send_ns)
         self.steps_received += 1
         tracks = self._step_decoder.decode(step)
-        self._time(
-            Channel.TRACKS,
-            item,
-            sequence=step.sequence,
-            frame_index=step.frame_index,
-            capture_ns=step.capture_ns,
-            send_ns=step.send_ns,
-            handled=tracks is not None,
-        )
+        self._time(Channel.TRACKS, item, step, handled=tracks is not None)
         if tracks is not None:
             self.worker.step(tracks, step.capture_ns)
 
@@ -232,7 +208,7 @@ class GroundSession:
             return
         self._status_ns = now_ns
         self._account(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
-        self._time(Channel.STATUS, item, sequence=status.sequence, send_ns=status.send_ns)
+        self._time(Channel.STATUS, item, status, handled=True)
         self.last_status = status
 
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
@@ -240,7 +216,7 @@ class GroundSession:
         self._statistics.backlog(size_bytes=item.size_bytes, arrived_ns=item.received_ns)
         self._account(Channel.BACKLOG, Account.BACKLOG, item, at_ns=header.send_ns)
         kind = f"{Channel.BACKLOG}-{header.kind}"
-        self._time(kind, item, sequence=header.number, send_ns=header.send_ns, handled=delivered)
+        self._time(kind, item, header, handled=delivered)
         if delivered and header.kind == BacklogKind.STILL and header.session_id == self.info.session_id:
             self._statistics.stored_still(header.number)
 
@@ -393,20 +369,30 @@ class GroundSession:
         self,
         kind: str,
         item: Received,
+        header: BaseHeader | RoiHeader | TrackStep | Status | BacklogHeader,
         *,
-        sequence: int,
-        send_ns: int,
-        frame_index: int = -1,
-        capture_ns: int = 0,
-        handled: bool | None = True,
+        handled: bool | None,
     ) -> None:
         """Give out when a message came; ``handled``: something was made of it, None is said later."""
         size, extra = len(item.payload), len(item.attachment)
         line = size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding)
         offset_ns = 0 if self._reports is None else self._reports.clock_offset.offset_ns or 0
-        handled_ns = None if handled is None else self._clock() if handled else 0
-        times = capture_ns, send_ns, item.received_ns, handled_ns
-        self._emit(MessageTiming(kind, sequence, frame_index, *times, line, offset_ns))
+        frame_index, capture_ns = -1, 0
+        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
+            frame_index, capture_ns = header.frame_index, header.capture_ns
+        self._emit(
+            MessageTiming(
+                kind=kind,
+                sequence=header.number if isinstance(header, BacklogHeader) else header.sequence,
+                frame_index=frame_index,
+                capture_ns=capture_ns,
+                send_ns=header.send_ns,
+                received_ns=item.received_ns,
+                handled_ns=None if handled is None else self._clock() if handled else 0,
+                line_bytes=line,
+                clock_offset_ns=offset_ns,
+            )
+        )
 
     def _traffic(self, at_ns: int) -> None:
         """Twice a second of the stream, how full the link was and how old the picture is."""

@@ -50,7 +50,7 @@ def wait_for(condition, *, timeout_s: float = 30) -> None:
 
 
 class Models:
-    """Lends red-square detectors."""
+    """Gives red-square detectors."""
 
     @contextmanager
     def checkout(self):
@@ -647,13 +647,13 @@ def test_a_still_is_read_in_the_middle_of_a_stretch(flight, tmp_path):
             order.append("still")
             return super().read(stills, base_bgr)
 
-    class Lent:
+    class Stepped:
         @contextmanager
         def checkout(self):
             yield Stepwise(), None
 
     with Rig(
-        tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), models=Lent()
+        tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), models=Stepped()
     ) as rig:
         rig.base(*range(25))
         for item in backlog(flight, "base", 40, video_object(flight, range(40, 60))):

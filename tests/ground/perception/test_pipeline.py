@@ -413,6 +413,6 @@ def test_looking_ahead_tells_what_would_be_shown_and_changes_nothing(pictures):
     now = asked.pipeline.list_at(19)
     np.testing.assert_allclose(now.boxes_base_px, asked.of(Overlay)[-1].boxes_base_px)
     np.testing.assert_allclose(asked.pipeline.list_at(22).boxes_base_px[0], square_box(22), atol=8)
-    with pytest.raises(ValueError, match="tick 18 lies before"):
+    with pytest.raises(ValueError, match="frame 18 lies before"):
         asked.pipeline.list_at(18)
     assert len(Rig().pipeline.list_at(0).track_ids) == 0

@@ -50,22 +50,14 @@ __all__ = ["FusedTracks", "Fusion", "unified_names"]
 PAIR_IOU = 0.3
 """Lower than the usual half: boxes of 15 pixels from two detectors, some frames apart, seldom reach that."""
 APART_IOU = 0.1
-SAME_IOU = 0.5
-TWIN_IOU = 0.85
 CLASS_BONUS = 0.05
 """Of two partners that fit equally well, the one of the same class."""
 PATIENCE_S = 2.0
 REACH_S = 1.0
 """For how long an object is believed to move on as it did."""
 HALF_LIFE_S = 0.3
-EDGE_BOX_WEIGHT = 4.0
-"""A box from the source overlaps the truth better than ours on a base of 200 kbit/s even when it is 0.5 s old."""
 EDGE_CLASS_WEIGHT = 0.85
 """Nearly as much as ours: it saw the source, but the drone's network is often the smaller one. The surer says."""
-ALONE_CONFIDENCE = 0.3
-"""Of what the edge alone reports at less, one in two is nothing."""
-CORRECTION_WEIGHT = 0.5
-"""A still's box stands against one box of ours at that frame, and each is off by a little."""
 FORGET_S = 10.0
 """How long an entity without any witness keeps its id for a track that is found again."""
 MAX_ENTITIES = 2048
@@ -110,12 +102,7 @@ class Fusion:
             patience=max(1, round(PATIENCE_S * fps)),
             reach=max(1, round(REACH_S * fps)),
             half_life=HALF_LIFE_S * fps,
-            edge_box_weight=EDGE_BOX_WEIGHT,
             edge_class_weight=edge_class_weight,
-            correction_weight=CORRECTION_WEIGHT,
-            alone_confidence=ALONE_CONFIDENCE,
-            same_iou=SAME_IOU,
-            twin_iou=TWIN_IOU,
         )
         self._forget = max(1, round(FORGET_S * fps))
         self._entities: list[Entity] = []

@@ -19,9 +19,19 @@ __all__ = ["FusedTracks", "FusionRules", "far_boxes", "list_entities"]
 _Floats = npt.NDArray[np.float64]
 
 
+SAME_IOU = 0.5
+TWIN_IOU = 0.85
+EDGE_BOX_WEIGHT = 4.0
+"""A box from the source overlaps the truth better than ours on a base of 200 kbit/s even when it is 0.5 s old."""
+ALONE_CONFIDENCE = 0.3
+"""Of what the edge alone reports at less, one in two is nothing."""
+CORRECTION_WEIGHT = 0.5
+"""A still's box stands against one box of ours at that frame, and each is off by a little."""
+
+
 @dataclass(frozen=True, slots=True)
 class FusionRules:
-    """How two opinions on one object become one; the reasons stand in `fuse`."""
+    """How two opinions on one object become one, where it depends on the session; the reasons stand in `fuse`."""
 
     patience: int
     """For how many frames what was seen from afar holds."""
@@ -29,15 +39,7 @@ class FusionRules:
     """For how many frames its own motion is believed to go on."""
     half_life: float
     """After how many frames a box counts half."""
-    edge_box_weight: float
     edge_class_weight: float
-    correction_weight: float
-    alone_confidence: float
-    """Below it what only the edge sees is not listed."""
-    same_iou: float
-    """Of one class, seen by the edge and only by us."""
-    twin_iou: float
-    """Of two classes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,7 @@ def list_entities(
     lines = _lines(entities, own, rules)
     boxes = _boxes(lines, own, path, rules)
     classes, confidences = _classes(lines, own, rules)
-    listed = _once_each(lines, boxes, classes, confidences, rules)
+    listed = _once_each(lines, boxes, classes, confidences)
     lines = [line for line, is_listed in zip(lines, listed, strict=True) if is_listed]
     born = [line.entity.born for line in lines]
     tracks = Tracks(
@@ -107,7 +109,7 @@ def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules) -> list[
     lines = []
     for entity in entities:
         origin = entity.origin(rows, own.frame_index, patience=rules.patience)
-        unsure = origin == "edge" and entity.far_vote.confidence < rules.alone_confidence
+        unsure = origin == "edge" and entity.far_vote.confidence < ALONE_CONFIDENCE
         if origin is not None and entity.id and not unsure:
             lines.append(_Line(entity, origin, rows.get(entity.own_id)))
     return sorted(lines, key=lambda line: line.entity.id)
@@ -132,7 +134,7 @@ def _boxes(
             continue
         theirs = _moved_with_ours(entity, witness, box, boxes[place])
         age = abs(frame_index - witness.frame_index)
-        against = rules.edge_box_weight * witness.confidence * 0.5 ** (age / rules.half_life)
+        against = EDGE_BOX_WEIGHT * witness.confidence * 0.5 ** (age / rules.half_life)
         share = weight / max(weight + against, 1e-9)
         boxes[place] = share * box + (1 - share) * theirs
     return boxes.astype(np.float32)
@@ -151,7 +153,7 @@ def _correction(entity: Entity, frame_index: int, rules: FusionRules) -> _Floats
     assert entity.correction is not None
     offset, since = entity.correction
     return np.asarray(
-        offset * (rules.correction_weight * 0.5 ** (max(0, frame_index - since) / rules.half_life)),
+        offset * (CORRECTION_WEIGHT * 0.5 ** (max(0, frame_index - since) / rules.half_life)),
         np.float64,
     )
 
@@ -180,7 +182,6 @@ def _once_each(
     boxes: npt.NDArray[np.float32],
     classes: npt.NDArray[np.int32],
     confidences: npt.NDArray[np.float32],
-    rules: FusionRules,
 ) -> npt.NDArray[np.bool_]:
     """(N,) which to list: of two that are one object the better known, then the surer, then the older."""
     listed = np.ones(len(lines), np.bool_)
@@ -194,7 +195,7 @@ def _once_each(
     order = np.lexsort((np.arange(len(lines)), -confidences, ~both))
     rank = np.empty(len(lines), int)
     rank[order] = np.arange(len(lines))
-    clash = np.where(alike, mixed & (overlaps >= rules.same_iou), overlaps >= rules.twin_iou)
+    clash = np.where(alike, mixed & (overlaps >= SAME_IOU), overlaps >= TWIN_IOU)
     weaker = clash & (rank[None] > rank[:, None])
     for place in order[np.asarray(weaker.any(axis=1))[order]]:
         if listed[place]:

@@ -14,6 +14,7 @@ from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, OnnxDetector
 from hvt_common.values import Boxes, Detections, Image, Posterior, View
 from hvt_ground.perception.stills.composite import composite
+from hvt_ground.perception.stills.decode import Box, DecodedStill
 
 __all__ = [
     "Box",
@@ -27,9 +28,6 @@ __all__ = [
     "object_crops",
 ]
 
-Box = tuple[float, float, float, float]
-"""x1 y1 x2 y2."""
-
 _SAME_OBJECT_IOU = 0.4
 """A detection on the composite that overlaps an object's box less is of something else."""
 _NEW_OBJECT_IOU = 0.2
@@ -39,23 +37,6 @@ _INSIDE_SHARE = 0.9
 
 _PADDING = 0.15
 """Of an object's width and height on each side, as the edge pads a crop."""
-
-
-@dataclass(frozen=True, slots=True)
-class DecodedStill:
-    """A decoded still and where it belongs."""
-
-    image_bgr: Image
-    crop_source_px: tuple[int, int, int, int]
-    box_base_px: Box
-    frame_index: int
-    also_boxes_base_px: tuple[Box, ...] = ()
-    """Of the further objects that it shows, in the order of the header's ``also``."""
-
-    @property
-    def boxes_base_px(self) -> tuple[Box, ...]:
-        """The lead object's box, then those of the others."""
-        return (self.box_base_px, *self.also_boxes_base_px)
 
 
 @dataclass(frozen=True, slots=True)

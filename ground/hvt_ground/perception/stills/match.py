@@ -23,9 +23,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
+from hvt_common.boxes import iou
 from hvt_common.values import Boxes, Tracks
 
-__all__ = ["Matcher", "StillToMatch", "TrackMatch", "iou_matrix"]
+__all__ = ["Matcher", "StillToMatch", "TrackMatch"]
 
 KNOWN_BONUS = 0.10
 OTHERS_PENALTY = 0.25
@@ -62,14 +63,14 @@ class Matcher:
     """Remembers which edge track is which ground track, for one session and in bounded memory.
 
     Args:
-        iou: the threshold that the evidence must reach.
+        least_iou: the threshold that the evidence must reach.
         owned_frames: for how many frames after a still a ground track counts as the edge track's own.
     """
 
-    def __init__(self, *, iou: float, owned_frames: int) -> None:
-        if not 0 < iou <= 1:
-            raise ValueError(f"the IoU threshold lies within 0…1, not {iou!r}")
-        self._iou = iou
+    def __init__(self, *, least_iou: float, owned_frames: int) -> None:
+        if not 0 < least_iou <= 1:
+            raise ValueError(f"the IoU threshold lies within 0…1, not {least_iou!r}")
+        self._iou = least_iou
         self._owned_frames = owned_frames
         self._ground_of: OrderedDict[int, tuple[int, int]] = (
             OrderedDict()
@@ -154,7 +155,7 @@ class Matcher:
     ) -> Floats:
         """(heads, rows) how much each pair is preferred; 0 where the evidence does not reach the threshold."""
         wanted_px = np.array([head.box_base_px for head in heads], np.float32)
-        evidence = iou_matrix(wanted_px, tracks.boxes_xyxy_px[rows])
+        evidence = iou(wanted_px, tracks.boxes_xyxy_px[rows])
         same_class = np.zeros(evidence.shape, np.bool_)
         claims = self._claims.get(frame_index, {})
         for column, row in enumerate(rows):
@@ -192,16 +193,6 @@ class Matcher:
                 known.popitem(last=False)
 
 
-def iou_matrix(boxes_a_px: Boxes, boxes_b_px: Boxes) -> Floats:
-    """(A, B) intersection over union of two sets of boxes (x1 y1 x2 y2); 0 for boxes without area."""
-    a, b = boxes_a_px.astype(np.float64)[:, None], boxes_b_px.astype(np.float64)[None]
-    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    overlap = sides.clip(0).prod(-1)
-    union = (a[..., 2:] - a[..., :2]).clip(0).prod(-1) + (b[..., 2:] - b[..., :2]).clip(0).prod(-1) - overlap
-    iou: Floats = np.divide(overlap, union, out=np.zeros_like(overlap), where=union > 0)
-    return iou
-
-
 def _by_edge_track(wanted: Sequence[StillToMatch]) -> list[list[StillToMatch]]:
     groups: dict[tuple[str, Hashable], list[StillToMatch]] = {}
     for want in wanted:
@@ -214,5 +205,5 @@ def _ambiguous(preference: Floats, chosen: int, taken: Sequence[int], boxes: Box
     """Whether a free track fits nearly as well and is another object."""
     near = (preference > 0) & (preference >= preference[chosen] - AMBIGUITY_MARGIN)
     near[[chosen, *taken]] = False
-    apart = iou_matrix(boxes[chosen : chosen + 1], boxes)[0] < SAME_OBJECT_IOU
+    apart = iou(boxes[chosen : chosen + 1], boxes)[0] < SAME_OBJECT_IOU
     return bool((near & apart).any())

@@ -6,7 +6,7 @@ base packet must not refine the wrong object. What cannot be decided yet is held
 when it never will be.
 
 ``replace`` is the paper's rule: the newest still's prediction is the class. ``fuse`` multiplies what all
-stills of the track say (see `TrackPosterior`). Frames are the only clock here; `History` satisfies `TrackLog`.
+stills of the track say (see `TrackPosterior`). Frames are the only clock here.
 """
 
 from __future__ import annotations
@@ -14,14 +14,21 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
-from typing import Generic, Literal, Protocol, TypeVar
+from typing import Literal
 
 import numpy as np
 
 from hvt_common.values import Tracks
+from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher, StillToMatch, TrackMatch
 from hvt_ground.perception.stills.posterior import ClassEstimate, ClassNames, TrackPosterior
-from hvt_ground.perception.stills.resolved import Outcome, ResolvedStill, ShownClasses, StillSeen
+from hvt_ground.perception.stills.resolved import (
+    Outcome,
+    ResolvedStill,
+    ShownClasses,
+    StillContext,
+    StillSeen,
+)
 
 __all__ = [
     "Mode",
@@ -30,8 +37,8 @@ __all__ = [
     "Refiner",
     "ResolvedStill",
     "ShownClasses",
+    "StillContext",
     "StillSeen",
-    "TrackLog",
 ]
 
 Mode = Literal["replace", "fuse"]
@@ -39,23 +46,6 @@ Mode = Literal["replace", "fuse"]
 MAX_HELD = 256
 MAX_TRACK_POSTERIORS = 1024
 _REMEMBERED_STILLS = 4096
-
-P = TypeVar("P")
-
-
-class TrackLog(Protocol):
-    """The ground's tracks by frame; every decoded frame has an entry, with or without tracks in it."""
-
-    @property
-    def oldest_tracked(self) -> int | None:
-        """Frame index of the oldest entry."""
-
-    @property
-    def newest_tracked(self) -> int | None:
-        """Frame index of the newest entry."""
-
-    def tracks(self, frame_index: int) -> Tracks | None:
-        """The tracks of that frame; None if it is lost, gone, or not tracked yet."""
 
 
 @dataclass(slots=True)
@@ -81,13 +71,13 @@ def _unknown(_edge_track_id: int) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Held(Generic[P]):
-    still: StillSeen[P]
+class _Held:
+    still: StillSeen
     last_frame: int
     """It waits no longer once the stream is past this frame."""
 
 
-class Refiner(Generic[P]):
+class Refiner:
     """Holds stills until their track is known, and the classes that came of them. One for each session.
 
     Args:
@@ -121,14 +111,14 @@ class Refiner(Generic[P]):
         self._hold_frames = round(hold_s * fps)
         self._confirm_frames = round(confirm_s * fps)
         self._forget_frames = round(forget_s * fps)
-        self._matcher = Matcher(iou=iou, owned_frames=self._forget_frames)
-        self._held: dict[tuple[int, int], _Held[P]] = {}  # by still sequence and part, oldest offer first
+        self._matcher = Matcher(least_iou=iou, owned_frames=self._forget_frames)
+        self._held: dict[tuple[int, int], _Held] = {}  # by still sequence and part, oldest offer first
         self._seen: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._track_posteriors: OrderedDict[int, TrackPosterior] = (
             OrderedDict()
         )  # by ground track id, longest unseen first
 
-    def offer(self, still: StillSeen[P], *, now_frame: int) -> list[ResolvedStill[P]]:
+    def offer(self, still: StillSeen, *, now_frame: int) -> list[ResolvedStill]:
         """Take a still; returns what had to make room for it (almost always nothing).
 
         ``now_frame`` is the newest frame that was decoded. A part of a still that was here before is ignored.
@@ -147,24 +137,24 @@ class Refiner(Generic[P]):
         return [self._unmatched(self._held.pop(oldest).still, "overflow")]
 
     def settle(
-        self, log: TrackLog, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
-    ) -> list[ResolvedStill[P]]:
+        self, history: History, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
+    ) -> list[ResolvedStill]:
         """Match what can be matched and give up what never will be, oldest frame first.
 
         Call it after each frame was tracked, with the newest frame that was decoded. ``known_as`` gives the ground's
         track for one of the edge, where the edge itself has told.
         """
-        by_frame: dict[int, list[_Held[P]]] = {}
+        by_frame: dict[int, list[_Held]] = {}
         for held in self._held.values():
             by_frame.setdefault(held.still.frame_index, []).append(held)
-        resolved: list[ResolvedStill[P]] = []
+        resolved: list[ResolvedStill] = []
         for frame_index in sorted(by_frame):
-            resolved += self._resolve_frame(by_frame[frame_index], log, now_frame, known_as)
+            resolved += self._resolve_frame(by_frame[frame_index], history, now_frame, known_as)
         for done in resolved:
             del self._held[done.still.key]
         return resolved
 
-    def end(self) -> list[ResolvedStill[P]]:
+    def end(self) -> list[ResolvedStill]:
         """Give out all that still waits, as unmatched: the stream or its session is over."""
         ended = [self._unmatched(held.still, "ended") for held in self._held.values()]
         self._held.clear()
@@ -206,15 +196,15 @@ class Refiner(Generic[P]):
     # One frame's stills.
 
     def _resolve_frame(
-        self, held: list[_Held[P]], log: TrackLog, now_frame: int, known_as: Callable[[int], int | None]
-    ) -> list[ResolvedStill[P]]:
+        self, held: list[_Held], history: History, now_frame: int, known_as: Callable[[int], int | None]
+    ) -> list[ResolvedStill]:
         frame_index = held[0].still.frame_index
-        tracks = log.tracks(frame_index)
+        tracks = history.tracks(frame_index)
         if tracks is None:
-            return self._resolve_untracked(held, log, now_frame, known_as)
-        found = self._match(held, tracks, log)
-        newest = log.newest_tracked
-        resolved: list[ResolvedStill[P]] = []
+            return self._resolve_untracked(held, history, now_frame, known_as)
+        found = self._match(held, tracks, history)
+        newest = history.newest_tracked
+        resolved: list[ResolvedStill] = []
         for pending in sorted(held, key=lambda pending: pending.still.key):
             candidate = found[pending.still.key]
             if candidate.tracks is not None:
@@ -228,15 +218,19 @@ class Refiner(Generic[P]):
 
     def _resolve_untracked(
         self,
-        held: Iterable[_Held[P]],
-        log: TrackLog,
+        held: Iterable[_Held],
+        history: History,
         now_frame: int,
         known_as: Callable[[int], int | None],
-    ) -> list[ResolvedStill[P]]:
+    ) -> list[ResolvedStill]:
         """Tracks come in the order of frames: once a later frame is there, an absent one never will be."""
-        resolved: list[ResolvedStill[P]] = []
+        resolved: list[ResolvedStill] = []
         for pending in held:
-            oldest, newest, frame_index = log.oldest_tracked, log.newest_tracked, pending.still.frame_index
+            oldest, newest, frame_index = (
+                history.oldest_tracked,
+                history.newest_tracked,
+                pending.still.frame_index,
+            )
             outcome: Outcome | None = None
             if oldest is not None and frame_index < oldest:
                 outcome = "late"
@@ -245,25 +239,25 @@ class Refiner(Generic[P]):
             elif now_frame > pending.last_frame:
                 outcome = "late"
             if outcome is not None:
-                named = self._by_name(pending.still, log, known_as) if pending.still.stored else None
+                named = self._by_name(pending.still, history, known_as) if pending.still.stored else None
                 resolved.append(named or self._unmatched(pending.still, outcome))
         return resolved
 
     def _by_name(
-        self, still: StillSeen[P], log: TrackLog, known_as: Callable[[int], int | None]
-    ) -> ResolvedStill[P] | None:
+        self, still: StillSeen, history: History, known_as: Callable[[int], int | None]
+    ) -> ResolvedStill | None:
         """Let a still of long ago speak on the track that its edge track is known as now; None where it is not."""
         edge_id = still.edge_track_id
-        if edge_id < 0 or log.newest_tracked is None:
+        if edge_id < 0 or history.newest_tracked is None:
             return None
-        track_id, tracks = known_as(edge_id), log.tracks(log.newest_tracked)
+        track_id, tracks = known_as(edge_id), history.tracks(history.newest_tracked)
         if track_id is None:
             track_id = self._matcher.known_as(edge_id)
         if track_id is None or tracks is None or track_id not in tracks.ids:
             return None
         return self._apply(still, tracks, int(np.flatnonzero(tracks.ids == track_id)[0]))
 
-    def _match(self, held: list[_Held[P]], tracks: Tracks, log: TrackLog) -> dict[Hashable, TrackMatch]:
+    def _match(self, held: list[_Held], tracks: Tracks, history: History) -> dict[Hashable, TrackMatch]:
         wanted = [
             StillToMatch(
                 key=pending.still.key,
@@ -273,14 +267,14 @@ class Refiner(Generic[P]):
             )
             for pending in held
         ]
-        newest = log.newest_tracked or 0
+        newest = history.newest_tracked or 0
         last = min(tracks.frame_index + self._confirm_frames, newest)
-        later = (log.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
+        later = (history.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
         return self._matcher.match(
             wanted, tracks, later=(t for t in later if t is not None), class_names=self._class_names.detector
         )
 
-    def _apply(self, still: StillSeen[P], tracks: Tracks, row: int) -> ResolvedStill[P]:
+    def _apply(self, still: StillSeen, tracks: Tracks, row: int) -> ResolvedStill:
         """Let a still speak on the class of a track."""
         track_id = int(tracks.ids[row])
         class_posterior = self._track_posteriors.get(track_id)
@@ -309,7 +303,7 @@ class Refiner(Generic[P]):
             entropy_nats=after.entropy_nats,
         )
 
-    def _unmatched(self, still: StillSeen[P], outcome: Outcome) -> ResolvedStill[P]:
+    def _unmatched(self, still: StillSeen, outcome: Outcome) -> ResolvedStill:
         self.counters.unmatched += 1
         self.counters.late += outcome == "late"
         said = still.posterior

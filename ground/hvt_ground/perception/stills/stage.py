@@ -14,12 +14,12 @@ from hvt_common.video.base_crop import base_crop
 from hvt_common.video.still_codecs import BaseMissingError, StillError, psnr_y_db, still_codec
 from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.fusion.fuse import Fusion
-from hvt_ground.perception.history import FilledLog, History
+from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.classify import Box, DecodedStill, ObjectReading, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
-from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillSeen
+from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillContext, StillSeen
 
-__all__ = ["Progress", "StillContext", "StillStage"]
+__all__ = ["Progress", "StillStage"]
 
 SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
@@ -40,20 +40,6 @@ class Progress:
     """The newest decoded frame; -1 before the first."""
 
 
-@dataclass(frozen=True, slots=True)
-class StillContext:
-    """What a still brings along while it waits for its track, for one of the objects that it shows."""
-
-    received: ReceivedStill
-    decoded: DecodedStill
-    track_id: int
-    """The edge's."""
-    box_base_px: Box
-    found_base_px: Box | None
-    """Where the reader found the object."""
-    base_crop_bgr: Image | None
-
-
 class StillStage:
     """One session's stills. Used by one thread; ``emit`` takes the events.
 
@@ -71,7 +57,7 @@ class StillStage:
     def __init__(
         self,
         reader: StillReader,
-        refiner: Refiner[StillContext],
+        refiner: Refiner,
         *,
         history: History,
         fusion: Fusion,
@@ -83,7 +69,6 @@ class StillStage:
         self._reader = reader
         self._refiner = refiner
         self._history = history
-        self._log = FilledLog(history, within=gap_frames)
         self._gap_frames = gap_frames
         self._fusion = fusion
         self._view = view
@@ -113,7 +98,7 @@ class StillStage:
             ready, self._pending = ready + self._pending[:surplus], self._pending[surplus:]
         self._read(ready, now)
         for resolved in self._refiner.settle(
-            self._log, now_frame=now.frame_index, known_as=self._fusion.known_as
+            self._history, now_frame=now.frame_index, known_as=self._fusion.known_as
         ):
             self._resolved(resolved, now)
 
@@ -151,7 +136,7 @@ class StillStage:
             for (still, decoded), objects in zip(pairs, readings.objects, strict=True):
                 self._offer(still, decoded, objects, base_bgr, now)
             if len(readings.found):
-                known = self._log.tracks(frame_index)
+                known = self._history.tracks(frame_index)
                 if known is not None:
                     self._fusion.take_found(readings.found, known=known)
 
@@ -202,12 +187,12 @@ class StillStage:
         news = self._news(decoded)
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
-            wire_field = StillContext(still, decoded, track_id, box, reading.box_base_px, crop)
+            context = StillContext(still, decoded, track_id, box, reading.box_base_px, crop)
             self._answer(header, track_id, reading.posterior)
             if reading.posterior is None:
                 self.outcomes["unread"] += 1
                 name = header.class_name
-                self._emit(self._refinement(wire_field, now, None, name, name, header.confidence))
+                self._emit(self._refinement(context, now, None, name, name, header.confidence))
                 continue
             seen = StillSeen(
                 sequence=header.sequence,
@@ -217,7 +202,7 @@ class StillStage:
                 box_base_px=box,
                 class_name=header.class_name,
                 posterior=reading.posterior,
-                wire_field=wire_field,
+                context=context,
                 news=news,
                 part=part,
                 stored=bool(header.flags & Flags.STORED),
@@ -241,27 +226,27 @@ class StillStage:
         nearness_db = psnr_y_db(seen, decoded.image_bgr)
         return float(np.clip((SAME_DB - nearness_db) / (SAME_DB - OTHER_DB), 0.0, 1.0))
 
-    def _resolved(self, resolved: ResolvedStill[StillContext], now: Progress) -> None:
+    def _resolved(self, resolved: ResolvedStill, now: Progress) -> None:
         self.outcomes[resolved.outcome] += 1
-        wire_field, track_id = resolved.still.wire_field, resolved.track_id
+        context, track_id = resolved.still.context, resolved.track_id
         if track_id is not None:
             self._name_track(resolved.still, track_id)
-            if wire_field.found_base_px is not None and not resolved.still.stored:
+            if context.found_base_px is not None and not resolved.still.stored:
                 frame_index = resolved.still.frame_index
-                self._fusion.take_box(track_id, wire_field.found_base_px, frame_index=frame_index)
+                self._fusion.take_box(track_id, context.found_base_px, frame_index=frame_index)
         before, after = resolved.class_before, resolved.class_after
-        self._emit(self._refinement(wire_field, now, track_id, before, after, resolved.confidence))
+        self._emit(self._refinement(context, now, track_id, before, after, resolved.confidence))
 
     def _refinement(
         self,
-        wire_field: StillContext,
+        context: StillContext,
         now: Progress,
         track_id: int | None,
         before: str,
         after: str,
         confidence: float,
     ) -> Refinement:
-        header = wire_field.received.header
+        header = context.received.header
         stored = bool(header.flags & Flags.STORED)
         # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. What
         # was kept while the link was away tells of then, and nobody looked on.
@@ -270,17 +255,17 @@ class StillStage:
             capture_ns=header.capture_ns if stored else now.capture_ns,
             still_sequence=header.sequence,
             track_id=track_id,
-            edge_track_id=wire_field.track_id,
-            box_base_px=wire_field.box_base_px,
-            still=wire_field.received.data,
+            edge_track_id=context.track_id,
+            box_base_px=context.box_base_px,
+            still=context.received.data,
             media_type=still_codec(header.codec).media_type,  # not what Zenoh said: that is nobody's word
-            base_crop_bgr=wire_field.base_crop_bgr,
+            base_crop_bgr=context.base_crop_bgr,
             class_before=before,
             class_after=after,
             confidence=confidence,
             reason=header.reason,
             quality_pct=header.quality_pct,
-            still_bgr=wire_field.decoded.image_bgr,
+            still_bgr=context.decoded.image_bgr,
             crop_base_px=self._to_base(header.crop_source_px),
             stored=stored,
         )
@@ -306,7 +291,7 @@ class StillStage:
             )
         )
 
-    def _name_track(self, still: StillSeen[StillContext], ground_track_id: int) -> None:
+    def _name_track(self, still: StillSeen, ground_track_id: int) -> None:
         """Add the track that a still refined to its answer, if that has not been reported yet."""
         for place, result in enumerate(self._results):
             if (result.still_sequence, result.track_id) == (still.sequence, still.edge_track_id):

@@ -166,7 +166,7 @@ def test_the_edges_knowledge_ends(ground):
     ground.step(10, {71: B})
     assert brief(ground.own(11, {})) == {2: ("edge", whole(B))}
     assert len(brief(ground.own(40, {}))) == 1
-    assert brief(ground.own(41, {})) == {}, "31 ticks without a step"
+    assert brief(ground.own(41, {})) == {}, "31 frames without a step"
 
 
 def test_where_the_edge_lets_go_our_track_stays(ground):

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hvt_common.boxes import iou
 from hvt_common.values import Posterior, Tracks
 from hvt_ground.perception.history import History
-from hvt_ground.perception.stills.match import Matcher, StillToMatch, iou_matrix
+from hvt_ground.perception.stills.match import Matcher, StillToMatch
 from hvt_ground.perception.stills.refine import MAX_HELD, MAX_TRACK_POSTERIORS, Refiner, StillSeen
 
 DETECTOR = ("car", "van", "person")
@@ -142,7 +143,7 @@ def test_a_missing_track_leaves_the_neighbour_alone(ground):
 
 
 def test_a_close_neighbour_that_has_its_own_edge_track_is_left_alone(ground):
-    """Two cars that overlap in the picture would swap classes when the ground loses sight of one."""
+    """Two cars that overlap in the picture would swap classes when the ground loses one."""
     ground.track(5, {1: A, 2: A_NEAR})
     assert brief(ground.offer(still(0, 5, A, edge=70), still(1, 5, A_NEAR, edge=71))) == [
         (0, "matched", 1),
@@ -167,7 +168,7 @@ def rows(matcher, frame_index, boxes, *wanted):
 
 def test_a_track_is_another_edge_tracks_own_only_for_a_while():
     """When the edge gives an object a new id, its stills would be refused for the rest of the flight."""
-    matcher = Matcher(iou=0.5, owned_frames=20)
+    matcher = Matcher(least_iou=0.5, owned_frames=20)
     assert rows(matcher, 5, {1: A}, FIRST) == [0]
     assert rows(matcher, 25, {1: A}, OTHER) == [-1]
     assert rows(matcher, 26, {1: A}, OTHER) == [0]
@@ -175,7 +176,7 @@ def test_a_track_is_another_edge_tracks_own_only_for_a_while():
 
 def test_a_track_that_its_owner_has_left_is_free():
     """After an exchange of ids on the ground, the second object would be refused as the first one's."""
-    matcher = Matcher(iou=0.5, owned_frames=1000)
+    matcher = Matcher(least_iou=0.5, owned_frames=1000)
     assert rows(matcher, 5, {1: A}, FIRST) == [0]
     assert rows(matcher, 6, {1: (300, 100, 340, 120), 2: A}, FIRST) == [1]
     assert rows(matcher, 7, {1: A}, OTHER) == [0]
@@ -183,7 +184,7 @@ def test_a_track_that_its_owner_has_left_is_free():
 
 def test_an_older_still_does_not_overrule_what_a_newer_one_showed():
     """A late still from before an exchange of ids would bring the old posterior back."""
-    matcher = Matcher(iou=0.5, owned_frames=1000)
+    matcher = Matcher(least_iou=0.5, owned_frames=1000)
     assert rows(matcher, 9, {2: A}, FIRST) == [0]
     assert rows(matcher, 5, {1: A}, FIRST) == [0]
     assert rows(matcher, 10, {2: A}, OTHER) == [-1], "2 is still the first one's own"
@@ -261,9 +262,7 @@ def test_two_stills_of_one_frame_go_to_two_tracks(ground):
     middle = (112.0, 100.0, 152.0, 120.0)  # nearer to track 2, but track 2 is what the other still wants
     ground.track(5, {1: A, 2: (112.0, 100.0, 152.0, 120.0)})
     first = still(0, 5, A_NEAR, edge=70)
-    assert iou_matrix(np.float32([A_NEAR]), np.float32([A, middle]))[0] == pytest.approx(
-        [0.739, 0.739], abs=1e-3
-    )
+    assert iou(np.float32([A_NEAR]), np.float32([A, middle]))[0] == pytest.approx([0.739, 0.739], abs=1e-3)
     done = ground.offer(first)
     assert done == []
     assert brief(ground.offer(still(1, 5, middle, edge=71))) == [(0, "matched", 1), (1, "matched", 2)]
