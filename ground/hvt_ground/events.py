@@ -40,7 +40,7 @@ class VideoSample:
     data: bytes
     keyframe: bool
     stored: bool = False
-    """It was kept at the edge while the link was away: it lies before others that are logged already."""
+    """It was stored at the edge while the link was down: it lies before others that are logged already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +59,11 @@ class Overlay:
     base_classes: tuple[str, ...]
     """N names: what the detector says of the base stream."""
     classes: tuple[str, ...]
-    """N names: the same after refinement; equal to the base class where no still has spoken."""
+    """N names: the same after refinement; equal to the base class where no still has refined it."""
     confidences: npt.NDArray[np.float32]
     """(N,) of the class that is shown, 0…1."""
     refined: npt.NDArray[np.bool_]
-    """(N,) True once a still has spoken on the track's class."""
+    """(N,) True once a still has refined the track's class."""
     origins: tuple[Origin, ...] = ()
     """N words; empty says ``base`` for all."""
     stored: bool = False
@@ -102,7 +102,7 @@ class Refinement:
     """x1 y1 x2 y2, where the whole still lies in the base picture of its own frame (that of ``box_base_px``), not
     clipped; None leaves it out of the enhanced picture."""
     stored: bool = False
-    """It was kept at the edge while the link was away: its frame is the one that it shows, long ago."""
+    """It was stored at the edge while the link was down: its frame is the one that it shows, long ago."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ def summary(
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do.
 
     ``unusable`` counts messages of the edge that were skipped, over all its sessions; ``backlog_recordings`` are of
-    sessions that it kept things of, and that were over when they came.
+    former sessions, of which a backlog came.
     """
     info, pipeline, counters = session.info, session.pipeline, session.counters
     account = session.ledger.summary(session.duration_s)

@@ -1,7 +1,7 @@
-"""Puts together again what an edge kept while the link was away: chunks in, whole objects and acknowledgements out.
+"""Puts together again what an edge stored while the link was down: chunks in, whole objects and acknowledgements out.
 
 Pure, and bounded whatever comes. Of an object is held what has come without a hole from its beginning: a chunk beyond
-that is not kept, and the edge hears how far it got. Where room is short the object that has waited longest for its
+that is not taken, and the edge learns how far it got. Where space is short the object that has waited longest for its
 next chunk goes; its edge begins it again. What has been delivered is remembered, so that a repetition is acknowledged
 and nothing more.
 
@@ -173,11 +173,11 @@ class BacklogAssembly:
 
     @property
     def unreported(self) -> int:
-        """How many acknowledgements the edge has not heard yet."""
+        """How many acknowledgements the edge has not been sent yet."""
         return len(self._unreported)
 
     def take_acknowledged_ranges(self, most: int) -> tuple[AcknowledgedRange, ...]:
-        """Return and forget up to ``most`` acknowledgements that the edge has not heard yet, oldest first."""
+        """Return and forget up to ``most`` acknowledgements that the edge has not been sent yet, oldest first."""
         taken = [self._unreported.popitem(last=False) for _ in range(min(most, len(self._unreported)))]
         return tuple(
             AcknowledgedRange(

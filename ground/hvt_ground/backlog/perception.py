@@ -28,7 +28,7 @@ from hvt_ground.perception.stills.stage import Progress, StillStage
 __all__ = ["FIRST_TRACK_ID", "BacklogPerception", "StretchTracker"]
 
 FIRST_TRACK_ID = 1_000_001
-"""Tracks of kept video are others than those of the session, and told apart by their numbers."""
+"""Of the first track in stored video: these tracks are others than those of the live stream."""
 
 Emit = Callable[[Event], None]
 

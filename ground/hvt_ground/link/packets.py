@@ -40,7 +40,7 @@ class TracksPacket:
 
 @dataclass(frozen=True, slots=True)
 class BacklogPacket:
-    """A chunk of what was stored while the link was away."""
+    """A chunk of what was stored while the link was down."""
 
     header: BacklogHeader
     item: Received

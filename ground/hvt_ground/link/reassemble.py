@@ -13,13 +13,13 @@ keyframe never waits: what is missing before it no longer matters.
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
 `ADOPTION_INTERVAL_NS`: late units of the old session or a flood of invented ids cannot make the picture jump to
-and fro. Where the present session still goes on `DUPLICATE_AFTER_NS` after another was first heard, that is no
+and fro. Where the present session still goes on `DUPLICATE_AFTER_NS` after another first came, that is no
 restart but a second edge of the same name: a *duplicate*, which is shown only when the first has been silent for
 `DUPLICATE_SILENCE_NS`. A session that was left may come back, but only beyond where it had been. One that the edge
 does not know (`Reassembler.disown`) is nobody's, and the one before it goes on.
 
 *Plausibility.* A sequence number or frame index that is further ahead than `MAX_RATE_HZ` allows since the last
-progress (plus some slack) is not believed, so that one flipped bit cannot make all that follows look old. If
+progress (plus some slack) does not count, so that one flipped bit cannot make all that follows look old. If
 nothing else comes for `RESTART_SILENCE_NS` it was we who were wrong, and the next keyframe starts afresh. So it is
 where nothing comes but old numbers that have not been here: somebody else has counted on in the edge's name.
 """
@@ -114,7 +114,7 @@ class StreamCounters:
     corrupt: int = 0
     """Reported by the caller: the header could not be read, or the CRC was wrong."""
     sessions: int = 0
-    """Adopted; one that starts afresh after numbers that could not be believed counts again."""
+    """Adopted; one that starts afresh after implausible numbers counts again."""
     keyframe_requests: int = 0
 
     def since(self, before: StreamCounters) -> StreamCounters:
@@ -138,7 +138,7 @@ class Reassembler:
         self._session: int | None = None
         self._adopted_ns: int | None = None
         self._left: OrderedDict[int | None, int] = OrderedDict()  # session id → the sequence it had reached
-        self._outsiders: OrderedDict[int | None, int] = OrderedDict()  # session id → when it was first heard
+        self._outsiders: OrderedDict[int | None, int] = OrderedDict()  # session id → when it first came
         self._disowned: OrderedDict[int | None, None] = OrderedDict()
         self._first = 0
         self._next = 0
@@ -288,7 +288,7 @@ class Reassembler:
     # Between sessions.
 
     def _is_duplicate(self, session_id: int, now_ns: int) -> bool:
-        """Whether the present session has gone on for a while since that one was first heard."""
+        """Whether the present session has gone on for a while since that one first came."""
         if self._adopted_ns is None:
             return False
         since_ns = self._outsiders.setdefault(session_id, now_ns)

@@ -12,7 +12,7 @@ _PAGE_BITS = 12
 _MOST_SENT = 512
 """Stills whose second copy is still known for one: those of the last seconds."""
 _NEVER_NS = -(2**64)
-"""When a still was sent that has come with what was kept only."""
+"""When a still was sent that has come with the backlog only."""
 
 
 class SequenceWindow:

@@ -83,12 +83,12 @@ class ReceptionStatistics:
             self._note(size_bytes, arrived_ns)
 
     def backlog(self, *, size_bytes: int, arrived_ns: int) -> None:
-        """A chunk of what was kept while the link was away has arrived."""
+        """A chunk of the backlog has arrived."""
         with self._lock:
             self._note(size_bytes, arrived_ns)
 
     def stored_still(self, sequence: int) -> None:
-        """A still that never came on ``roi`` came afterwards, with what was kept."""
+        """A still that never came on ``roi`` came afterwards, with the backlog."""
         with self._lock:
             self._missing.pop(sequence, None)
 

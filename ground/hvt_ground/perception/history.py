@@ -74,7 +74,7 @@ class History:
             self._frame_bytes -= dropped.nbytes
 
     def add_tracks(self, tracks: Tracks) -> None:
-        """Keep the tracks of a frame; an empty `Tracks` says that the frame was seen and held nothing."""
+        """Keep the tracks of a frame; an empty `Tracks` says that the frame was analyzed and held nothing."""
         _require_rising(self.newest_tracked, tracks.frame_index)
         self._tracks[tracks.frame_index] = tracks
         if len(self._tracks) > self._track_frames:

@@ -1,4 +1,4 @@
-"""What the ground sees: the base stream, the edge's own tracks and the stills, as one list of tracks."""
+"""The perception of one session: base stream, the edge's own tracks and stills become one list of tracks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = ["DecodedFrame", "Pipeline", "PipelineParts", "ReceivedStill"]
 
 _SECOND_NS = 1_000_000_000
 _FARTHEST_S = 5
-"""A step further ahead of all that is known is not believed: nothing that comes after it could be shown."""
+"""A step further ahead of all that is known is not plausible: nothing that comes after it could be shown."""
 _GAP_S = 1.0
 """For how long the base stream may leave out frames and still tell where tracks were between."""
 
@@ -82,7 +82,7 @@ class Pipeline:
         view: between source and base pixels.
         fps: frames a second.
         detect_every: frames from one detection to the next, at least.
-        wants_base: whether the reader looks at the base frame of a still.
+        wants_base: whether the reader uses the base frame of a still.
         emit: takes the events.
     """
 
@@ -133,7 +133,7 @@ class Pipeline:
 
     @property
     def refined(self) -> int:
-        """Distinct tracks on whose class a still has spoken."""
+        """Distinct tracks that a still has refined."""
         return self._parts.refiner.counters.tracks_refined
 
     @property
@@ -206,7 +206,7 @@ class Pipeline:
         return _overlay(fused, shown, self._capture_ns(frame_index))
 
     def take_results(self) -> list[StillResult]:
-        """Return and forget what the edge wants to hear of its stills."""
+        """Return and forget the results of stills that the edge has not been sent yet."""
         return self._stills.take_results()
 
     def end(self) -> None:

@@ -70,7 +70,7 @@ class EdgeSessions:
         self._patience_ns = round(patience_s * _SECOND_NS)
         clock = clock or SteadyClock()
         self.backlog = EdgeBacklog(port.edge, recordings=recordings)
-        """What was stored while the link was away."""
+        """What was stored while the link was down."""
         self._reports = ReceiverReports(
             port.report, clock=clock, clock_offset=ClockOffset(), backlog=self.backlog
         )

@@ -35,7 +35,7 @@ __all__ = ["Receiver"]
 _log = logging.getLogger(__name__)
 
 _SILENT_NS = 2_000_000_000
-"""A keyframe is requested only of an edge that was heard from so long ago at most."""
+"""A keyframe is requested only of an edge that sent something so long ago at most."""
 
 
 class Receiver:

@@ -64,7 +64,7 @@ class GroundSession:
         clock: Unix nanoseconds without steps.
         reports: to the edge; without it nothing is reported, and the edge's clock is this one.
         recording: the file of its recording, for its summary.
-        backlog_perception: finds boxes in video that was stored while the link was away.
+        backlog_perception: finds boxes in video that was stored while the link was down.
         worker_of: makes the worker that analyzes; by default by the session's pace.
     """
 
@@ -125,7 +125,7 @@ class GroundSession:
             read=lambda still: self._read([still]),
             stills=self._still_window,
         )
-        """What of this session was stored at the edge while the link was away."""
+        """What of this session was stored at the edge while the link was down."""
 
     # What the receiving thread brings
 

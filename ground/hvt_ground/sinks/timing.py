@@ -65,7 +65,7 @@ class TimingTable:
         """Append one line; after `close` nothing."""
         text = ",".join(map(str, values)) + "\n"
         with self._lock:
-            if self._file is None:  # a receiver that did not end in time still speaks
+            if self._file is None:  # a receiver that did not end in time still writes
                 return
             try:
                 os.write(self._file, text.encode("ascii"))

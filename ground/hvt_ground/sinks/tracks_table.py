@@ -12,9 +12,9 @@ __all__ = ["COLUMNS", "TrackTable"]
 
 COLUMNS = ("frame", "id", "x", "y", "w", "h", "confidence", "base_class", "class", "refined", "origin")
 """``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``base_class`` is what the detectors
-say without stills, ``class`` the same after refinement, ``refined`` 1 once a still has spoken, ``origin`` who knows
-of the track: ``base``, ``edge``, ``edge+base`` or ``still``. A source frame that the base stream left out has lines
-too where the edge reported it."""
+say without stills, ``class`` the same after refinement, ``refined`` 1 once a still has refined it; ``origin``:
+``base``, ``edge``, ``edge+base`` or ``still``. A source frame that the base stream left out has lines too where the
+edge reported it."""
 
 
 class TrackTable:

@@ -1,4 +1,4 @@
-"""How the camera moved over the last seconds: boxes are carried from the frame that they were seen at to another."""
+"""How the camera moved over the last seconds: boxes are moved from one frame to another."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class CameraPath:
     ``ahead_ticks`` and then stands; before the oldest it stands.
 
     Args:
-        ahead_ticks: for how long the last motion is believed to go on.
+        ahead_frames: for how long the last motion is extrapolated.
         frames: how many motions are remembered.
     """
 

@@ -1,4 +1,4 @@
-"""One object as the ground believes in it, and the witnesses that it has; see `fuse`."""
+"""One object of the world, and who reports it; see `fuse`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """One list of tracks from three sources: the ground's own tracker on the base, the edge's report, and stills.
 
-An *entity* is one object as the ground believes in it. It has an id that never changes and up to three witnesses: a
+An *entity* is one object of the world. It has an id that never changes and up to three witnesses: a
 track of the ground's own, a track of the edge, and stills in which it was found.
 
 **Who is who.** Witnesses stay with their entity. Where one entity has only a track of our own and another is known
@@ -18,7 +18,7 @@ seen, and the edge's counts `EDGE_BOX_WEIGHT` times.
 over some detections, is its weight; the edge's counts `EDGE_CLASS_WEIGHT` times. A still's opinion comes after, in
 `refine`, and stands above both.
 
-**How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been heard of
+**How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been reported of
 it for `PATIENCE_S`; what only a still has shown ends so long after the still.
 
 **Once each.** What only one side sees on top of what the other sees is listed once (`SAME_IOU`); so are two boxes of
@@ -54,7 +54,7 @@ CLASS_BONUS = 0.05
 """Of two partners that fit equally well, the one of the same class."""
 PATIENCE_S = 2.0
 REACH_S = 1.0
-"""For how long an object is believed to move on as it did."""
+"""For how long the motion of an object is extrapolated."""
 HALF_LIFE_S = 0.3
 EDGE_CLASS_WEIGHT = 0.85
 """Nearly as much as ours: it saw the source, but the drone's network is often the smaller one. The surer says."""
@@ -79,7 +79,7 @@ def unified_names(own: Sequence[str], edge: Sequence[str]) -> tuple[tuple[str, .
 
 
 class Fusion:
-    """The entities of one session. The ``take_…`` methods teach it; `listed` only looks.
+    """The entities of one session. The ``take_…`` methods update it; `listed` changes nothing.
 
     Args:
         fps: frames a second.

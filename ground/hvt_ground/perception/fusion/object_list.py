@@ -1,4 +1,4 @@
-"""What the ground shows at one frame of all that it believes in: boxes, classes and who knows of each."""
+"""The list of one frame out of all entities: boxes, classes and who reports each."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FusionRules:
     patience: int
     """For how many frames what was seen from afar holds."""
     reach: int
-    """For how many frames its own motion is believed to go on."""
+    """For how many frames its own motion is extrapolated."""
     half_life: float
     """After how many frames a box counts half."""
     edge_class_weight: float

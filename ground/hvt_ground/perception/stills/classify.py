@@ -46,7 +46,7 @@ class ObjectReading:
     posterior: Posterior | None = None
     """None is no opinion."""
     box_base_px: Box | None = None
-    """Where the object was found at the still's frame; None where the reader does not look for boxes."""
+    """Where the object was found at the still's frame; None where the reader finds no boxes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class Redetection:
     larger than the base, so is the composite, and the stills keep their detail.
 
     Args:
-        detector: What is run; its confidence is the least at which a class or a box is believed.
+        detector: What is run; its confidence is the least at which a class or a box counts.
         view: Between source and base pixels.
         new_confidence: Least confidence of an object that nobody has named.
     """

@@ -22,7 +22,7 @@ from hvt_ground.perception.stills.decode import DecodedStill
 __all__ = ["Patch", "composite", "patch_of"]
 
 _FEATHER_PX = 1.5
-"""Width of the seam in pixels of the result. A hard edge is a contour that a detector looks at."""
+"""Width of the seam in pixels of the result. A detector takes a hard edge for a contour."""
 
 
 @dataclass(frozen=True, slots=True)

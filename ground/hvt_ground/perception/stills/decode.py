@@ -54,7 +54,7 @@ def decode_still(still: ReceivedStill, *, base_bgr: Image | None, view: View) ->
     """The crop at the size at which it was coded, BGR.
 
     ``base_bgr`` is the decoded base frame of the still's own index, None where it is not at hand; only codecs that
-    need it look at it.
+    need it use it.
 
     Raises:
         BaseMissingError: the still builds on a base frame that is not at hand, or not the one that the edge had.

@@ -99,13 +99,13 @@ class TrackPosterior:
     def newest(self) -> ClassEstimate:
         """What the still of the newest frame said."""
         if self._newest is None:
-            raise ValueError("no still has spoken on this track yet")
+            raise ValueError("no still has refined this track yet")
         return self._newest
 
     def fused(self, names: ClassNames, *, class_id: int, confidence: float) -> ClassEstimate:
         """All stills together with the detector's present vote (its class and confidence on the base)."""
         if self._log_sum is None:
-            raise ValueError("no still has spoken on this track yet")
+            raise ValueError("no still has refined this track yet")
         logs = self._log_sum / _UNITS_PER_NAT
         vote = names.base_log_vote(class_id=class_id, confidence=confidence)
         if vote is not None:

@@ -61,7 +61,7 @@ class RefinementCounters:
     late: int = 0
     """Among the unmatched: those whose outcome is late."""
     tracks_refined: int = 0
-    """Distinct tracks of the ground on whose class a still has spoken."""
+    """Distinct tracks of the ground that a still has refined."""
     class_changes: int = 0
     """Stills after which the class shown was another than before."""
 
@@ -142,7 +142,7 @@ class Refiner:
         """Match what can be matched and give up what never will be, oldest frame first.
 
         Call it after each frame was tracked, with the newest frame that was decoded. ``known_as`` gives the ground's
-        track for one of the edge, where the edge itself has told.
+        track for one of the edge, where the edge has reported it.
         """
         by_frame: dict[int, list[_Held]] = {}
         for held in self._held.values():
@@ -161,7 +161,7 @@ class Refiner:
         return ended
 
     def merge(self, survivor_id: int, merged_id: int) -> None:
-        """Two tracks have turned out to be one: what is believed of the one that is gone holds for the other.
+        """Two tracks have turned out to be one: the posterior of the one that is gone holds for the other.
 
         Where both were refined, the track that stays keeps its own posterior.
         """
@@ -246,7 +246,7 @@ class Refiner:
     def _by_name(
         self, still: StillSeen, history: History, known_as: Callable[[int], int | None]
     ) -> ResolvedStill | None:
-        """Let a still of long ago speak on the track that its edge track is known as now; None where it is not."""
+        """Apply a still of long ago to the track that its edge track is known as now; None where it is not known."""
         edge_id = still.edge_track_id
         if edge_id < 0 or history.newest_tracked is None:
             return None
@@ -275,7 +275,7 @@ class Refiner:
         )
 
     def _apply(self, still: StillSeen, tracks: Tracks, row: int) -> ResolvedStill:
-        """Let a still speak on the class of a track."""
+        """Update the class of a track by a still."""
         track_id = int(tracks.ids[row])
         class_posterior = self._track_posteriors.get(track_id)
         if class_posterior is None:
@@ -317,7 +317,7 @@ class Refiner:
             entropy_nats=said.entropy_nats,
         )
 
-    # What is believed of each track.
+    # The posterior of each track.
 
     def _read(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> ClassEstimate:
         if self._mode == "replace":
@@ -331,7 +331,7 @@ class Refiner:
         self._track_posteriors.move_to_end(track_id)
 
     def _forget(self, now_frame: int) -> None:
-        """Drop what is believed of tracks that ended; the longest unseen stand first."""
+        """Drop the posteriors of tracks that ended; the longest unseen stand first."""
         while self._track_posteriors:
             track_id, class_posterior = next(iter(self._track_posteriors.items()))
             if now_frame - class_posterior.last_frame <= self._forget_frames:

@@ -70,7 +70,7 @@ class StillSeen:
     part: int = 0
     """Which of the objects that the still shows: each is offered by itself, under the still's sequence number."""
     stored: bool = False
-    """It was kept while the link was away. Where nothing is known of its frame it may speak on the track that its
+    """It was stored while the link was down. Where nothing is known of its frame it may refine the track that its
     edge track is known as now: the object is the same, and so is its class."""
 
     @property
@@ -106,4 +106,4 @@ class ShownClasses:
     confidences: npt.NDArray[np.float32]
     """(N,) of ``classes``, 0…1."""
     refined: npt.NDArray[np.bool_]
-    """(N,) True once a still has spoken."""
+    """(N,) True once a still has refined it."""

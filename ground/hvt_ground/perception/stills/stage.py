@@ -49,7 +49,7 @@ class StillStage:
         history: the pictures and tracks by frame.
         fusion: learns where stills show objects.
         view: between source and base pixels.
-        wants_base: whether ``reader`` looks at the base frame; then all stills wait for theirs, not only residuals.
+        wants_base: whether ``reader`` uses the base frame; then all stills wait for theirs, not only residuals.
         gap_ticks: how many frames the base stream may leave out and still say where tracks were between.
         emit: takes the events.
     """
@@ -110,7 +110,7 @@ class StillStage:
             self._resolved(resolved, now)
 
     def take_results(self) -> list[StillResult]:
-        """Return and forget what the edge wants to hear of its stills."""
+        """Return and forget the results of stills that the edge has not been sent yet."""
         results, self._results = self._results, []
         return results
 
@@ -249,7 +249,7 @@ class StillStage:
         header = context.received.header
         stored = bool(header.flags & Flags.STORED)
         # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. What
-        # was kept while the link was away tells of then, and nobody looked on.
+        # was stored while the link was down belongs to that time.
         return Refinement(
             frame_index=header.frame_index if stored else now.frame_index,
             capture_ns=header.capture_ns if stored else now.capture_ns,
@@ -270,7 +270,7 @@ class StillStage:
             stored=stored,
         )
 
-    # What goes back and what is told
+    # Results and notices
 
     def _answer(
         self, header: RoiHeader, track_id: int, posterior: Posterior | None, *, again: bool = False
