@@ -15,8 +15,8 @@ from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 
-TO_THE_PICTURE, TO_THE_TRACKS = 9, 8
-"""Files of the ground that a frame enters at most in the receiving thread, and in the worker's."""
+TO_THE_PICTURE, TO_THE_TRACKS = 9, 9
+"""Files of the ground that a frame enters at most in the receiving thread, and in that of the worker."""
 
 
 class Events:
