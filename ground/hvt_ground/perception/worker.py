@@ -6,7 +6,6 @@ same: the same input gives the same tracks.
 
 from __future__ import annotations
 
-import queue
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -118,8 +117,9 @@ class RealtimeWorker(PerceptionWorker):
 
     def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
         super().__init__(analyze, step, read)
-        self._pictures: queue.Queue[DecodedFrame] = queue.Queue(_MOST_PICTURES)
-        self._stills: queue.Queue[ReceivedStill] = queue.Queue(_MOST_STILLS)
+        self._lock = threading.Lock()
+        self._pictures: deque[DecodedFrame] = deque(maxlen=_MOST_PICTURES)
+        self._stills: deque[ReceivedStill] = deque()
         self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
         self._jobs: deque[Job] = deque()
         self._last_jobs: deque[Job] = deque()
@@ -145,20 +145,13 @@ class RealtimeWorker(PerceptionWorker):
         return len(self._jobs) < _MOST_JOBS
 
     def _has_news(self) -> bool:
-        return bool(self._steps) or not (self._pictures.empty() and self._stills.empty())
+        return bool(self._steps or self._pictures or self._stills)
 
     def picture(self, picture: DecodedFrame) -> None:
         """Queue a frame; where the queue is full the oldest goes untracked."""
-        while True:
-            try:
-                self._pictures.put_nowait(picture)
-                break
-            except queue.Full:
-                try:
-                    self._pictures.get_nowait()
-                    self.untracked += 1
-                except queue.Empty:
-                    continue
+        with self._lock:
+            self.untracked += len(self._pictures) == _MOST_PICTURES
+            self._pictures.append(picture)
         self._wake.set()
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
@@ -168,14 +161,12 @@ class RealtimeWorker(PerceptionWorker):
 
     def still(self, still: ReceivedStill) -> None:
         """Queue a still; where the queue is full it is dropped."""
-        queued_bytes = sum(len(one.data) for one in tuple(self._stills.queue))
-        try:
-            if queued_bytes + len(still.data) <= _MOST_STILL_BYTES:
-                self._stills.put_nowait(still)
+        with self._lock:
+            queued_bytes = sum(len(one.data) for one in self._stills)
+            if len(self._stills) < _MOST_STILLS and queued_bytes + len(still.data) <= _MOST_STILL_BYTES:
+                self._stills.append(still)
             else:
                 self.dropped["overflow"] += 1
-        except queue.Full:
-            self.dropped["overflow"] += 1
         self._wake.set()
 
     def submit(self, job: Job, *, last: bool = False) -> bool:
@@ -194,8 +185,8 @@ class RealtimeWorker(PerceptionWorker):
         self._thread.join(_FINISH_S)
         self._given_up.set()
         self._thread.join(_LEAVE_S)
-        self.dropped["ended"] += self._stills.qsize()
-        self.untracked += self._pictures.qsize()
+        self.dropped["ended"] += len(self._stills)
+        self.untracked += len(self._pictures)
         return not self._thread.is_alive()
 
     def raise_error(self) -> None:
@@ -224,18 +215,15 @@ class RealtimeWorker(PerceptionWorker):
 
     def _work_off(self) -> None:
         """Analyze the pictures that came before the stills taken here, then take the edge's tracks, then read."""
-        stills: list[ReceivedStill] = []
-        while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
-            stills.append(self._stills.get_nowait())
+        with self._lock:
+            stills = [self._stills.popleft() for _ in range(min(len(self._stills), _STILLS_AT_ONCE))]
         # Those that come meanwhile are not among them, or on a slow machine stills would wait for ever.
-        for _ in range(self._pictures.qsize()):
+        for _ in range(len(self._pictures)):
             if self._given_up.is_set():
                 break
-            try:
-                picture = self._pictures.get_nowait()
-            except queue.Empty:
-                break
-            self._analyze(picture, self._pictures.qsize() > _BEHIND_PICTURES)
+            with self._lock:
+                picture = self._pictures.popleft()
+            self._analyze(picture, len(self._pictures) > _BEHIND_PICTURES)
         while self._steps and not self._given_up.is_set():
             self._step(*self._steps.popleft())
         if stills:

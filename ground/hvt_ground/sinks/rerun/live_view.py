@@ -20,7 +20,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.rerun.sdk import send_blueprint, viewer_environment, viewer_program
+from hvt_ground.sinks.rerun.sdk import new_recording, send_blueprint, viewer_environment, viewer_program
 
 __all__ = ["LiveRecording", "LiveView", "free_port", "listening"]
 
@@ -113,23 +113,18 @@ class LiveRecording:
     live = True
     size_bytes = 0
 
-    def __init__(self, url: str, *, application_id: str, recording_id: str, name: str) -> None:
+    def __init__(self, url: str, *, recording_id: str, name: str) -> None:
         self._url = url
         self._port = int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
         self._next_check_s = 0.0
-        self._application_id = application_id
-        self._recording: rr.RecordingStream | None = rr.RecordingStream(
-            application_id, recording_id=recording_id, send_properties=False
-        )
-        self._recording.set_log_time_enabled(False)
-        self._recording.set_log_tick_enabled(False)
+        self._recording: rr.RecordingStream | None = new_recording(recording_id)
         self._recording.connect_grpc(url)
         self._recording.send_recording_name(name)
 
     def open(self, screen: rrb.Blueprint, chunks: Sequence[Chunk]) -> None:
         """Show the recording on this screen."""
         if self._recording is not None:
-            send_blueprint(self._recording, screen, application_id=self._application_id)
+            send_blueprint(self._recording, screen)
         self.write(chunks)
 
     def write(self, chunks: Sequence[Chunk]) -> None:

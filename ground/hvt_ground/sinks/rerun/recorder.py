@@ -20,7 +20,6 @@ from rerun.chunk import Chunk
 from hvt_common.units import bitrate_text
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.blueprint import Front
 from hvt_ground.sinks.rerun.live_view import LiveRecording
 from hvt_ground.sinks.rerun.overlays import (
     LAYERS,
@@ -36,11 +35,10 @@ from hvt_ground.sinks.rerun.static_data import class_chunk, static_chunks
 from hvt_ground.sinks.rerun.stills import StillRows
 from hvt_ground.sinks.rerun.tables import TABLE_BYTES, CodedIdentity, LogText, SizeLimit, Table, TableRow
 
-__all__ = ["APPLICATION_ID", "COMPACT_BYTES", "Recorder", "RecorderSettings"]
+__all__ = ["COMPACT_BYTES", "Recorder", "RecorderSettings"]
 
 log = logging.getLogger(__name__)
 
-APPLICATION_ID = "hvt"
 COMPACT_BYTES = 3 << 19
 """Payload of the append log at which it is compacted: a compaction costs some 50 kB, and this much is in memory."""
 
@@ -71,14 +69,10 @@ class RecorderSettings:
     """(width, height) of the base stream in pixels."""
     fps: float
     budget_bps: float
-    title: str = ""
-    """Heading of the session panel; the edge's id where empty."""
     facts: Mapping[str, str] = field(default_factory=dict)
     """Further lines of the session panel: ``{"method": "M5", "source": "clip.mp4"}``."""
     clocked: bool = True
     """Whether latencies will be known; False leaves their plot out."""
-    front: Front = "tracks"
-    """The tab of the video that is seen first."""
     live_url: str | None = None
     """Where a viewer listens (`LiveView.url`) that shows it in place of a file."""
 
@@ -114,10 +108,8 @@ class Recorder:
                 budget_bps=settings.budget_bps,
                 clocked=settings.clocked,
                 live=self._output.live,
-                front=settings.front,
             )
-            title = settings.title or settings.edge_id
-            self._output.open(screen, static_chunks(title=title, facts=_facts(settings)))
+            self._output.open(screen, static_chunks(title=settings.edge_id, facts=_facts(settings)))
 
     @property
     def size_bytes(self) -> int:
@@ -270,13 +262,10 @@ class Recorder:
 
 def _output(settings: RecorderSettings) -> RrdFile | LiveRecording | None:
     recording_id = f"{settings.edge_id}-{settings.session}"
-    name = settings.title or settings.edge_id
     if settings.path is not None:
-        return RrdFile(settings.path, application_id=APPLICATION_ID, recording_id=recording_id, name=name)
+        return RrdFile(settings.path, recording_id=recording_id, name=settings.edge_id)
     if settings.live_url is not None:
-        return LiveRecording(
-            settings.live_url, application_id=APPLICATION_ID, recording_id=recording_id, name=name
-        )
+        return LiveRecording(settings.live_url, recording_id=recording_id, name=settings.edge_id)
     return None
 
 

@@ -25,6 +25,7 @@ from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
 from hvt_ground.sinks.rerun.sdk import (
+    new_recording,
     release_recordings,
     send_blueprint,
     viewer_environment,
@@ -55,14 +56,10 @@ class RrdFile:
 
     live = False
 
-    def __init__(self, path: Path, *, application_id: str, recording_id: str, name: str) -> None:
+    def __init__(self, path: Path, *, recording_id: str, name: str) -> None:
         self._path = path
         self._file = _created(path)
-        self._application_id = application_id
-        self._recording = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
-        # Rows are timed by frame and capture time; the SDK's own two timelines would cost bytes and mean nothing.
-        self._recording.set_log_time_enabled(False)
-        self._recording.set_log_tick_enabled(False)
+        self._recording = new_recording(recording_id)
         self._stream = rr.binary_stream(self._recording)
         self._recording.send_recording_name(name)
         self._compacted_bytes = 0
@@ -75,7 +72,7 @@ class RrdFile:
 
     def open(self, screen: rrb.Blueprint, chunks: Sequence[Chunk]) -> None:
         """Begin with the screen, made active when the recording is opened, and what holds for all of it."""
-        send_blueprint(self._recording, screen, application_id=self._application_id)
+        send_blueprint(self._recording, screen)
         self._recording.send_chunks(chunks)
         stream = self._stream.read() or b""
         self._write(stream[:_STREAM_HEADER_BYTES] + _messages(stream), at=0)

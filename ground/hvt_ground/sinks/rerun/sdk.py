@@ -22,25 +22,42 @@ try:
 except ImportError:
     bindings = None  # type: ignore[assignment]
 
-__all__ = ["release_recordings", "send_blueprint", "viewer_environment", "viewer_program"]
+__all__ = [
+    "APPLICATION_ID",
+    "new_recording",
+    "release_recordings",
+    "send_blueprint",
+    "viewer_environment",
+    "viewer_program",
+]
 
 _log = logging.getLogger(__name__)
 
+APPLICATION_ID = "hvt"
 
-def send_blueprint(recording: rr.RecordingStream, blueprint: rrb.Blueprint, *, application_id: str) -> None:
+
+def new_recording(recording_id: str) -> rr.RecordingStream:
+    """A recording without the SDK's own two timelines, which would cost bytes and mean nothing here."""
+    recording = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id, send_properties=False)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    return recording
+
+
+def send_blueprint(recording: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
     """Send the blueprint and make it active: the SDK's own function never frees the stream that it writes it to."""
     try:
-        _send_and_let_go(recording, blueprint, application_id=application_id)
+        _send_and_let_go(recording, blueprint)
     except (AttributeError, TypeError) as error:
         _log.debug("this Rerun SDK has other names inside (%s): a recording leaves its threads behind", error)
         rr.send_blueprint(blueprint, recording=recording)
 
 
-def _send_and_let_go(recording: rr.RecordingStream, blueprint: rrb.Blueprint, *, application_id: str) -> None:
+def _send_and_let_go(recording: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
     # As rerun.sinks.send_blueprint has it, but for the last line: stream and storage hold each other until then.
     stream = rr.RecordingStream._from_native(  # noqa: SLF001
         bindings.new_blueprint(
-            application_id=application_id, make_default=False, make_thread_default=False, default_enabled=True
+            application_id=APPLICATION_ID, make_default=False, make_thread_default=False, default_enabled=True
         )
     )
     stream.set_time("blueprint", sequence=0)

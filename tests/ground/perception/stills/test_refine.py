@@ -63,7 +63,7 @@ def still(sequence, frame_index, box=A, *, edge=70, posterior=TRUCK, class_name=
         box_base_px=box,
         class_name=class_name,
         posterior=posterior,
-        wire_field=f"still {sequence}",
+        context=f"still {sequence}",
     )
 
 
@@ -116,7 +116,7 @@ def test_a_still_replaces_the_class_of_its_track(ground):
     assert (done.track_id, done.class_before, done.class_after) == (1, "car", "truck")
     assert done.confidence == pytest.approx(0.7)
     assert done.entropy_nats == pytest.approx(0.8018, abs=1e-4)
-    assert done.still.wire_field == "still 0"
+    assert done.still.context == "still 0"
     shown = ground.refiner.shown(tracks(6, {1: A, 2: B}, classes={2: 1}, confidences={2: 0.25}))
     assert shown.base_classes == ("car", "van")
     assert shown.classes == ("truck", "van")
