@@ -153,6 +153,11 @@ class Reassembler:
         self._requests_in_gap = 0
 
     @property
+    def held(self) -> int:
+        """How many units wait behind a hole."""
+        return len(self._held)
+
+    @property
     def session_id(self) -> int | None:
         """Of the session that is shown; None before the first keyframe. Stills of others are not wanted."""
         return self._session

@@ -132,6 +132,11 @@ class Pipeline:
         return self._track_ids.count
 
     @property
+    def history_bytes(self) -> int:
+        """Of the pictures that are remembered for stills."""
+        return self._history.size_bytes
+
+    @property
     def refined(self) -> int:
         """Distinct tracks that a still has refined."""
         return self._parts.refiner.counters.tracks_refined

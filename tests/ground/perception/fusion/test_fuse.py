@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from flight import tracks_at
+from footprint import footprint_bytes
 from hvt_common.values import Detections, Tracks
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
@@ -311,16 +312,16 @@ def test_steps_that_go_back_or_make_no_sense_are_left_out(ground):
 
 def test_memory_is_bounded(ground):
     """An edge whose tracker renumbers at each step would fill the ground's memory."""
+    sizes = []
     for index in range(60):
         ground.own(index, {})
         boxes = {1000 * index + i: (10.0 * i, 0.0, 10.0 * i + 5, 5.0 + index * 20) for i in range(200)}
         ground.step(index, {key: (b[0], b[3] - 5, b[2], b[3]) for key, b in boxes.items()})
-    assert len(ground.fusion._entities) <= 2048
-    assert len(ground.fusion._by_edge) <= 2048
-    assert len(ground.fusion._own) <= 64
+        sizes.append(footprint_bytes(ground.fusion))
+    assert sizes[-1] < 1.1 * sizes[len(sizes) // 2]
     for index in range(60, 400):
         ground.own(index, {})
-    assert not ground.fusion._entities
+    assert footprint_bytes(ground.fusion) < 0.2 * sizes[-1]
 
 
 def test_random_scenes_never_list_an_object_twice_or_an_id_twice():
