@@ -19,7 +19,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
 from hvt_common.inference.runtimes.providers import PROVIDERS
-from hvt_common.inference.store.resolve import embedded_models
+from hvt_common.inference.store import embedded_models
 from hvt_common.values import Detections, Image
 
 DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))

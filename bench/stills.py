@@ -41,7 +41,7 @@ BOXES_A_FRAME = 26
 JUDGED_EVERY = 3
 """The classifier sees every third crop."""
 LADDER = (1, 10, 20, 30, 42, 54, 65, 76, 87, 98)
-BARS = {"h264-intra": 0.60, "hevc-intra": 0.60, "residual at 800 kbps": 0.25, "residual at 400 kbps": 0.40}
+BARS = {"h264-intra": 0.60, "residual at 800 kbps": 0.25, "residual at 400 kbps": 0.40}
 SPEED_BAR_MS = 2.0
 
 

@@ -1,4 +1,4 @@
-"""What both ends of an HVT link agree on: values, link (Zenoh, bytes) and vision (pixels)."""
+"""What edge and ground share: values, settings, wire protocol, transport, video, inference and tracking."""
 
 import os
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ __all__ = [
     "Still",
     "Tracks",
     "View",
+    "iou",
 ]
 
 Boxes = npt.NDArray[np.float32]
@@ -190,3 +191,20 @@ class Still:
     """What the ground needs beside the bytes to undo the coding; see the codec."""
     also: tuple[tuple[int, tuple[float, float, float, float]], ...] = ()
     """Further tracks that the same crop shows: each with its edge track id and its box, source pixels."""
+
+
+def iou(
+    a_xyxy_px: npt.NDArray[np.floating[Any]], b_xyxy_px: npt.NDArray[np.floating[Any]]
+) -> npt.NDArray[np.float64]:
+    """Intersection over union of (N, 4) with (M, 4) boxes in one pixel space, (N, M); 0 for empty boxes.
+
+    ByteTrack measures boxes differently: see `tracking.association.overlaps`.
+    """
+    a, b = np.asarray(a_xyxy_px, np.float64)[:, None, :], np.asarray(b_xyxy_px, np.float64)[None, :, :]
+    shared = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(
+        -1
+    )
+    areas_a = np.clip(a[..., 2:] - a[..., :2], 0, None).prod(-1)
+    areas_b = np.clip(b[..., 2:] - b[..., :2], 0, None).prod(-1)
+    union = areas_a + areas_b - shared
+    return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0), np.float64)

@@ -16,7 +16,7 @@ from hvt_common.protocol.messages import Feedback, Status
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.transport.doctor.diagnose import LinkWatch
-from hvt_common.transport.doctor.duplicate_edge import refuse_same_id
+from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
 from hvt_common.transport.session import open_session
 from hvt_common.values import Fit
 from hvt_edge.config import EdgeConfig, check_rate
@@ -236,7 +236,7 @@ class Edge:
     def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> EdgeLink:
         config = self._config
         settings = make_link_settings(config)
-        refuse_same_id(settings, EdgeKeys(config.edge_id))
+        refuse_duplicate_edge(settings, EdgeKeys(config.edge_id))
         session = stack.enter_context(open_session(settings))
         link = stack.enter_context(
             EdgeLink(

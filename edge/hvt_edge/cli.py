@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
-from hvt_common.runtime.allocator import limit_malloc_arenas
+from hvt_common.runtime.process import limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, start_log, write_json
-from hvt_common.runtime.stopping import stop_on_signals
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.profiles import with_profile

@@ -23,8 +23,8 @@ from hvt_common.config import (
     switch,
 )
 from hvt_common.errors import UserError
-from hvt_common.inference.embedded import DETECTOR as EMBEDDED_DETECTOR
 from hvt_common.inference.runtimes.providers import PROVIDERS
+from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import parse_tiles
 from hvt_common.protocol.channels import EdgeKeys
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT

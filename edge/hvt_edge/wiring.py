@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Literal, cast
 
 from hvt_common.inference.detect import Detector, open_detector, warm_up
-from hvt_common.inference.tiles import tiled, warm_up_source
+from hvt_common.inference.tiles import tiled
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.transport.zenoh_config import LinkSettings
@@ -115,7 +115,7 @@ def make_detector(config: EdgeConfig) -> Detector:
 def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
     """Run the detector once on what it will be given: a runtime may compile for each shape."""
     if config.candidates == "source":
-        warm_up_source(detector, view.base_size if view.enlarges else view.source_size)
+        warm_up(detector, view.base_size if view.enlarges else view.source_size)
     else:
         warm_up(detector, view.base_size)
 

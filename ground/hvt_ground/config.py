@@ -8,9 +8,8 @@ from pathlib import Path
 
 from hvt_common.config import DURATION, PATH, TEXT, choice, integer, number, option, switch
 from hvt_common.errors import UserError
-from hvt_common.inference.embedded import CLASSIFIER as EMBEDDED_CLASSIFIER
-from hvt_common.inference.embedded import DETECTOR as EMBEDDED_DETECTOR
 from hvt_common.inference.runtimes.providers import PROVIDERS
+from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 
 __all__ = ["DETECTOR", "MOTION", "NONE", "GroundConfig", "check"]

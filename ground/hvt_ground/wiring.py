@@ -11,11 +11,11 @@ from itertools import count as count_from
 from pathlib import Path
 from typing import Literal, cast
 
+from hvt_common.camera_motion import CameraMotion
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_common.tracking.camera_motion import CameraMotion
 from hvt_common.units import bitrate_text
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording

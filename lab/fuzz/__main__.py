@@ -1,6 +1,7 @@
 """``make fuzz``: a coverage-guided fuzzer over everything that takes bytes from outside.
 
-Each target runs in a process of its own, one after the other, until its share of the inputs is done. One that breaks
+First the seeds of every target run once: a target that cannot start ends the whole run with exit code 2. Then each
+target runs in a process of its own, one after the other, until its share of the inputs is done. One that breaks
 begins again with what is left, with its finding set aside. At the end there is one table, and its rows are in
 build/fuzz/summary.json.
 """
@@ -22,17 +23,19 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from lab.fuzz.contract import CannotStartError, checked_seeds
 from lab.fuzz.table import TARGETS
 
 BUILD = Path("build/fuzz")
 RUNS = 1_000_000
 _COVERAGE = re.compile(rb"cov: (\d+) .*corp: (\d+)/")
+_NO_START = "no start"
 _WARM = 0.2
 """Memory counts from this share of the inputs on."""
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TargetResult:
     """What became of one target."""
 
     target: str
@@ -48,7 +51,7 @@ class Row:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """1 where anything was found."""
+    """1 where anything was found, 2 where a target cannot start."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -63,18 +66,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         default=5,
         help="a target with so many is left alone until they are mended [5]",
     )
-    asked = parser.parse_args(argv)
-    unknown = set(asked.target or ()) - set(TARGETS)
+    arguments = parser.parse_args(argv)
+    unknown = set(arguments.target or ()) - set(TARGETS)
     if unknown:
         parser.error(f"--target {', '.join(sorted(unknown))} is not one of {', '.join(names)}")
     if find_spec("atheris") is None:
         parser.error("atheris is not installed: install the dependency group 'fuzz'")
-    asked.folder.mkdir(parents=True, exist_ok=True)
-    rows = [
-        _fuzzed(name, runs=runs, folder=asked.folder, seed=asked.seed, most_findings=asked.findings)
-        for name, runs in shared(asked.target or names, asked.runs).items()
-    ]
-    (asked.folder / "summary.json").write_text(
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    chosen = arguments.target or names
+    try:
+        for name in chosen:
+            checked_seeds(TARGETS[name])
+        rows = [
+            _fuzzed(
+                name,
+                runs=runs,
+                folder=arguments.folder,
+                seed=arguments.seed,
+                most_findings=arguments.findings,
+            )
+            for name, runs in shared(chosen, arguments.runs).items()
+        ]
+    except CannotStartError as error:
+        print(f"fuzz: {error}", file=sys.stderr)
+        return 2
+    (arguments.folder / "summary.json").write_text(
         json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8"
     )
     Console(highlight=False, width=max(100, Console().width)).print(_table(rows))
@@ -88,13 +104,15 @@ def shared(names: Sequence[str], runs: int) -> dict[str, int]:
     return {name: math.ceil(runs * share / whole) for name, share in shares.items()}
 
 
-def _fuzzed(name: str, *, runs: int, folder: Path, seed: int, most_findings: int) -> Row:
+def _fuzzed(name: str, *, runs: int, folder: Path, seed: int, most_findings: int) -> TargetResult:
     done, seconds, slowest_ms, growth_mb, findings = 0, 0.0, 0.0, 0.0, []
     coverage = corpus = 0
     while done < runs and len(findings) < most_findings:
         before = _artefacts(name, folder)
         log = _run_worker(name, runs=runs - done, folder=folder, seed=seed + len(findings))
         said = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        if said["broke"] == _NO_START:
+            raise CannotStartError(f"target {name} does not run its first input: see {log}")
         done += said["inputs"]
         seconds += said["seconds"]
         slowest_ms = max(slowest_ms, said["slowest_ms"])
@@ -106,7 +124,9 @@ def _fuzzed(name: str, *, runs: int, folder: Path, seed: int, most_findings: int
         if fresh or said["inputs"] < runs - done + said["inputs"]:
             findings.append(f"{said['broke'] or 'ended early'} ({', '.join(fresh) or log})")
             print(f"{name}: {findings[-1]}", file=sys.stderr, flush=True)
-    row = Row(name, done, done / max(seconds, 1e-9), corpus, coverage, slowest_ms, growth_mb, tuple(findings))
+    row = TargetResult(
+        name, done, done / max(seconds, 1e-9), corpus, coverage, slowest_ms, growth_mb, tuple(findings)
+    )
     print(
         f"{name}: {row.inputs} inputs, {row.inputs_per_s:.0f}/s, {row.growth_mb:+.1f} MB",
         file=sys.stderr,
@@ -119,7 +139,7 @@ def _run_worker(name: str, *, runs: int, folder: Path, seed: int) -> Path:
     """One process; its output goes to a file, of which the end is kept."""
     log = folder / f"{name}.log"
     (folder / f"{name}.json").write_text(
-        json.dumps({"inputs": 0, "seconds": 0, "slowest_ms": 0, "rss_kb": [], "broke": "no start"})
+        json.dumps({"inputs": 0, "seconds": 0, "slowest_ms": 0, "rss_kb": [], "broke": _NO_START})
     )
     command = [sys.executable, "-m", "lab.fuzz.worker", name, "--runs", str(runs)]
     command += ["--folder", str(folder), "--seed", str(seed)]
@@ -150,7 +170,7 @@ def _growth_mb(rss_kb: Sequence[tuple[int, int]]) -> float:
     return (last[1] - warm[1]) / 1024
 
 
-def _table(rows: Sequence[Row]) -> Table:
+def _table(rows: Sequence[TargetResult]) -> Table:
     title = f"make fuzz: {sum(row.inputs for row in rows)} inputs"
     table = Table(title=title, title_justify="left")
     table.add_column("target")

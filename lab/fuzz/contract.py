@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import atexit
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from random import Random
+from tempfile import mkdtemp
 
 from lab.fuzz.mutate import Bytes, Mutator
 
-__all__ = ["Target", "raw_bytes"]
+__all__ = ["CannotStartError", "Target", "checked_seeds", "raw_bytes", "scratch"]
 
 
 def raw_bytes(data: bytes, rng: Random, raw: Bytes) -> bytes:
@@ -32,7 +37,32 @@ class Target:
     share: int = 10
     """Of the inputs of a run over all targets."""
     short: int = 2000
-    """Inputs in the normal tests: what takes some tenths of a second."""
+    """Inputs in the normal tests: at least a hundred, in some tenths of a second where that can be."""
     most_bytes: int = 4096
     most_growth_mb: int = 64
     """By so much one input may raise the process's peak of memory."""
+
+
+class CannotStartError(Exception):
+    """A target whose seeds cannot be made, or are findings themselves: not one of its inputs would be tried."""
+
+
+def checked_seeds(target: Target) -> list[bytes]:
+    """The target's seeds, each of which has run once; `CannotStartError` where one has not."""
+    try:
+        seeds = list(target.seeds())
+        for seed in seeds:
+            target.run(seed)
+    except Exception as error:  # whatever it is, the target is of no use
+        raise CannotStartError(f"target {target.name} cannot start: {error!r:.300}") from error
+    if not seeds:
+        raise CannotStartError(f"target {target.name} cannot start: it has no seeds")
+    return seeds
+
+
+@cache
+def scratch() -> Path:
+    """A folder for the files that targets write, the same each time; gone when the process ends."""
+    folder = Path(mkdtemp(prefix="hvt-fuzz-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder

@@ -35,8 +35,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_units,
 )
 from lab.fuzz.contract import Target
-from lab.fuzz.mutate import Bytes, each_part, plain, resealed, sealed_values
-from lab.fuzz.parts import joined, parted
+from lab.fuzz.mutate import Bytes, changed_values, each_part, joined, parted, plain, with_checksum
 
 __all__ = ["ROI", "TARGETS", "feedback"]
 
@@ -94,14 +93,14 @@ def _with_payload(message: type[Message]) -> Callable[[bytes], None]:
     return run
 
 
-def _sealed_to_payload(data: bytes, rng: Random, raw: Bytes) -> bytes:
+def _with_changed_payload(data: bytes, rng: Random, raw: Bytes) -> bytes:
     """An attachment and its payload, either changed, and mostly sealed together again."""
     attachment, payload = parted(data, least=2)[:2]
     if rng.random() < 0.3:
         payload = raw(payload)
-    changed = sealed_values(attachment, rng, raw) if rng.random() < 0.8 else attachment
+    changed = changed_values(attachment, rng, raw) if rng.random() < 0.8 else attachment
     if rng.random() < 0.85:
-        changed = resealed(changed[:-5], payload)
+        changed = with_checksum(changed[:-5], payload)
     return joined([changed, payload])
 
 
@@ -125,11 +124,12 @@ def _step_seeds() -> list[bytes]:
         steps = [
             encoder.encode(
                 tracks_at(
-                    tick, {n + 1: (20.0 * n + tick, 10.0, 20.0 * n + 16 + tick, 30.0) for n in range(count)}
+                    index,
+                    {n + 1: (20.0 * n + index, 10.0, 20.0 * n + 16 + index, 30.0) for n in range(count)},
                 ),
-                capture_ns=_NOW + tick * 66_666_667,
+                capture_ns=_NOW + index * 66_666_667,
             ).pack()
-            for tick in (1, 2, 5)
+            for index in (1, 2, 5)
         ]
         seeds += [joined(steps), joined(steps[:1])]
     return seeds
@@ -160,7 +160,7 @@ def _message(name: str, message: type[Message], seeds: Sequence[Message], *, sha
         name,
         _parsed(message),
         lambda: [one.pack() for one in seeds],
-        mutate=sealed_values,
+        mutate=changed_values,
         share=share,
         most_bytes=message.MAX_BYTES + 64,
     )
@@ -172,7 +172,7 @@ def _streamed(name: str, message: type[Message], seed: Message) -> Target:
         name,
         _with_payload(message),
         lambda: [joined([seed.pack(payload), payload])],
-        mutate=_sealed_to_payload,
+        mutate=_with_changed_payload,
         share=40,
         most_bytes=message.MAX_BYTES + 256,
     )
@@ -196,7 +196,7 @@ TARGETS = (
         "track-steps",
         _track_steps,
         _step_seeds,
-        mutate=each_part(sealed_values),
+        mutate=each_part(changed_values),
         share=60,
         short=250,
         most_bytes=6000,

@@ -8,8 +8,7 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from lab.fuzz.contract import Target
-from lab.fuzz.scratch import scratch
+from lab.fuzz.contract import Target, scratch
 from onnx_models import colour_classifier, constant_model
 
 __all__ = ["TARGETS"]
@@ -27,4 +26,4 @@ def _seeds() -> list[bytes]:
     return [small.read_bytes(), colour_classifier(scratch() / "seed.onnx").read_bytes()]
 
 
-TARGETS = (Target("model-file", _model, _seeds, share=8, short=150, most_bytes=2000),)
+TARGETS = (Target("model-file", _model, _seeds, share=8, short=200, most_bytes=2000),)

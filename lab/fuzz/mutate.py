@@ -1,4 +1,4 @@
-"""Mutations that get past the checksum: of raw bytes, of the values in a sealed message, and of parts of an input.
+"""Mutations that get past the checksum: of raw bytes, of the values in a message, and of parts of an input.
 
 `Bytes` is whatever mutates plain bytes: libFuzzer's own mutator where atheris drives, `plain` in the short tests.
 """
@@ -12,15 +12,14 @@ from typing import Any
 
 import msgpack
 
-from lab.fuzz.parts import joined, parted
-
-__all__ = ["Bytes", "Mutator", "each_part", "plain", "sealed_values"]
+__all__ = ["Bytes", "Mutator", "changed_values", "each_part", "plain"]
 
 Bytes = Callable[[bytes], bytes]
 Mutator = Callable[[bytes, Random, Bytes], bytes]
 """(input, dice, mutator of plain bytes) → input."""
 
 _CRC_BYTES = 5
+_MOST_PARTS = 8
 _NUMBERS = (-(2**63), -(2**31), -32768, -1, 0, 1, 2, 15, 16, 63, 255, 256, 2047, 2048, 32767, 65536)
 _LARGE = (2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**53, 2**63 - 1, 2**63, 2**64 - 1)
 _REALS = (0.0, -0.0, 0.5, -1.0, 1e-310, 1e300, 1.8e308, float("inf"), float("-inf"), float("nan"))
@@ -83,22 +82,24 @@ def each_part(*mutators: Mutator | None) -> Mutator:
     return mutated
 
 
-def sealed_values(data: bytes, rng: Random, raw: Bytes) -> bytes:
+def changed_values(data: bytes, rng: Random, raw: Bytes) -> bytes:
     """A message with another value somewhere, or other bytes; most often with the checksum that belongs to it."""
     dice = rng.random()
     if dice < 0.1:
         return raw(data)
     if dice < 0.4:
-        return resealed(raw(data[:-_CRC_BYTES]))
+        return with_checksum(raw(data[:-_CRC_BYTES]))
     try:
         values = msgpack.unpackb(data, raw=False, strict_map_key=False)
         changed = _changed(values[:-1], rng, raw)
-        return resealed(msgpack.packb([*changed, 2**32 - 1], unicode_errors="surrogatepass")[:-_CRC_BYTES])
+        return with_checksum(
+            msgpack.packb([*changed, 2**32 - 1], unicode_errors="surrogatepass")[:-_CRC_BYTES]
+        )
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException):
-        return resealed(raw(data[:-_CRC_BYTES]))
+        return with_checksum(raw(data[:-_CRC_BYTES]))
 
 
-def resealed(body: bytes, payload: bytes = b"") -> bytes:
+def with_checksum(body: bytes, payload: bytes = b"") -> bytes:
     """A message's bytes up to its checksum, and the checksum."""
     return body + b"\xce" + zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")
 
@@ -162,3 +163,19 @@ _REPLACEMENTS: Sequence[Callable[[Random], Any]] = (
     lambda rng: rng.randbytes(rng.choice((1, 16, 300))),
     _nested,
 )
+
+
+def joined(parts: Sequence[bytes]) -> bytes:
+    """One input: each part behind its length in three bytes."""
+    return b"".join(len(part).to_bytes(3, "big") + part for part in parts)
+
+
+def parted(data: bytes, *, least: int = 1) -> list[bytes]:
+    """The parts of any input whatever; missing ones are empty, and a length too long ends with the input."""
+    found: list[bytes] = []
+    at = 0
+    while at + 3 <= len(data) and len(found) < _MOST_PARTS:
+        end = at + 3 + int.from_bytes(data[at : at + 3], "big")
+        found.append(data[at + 3 : end])
+        at = end
+    return found + [b""] * (least - len(found))

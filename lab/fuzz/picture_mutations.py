@@ -6,7 +6,7 @@ from collections.abc import Callable
 from random import Random
 
 from hvt_common.video.still_codecs import StillError
-from hvt_common.video.still_codecs.avif import av1_data, av1_size, avif_file
+from hvt_common.video.still_codecs.plugins.avif import av1_data, av1_size, avif_file
 from lab.fuzz.mutate import Bytes, Mutator
 
 __all__ = ["inside"]
@@ -74,14 +74,13 @@ def _leb128(number: int) -> bytes:
 
 
 def _jxl(data: bytes, rng: Random, raw: Bytes) -> bytes:
-    kept = rng.choice((10, 12, 16, 24))
-    return data[:kept] + raw(data[kept:])
+    length = rng.choice((10, 12, 16, 24))
+    return data[:length] + raw(data[length:])
 
 
 _CHANGES: dict[str, _Change] = {
     "jpeg": _jpeg,
     "webp": _webp,
     "avif": _avif,
-    "avif-lite": _av1,
     "jxl": _jxl,
 }

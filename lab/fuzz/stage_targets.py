@@ -16,8 +16,7 @@ from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_ground.link.reassemble import REORDER_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
-from lab.fuzz.mutate import each_part, sealed_values
-from lab.fuzz.parts import joined, parted
+from lab.fuzz.mutate import changed_values, each_part, joined, parted
 
 __all__ = ["TARGETS"]
 
@@ -142,7 +141,7 @@ TARGETS = (
         "commands",
         _commands,
         _command_seeds,
-        mutate=each_part(sealed_values),
+        mutate=each_part(changed_values),
         share=30,
         short=1500,
         most_bytes=3000,
@@ -151,7 +150,7 @@ TARGETS = (
         "reports",
         _reports,
         _report_seeds,
-        mutate=each_part(sealed_values),
+        mutate=each_part(changed_values),
         share=20,
         short=600,
         most_bytes=6000,

@@ -17,8 +17,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
-from lab.fuzz.contract import Target
-from lab.fuzz.scratch import scratch
+from lab.fuzz.contract import Target, scratch
 
 __all__ = ["TARGETS"]
 
@@ -129,7 +128,7 @@ _ZENOH = (
 )
 _EDGE_LINES = (
     b"--source\0demo\0--budget\0800kbps\0--size\0640x360\0--method\0M6",
-    b"--source\0a.mp4\0--fps\0auto\0--tiles\0auto\0--pulse\0001s\0--pulse-depth\0000.3",
+    b"--source\0a.mp4\0--fps\0auto\0--tiles\0auto\0--refresh\0001s\0--refresh-depth\0000.3",
     b"--connect\0tcp/127.0.0.1:7447\0--edge-id\0uav-1\0--video-share\00081%",
 )
 _GROUND_LINES = (
@@ -169,10 +168,10 @@ TARGETS = (
             b"once = true\n",
         ],
         share=10,
-        short=150,
+        short=200,
         most_bytes=1000,
     ),
-    Target("zenoh-file", _zenoh, lambda: list(_ZENOH), share=8, short=150, most_bytes=1000),
+    Target("zenoh-file", _zenoh, lambda: list(_ZENOH), share=8, short=200, most_bytes=1000),
     Target(
         "endpoint",
         _endpoint,

@@ -23,7 +23,7 @@ from typing import Any
 import atheris
 
 with atheris.instrument_imports(include=["hvt_common", "hvt_edge", "hvt_ground"]):
-    from lab.fuzz.contract import Target
+    from lab.fuzz.contract import Target, checked_seeds
     from lab.fuzz.table import TARGETS
 
 __all__: list[str] = []
@@ -94,14 +94,14 @@ def _resident_kb() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE") // 1024
 
 
-def _prepared(target: Target, folder: Path) -> list[str]:
+def _prepared(target: Target, folder: Path, seeds: list[bytes]) -> list[str]:
     """The folders of libFuzzer: what it finds interesting goes to the first."""
-    corpus, seeds = folder / "corpus" / target.name, folder / "seeds" / target.name
-    for one in (corpus, seeds, folder / "found"):
+    corpus, first = folder / "corpus" / target.name, folder / "seeds" / target.name
+    for one in (corpus, first, folder / "found"):
         one.mkdir(parents=True, exist_ok=True)
-    for number, seed in enumerate(target.seeds()):
-        (seeds / f"{number:02}").write_bytes(seed)
-    return [str(corpus), str(seeds)]
+    for number, seed in enumerate(seeds):
+        (first / f"{number:02}").write_bytes(seed)
+    return [str(corpus), str(first)]
 
 
 def main() -> None:
@@ -111,12 +111,11 @@ def main() -> None:
     parser.add_argument("--runs", type=int, required=True)
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=_SEED)
-    asked = parser.parse_args()
-    target = TARGETS[asked.target]
-    folders = _prepared(target, asked.folder)
-    watched = _Watched(target, runs=asked.runs, path=asked.folder / f"{target.name}.json")
-
-    seeds = list(target.seeds())
+    arguments = parser.parse_args()
+    target = TARGETS[arguments.target]
+    seeds = checked_seeds(target)
+    folders = _prepared(target, arguments.folder, seeds)
+    watched = _Watched(target, runs=arguments.runs, path=arguments.folder / f"{target.name}.json")
 
     def mutator(data: bytes, max_size: int, seed: int) -> bytes:
         rng = Random(seed)
@@ -126,14 +125,14 @@ def main() -> None:
         return changed[:max_size]
 
     flags = [
-        f"-runs={asked.runs}",
-        f"-seed={asked.seed}",
+        f"-runs={arguments.runs}",
+        f"-seed={arguments.seed}",
         f"-max_len={target.most_bytes}",
         "-timeout=30",
         "-rss_limit_mb=2048",
         "-len_control=0",
         "-print_final_stats=1",
-        f"-artifact_prefix={asked.folder / 'found' / target.name}-",
+        f"-artifact_prefix={arguments.folder / 'found' / target.name}-",
     ]
     _quieten()
     atheris.Setup([sys.argv[0], *flags, *folders], watched, custom_mutator=mutator)

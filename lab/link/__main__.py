@@ -16,52 +16,52 @@ from typing import Any
 from rich.console import Console
 
 from hvt_common.errors import exit_with_sentence
+from lab.link.carriers.sides import UnavailableError, congestion_control
 from lab.link.laboratory import CARRIERS, Run, run
 from lab.link.material import demo_clip, looped
-from lab.link.measures import Outcome, rate_over_time, rows
-from lab.link.rows import row, save, table
+from lab.link.measures.outcome import Outcome, rate_over_time, rows
+from lab.link.measures.rows import row, save, table
 from lab.link.script import LENGTHS, load_scenario, scenario_names
-from lab.link.sides import UnavailableError, congestion_control
 
 BUILD = Path("build")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run what is asked for; 1 where a bar does not hold and ``--strict`` is given."""
+    """Run what is arguments for; 1 where a bar does not hold and ``--strict`` is given."""
     return exit_with_sentence(_run, program="link", argv=argv)
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    asked = _arguments(argv)
-    names = asked.scenarios or scenario_names()
+    arguments = _arguments(argv)
+    names = arguments.scenarios or scenario_names()
     scenarios = [load_scenario(name) for name in names]
-    clip = Path(asked.clip) if asked.clip else demo_clip(BUILD / "link" / "demo.mp4")
+    clip = Path(arguments.clip) if arguments.clip else demo_clip(BUILD / "link" / "demo.mp4")
     console, found, outcomes = Console(highlight=False), [], []
-    if asked.carrier != "relay":
+    if arguments.carrier != "relay":
         console.print(f"the kernel's TCP paces itself by {congestion_control()}")
     for scenario in scenarios:
         folder = BUILD / "link" / scenario.name
-        lasts_s = scenario.script(asked.length, lasts=asked.lasts).lasts_s
+        lasts_s = scenario.script(arguments.length, lasts=arguments.lasts).lasts_s
         wanted = Run(
             scenario=scenario,
             source=str(looped(clip, folder / "clip.ffconcat", lasts_s=lasts_s + 15)),
             folder=folder,
-            length=asked.length,
-            lasts=asked.lasts,
-            carrier=asked.carrier,
-            seed=asked.seed,
-            edge_arguments=shlex.split(asked.edge),
-            ground_arguments=shlex.split(asked.ground),
+            length=arguments.length,
+            lasts=arguments.lasts,
+            carrier=arguments.carrier,
+            seed=arguments.seed,
+            edge_arguments=shlex.split(arguments.edge),
+            ground_arguments=shlex.split(arguments.ground),
         )
         console.print(f"{scenario.name}, {lasts_s:g} s: {scenario.about}")
         measured, outcome = _one(wanted, bars=dict(scenario.bars))
         found += measured
         outcomes += [] if outcome is None else [outcome]
-        save(found, BUILD / f"{asked.name}.json")
+        save(found, BUILD / f"{arguments.name}.json")
     console.print(table(found, title="make link"))
     if outcomes:
-        _drawn(outcomes, BUILD / f"{asked.name}.png", console)
-    return int(asked.strict and any(one["holds"] is False for one in found))
+        _drawn(outcomes, BUILD / f"{arguments.name}.png", console)
+    return int(arguments.strict and any(one["holds"] is False for one in found))
 
 
 def _one(wanted: Run, *, bars: dict[str, str]) -> tuple[list[dict[str, Any]], Outcome | None]:
@@ -80,7 +80,7 @@ def _one(wanted: Run, *, bars: dict[str, str]) -> tuple[list[dict[str, Any]], Ou
 
 def _drawn(outcomes: Sequence[Outcome], path: Path, console: Console) -> None:
     try:
-        from lab.link.picture import draw  # matplotlib belongs to the study
+        from lab.link.measures.picture import draw  # matplotlib belongs to the study
     except ImportError:
         console.print("no picture: pip install 'hvt[study]' for matplotlib")
         return

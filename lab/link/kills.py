@@ -27,12 +27,12 @@ from rich.console import Console
 
 from hvt_common.errors import exit_with_sentence
 from hvt_common.video.hevc import BaseDecoder
-from lab.link.relay import Relay
-from lab.link.rows import row, save, table
+from lab.link.carriers.relay import Relay
+from lab.link.measures.rows import row, save, table
+from lab.link.measures.store_left import StoreLeft, store_left
+from lab.link.measures.timing import Arrival, read_timing
 from lab.link.script import load_scenario
 from lab.link.started import Started
-from lab.link.store_left import StoreLeft, store_left
-from lab.link.timing import Arrival, read_timing
 from pictures import write_scene
 from processes import eventually, free_ports
 from rrd import Recording
@@ -83,7 +83,7 @@ class Trial:
     after_s: float
     """From the ground's first frame on."""
     ending_s: float | None
-    """So long before the kill it was asked to end; None where it was not."""
+    """So long before the kill it was arguments to end; None where it was not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,15 +175,15 @@ def _judged(
     frames = [one for one in read_timing(folder / "timing.csv") if one.kind == "base"]
     shown = [one for one in frames if one.shown]
     recorded = in_recording(folder / "run.rrd")
-    kept = in_matroska(folder / "base.mkv")
+    times_s = in_matroska(folder / "base.mkv")
     # The file counts from its first frame, which is the flight's.
-    kept_s = None if kept is None else [frames[0].capture_s + one for one in kept]
+    matroska_s = None if times_s is None else [frames[0].capture_s + one for one in times_s]
     return Verdict(
         trial=trial,
         frames=len(shown),
         recording_missing_s=None if recorded is None else missing_s(shown, recorded),
-        matroska_missing_s=None if kept_s is None else missing_s(frames, kept_s),
-        matroska_behind_kill_s=kill_s - max(kept_s) if kept_s else 0.0,
+        matroska_missing_s=None if matroska_s is None else missing_s(frames, matroska_s),
+        matroska_behind_kill_s=kill_s - max(matroska_s) if matroska_s else 0.0,
         ended=ended,
         store=store_left(folder / "store"),
         survivor=survivor,
@@ -273,21 +273,25 @@ def _run(argv: Sequence[str] | None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--at-once", type=int, default=2)
     parser.add_argument("--only", type=int, help="one trial of these, by its number")
-    parser.add_argument("--keep", type=Path, help="folder to leave the files of every trial in")
+    parser.add_argument(
+        "--keep", dest="folder", type=Path, metavar="DIR", help="folder to leave the files of every trial in"
+    )
     parser.add_argument("--json", type=Path, default=Path("build/kills.json"))
     parser.add_argument("--strict", action="store_true", help="exit code 1 where a bar does not hold")
-    asked = parser.parse_args(argv)
-    trials = [one for one in plan(asked.count, seed=asked.seed) if asked.only in (None, one.number)]
+    arguments = parser.parse_args(argv)
+    trials = [
+        one for one in plan(arguments.count, seed=arguments.seed) if arguments.only in (None, one.number)
+    ]
     with tempfile.TemporaryDirectory() as scratch:
-        verdicts = run_all(trials, asked.keep or Path(scratch), at_once=asked.at_once)
+        verdicts = run_all(trials, arguments.folder or Path(scratch), at_once=arguments.at_once)
     console = Console(highlight=False)
     for one in verdicts:
         if None in (one.recording_missing_s, one.matroska_missing_s) or one.survivor != 0:
             console.print(one, one.said)
     found = rows_of(verdicts)
     console.print(table(found, title="kill -9"))
-    save(found, asked.json)
-    return int(asked.strict and any(one["holds"] is False for one in found))
+    save(found, arguments.json)
+    return int(arguments.strict and any(one["holds"] is False for one in found))
 
 
 if __name__ == "__main__":

@@ -11,16 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from lab.link.measures import Outcome
-from lab.link.netns import Namespaces
-from lab.link.relay import Relay
+from lab.link.carriers.netns import Namespaces
+from lab.link.carriers.relay import Relay
+from lab.link.carriers.sides import GROUND_HOST, Sides
+from lab.link.carriers.tunnel import Tunnel
+from lab.link.measures.outcome import Outcome
+from lab.link.measures.resources import ResourceSampler
+from lab.link.measures.store_left import store_left
+from lab.link.measures.timing import read_timing
 from lab.link.script import Length, Scenario, Script, Transport
-from lab.link.sides import GROUND_HOST, Sides
 from lab.link.started import Started
-from lab.link.store_left import store_left
-from lab.link.timing import read_timing
-from lab.link.tunnel import Tunnel
-from lab.link.watch import Watch
 from processes import eventually, free_ports
 
 __all__ = ["CARRIERS", "Carrier", "Run", "run"]
@@ -62,47 +62,47 @@ class Run:
         return "tcp" if self.carrier == "netns" else self.scenario.transport
 
 
-def run(asked: Run) -> Outcome:
+def run(wanted: Run) -> Outcome:
     """Run one scenario from start to end; nothing is left running.
 
     Raises:
         UnavailableError: the carrier is netns or tun, and there is none to be had.
         AssertionError: edge or ground did not come up.
     """
-    asked.folder.mkdir(parents=True, exist_ok=True)
-    script, timing = asked.script, asked.folder / "timing.csv"
-    for old in (timing, *asked.folder.glob("run*.rrd")):
+    wanted.folder.mkdir(parents=True, exist_ok=True)
+    script, timing = wanted.script, wanted.folder / "timing.csv"
+    for old in (timing, *wanted.folder.glob("run*.rrd")):
         old.unlink(missing_ok=True)
-    shutil.rmtree(asked.folder / "store", ignore_errors=True)
-    kind, (port,) = asked.transport, free_ports(1)
-    with _carrier(asked, script, target_port=port) as link, ExitStack() as stack:
+    shutil.rmtree(wanted.folder / "store", ignore_errors=True)
+    kind, (port,) = wanted.transport, free_ports(1)
+    with _carrier(wanted, script, target_port=port) as link, ExitStack() as stack:
         if isinstance(link, Sides):
             sides, open_to_all = {side: link.prefix(side) for side in link.names}, ["--insecure"]
             listen = connect = f"{kind}/{GROUND_HOST}:{port}"
         else:
             sides, open_to_all = {"edge": [], "ground": []}, []
             listen, connect = f"{kind}/127.0.0.1:{port}", f"{kind}/127.0.0.1:{link.port}"
-        ground = stack.enter_context(Started("ground", asked.folder, [
+        ground = stack.enter_context(Started("ground", wanted.folder, [
             *sides["ground"], sys.executable, "-m", "hvt_ground.cli", "--timing", str(timing), "--listen", listen,
-            *open_to_all, "--record", str(asked.folder / "run.rrd"), *asked.ground_arguments,
+            *open_to_all, "--record", str(wanted.folder / "run.rrd"), *wanted.ground_arguments,
         ]))  # fmt: skip
         ground.until("listening on", within_s=_START_S)
-        edge = stack.enter_context(Started("edge", asked.folder, [
+        edge = stack.enter_context(Started("edge", wanted.folder, [
             *sides["edge"], sys.executable, "-m", "hvt_edge.cli", "--connect", connect, "--wait", "60s",
-            "--source", asked.source, "--budget", asked.scenario.budget,
-            "--store-folder", str(asked.folder / "store"), *asked.edge_arguments,
+            "--source", wanted.source, "--budget", wanted.scenario.budget,
+            "--store-folder", str(wanted.folder / "store"), *wanted.edge_arguments,
         ]))  # fmt: skip
         eventually(lambda: _playing(edge, timing), within_s=_START_S, what="a first frame reaches the ground")
         began_s = link.begin()
-        with Watch({"edge": edge.process.pid, "ground": ground.process.pid}) as watch:
+        with ResourceSampler({"edge": edge.process.pid, "ground": ground.process.pid}) as watch:
             _wait(began_s + script.lasts_s, edge, ground)
-        watch.save(asked.folder / "resources.csv")
+        watch.save(wanted.folder / "resources.csv")
         codes = {"edge": edge.end()}
         # Not --once: a ground with it leaves in an outage that is longer than its patience.
         _wait(time.time() + _TAKES_IN_S, ground)
         codes["ground"] = ground.end()
     return Outcome(
-        scenario=asked.scenario.name,
+        scenario=wanted.scenario.name,
         script=script,
         began_s=began_s,
         arrivals=read_timing(timing),
@@ -111,16 +111,16 @@ def run(asked: Run) -> Outcome:
         samples=watch.samples,
         exit_codes=codes,
         said={"edge": edge.said, "ground": ground.said},
-        kept=store_left(asked.folder / "store"),
+        stored=store_left(wanted.folder / "store"),
     )
 
 
-def _carrier(asked: Run, script: Script, *, target_port: int) -> Relay | Sides:
-    if asked.carrier == "netns":
+def _carrier(wanted: Run, script: Script, *, target_port: int) -> Relay | Sides:
+    if wanted.carrier == "netns":
         return Namespaces(script)
-    if asked.carrier == "tun":
-        return Tunnel(script, seed=asked.seed)
-    return Relay(script, protocol=asked.transport, target_port=target_port, seed=asked.seed)
+    if wanted.carrier == "tun":
+        return Tunnel(script, seed=wanted.seed)
+    return Relay(script, protocol=wanted.transport, target_port=target_port, seed=wanted.seed)
 
 
 def _playing(edge: Started, timing: Path) -> bool:

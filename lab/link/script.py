@@ -1,4 +1,4 @@
-"""What a link does over time, as a scenario file says it: pieces of constant rate, delay and loss, and darkness.
+"""What a link does over time, as a scenario file says it: phases of constant rate, delay and loss, and darkness.
 
 A script is a pure function of the file, the length and the seed: relay and namespaces play the same one.
 """
@@ -22,7 +22,7 @@ __all__ = [
     "SCENARIOS",
     "Length",
     "LinkState",
-    "Piece",
+    "Phase",
     "Scenario",
     "Script",
     "Transport",
@@ -37,7 +37,7 @@ LENGTHS: tuple[Length, ...] = ("short", "full")
 
 _WAVE_STEP_S = 0.25
 _LONGEST_S = 2 * 3600.0
-_MAX_PIECES = 100_000
+_MAX_PHASES = 100_000
 _MAX_DELAY_S = 5.0
 _MAX_QUEUE_BYTES = 4_000_000
 
@@ -61,7 +61,7 @@ class LinkState:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class Phase:
     """A state and when it begins, in seconds of the script."""
 
     start_s: float
@@ -72,7 +72,7 @@ class Piece:
 class Script:
     """Pieces in order of time. The first holds before its start too, the last for ever."""
 
-    pieces: tuple[Piece, ...]
+    phases: tuple[Phase, ...]
     lasts_s: float
     queue_bytes: int
     """What the sender's end of the link holds before it drops (UDP) or pushes back (TCP)."""
@@ -85,17 +85,17 @@ class Script:
     _starts: tuple[float, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_starts", tuple(piece.start_s for piece in self.pieces))
-        object.__setattr__(self, "dark", tuple(_dark_spans(self.pieces)))
+        object.__setattr__(self, "_starts", tuple(phase.start_s for phase in self.phases))
+        object.__setattr__(self, "dark", tuple(_dark_spans(self.phases)))
 
     def at(self, t_s: float) -> LinkState:
         """The state at a moment."""
-        return self.pieces[self._index(t_s)].state
+        return self.phases[self._index(t_s)].state
 
     def until(self, t_s: float) -> float:
         """When the state of this moment ends; infinite for the last."""
         index = self._index(t_s)
-        return self._starts[index + 1] if index + 1 < len(self.pieces) else math.inf
+        return self._starts[index + 1] if index + 1 < len(self.phases) else math.inf
 
     def light_s(self, t_s: float) -> float:
         """The first moment from ``t_s`` on at which the link is not dark."""
@@ -126,21 +126,21 @@ class Script:
     def shifted(self, begin_s: float) -> Script:
         """The same, begun at this moment of another clock."""
         return replace(
-            self, pieces=tuple(replace(piece, start_s=piece.start_s + begin_s) for piece in self.pieces)
+            self, phases=tuple(replace(phase, start_s=phase.start_s + begin_s) for phase in self.phases)
         )
 
     def still(self) -> Script:
         """Before the beginning: the first state, for ever, without loss."""
-        first = replace(self.pieces[0].state, dark=False, loss=0.0)
-        return replace(self, pieces=(Piece(0.0, first),))
+        first = replace(self.phases[0].state, dark=False, loss=0.0)
+        return replace(self, phases=(Phase(0.0, first),))
 
     def without_delay(self) -> Script:
         """What namespaces can play: a floor that counted a delay they do not have would flatter."""
         return replace(
             self,
-            pieces=tuple(
-                replace(piece, state=replace(piece.state, delay_s=0.0, jitter_s=0.0, reorder=0.0))
-                for piece in self.pieces
+            phases=tuple(
+                replace(phase, state=replace(phase.state, delay_s=0.0, jitter_s=0.0, reorder=0.0))
+                for phase in self.phases
             ),
         )
 
@@ -148,13 +148,13 @@ class Script:
         return max(0, bisect_right(self._starts, t_s) - 1)
 
 
-def _dark_spans(pieces: Sequence[Piece]) -> Iterator[tuple[float, float]]:
+def _dark_spans(phases: Sequence[Phase]) -> Iterator[tuple[float, float]]:
     began_s: float | None = None
-    for piece in pieces:
-        if piece.state.dark and began_s is None:
-            began_s = piece.start_s
-        elif not piece.state.dark and began_s is not None:
-            yield began_s, piece.start_s
+    for phase in phases:
+        if phase.state.dark and began_s is None:
+            began_s = phase.start_s
+        elif not phase.state.dark and began_s is not None:
+            yield began_s, phase.start_s
             began_s = None
 
 
@@ -244,7 +244,7 @@ def _script(name: str, link: Mapping[str, Any], plan: Mapping[str, Any], *, seed
         if after.state.rate_bps != before.state.rate_bps:
             (falls if after.state.rate_bps < before.state.rate_bps else rises).append(after.start_s)
     return Script(
-        pieces=_merged(steps, rates=rates, dark=dark, bursts=bursts, lasts_s=lasts_s),
+        phases=_merged(steps, rates=rates, dark=dark, bursts=bursts, lasts_s=lasts_s),
         lasts_s=lasts_s,
         queue_bytes=_queue(link, where=where),
         falls_s=tuple(falls),
@@ -275,18 +275,18 @@ def _state(before: LinkState, table: Mapping[str, Any], *, where: str) -> LinkSt
     return replace(before, **changes)
 
 
-def _steps(name: str, plan: Mapping[str, Any], first: LinkState, *, lasts_s: float) -> list[Piece]:
-    pieces = [Piece(0.0, first)]
+def _steps(name: str, plan: Mapping[str, Any], first: LinkState, *, lasts_s: float) -> list[Phase]:
+    phases = [Phase(0.0, first)]
     for number, table in enumerate(_tables_of(plan, "steps", where=name), 1):
         where = f"{name}: step {number}"
         _known(table, {"at", *_STATE}, where=where)
         at_s = _seconds(table, "at", where=where)
-        if not pieces[-1].start_s < at_s < lasts_s:
+        if not phases[-1].start_s < at_s < lasts_s:
             raise UserError(
                 f"{where}: at {table['at']!r} is not usable: after the step before, within {lasts_s:g} s"
             )
-        pieces.append(Piece(at_s, _state(pieces[-1].state, table, where=where)))
-    return pieces
+        phases.append(Phase(at_s, _state(phases[-1].state, table, where=where)))
+    return phases
 
 
 def _darkness(name: str, plan: Mapping[str, Any], *, lasts_s: float) -> Iterator[tuple[float, float]]:
@@ -339,30 +339,30 @@ def _bursts(mean_s: float, loss: float, *, lasts_s: float, seed: int) -> list[tu
 
 
 def _merged(
-    steps: list[Piece],
+    steps: list[Phase],
     *,
     rates: list[tuple[float, int]],
     dark: list[tuple[float, float]],
     bursts: list[tuple[float, float]],
     lasts_s: float,
-) -> tuple[Piece, ...]:
-    """One list of pieces out of all that changes; at the end the link is light again."""
-    times = {piece.start_s for piece in steps} | {t for t, _ in rates} | {lasts_s}
+) -> tuple[Phase, ...]:
+    """One list of phases out of all that changes; at the end the link is light again."""
+    times = {phase.start_s for phase in steps} | {t for t, _ in rates} | {lasts_s}
     times |= {t for span in (*dark, *bursts) for t in span}
-    if len(times) > _MAX_PIECES:
-        raise UserError(f"the scenario has {len(times)} changes: at most {_MAX_PIECES}")
-    pieces: list[Piece] = []
+    if len(times) > _MAX_PHASES:
+        raise UserError(f"the scenario has {len(times)} changes: at most {_MAX_PHASES}")
+    phases: list[Phase] = []
     for t_s in sorted(times):
-        state = [piece for piece in steps if piece.start_s <= t_s][-1].state
+        state = [phase for phase in steps if phase.start_s <= t_s][-1].state
         if rates:
             state = replace(state, rate_bps=rates[min(int(t_s / _WAVE_STEP_S), len(rates) - 1)][1])
         if bursts:
             state = replace(state, loss=1.0 if _within(bursts, t_s) else 0.0)
         if t_s < lasts_s and _within(dark, t_s):
             state = replace(state, dark=True)
-        if not pieces or pieces[-1].state != state:
-            pieces.append(Piece(t_s, state))
-    return tuple(pieces)
+        if not phases or phases[-1].state != state:
+            phases.append(Phase(t_s, state))
+    return tuple(phases)
 
 
 def _within(spans: Sequence[tuple[float, float]], t_s: float) -> bool:

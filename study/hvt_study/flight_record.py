@@ -12,12 +12,11 @@ from typing import Any, cast
 
 import numpy as np
 
-from hvt_common.boxes import iou
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.transport.inbox import Received
-from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View
+from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View, iou
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.stills.classify import DecodedStill, object_crops

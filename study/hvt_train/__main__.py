@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hvt_common.errors import UserError, exit_with_sentence
-from hvt_common.inference.embedded import CLASSIFIER, DETECTOR, embedded_model
+from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
+from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
+from hvt_common.inference.store import embedded_models
 
 __all__ = ["main"]
 
@@ -61,8 +63,8 @@ def _parser() -> argparse.ArgumentParser:
     own.add_argument(
         "--speed", action="store_true", help="milliseconds of the detector at 640x384 on one thread"
     )
-    own.add_argument("--detector", type=Path, default=embedded_model(DETECTOR))
-    own.add_argument("--classifier", type=Path, default=embedded_model(CLASSIFIER))
+    own.add_argument("--detector", type=Path, default=embedded_models()[DETECTOR])
+    own.add_argument("--classifier", type=Path, default=embedded_models()[CLASSIFIER])
     own.add_argument("--seeds", type=int, default=8, help="held-out scenes")
     own.add_argument("--every", type=int, default=10, help="frames of the clip: every n-th")
     own.add_argument("--threads", type=int, default=1)

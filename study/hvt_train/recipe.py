@@ -16,7 +16,8 @@ from torch import nn
 
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
-from hvt_common.inference.embedded import CLASSIFIER, DETECTOR
+from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
+from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_scene.vehicles import CLASS_NAMES
 from hvt_train.classifier import export_classifier, train_classifier
 from hvt_train.crops import CropSource, held_out_crops, pool_crops, scene_crops

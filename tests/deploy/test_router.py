@@ -18,7 +18,7 @@ import pytest
 import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
-from hvt_common.transport.session import ask, declare_publisher, open_session, serve
+from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -104,7 +104,7 @@ def test_messages_questions_and_presence_pass(free_port: int, receiver: str) -> 
         assert sample.attachment is not None
         assert sample.attachment.to_bytes() == b"header"
         assert sample.timestamp is None, "a router that stamps adds 26 bytes to each message"
-        assert ask(other, Channel.INFO, keys=KEYS, question=b"this", timeout_s=5) == b"answer to this"
+        assert query(other, Channel.INFO, keys=KEYS, question=b"this", timeout_s=5) == b"answer to this"
         alive = [reply.ok.key_expr for reply in other.liveliness().get("hvt/*/alive") if reply.ok is not None]
         assert [str(key) for key in alive] == ["hvt/uav-1/alive"]
         token.undeclare()

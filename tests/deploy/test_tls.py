@@ -17,7 +17,7 @@ import zenoh
 from fleet_keys import Fleet
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
-from hvt_common.transport.session import ask, declare_publisher, open_session, serve
+from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -75,7 +75,7 @@ class _Ground:
                 session.declare_subscriber(selector(row), take)
 
     def asked(self, row: Channel) -> list[bytes | None]:
-        return [ask(self.session, row, keys=EdgeKeys(edge), question=b"", timeout_s=1.5) for edge in EDGES]
+        return [query(self.session, row, keys=EdgeKeys(edge), question=b"", timeout_s=1.5) for edge in EDGES]
 
     def report(self, text: bytes) -> None:
         for edge in EDGES:
@@ -169,13 +169,13 @@ def test_who_asks_by_way_of_a_ground_has_its_own_rights(
     with (
         open_session(fleet.settings("base", "ground", listen=where)),
         open_session(fleet.settings("uav-1", "edge", connect=where)) as edge_session,
-        open_session(LinkSettings("asker", connect=where, zenoh_config=fleet.file(who))) as asker,
+        open_session(LinkSettings("client", connect=where, zenoh_config=fleet.file(who))) as client,
     ):
         edge = _Edge(edge_session, "uav-1")
         _until(
-            lambda: ask(asker, Channel.INFO, keys=edge.keys, question=b"", timeout_s=1), "info is answered"
+            lambda: query(client, Channel.INFO, keys=edge.keys, question=b"", timeout_s=1), "info is answered"
         )
-        answer = ask(asker, Channel.CONTROL, keys=edge.keys, question=b"", timeout_s=1.5)
+        answer = query(client, Channel.CONTROL, keys=edge.keys, question=b"", timeout_s=1.5)
         assert answer == said
 
 
@@ -184,7 +184,7 @@ def test_who_asks_with_keys_of_another_fleet_is_told(fleet: Fleet, tmp_path: Pat
     other = Fleet(tmp_path / "other")
     other.keys("add-ground", "base")
     where = (f"tls/127.0.0.1:{free_port}",)
-    settings = LinkSettings("asker", connect=where, zenoh_config=other.file("base"))
+    settings = LinkSettings("client", connect=where, zenoh_config=other.file("base"))
     with (
         open_session(fleet.settings("base", "ground", listen=where)),
         pytest.raises(UserError, match=r"^no link: tls/.*: its certificate was not signed by the CA in"),

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from lab.link.relay import Relay
-from lab.link.script import LinkState, Piece, Script
+from lab.link.carriers.relay import Relay
+from lab.link.script import LinkState, Phase, Script
 from processes import Link
 
 pytestmark = pytest.mark.integration
 
 THIN = Script(
-    pieces=(Piece(0.0, LinkState(rate_bps=250_000, delay_s=0.02)),), lasts_s=120.0, queue_bytes=64_000
+    phases=(Phase(0.0, LinkState(rate_bps=250_000, delay_s=0.02)),), lasts_s=120.0, queue_bytes=64_000
 )
 EDGE = (
     "--source-fps", "15", "--size", "640x360", "--budget", "800kbps", "--detector", "motion",

@@ -12,7 +12,7 @@ import av
 import pytest
 
 from hvt_common.protocol.messages import BaseHeader, Command, ControlAnswer, ControlRequest
-from lab.link.timing import read_timing
+from lab.link.measures.timing import read_timing
 from outsider import Tap, answer, joined
 from processes import Link, Running, eventually
 from rrd import Recording

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from hvt_common.protocol.messages import Feedback
-from lab.link.relay import Relay
-from lab.link.script import LinkState, Piece, Script
-from lab.link.timing import Arrival, read_timing
+from lab.link.carriers.relay import Relay
+from lab.link.measures.timing import Arrival, read_timing
+from lab.link.script import LinkState, Phase, Script
 from outsider import Tap, joined
 from processes import Link, Running, eventually
 from rrd import Recording
@@ -253,7 +253,7 @@ def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(lin
 def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
     """On a radio that loses datagrams the sharp pictures would have holes; or the gallery show some twice."""
     lossy = Script(
-        (Piece(0.0, LinkState(4_000_000, delay_s=0.01, loss=0.12)),), lasts_s=60.0, queue_bytes=100_000
+        (Phase(0.0, LinkState(4_000_000, delay_s=0.01, loss=0.12)),), lasts_s=60.0, queue_bytes=100_000
     )
     ground = link._start(
         "hvt_ground.cli",

@@ -17,9 +17,9 @@ import zenoh
 import hvt_edge.cli
 from fleet_keys import EXPIRED, Fleet
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
-from hvt_common.runtime.stopping import STOP_SIGNALS
+from hvt_common.runtime.process import STOP_SIGNALS
 from hvt_common.transport.doctor.diagnose import LinkWatch
-from hvt_common.transport.session import ask, declare_publisher, open_session, serve
+from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from processes import Running, eventually, free_ports
 
@@ -202,7 +202,7 @@ def test_an_edge_cannot_write_as_another(
             forger.put(UAV2.key(row), b"forged")
         own.put(b"own")
         eventually(lambda: came, within_s=20, what="the edge's own message")
-        assert ask(ground, Channel.INFO, keys=UAV2, question=b"", timeout_s=1) is None
+        assert query(ground, Channel.INFO, keys=UAV2, question=b"", timeout_s=1) is None
         eventually(lambda: "'uav-1' is linked" in caplog.text, within_s=20, what="the ground is told")
         assert came == [UAV1.key(Channel.STATUS)]
     assert "or it runs under another id than its certificate says, and all it sends is dropped" in caplog.text
@@ -237,12 +237,12 @@ def test_watching_commanding_and_being_a_stranger(
         publisher = declare_publisher(edge, Channel.STATUS, keys=UAV1)
         eventually(_linked(*grounds.values()), within_s=20, what="all three are linked")
         info = {
-            name: ask(ground, Channel.INFO, keys=UAV1, question=b"", timeout_s=2)
+            name: query(ground, Channel.INFO, keys=UAV1, question=b"", timeout_s=2)
             for name, ground in grounds.items()
         }
         assert info == {"base": b"info", "guest": b"info", "stranger": None}
         control = {
-            name: ask(ground, Channel.CONTROL, keys=UAV1, question=b"do", timeout_s=2)
+            name: query(ground, Channel.CONTROL, keys=UAV1, question=b"do", timeout_s=2)
             for name, ground in grounds.items()
         }
         assert control == {"base": b"done", "guest": None, "stranger": None}

@@ -12,8 +12,8 @@ import pytest
 
 from hvt_edge.backlog.entry import FIRST_STORED
 from hvt_edge.backlog.segment import read_segment
-from lab.link.relay import Relay
-from lab.link.script import LinkState, Piece, Script
+from lab.link.carriers.relay import Relay
+from lab.link.script import LinkState, Phase, Script
 from processes import Link, eventually
 from rrd import Recording
 
@@ -29,8 +29,8 @@ EDGE = (
 
 def outage(*, begins_s: float, lasts_s: float) -> Script:
     """A good link with one hole in it."""
-    pieces = (Piece(0.0, LIGHT), Piece(begins_s, DARK), Piece(begins_s + lasts_s, LIGHT))
-    return Script(pieces=pieces, lasts_s=200.0, queue_bytes=64_000)
+    pieces = (Phase(0.0, LIGHT), Phase(begins_s, DARK), Phase(begins_s + lasts_s, LIGHT))
+    return Script(phases=pieces, lasts_s=200.0, queue_bytes=64_000)
 
 
 def times_in(path: Path) -> list[int]:

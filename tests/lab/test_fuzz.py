@@ -17,8 +17,9 @@ from random import Random
 import pytest
 
 from hvt_common.protocol.messages import Status
-from lab.fuzz.mutate import plain, resealed, sealed_values
-from lab.fuzz.parts import joined, parted
+from lab.fuzz.__main__ import main
+from lab.fuzz.contract import CannotStartError, Target, checked_seeds
+from lab.fuzz.mutate import changed_values, joined, parted, plain, with_checksum
 from lab.fuzz.table import PLANTED, TARGETS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,18 +32,18 @@ NAMES = [name for name, target in TARGETS.items() if target is not PLANTED]
 def test_no_input_breaks_anything(name):
     """Whoever reaches the link, or leaves a file where it is read, could end the process."""
     target, rng = TARGETS[name], Random(7)
-    seeds = list(target.seeds())
-    for seed in seeds:
-        target.run(seed)
+    seeds = checked_seeds(target)
+    assert seeds == list(target.seeds()), "a second process, or a second call, begins with the same"
+    assert target.short >= 100
     for number in range(target.short):
         data = target.mutate(rng.choice(seeds), rng, plain(rng))[: target.most_bytes]
         try:
             target.run(data)
         except Exception as error:
-            kept = Path("build/fuzz/found") / f"{name}-short"
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_bytes(data)
-            raise AssertionError(f"input {number} of {name}, kept in {kept}: {error!r}") from error
+            found = Path("build/fuzz/found") / f"{name}-short"
+            found.parent.mkdir(parents=True, exist_ok=True)
+            found.write_bytes(data)
+            raise AssertionError(f"input {number} of {name}, now in {found}: {error!r}") from error
 
 
 @pytest.mark.parametrize(
@@ -59,8 +60,8 @@ def test_mutations_get_past_the_checksum():
     """The fuzzer would see the checksum refuse a million inputs, and nothing behind it."""
     rng = Random(3)
     (seed,) = TARGETS["status"].seeds()
-    mutated = [sealed_values(seed, rng, plain(rng)) for _ in range(300)]
-    sealed = [data for data in mutated if resealed(data[:-5]) == data]
+    mutated = [changed_values(seed, rng, plain(rng)) for _ in range(300)]
+    sealed = [data for data in mutated if with_checksum(data[:-5]) == data]
     assert len(sealed) > 0.8 * len(mutated)
     assert len(set(sealed)) > 200
     assert Status.parse(seed)
@@ -72,6 +73,29 @@ def test_parts_come_back():
     assert parted(joined(parts)) == parts
     assert parted(b"\0\0\x09cut", least=2) == [b"cut", b""]
     assert parted(b"") == [b""]
+
+
+@pytest.mark.parametrize(
+    ("seeds", "why"),
+    [
+        (list, "it has no seeds"),
+        (lambda: 1 / 0, "division by zero"),
+        (lambda: [b"t"], "here to be found"),
+    ],
+)
+def test_a_target_that_cannot_start_is_an_error_at_once(seeds, why):
+    """The weightiest target was not tried for weeks, and nothing said so."""
+    target = Target("idle", PLANTED.run, seeds)
+    with pytest.raises(CannotStartError, match=f"target idle cannot start.*{why}"):
+        checked_seeds(target)
+
+
+def test_the_run_ends_before_any_input_where_a_target_cannot_start(tmp_path, monkeypatch, capsys):
+    """An hour later the table would show that one target had no inputs."""
+    monkeypatch.setitem(TARGETS, "units", Target("units", TARGETS["units"].run, list))
+    assert main(["--runs", "10", "--folder", str(tmp_path)]) == 2
+    assert "target units cannot start: it has no seeds" in capsys.readouterr().err
+    assert not (tmp_path / "summary.json").exists()
 
 
 @pytest.mark.skipif(find_spec("atheris") is None, reason="atheris is not installed: dependency group 'fuzz'")

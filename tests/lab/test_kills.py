@@ -19,8 +19,8 @@ from lab.link.kills import (
     rows_of,
     run_all,
 )
-from lab.link.store_left import StoreLeft, store_left
-from lab.link.timing import Arrival
+from lab.link.measures.store_left import StoreLeft, store_left
+from lab.link.measures.timing import Arrival
 
 KILLS = 4
 SIZE = (320, 192)

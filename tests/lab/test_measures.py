@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import pytest
 
-from lab.link.measures import KEPT_FROM, Outcome, measures, rate_over_time, rows
-from lab.link.rows import holds
+from lab.link.measures.outcome import STORED_FROM, Outcome, measures, rate_over_time, rows
+from lab.link.measures.resources import Sample, more_at_the_end, slope_mb_per_hour
+from lab.link.measures.rows import holds
+from lab.link.measures.store_left import StoreLeft
+from lab.link.measures.timing import Arrival
 from lab.link.script import load_scenario
-from lab.link.store_left import StoreLeft
-from lab.link.timing import Arrival
-from lab.link.watch import Sample, more_at_the_end, slope_mb_per_hour
 
 BEGAN_S = 1_790_000_000.0
 STORE = dict.fromkeys(
@@ -130,7 +130,7 @@ def still(sequence: int, kind: str = "roi", *, shown: bool = True) -> Arrival:
 
 def test_what_is_still_kept_is_not_lost_and_what_was_given_up_is():
     """An edge that throws away what it kept would lose nothing."""
-    first = KEPT_FROM
+    first = STORED_FROM
     came = [still(number) for number in (0, 1, 2, 4, 5)]
     past = [
         still(first, "backlog-still"),
@@ -138,9 +138,9 @@ def test_what_is_still_kept_is_not_lost_and_what_was_given_up_is():
         still(3, "backlog-base"),
     ]
 
-    def lost(kept: set[int], **store: int) -> float:
+    def lost(stored: set[int], **store: int) -> float:
         result = outcome("outage-60s", [*came, *past], store=store)
-        return measures(replace(result, kept=StoreLeft(9, 0, stills=frozenset(kept))))["stills lost"]
+        return measures(replace(result, stored=StoreLeft(9, 0, stills=frozenset(stored))))["stills lost"]
 
     assert lost({3, 6, first + 1, first + 2}) == 0
     assert lost({3, 6, first + 2}) == 1, "a half of one came"

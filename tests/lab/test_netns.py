@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from lab.link.netns import GROUND_HOST, Namespaces, UnavailableError
-from lab.link.script import LinkState, Piece, Script
+from lab.link.carriers.netns import GROUND_HOST, Namespaces, UnavailableError
+from lab.link.script import LinkState, Phase, Script
 
 pytestmark = pytest.mark.integration
 
@@ -82,7 +82,7 @@ def wire_field():
 
 def script(*pieces: tuple[float, LinkState], lasts_s: float) -> Script:
     """A script by hand."""
-    return Script(tuple(Piece(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=16_000)
+    return Script(tuple(Phase(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=16_000)
 
 
 def namespaces() -> str:

@@ -13,9 +13,9 @@ from itertools import accumulate, pairwise
 import psutil
 import pytest
 
-from lab.link.pipe import DATAGRAM_HEADER_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
-from lab.link.relay import Relay
-from lab.link.script import LinkState, Piece, Script
+from lab.link.carriers.pipe import DATAGRAM_HEADER_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
+from lab.link.carriers.relay import Relay
+from lab.link.script import LinkState, Phase, Script
 from processes import eventually
 
 PACKET = 1200 + DATAGRAM_HEADER_BYTES
@@ -23,7 +23,7 @@ PACKET = 1200 + DATAGRAM_HEADER_BYTES
 
 def script(*pieces: tuple[float, LinkState], lasts_s: float = 60.0, queue_bytes: int = 32_000) -> Script:
     """A script by hand."""
-    return Script(tuple(Piece(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=queue_bytes)
+    return Script(tuple(Phase(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=queue_bytes)
 
 
 def offered(pipe: Pipe, *, every_s: float, lasts_s: float) -> list[tuple[float, float | None]]:
@@ -387,7 +387,7 @@ def given_up_in_darkness(listener: socket.socket, *, dark_s: float) -> bool:
     with Relay(script((0, dark), (dark_s, light)), target_port=listener.getsockname()[1]) as relay:
         began_s = time.monotonic()
         relay.begin()
-        eventually(lambda: relay.up.script.pieces[0].state.dark, within_s=20, what="it is dark")
+        eventually(lambda: relay.up.script.phases[0].state.dark, within_s=20, what="it is dark")
         for _ in range(3):
             socket.create_connection(("127.0.0.1", relay.port)).close()
         if time.monotonic() >= began_s + dark_s:

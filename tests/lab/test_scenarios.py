@@ -12,9 +12,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from lab.link.carriers.netns import UnavailableError
 from lab.link.laboratory import Run, run
-from lab.link.measures import Outcome, measures
-from lab.link.netns import UnavailableError
+from lab.link.measures.outcome import Outcome, measures
 from lab.link.script import load_scenario, scenario_names
 from pictures import write_scene
 

@@ -70,7 +70,7 @@ def test_a_step_is_told_as_a_fall_and_a_rise():
 def test_a_fade_swings_and_goes_dark_at_its_lowest():
     """A fade without its hole is a mild link."""
     script = load_scenario("drone-fade").script("full")
-    rates = [piece.state.rate_bps for piece in script.pieces]
+    rates = [phase.state.rate_bps for phase in script.phases]
     assert min(rates) == pytest.approx(200_000, rel=0.02)
     assert max(rates) == pytest.approx(1_200_000, rel=0.02)
     assert all(script.at(begin).rate_bps < 210_000 for begin, _ in script.dark)
@@ -81,7 +81,7 @@ def test_bursts_have_the_share_and_come_from_the_seed():
     """Five percent would be three or eight, or another run's."""
     found = load_scenario("burst-loss")
     script = found.script("full", seed=1)
-    lost_s = sum(script.until(one.start_s) - one.start_s for one in script.pieces if one.state.loss == 1.0)
+    lost_s = sum(script.until(one.start_s) - one.start_s for one in script.phases if one.state.loss == 1.0)
     assert lost_s / script.lasts_s == pytest.approx(0.05, rel=0.15)
     assert found.script("full", seed=1) == script != found.script("full", seed=2)
 

@@ -14,12 +14,13 @@ from pathlib import Path
 
 import pytest
 
+from lab.link.carriers.pipe import DATAGRAM_HEADER_BYTES, Pipe
+from lab.link.carriers.tunnel import GROUND_HOST, Flight, Tunnel, UnavailableError
 from lab.link.laboratory import Run, run
-from lab.link.measures import measures
-from lab.link.pipe import DATAGRAM_HEADER_BYTES, Pipe
-from lab.link.script import LinkState, Piece, Script, load_scenario
-from lab.link.tunnel import GROUND_HOST, Flight, Tunnel, UnavailableError
+from lab.link.measures.outcome import measures
+from lab.link.script import LinkState, Phase, Script, load_scenario
 from pictures import write_scene
+from processes import eventually
 
 pytestmark = pytest.mark.integration
 
@@ -95,7 +96,7 @@ UTTERED_BYTES = 100 + DATAGRAM_HEADER_BYTES
 
 def script(*pieces: tuple[float, LinkState], lasts_s: float = 60.0) -> Script:
     """A script by hand."""
-    return Script(tuple(Piece(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=64_000)
+    return Script(tuple(Phase(at, state) for at, state in pieces), lasts_s=lasts_s, queue_bytes=64_000)
 
 
 @contextmanager
@@ -239,24 +240,22 @@ def test_nothing_is_left_behind():
         there = subprocess.run(
             [*link.prefix("edge"), "ip", "link"], capture_output=True, text=True, check=True
         )
-        assert f"hvt{link._token}e" in there.stdout
+        assert link.devices["edge"] in there.stdout
         names = list(link.names.values())
         assert all(name in _namespaces() for name in names)
         assert [target for target in _open_files() if "/dev/net/tun" in target]
     assert not any(name in _namespaces() for name in names)
-    assert (
-        link._token not in subprocess.run(["ip", "link"], capture_output=True, text=True, check=True).stdout
-    )
+    left = subprocess.run(["ip", "link"], capture_output=True, text=True, check=True).stdout
+    assert not any(device in left for device in link.devices.values())
     assert not any("/dev/net/tun" in target for target in _open_files())
     assert "link-tunnel" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_without_the_device_it_says_so_and_leaves_nothing(monkeypatch):
+def test_without_the_device_it_says_so_and_leaves_nothing():
     """In a container without /dev/net/tun `make link CARRIER=tun` would end in a traceback."""
     with tunnel(script((0, LinkState(1)))):
         pass
-    monkeypatch.setattr("link.tunnel._CLONE", "/nonexistent/tun")
-    one = Tunnel(script((0, LinkState(1))))
+    one = Tunnel(script((0, LinkState(1))), clone="/nonexistent/tun")
     with pytest.raises(UnavailableError, match="/nonexistent/tun"), one:
         pass
     assert not any(name in _namespaces() for name in one.names.values())
@@ -276,8 +275,11 @@ def test_what_breaks_on_the_way_is_heard_of():
         with tunnel(script((0, LinkState(5_000_000)))) as link:
             subprocess.run(["ip", "netns", "delete", link.names["ground"]], check=True)
             subprocess.run([*link.prefix("edge"), sys.executable, "-c", SHOUT, GROUND_HOST], check=False)
-            link._worker.join(PATIENCE_S)
-            assert not link._worker.is_alive()
+            eventually(
+                lambda: "link-tunnel" not in [thread.name for thread in threading.enumerate()],
+                within_s=PATIENCE_S,
+                what="the carrier ends",
+            )
 
     with pytest.raises(OSError, match="in bad state"):
         broken()

@@ -12,8 +12,7 @@ import pytest
 
 from flight import RedSquares
 from hvt_common.errors import UserError
-from hvt_common.inference.class_names import COCO_NAMES, MOVING, VISDRONE_NAMES
-from hvt_common.inference.imagenet_names import IMAGENET_NAMES
+from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, MOVING, VISDRONE_NAMES
 from hvt_common.values import Posterior
 from hvt_study.datasets.classes import map_classes
 from hvt_study.datasets.labels import covered_share

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hvt_common.boxes import iou
 from hvt_common.inference.class_names import kind_of
+from hvt_common.values import iou
 from hvt_study.metrics.contract import FrameView
 from hvt_study.metrics.detection import detection_score
 from metric_ticks import labels, square, view

@@ -130,9 +130,15 @@ class Flight:
     """One session of an edge: its messages by frame."""
 
     def __init__(
-        self, count: int, *, keyframes: Sequence[int] = (), pace: str = "realtime", size=SIZE
+        self,
+        count: int,
+        *,
+        keyframes: Sequence[int] = (),
+        pace: str = "realtime",
+        size=SIZE,
+        session_id: int | None = None,
     ) -> None:
-        self.session_id, self.pace, self.size = next(_ids), pace, size
+        self.session_id, self.pace, self.size = session_id or next(_ids), pace, size
         encoder = BaseEncoder(EncoderSettings(size=size, fps=15, bitrate_bps=300_000, preset="ultrafast"))
         self.pictures = smooth_pictures(count, size=size)
         self.units = [

@@ -14,7 +14,7 @@ import pytest
 
 import hvt_edge.cli
 import hvt_ground.cli
-from hvt_common.runtime.stopping import STOP_SIGNALS
+from hvt_common.runtime.process import STOP_SIGNALS
 from refusal import checked, snapshot
 
 Refused = Callable[..., str]

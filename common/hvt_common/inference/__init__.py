@@ -1,1 +1,1 @@
-"""Detectors and classifiers, and what runs them. The store gives paths, the models open them."""
+"""Detectors and classifiers: others use `detect`, `tiles`, `classify`, `class_names`, and `store` for paths."""

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.imagenet_names import IMAGENET_NAMES
+from hvt_common.inference.class_names import IMAGENET_NAMES
 from hvt_common.inference.labels import first_synonym, metadata_labels, read_labels
 from hvt_common.inference.letterbox import as_bgr
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
@@ -42,7 +42,7 @@ _USUAL_SIDE = 224
 
 
 class Classifier(Protocol):
-    """Says what crops show."""
+    """Classifies crops."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -71,13 +71,11 @@ def open_classifier(
     """Open an ONNX classifier.
 
     Args:
-        spec: The name of a model (`hvt_common.inference.store.resolve_model`), or the path of an ONNX file.
-        labels: Class names, one a line; else those in the model's metadata, else ImageNet's for 1000 or 1001
-            classes, else "class 0" and so on. Names of 1000 classes fit a model of 1001 (a background is put in
-            front), and 1001 names that begin with "background" fit a model of 1000. Of synonyms separated by commas
-            the first is shown.
+        spec: The name of a model (see `resolve_model`), or the path of an ONNX file.
+        labels: Class names, one a line; else those of the metadata, ImageNet's, or "class 0" and so on. 1000 names
+            fit a model of 1001 classes (a background comes first), and the reverse. The first synonym is shown.
         threads: CPU threads of the network.
-        provider: What runs the network, one of `hvt_common.inference.runtimes.providers.PROVIDERS`.
+        provider: One of `providers.PROVIDERS`.
 
     Raises:
         UserError: No such model, not a classifier, metadata or labels that do not fit.
@@ -90,7 +88,7 @@ def open_classifier(
 class OnnxClassifier:
     """A network from one image to one row of scores; arguments as of `open_classifier`.
 
-    Construction runs the network once on grey noise: that tells logits (softmax is applied) from probabilities
+    Construction runs the network once on noise, to distinguish logits (softmax is applied) from probabilities
     (each row sums to one).
 
     Raises:
@@ -121,7 +119,7 @@ class OnnxClassifier:
         return posteriors
 
     def _prepared(self, crop_bgr: Image) -> npt.NDArray[Any]:
-        """One crop as the network wants it, without the batch axis."""
+        """The network's input for one crop, without the batch axis."""
         crop = as_bgr(crop_bgr)
         shrinks = crop.shape[1] >= self._size[0] and crop.shape[0] >= self._size[1]
         resized = cv2.resize(crop, self._size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
@@ -180,15 +178,9 @@ def _geometry(model: OnnxModel) -> tuple[bool, int | None, tuple[int, int]]:
 
 def _is_scores(output: npt.NDArray[Any], batch: int) -> bool:
     """(batch, C), or (batch, C, 1, 1) as some exports leave it, with at least two classes."""
-    row = output.shape[1:]
-    numbers = np.issubdtype(output.dtype, np.floating)
-    return (
-        numbers
-        and output.ndim >= 2
-        and len(output) == batch
-        and row[0] >= 2
-        and all(size == 1 for size in row[1:])
-    )
+    if not np.issubdtype(output.dtype, np.floating) or output.ndim < 2 or len(output) != batch:
+        return False
+    return output.shape[1] >= 2 and all(size == 1 for size in output.shape[2:])
 
 
 def _not_a_classifier(model: OnnxModel, why: str) -> str:
@@ -238,11 +230,10 @@ def _class_names(model: OnnxModel, classes: int, labels: Path | None) -> tuple[s
         names = IMAGENET_NAMES
     if names is None:
         return tuple(f"class {index}" for index in range(classes))
-    if (len(names), classes) == (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):
+    fit = (len(names), classes)
+    if fit == (_IMAGENET_CLASSES, _IMAGENET_CLASSES + 1):
         names = (_BACKGROUND, *names)
-    elif (len(names), classes) == (_IMAGENET_CLASSES + 1, _IMAGENET_CLASSES) and names[
-        0
-    ].lower() == _BACKGROUND:
+    elif fit == (_IMAGENET_CLASSES + 1, _IMAGENET_CLASSES) and names[0].lower() == _BACKGROUND:
         names = names[1:]
     if len(names) != classes:
         origin = f"labels file {labels}" if labels is not None else f"metadata of {model.path}"

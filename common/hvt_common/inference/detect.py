@@ -27,8 +27,6 @@ _CELL = 32  # input sides are multiples of the largest usual stride
 _TRIAL_SIDE = 256
 _MAX_FREE_SIDE = 1920
 _MAX_SIDE = 8192
-
-
 _TWIN_IOU = 0.8
 """Two boxes that overlap more are one object, whatever their classes: networks call one vehicle a car and a van. A
 rider and the bicycle below overlap less."""
@@ -58,16 +56,14 @@ def open_detector(
     """Open the detector that ``spec`` names.
 
     Args:
-        spec: ``motion``, the name of a model (see `resolve_model`), or the path of an ONNX file
-            with one of the heads of `detect_heads`.
-        labels: Class names, one a line; else those in the model's metadata, else COCO for 80 classes and VisDrone
-            for 10, else "class 0" and so on.
+        spec: ``motion``, the name of a model (see `resolve_model`), or an ONNX file with a head of `detect_heads`.
+        labels: Class names, one a line; else those of the metadata, COCO (80), VisDrone (10), or "class 0" and so on.
         confidence: Least confidence of a detection, 0…1.
         nms_iou: Largest overlap of two detections of one class, 0…1.
         size: (width, height) of the network's input where the model leaves it free; else each image gets the
             multiples of 32 that hold it (at most 1920 on the longer side).
         threads: CPU threads of the network.
-        provider: What runs the network, one of `hvt_common.inference.runtimes.providers.PROVIDERS`.
+        provider: One of `providers.PROVIDERS`.
 
     Raises:
         UserError: No such model, not a detector, labels that do not fit, a setting out of its range.
@@ -83,11 +79,11 @@ def open_detector(
 
 
 def warm_up(detector: Detector, size: tuple[int, int]) -> None:
-    """Run a network once at the (width, height) it will see: a runtime may compile for it, which takes 0.2 s.
+    """Run a network once at the (width, height) it will get: a runtime may compile for it, which takes 0.2 s.
 
-    A detector that remembers pictures, such as `motion`, is left alone.
+    The motion detector, which remembers pictures, is left alone.
     """
-    if isinstance(detector, OnnxDetector):
+    if not isinstance(detector, MotionDetector):
         detector.detect(np.zeros((size[1], size[0], 3), np.uint8))
 
 
@@ -134,19 +130,14 @@ class OnnxDetector:
         output = self.model.run(tensor)[self._output_index].astype(np.float32, copy=False)
         found = self.head.decode(output, confidence=self._confidence, input_size=input_size)
         if self.head.suppresses:
-            kept = suppress(
-                found.boxes_input_px,
-                found.scores,
-                found.class_ids,
-                iou=self._nms_iou,
-                any_class_iou=_TWIN_IOU,
-            )
+            candidates = found.boxes_input_px, found.scores, found.class_ids
+            selected = suppress(*candidates, iou=self._nms_iou, any_class_iou=_TWIN_IOU)
         else:
-            kept = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
-        boxes = letterbox.to_image(found.boxes_input_px[kept])
-        class_ids = found.class_ids[kept]
+            selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
+        boxes = letterbox.to_image(found.boxes_input_px[selected])
+        class_ids = found.class_ids[selected]
         inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & (class_ids < len(self.class_names))
-        return Detections(boxes[inside], found.scores[kept][inside], class_ids[inside])
+        return Detections(boxes[inside], found.scores[selected][inside], class_ids[inside])
 
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
         """(width, height) in pixels that the network gets for an image of this (width, height)."""
@@ -167,7 +158,9 @@ def _fixed_size(model: OnnxModel, size: tuple[int, int] | None) -> tuple[int, in
     if model.inputs[0].dtype not in (np.float32, np.float16):
         raise UserError(_not_a_detector(model, "its input is neither float32 nor float16"))
     if size is None:
-        return (width, height) if width and height else _half_free(width, height)
+        # One free side gives a square; with both free, every image chooses.
+        side = width or height
+        return (width or side, height or side) if side else None
     if any(side % _CELL or not 0 < side <= _MAX_SIDE for side in size):
         raise UserError(
             f"detector size {size[0]}x{size[1]} is not accepted; multiples of {_CELL} to {_MAX_SIDE} are"
@@ -177,12 +170,6 @@ def _fixed_size(model: OnnxModel, size: tuple[int, int] | None) -> tuple[int, in
             f"detector size {size[0]}x{size[1]} does not fit {model.path}, whose input is {width}x{height}"
         )
     return size
-
-
-def _half_free(width: int | None, height: int | None) -> tuple[int, int] | None:
-    """A model with one free side gets a square; with both free, every image chooses."""
-    side = width or height
-    return (side, side) if side else None
 
 
 def _find_head(model: OnnxModel, trial_size: tuple[int, int]) -> tuple[int, Head]:

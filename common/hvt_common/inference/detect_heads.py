@@ -30,9 +30,9 @@ from hvt_common.values import Boxes
 
 __all__ = [
     "ACCEPTED_HEADS",
-    "Candidates",
     "EndToEndHead",
     "Head",
+    "HeadOutput",
     "UltralyticsHead",
     "YoloxHead",
     "anchor_count",
@@ -49,7 +49,7 @@ _MAX_LOG_SIZE = 20.0  # e^20 strides: far outside every image, and still finite 
 
 
 @dataclass(frozen=True, slots=True)
-class Candidates:
+class HeadOutput:
     """Boxes above the confidence, before suppression, in no particular order."""
 
     boxes_input_px: Boxes
@@ -82,8 +82,8 @@ class Head(Protocol):
     def suppresses(self) -> bool:
         """The output still needs non-maximum suppression."""
 
-    def decode(self, output: Array, *, confidence: float, input_size: tuple[int, int]) -> Candidates:
-        """Turn the (1, …) output into candidates of at least this confidence."""
+    def decode(self, output: Array, *, confidence: float, input_size: tuple[int, int]) -> HeadOutput:
+        """Decode the (1, …) output into boxes of at least this confidence."""
 
 
 class YoloxHead:
@@ -106,7 +106,7 @@ class YoloxHead:
         self._decoded = decoded
         self._grid_size = (0, 0)
 
-    def decode(self, output: Array, *, confidence: float, input_size: tuple[int, int]) -> Candidates:
+    def decode(self, output: Array, *, confidence: float, input_size: tuple[int, int]) -> HeadOutput:
         """Score is objectness times the best class score."""
         rows = np.flatnonzero(output[0, :, 4] >= confidence)
         picked = output[0, rows]
@@ -141,7 +141,7 @@ class UltralyticsHead:
     def __init__(self, classes: int) -> None:
         self.classes: int | None = classes
 
-    def decode(self, output: Array, *, confidence: float, input_size: tuple[int, int]) -> Candidates:
+    def decode(self, output: Array, *, confidence: float, input_size: tuple[int, int]) -> HeadOutput:
         """Score is the best class score."""
         del input_size
         columns = np.flatnonzero(output[0, 4:].max(axis=0) >= confidence)
@@ -160,7 +160,7 @@ class EndToEndHead:
     suppresses = False
     classes: int | None = None
 
-    def decode(self, output: Array, *, confidence: float, input_size: tuple[int, int]) -> Candidates:
+    def decode(self, output: Array, *, confidence: float, input_size: tuple[int, int]) -> HeadOutput:
         """The network has chosen; only the confidence is applied."""
         del input_size
         picked = output[0, output[0, :, 4] >= confidence]
@@ -217,14 +217,14 @@ def _corners(centres: Array, sizes: Array) -> Boxes:
     return np.concatenate([centres - half, centres + half], axis=1)
 
 
-def _valid(boxes: Boxes, scores: Array, class_ids: npt.NDArray[Any], confidence: float) -> Candidates:
+def _valid(boxes: Boxes, scores: Array, class_ids: npt.NDArray[Any], confidence: float) -> HeadOutput:
     """Drop what is not finite, has no area, or falls below the confidence; a broken number is never a detection."""
-    keep = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= 1.01) & (class_ids >= 0)
-    keep &= (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
-    return Candidates(
-        boxes[keep].astype(np.float32, copy=False),
-        np.minimum(scores[keep], np.float32(1)),
-        class_ids[keep].astype(np.int32),
+    valid = np.isfinite(boxes).all(axis=1) & (scores >= confidence) & (scores <= 1.01) & (class_ids >= 0)
+    valid &= (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+    return HeadOutput(
+        boxes[valid].astype(np.float32, copy=False),
+        np.minimum(scores[valid], np.float32(1)),
+        class_ids[valid].astype(np.int32),
     )
 
 

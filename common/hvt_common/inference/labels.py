@@ -50,7 +50,7 @@ def metadata_labels(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
     """Class names that a model carries: ``names`` as Ultralytics writes it, or a JSON list in ``classes``.
 
     ``names`` is a Python literal (``{0: 'car', 1: 'bus'}`` or a list), read without executing anything. Metadata
-    that is malformed counts as none: it is a courtesy of whoever exported the model, not an input of the user.
+    that is malformed counts as none.
     """
     return _literal_names(metadata.get("names", "")) or _json_names(metadata.get("classes", ""))
 

@@ -2,17 +2,18 @@
 
 Each image is compared with the last few, brought into its own coordinates by the camera's motion:
 
-1. The camera's motion since the last call (`CameraMotion`) is chained, so that each kept image can be warped onto the
-   new one.
-2. A pixel differs from a kept image by as much as it lies outside the values of its 3x3 neighbourhood there (tolerant
-   difference): a misalignment of a pixel, or the ringing of a coarse quantiser along an edge, costs nothing.
-3. The lower median over the kept images counts: an object differs from most of them, the ground that it has just left
-   only from a few, so nothing trails behind and no background model is learnt. A region must also differ, in part,
-   from all kept images but one: the place that a parked object has left is gone after two more calls.
+1. The camera's motion since the last call (`CameraMotion`) is chained, so that each stored image can be warped onto
+   the new one.
+2. A pixel differs from a stored image by as much as it lies outside the values of its 3x3 neighbourhood there
+   (tolerant difference): a misalignment of a pixel, or the ringing of a coarse quantiser along an edge, costs
+   nothing.
+3. The lower median over the stored images counts: an object differs from most of them, the ground that it has just
+   left only from a few, so nothing trails behind and no background model is learnt. A region must also differ, in
+   part, from all stored images but one: the place that a parked object has left is gone after two more calls.
 4. The threshold follows the noise of these very differences (median absolute deviation, Rousseeuw and Croux 1993), so
    coding noise stays below it; closing, connected components and merging make boxes.
 
-It is meant to be called on every n-th frame, three to five times a second, and sees what moves by about its own size
+It is meant to be called on every n-th frame, three to five times a second, and finds what moves by about its own size
 within the calls it remembers. Limits: it is silent in its first calls, a shadow belongs to its object, parallax of
 tall things near a fast camera looks like motion, and what has stood still for a second or two is not seen.
 """
@@ -27,10 +28,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse.csgraph import connected_components
 
+from hvt_common.camera_motion import Affine, CameraMotion
 from hvt_common.inference.class_names import MOVING
 from hvt_common.inference.letterbox import as_bgr
 from hvt_common.inference.nms import MAX_DETECTIONS
-from hvt_common.tracking.camera_motion import Affine, CameraMotion
 from hvt_common.values import Detections, Image
 
 __all__ = ["MotionDetector", "MotionSettings"]
@@ -48,9 +49,9 @@ class MotionSettings:
     """What counts as a moving object; lengths are pixels of the working image (`max_side_px`)."""
 
     memory_calls: int = 6
-    """So many past images are kept and compared with."""
+    """So many earlier images are compared with."""
     least_calls: int = 2
-    """Silent until so many images are kept."""
+    """Silent until so many images are stored."""
     max_side_px: int = 1280
     """A larger image is first scaled down to this longer side."""
     noise_factor: float = 6.0
@@ -58,7 +59,7 @@ class MotionSettings:
     least_difference: float = 9.0
     """… and so many grey levels of 255."""
     seed_share: float = 0.2
-    """Share of a region that must differ from all kept images but one."""
+    """Share of a region that must differ from all stored images but one."""
     join_px: int = 7
     """Parts nearer than this become one region."""
     near_share: float = 0.3
@@ -71,8 +72,8 @@ class MotionSettings:
     """… longer than so many times its width: the border of a letterboxed picture, for one."""
     largest_share: float = 0.25
     """A larger share of the image is no object."""
-    cut_share: float = 0.4
-    """When more than this share of the image differs, it is a cut, and the past is forgotten."""
+    scene_change_share: float = 0.4
+    """When more than this share of the image differs, it is a scene change, and the history is cleared."""
 
 
 class MotionDetector:
@@ -89,7 +90,7 @@ class MotionDetector:
         self._settings = settings or MotionSettings()
         self._confidence = confidence
         self._camera = CameraMotion()
-        self._past: deque[tuple[_Gray, Affine]] = deque(maxlen=self._settings.memory_calls)
+        self._history: deque[tuple[_Gray, Affine]] = deque(maxlen=self._settings.memory_calls)
 
     def detect(self, image_bgr: Image) -> Detections:
         """Moving objects in this image, in its pixels, best first; the image is remembered for the next calls.
@@ -99,11 +100,11 @@ class MotionDetector:
         """
         image = _shrunk(as_bgr(image_bgr), self._settings.max_side_px)
         gray = np.asarray(cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (3, 3), 0), np.uint8)
-        if self._past and self._past[-1][0].shape != gray.shape:
+        if self._history and self._history[-1][0].shape != gray.shape:
             self.reset()
-        self._move_past(self._camera.step(image))
+        self._move_history(self._camera.step(image))
         boxes, confidences = self._objects(gray)
-        self._past.append((gray, np.eye(2, 3)))
+        self._history.append((gray, np.eye(2, 3)))
         best = np.argsort(-confidences, kind="stable")[:MAX_DETECTIONS]
         to_image = np.tile([image_bgr.shape[1] / gray.shape[1], image_bgr.shape[0] / gray.shape[0]], 2)
         return Detections(
@@ -114,25 +115,25 @@ class MotionDetector:
 
     def reset(self) -> None:
         """Forget everything seen."""
-        self._past.clear()
+        self._history.clear()
         self._camera.reset()
 
-    def _move_past(self, step: Affine) -> None:
-        """Chain the camera's last step onto the maps of all kept images."""
-        moved = [(gray, _compose(step, affine)) for gray, affine in self._past]
-        self._past.clear()
-        self._past.extend(moved)
+    def _move_history(self, step: Affine) -> None:
+        """Chain the camera's last step onto the maps of all stored images."""
+        moved = [(gray, _compose(step, affine)) for gray, affine in self._history]
+        self._history.clear()
+        self._history.extend(moved)
 
     def _objects(self, gray: _Gray) -> tuple[_Floats, _Floats]:
         """Boxes (N, 4) in working pixels and confidences (N,) of at least the wanted confidence."""
         settings = self._settings
-        if len(self._past) < settings.least_calls:
+        if len(self._history) < settings.least_calls:
             return np.empty((0, 4)), np.empty(0)
         strict, median = self._differences(gray)
         threshold = max(settings.least_difference, settings.noise_factor * _noise(median))
         mask = np.asarray(median > threshold, np.uint8)
-        if mask.mean() > settings.cut_share:
-            self._past.clear()
+        if mask.mean() > settings.scene_change_share:
+            self._history.clear()
             return np.empty((0, 4)), np.empty(0)
         regions = _regions(mask, strict > threshold, (median / threshold).astype(np.float32), settings)
         boxes, confidences = _merged(*regions, near_share=settings.near_share)
@@ -140,11 +141,11 @@ class MotionDetector:
         return boxes[sure], confidences[sure]
 
     def _differences(self, gray: _Gray) -> tuple[_Gray, _Gray]:
-        """The second smallest and the lower median of the differences to the kept images, smoothed."""
-        rank = (len(self._past) - 1) // 2
+        """The second smallest and the lower median of the differences to the stored images, smoothed."""
+        rank = (len(self._history) - 1) // 2
         smallest = [np.full(gray.shape, 255, np.uint8) for _ in range(rank + 1)]
-        for past, affine in self._past:
-            larger = _tolerant_difference(gray, past, affine)
+        for earlier, affine in self._history:
+            larger = _tolerant_difference(gray, earlier, affine)
             for place, value in enumerate(smallest):
                 smallest[place] = np.asarray(cv2.min(value, larger), np.uint8)
                 larger = np.asarray(cv2.max(value, larger), np.uint8)
@@ -163,13 +164,13 @@ def _shrunk(image: Image, max_side_px: int) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _tolerant_difference(gray: _Gray, past: _Gray, affine: Affine) -> _Gray:
-    """How far each pixel lies outside its 3x3 neighbourhood in the past image; 0 where that image has no view."""
+def _tolerant_difference(gray: _Gray, earlier: _Gray, affine: Affine) -> _Gray:
+    """How far each pixel lies outside its 3x3 neighbourhood in the earlier image; 0 where that image has no view."""
     height, width = gray.shape
     edge = np.array([[0, 0], [width, 0], [width, height], [0, height]]) + _INSET_PX
     moved = edge @ affine[:, :2].T + affine[:, 2]
     still = np.abs(moved - edge).max() < _STILL_PX
-    warped = past if still else np.asarray(cv2.warpAffine(past, affine, (width, height)), np.uint8)
+    warped = earlier if still else np.asarray(cv2.warpAffine(earlier, affine, (width, height)), np.uint8)
     above = cv2.subtract(gray, np.asarray(cv2.dilate(warped, _SQUARE), np.uint8))
     below = cv2.subtract(np.asarray(cv2.erode(warped, _SQUARE), np.uint8), gray)
     difference = np.asarray(cv2.max(above, below), np.uint8)

@@ -1,7 +1,7 @@
 """Non-maximum suppression, class by class and, if wanted, across classes.
 
 OpenCV's C++ loop does the work: on 2000 boxes of 500 objects it takes 4 ms where a vectorised NumPy loop takes 9 and
-a full IoU matrix 23, and it keeps the same boxes in the same order.
+a full IoU matrix 23, and it selects the same boxes in the same order.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["MAX_CANDIDATES", "MAX_DETECTIONS", "suppress"]
 MAX_CANDIDATES = 8192
 """At most so many of the most confident boxes are compared, so that no image costs more than a tenth of a second."""
 MAX_DETECTIONS = 1000
-"""At most so many boxes are kept."""
+"""At most so many boxes are returned."""
 
 
 def suppress(
@@ -31,7 +31,7 @@ def suppress(
 ) -> npt.NDArray[np.intp]:
     """Return the indices of the boxes to keep, best first (equal scores: first come).
 
-    A box goes when a better one of the same class overlaps it with more than ``iou``. Classes are kept apart by
+    A box is suppressed when a better one of the same class overlaps it by more than ``iou``. Classes are separated by
     shifting each to its own place on the plane, in float64 so that no precision is lost.
 
     Args:
@@ -51,10 +51,10 @@ def suppress(
     span = float(np.abs(boxes_xyxy).max()) * 2 + 1
     apart = rects.copy()
     apart[:, :2] += class_ids[best, None] * span
-    kept = _greedy(apart, iou)
+    selected = _greedy(apart, iou)
     if any_class_iou < 1:
-        kept = kept[_greedy(rects[kept], any_class_iou)]
-    return best[kept[:limit]]
+        selected = selected[_greedy(rects[selected], any_class_iou)]
+    return best[selected[:limit]]
 
 
 def _greedy(rects: npt.NDArray[np.float64], iou: float) -> npt.NDArray[np.intp]:

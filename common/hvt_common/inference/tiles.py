@@ -1,9 +1,8 @@
-"""Small objects: a detector on the whole picture and on overlapping tiles of it, its answers made one list.
+"""Tiled detection of small objects: the whole picture and overlapping tiles of it, merged into one list.
 
-A network of 640 pixels sees a picture of 1920 at a third of its size, and an object of 12 pixels in four. On tiles it
-sees it larger, at the price of a run for each tile. What lies whole in one tile may be cut in the next: boxes that
-touch a border inside the picture count only where no other box covers them (the idea of slicing aided inference,
-Akyon et al., ICIP 2022).
+A network of 640 pixels gets a picture of 1920 at a third of its size, and an object of 12 pixels in four. Tiles
+enlarge it, at the cost of a run for each. Boxes that touch a tile's border inside the picture may be truncated:
+they count only where no other box covers them (slicing aided inference, Akyon et al., ICIP 2022).
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ __all__ = [
     "parse_tiles",
     "tile_boxes",
     "tiled",
-    "warm_up_source",
 ]
 
 Grid = tuple[int, int]
@@ -38,7 +36,7 @@ MOST_RUNS: Final = 7
 """Runs of the detector at one decision step that ``auto`` may take: the whole picture and at most six tiles."""
 OVERLAP: Final = 0.1
 """Share of a tile that the next one shows too: objects up to that size lie whole in one of them, and the whole
-picture shows the larger ones well enough. With 0.2 small objects are seen smaller: F1 .61 instead of .64."""
+picture shows the larger ones well enough. With 0.2 small objects get fewer pixels: F1 .61 instead of .64."""
 
 _MOST_TILES: Final = 64
 _SMALL_PX: Final = 12
@@ -52,12 +50,12 @@ _ANY_CLASS_IOU: Final = 0.7
 _INSIDE: Final = 0.8
 _COVERED: Final = 0.5
 _ACROSS: Final = 0.7
-"""Two pieces are of one object if they share so much of the longer one's extent along the cut."""
+"""Two partial are of one object if they share so much of the longer one's extent along the truncated."""
 
 
 @runtime_checkable
 class _Sized(Protocol):
-    """A network: it keeps nothing from one picture to the next, and says how large it sees one."""
+    """A network: stateless, with a known input size for each picture."""
 
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]: ...
 
@@ -77,7 +75,7 @@ def parse_tiles(text: str) -> Grid | Literal["auto", "off"]:
 
 
 def tiled(detector: Detector, tiles: str) -> Detector:
-    """The detector as ``--tiles`` wants it.
+    """The detector with the tiles of ``--tiles``.
 
     Raises:
         UserError: ``tiles`` makes no sense, or the detector remembers pictures and cannot be given tiles.
@@ -90,15 +88,6 @@ def tiled(detector: Detector, tiles: str) -> Detector:
             return detector
         raise UserError(f"tiles {tiles} need a detector that is a network; 'motion' compares whole pictures")
     return TiledDetector(detector, grid=grid)
-
-
-def warm_up_source(detector: Detector, source_size: tuple[int, int]) -> None:
-    """Run a network once on a picture of this (width, height), with its tiles: a runtime may compile for each shape.
-
-    A detector that remembers pictures, such as ``motion``, is left alone.
-    """
-    if isinstance(detector, (TiledDetector, _Sized)):
-        detector.detect(np.zeros((source_size[1], source_size[0], 3), np.uint8))
 
 
 def auto_grid(
@@ -183,49 +172,49 @@ class TiledDetector:
         size = (image_bgr.shape[1], image_bgr.shape[0])
         grid = self.grid(size)
         parts = [self._detector.detect(image_bgr)]
-        cut = [np.zeros(len(parts[0]), bool)]
+        truncated = [np.zeros(len(parts[0]), bool)]
         for tile in tile_boxes(size, grid, overlap=self._overlap) if grid != (1, 1) else ():
             x1, y1, x2, y2 = tile
             found = self._detector.detect(np.ascontiguousarray(image_bgr[y1:y2, x1:x2]))
             boxes = found.boxes_xyxy_px + np.array([x1, y1, x1, y1], np.float32)
             parts.append(Detections(boxes, found.confidences, found.class_ids))
-            cut.append(_cut(boxes, tile, size))
-        return _merged(parts, np.concatenate(cut))
+            truncated.append(_truncated(boxes, tile, size))
+        return _merged(parts, np.concatenate(truncated))
 
 
-def _cut(boxes: Boxes, tile: tuple[int, int, int, int], size: tuple[int, int]) -> npt.NDArray[np.bool_]:
+def _truncated(boxes: Boxes, tile: tuple[int, int, int, int], size: tuple[int, int]) -> npt.NDArray[np.bool_]:
     """(N,) True for boxes that touch a border of the tile that is not one of the picture."""
     x1, y1, x2, y2 = tile
     margin_x, margin_y = (max(1.0, _BORDER_SHARE * side) for side in (x2 - x1, y2 - y1))
-    cut = np.zeros(len(boxes), bool)
+    truncated = np.zeros(len(boxes), bool)
     if x1 > 0:
-        cut |= boxes[:, 0] < x1 + margin_x
+        truncated |= boxes[:, 0] < x1 + margin_x
     if y1 > 0:
-        cut |= boxes[:, 1] < y1 + margin_y
+        truncated |= boxes[:, 1] < y1 + margin_y
     if x2 < size[0]:
-        cut |= boxes[:, 2] > x2 - margin_x
+        truncated |= boxes[:, 2] > x2 - margin_x
     if y2 < size[1]:
-        cut |= boxes[:, 3] > y2 - margin_y
-    return cut
+        truncated |= boxes[:, 3] > y2 - margin_y
+    return truncated
 
 
-def _merged(parts: list[Detections], cut: npt.NDArray[np.bool_]) -> Detections:
+def _merged(parts: list[Detections], truncated: npt.NDArray[np.bool_]) -> Detections:
     """One list of several over the same pixels, best first."""
     boxes = np.concatenate([part.boxes_xyxy_px for part in parts])
     scores = np.concatenate([part.confidences for part in parts])
     class_ids = np.concatenate([part.class_ids for part in parts])
-    whole = np.flatnonzero(~cut)
-    kept = whole[
+    whole = np.flatnonzero(~truncated)
+    chosen = whole[
         suppress(boxes[whole], scores[whole], class_ids[whole], iou=_SAME_IOU, any_class_iou=_ANY_CLASS_IOU)
     ]
-    kept = kept[_outermost(boxes[kept], class_ids[kept])]
-    pieces = np.flatnonzero(cut)
-    pieces = pieces[np.argsort(-scores[pieces], kind="stable")][:MAX_DETECTIONS]
-    pieces = pieces[_uncovered(boxes[pieces], boxes[kept])]
-    joined, best = _joined(boxes[pieces], class_ids[pieces])
-    kept, boxes = np.concatenate((kept, pieces[best])), np.concatenate((boxes[kept], joined))
-    order = np.argsort(-scores[kept], kind="stable")[:MAX_DETECTIONS]
-    return Detections(boxes[order], scores[kept][order], class_ids[kept][order])
+    chosen = chosen[_outermost(boxes[chosen], class_ids[chosen])]
+    partial = np.flatnonzero(truncated)
+    partial = partial[np.argsort(-scores[partial], kind="stable")][:MAX_DETECTIONS]
+    partial = partial[_uncovered(boxes[partial], boxes[chosen])]
+    joined, best = _joined(boxes[partial], class_ids[partial])
+    chosen, boxes = np.concatenate((chosen, partial[best])), np.concatenate((boxes[chosen], joined))
+    order = np.argsort(-scores[chosen], kind="stable")[:MAX_DETECTIONS]
+    return Detections(boxes[order], scores[chosen][order], class_ids[chosen][order])
 
 
 def _outermost(boxes: Boxes, class_ids: npt.NDArray[np.int32]) -> npt.NDArray[np.intp]:
@@ -235,20 +224,20 @@ def _outermost(boxes: Boxes, class_ids: npt.NDArray[np.int32]) -> npt.NDArray[np
     return _first_come(inside)
 
 
-def _uncovered(pieces: Boxes, others: Boxes) -> npt.NDArray[np.intp]:
-    """Of cut boxes, best first, those that neither the others nor a better piece cover by half."""
-    free = np.flatnonzero(~(_shared_of_smaller(pieces, others) > _COVERED).any(axis=1))
-    return free[_first_come(_shared_of_smaller(pieces[free], pieces[free]) > _COVERED)]
+def _uncovered(partial: Boxes, others: Boxes) -> npt.NDArray[np.intp]:
+    """Of truncated boxes, best first, those that neither the others nor a better one cover by half."""
+    free = np.flatnonzero(~(_shared_of_smaller(partial, others) > _COVERED).any(axis=1))
+    return free[_first_come(_shared_of_smaller(partial[free], partial[free]) > _COVERED)]
 
 
-def _joined(pieces: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, npt.NDArray[np.intp]]:
-    """Cut boxes, best first, put together: (M, 4) boxes and (M,) index of the best piece of each.
+def _joined(partial: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, npt.NDArray[np.intp]]:
+    """Truncated boxes, best first, joined by object: (M, 4) boxes and (M,) index of the best part of each.
 
-    Pieces of one object overlap where their tiles do, and agree across the cut in where the object lies.
+    Parts of one object overlap where their tiles do, and agree in extent along the tile border.
     """
-    if not len(pieces):
-        return pieces, np.empty(0, np.intp)
-    a, b = pieces[:, None, :], pieces[None, :, :]
+    if not len(partial):
+        return partial, np.empty(0, np.intp)
+    a, b = partial[:, None, :], partial[None, :, :]
     shared = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
     longer = np.maximum(a[..., 2:] - a[..., :2], b[..., 2:] - b[..., :2])
     one = (shared > 0).all(axis=-1) & (shared > _ACROSS * longer).any(axis=-1)
@@ -256,13 +245,13 @@ def _joined(pieces: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, npt
     count, group = connected_components(one, directed=False)
     low = np.full((count, 2), np.inf, np.float32)
     high = np.full((count, 2), -np.inf, np.float32)
-    np.minimum.at(low, group, pieces[:, :2])
-    np.maximum.at(high, group, pieces[:, 2:])
+    np.minimum.at(low, group, partial[:, :2])
+    np.maximum.at(high, group, partial[:, 2:])
     return np.concatenate((low, high), axis=1), np.unique(group, return_index=True)[1]
 
 
 def _first_come(same: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-    """Indices that are the same object as no index kept before them; ``same`` is (N, N)."""
+    """Indices that are the same object as no index chosen before them; ``same`` is (N, N)."""
     left = np.ones(len(same), bool)
     for index in range(len(same)):
         if left[index]:

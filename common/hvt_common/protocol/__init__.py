@@ -1,1 +1,1 @@
-"""HVT as bytes, without Zenoh: the channel table, the messages, the ledger that counts them."""
+"""HVT as bytes, without Zenoh: `channels` (the key table), `messages`, `ledger`, `clock_offset`."""

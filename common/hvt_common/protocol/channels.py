@@ -1,6 +1,6 @@
 """The key table: every stream of HVT, its direction and how Zenoh is to deliver it. Nothing else knows a key.
 
-Keys are ``hvt/<edge>/<row>``. This file knows strings only; `session` turns the names into Zenoh's own values.
+Keys are ``hvt/<edge>/<channel>``. This file knows strings only; `session` turns the names into Zenoh's own values.
 """
 
 from __future__ import annotations
@@ -51,22 +51,22 @@ class Channel(StrEnum):
 
 
 class Direction(Enum):
-    """Who speaks."""
+    """Who sends."""
 
     EDGE_TO_GROUND = "edge to ground"
     GROUND_TO_EDGE = "ground to edge"
-    GROUND_QUERIES = "ground asks, edge answers"
+    GROUND_QUERIES = "ground queries, edge answers"
     PRESENCE = "liveliness token of the edge"
 
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """How one row crosses the link."""
+    """How one channel crosses the link."""
 
     direction: Direction
     carries: str
     priority: str
-    """Name of a Zenoh priority. BLOCK and DROP rows never share one: on one priority they disturb each other."""
+    """Name of a Zenoh priority. BLOCK and DROP channels never share one: on one priority they disturb each other."""
     congestion: str
     """``BLOCK`` where the application owns a bounded queue of its own, ``DROP`` where the latest value wins."""
     encoding: str = MSGPACK_ENCODING
@@ -94,7 +94,7 @@ DELIVERIES: Mapping[Channel, Delivery] = MappingProxyType(
         Channel.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "TrackStep", "DATA_LOW", "DROP"),
         Channel.BACKLOG: Delivery(
             Direction.EDGE_TO_GROUND,
-            "a chunk of what was kept while the link was away; attachment BacklogHeader",
+            "a chunk of what was stored while the link was down; attachment BacklogHeader",
             "BACKGROUND",
             "BLOCK",
         ),
@@ -122,9 +122,9 @@ class EdgeKeys:
                 f"edge id {self.edge!r} is not usable: 1 to 32 characters of a-z, 0-9 and '-' are accepted"
             )
 
-    def key(self, row: Channel) -> str:
+    def key(self, channel: Channel) -> str:
         """The full key, such as ``hvt/uav-1/base``."""
-        return f"{ROOT}/{self.edge}/{row}"
+        return f"{ROOT}/{self.edge}/{channel}"
 
 
 def check_edge_pattern(pattern: str) -> str:
@@ -136,14 +136,14 @@ def check_edge_pattern(pattern: str) -> str:
     return pattern
 
 
-def selector(row: Channel, *, edges: str = "*") -> str:
-    """The Zenoh key expression of one row for all edges that ``edges`` matches, such as ``hvt/uav-$*/base``.
+def selector(channel: Channel, *, edges: str = "*") -> str:
+    """The Zenoh key expression of one channel for all edges that ``edges`` matches, such as ``hvt/uav-$*/base``.
 
-    The pattern travels to the sender, so edges that nobody asked for cost no line bytes.
+    The sender applies the pattern, so edges that are not selected cost no line bytes.
     """
     pattern = re.sub(r"\*+", "*", check_edge_pattern(edges))
     chunk = pattern if pattern == "*" else pattern.replace("*", "$*")
-    return f"{ROOT}/{chunk}/{row}"
+    return f"{ROOT}/{chunk}/{channel}"
 
 
 def matches(edge: str, *, edges: str) -> bool:
@@ -152,7 +152,7 @@ def matches(edge: str, *, edges: str) -> bool:
 
 
 def parse_key(key: str) -> tuple[str, Channel] | None:
-    """The edge id and row of a received key; None for any key that is not ours."""
+    """The edge id and channel of a received key; None for any key that is not ours."""
     parts = key.split("/")
     if len(parts) != 3 or parts[0] != ROOT or _EDGE_ID.fullmatch(parts[1]) is None:
         return None

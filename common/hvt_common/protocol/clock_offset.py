@@ -1,4 +1,4 @@
-"""How far the other side's clock is from ours, from the four times of a question and its answer. Pure."""
+"""The offset of a remote clock, from the four times of a request and its answer. Pure."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ class _Sample:
 
 
 class ClockOffset:
-    """The offset of a remote clock: of the recent exchanges, the one with the shortest round trip speaks.
+    """The offset of a remote clock, from the recent exchange with the shortest round trip.
 
-    With ``t0`` asked (ours), ``t1`` received and ``t2`` answered (theirs), ``t3`` heard (ours), the offset is
-    ``((t1 - t0) + (t2 - t3)) / 2`` and the round trip ``(t3 - t0) - (t2 - t1)`` (RFC 5905, section 8). The true
-    offset lies within half a round trip of the estimate, whatever the two directions each took. Where a new exchange
-    and the one before exclude each other a clock was set: those before the step are forgotten.
+    ``t0``: request sent (local), ``t1``: received and ``t2``: answered (remote), ``t3``: answer received (local).
+    The offset is ``((t1 - t0) + (t2 - t3)) / 2``, the round trip ``(t3 - t0) - (t2 - t1)`` (RFC 5905, section 8).
+    The true offset lies within half a round trip of it. Two exchanges that exclude each other mean that a clock was
+    set: those before the step are dropped.
     """
 
-    def __init__(self, *, window_ns: int = 60_000_000_000, keep: int = 64) -> None:
-        """Samples older than ``window_ns`` before the newest are forgotten; never more than ``keep`` are held."""
+    def __init__(self, *, window_ns: int = 60_000_000_000, max_samples: int = 64) -> None:
+        """Samples older than ``window_ns`` before the newest are dropped, and the oldest beyond ``max_samples``."""
         self._window_ns = window_ns
-        self._samples: deque[_Sample] = deque(maxlen=keep)
+        self._samples: deque[_Sample] = deque(maxlen=max_samples)
 
     def add(self, *, t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> bool:
         """Take one exchange; False if its times contradict each other (a stepped or hostile clock)."""
@@ -42,7 +42,6 @@ class ClockOffset:
             return False
         offset_ns = ((t1_ns - t0_ns) + (t2_ns - t3_ns)) // 2
         sample = _Sample(t3_ns, offset_ns, round_trip_ns)
-        # Two truths that exclude each other: one of the clocks was set in between, and what was before is history.
         while self._samples and not _agree(self._samples[-1], sample):
             self._samples.pop()
         self._samples.append(sample)
@@ -58,7 +57,7 @@ class ClockOffset:
 
     @property
     def error_ns(self) -> int | None:
-        """Half the round trip of the sample that speaks: the offset is right within this. None before the first."""
+        """Half the round trip of the chosen sample: the largest error of the offset. None before the first."""
         best = self._best()
         return None if best is None else (best.round_trip_ns + 1) // 2
 

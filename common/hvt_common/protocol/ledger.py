@@ -1,7 +1,7 @@
-"""The one account of what crosses the line: bytes by channel, rolling windows, and the fate of every still.
+"""The ledger of the link: bytes by channel, rolling windows, and the outcome of every still.
 
-Pure: the time of each message is an argument. Both sides feed it the same numbers (sizes of what was sent, times out
-of the headers) and get the same totals and windows.
+Pure: the time of each message is an argument. Both sides count the same sizes and the times of the headers, and get
+    the same totals and windows.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from enum import Enum
 from typing import Literal
 
 __all__ = [
+    "STANDARD_ENCODINGS",
     "Account",
     "Ledger",
     "LedgerSummary",
@@ -31,13 +32,13 @@ class Account(Enum):
     BASE = "base"
     ROI = "roi"
     BACKLOG = "backlog"
-    """What was kept while the link was away, and sent afterwards."""
+    """What was stored while the link was down, and sent afterwards."""
     META = "meta"
     """Status, info, feedback and tracks."""
 
 
 _MOST_REASONS = 23
-"""Of one fate, each by its own name; a status carries one more."""
+"""Of one outcome, each by its own name; a status carries one more."""
 _MOST_PENDING = 65_536
 
 # Measured between two peers of eclipse-zenoh 1.10 over TCP, with `ss -ti` (bytes_sent) and a veth's tx_bytes. It is
@@ -47,7 +48,7 @@ _FRAMING_BYTES = 12
 _STANDARD_ENCODING_BYTES = 1
 _CUSTOM_ENCODING_BYTES = 4
 _TIMESTAMP_BYTES = 26
-_STANDARD_ENCODINGS = frozenset(
+STANDARD_ENCODINGS = frozenset(
     {
         "application/octet-stream",
         "application/cbor",
@@ -79,7 +80,7 @@ def overhead_bytes(
     framing = _FRAMING_BYTES + len(key) + _varint_bytes(payload_bytes)
     if attachment_bytes:
         framing += 1 + _varint_bytes(attachment_bytes)
-    if encoding in _STANDARD_ENCODINGS:
+    if encoding in STANDARD_ENCODINGS:
         framing += _STANDARD_ENCODING_BYTES
     elif encoding:
         framing += _CUSTOM_ENCODING_BYTES + len(encoding)
@@ -118,7 +119,7 @@ class LedgerSummary:
     total_bps: int
     worst_window_bps: WindowRates
     outcomes: Mapping[str, Mapping[str, int]]
-    """For each fate the number of stills by reason."""
+    """For each outcome the number of stills by reason."""
 
     @property
     def line_bytes(self) -> int:
@@ -177,12 +178,12 @@ class Ledger:
         self._enter(at_ns, channel, line)
 
     def record_outcome(self, outcome: StillOutcome, reason: str) -> None:
-        """Note what became of a still and why. Some come from the network: of many, the later are ``other``."""
+        """Count the outcome of a still by reason; reasons beyond 23, which the network may send, are ``other``."""
         outcomes = self._outcomes[outcome]
         outcomes[reason if reason in outcomes or len(outcomes) < _MOST_REASONS else "other"] += 1
 
     def outcomes(self, outcome: StillOutcome) -> dict[str, int]:
-        """Number of stills with this fate, by reason."""
+        """Number of stills with this outcome, by reason."""
         return dict(self._outcomes[outcome])
 
     def messages(self, channel: Account) -> int:
@@ -209,7 +210,7 @@ class Ledger:
 
     @property
     def worst_window_bps(self) -> WindowRates:
-        """The fullest windows so far. May be asked for while another thread counts."""
+        """The fullest windows so far. Safe to read while another thread counts."""
         windows = self._windows.copy()
         for entry in tuple(self._pending):
             windows.add(*entry)
@@ -263,7 +264,7 @@ _SUMS = (*(channel.value for channel in Account), "total")
 
 @dataclass(slots=True)
 class _Windows:
-    """Rolling sums over messages that come in order of time; the worst of each is kept."""
+    """Rolling sums over messages in order of time, and the largest of each."""
 
     window_ns: int
     entries: deque[tuple[int, str, int]] = field(default_factory=deque)
@@ -282,7 +283,7 @@ class _Windows:
             self.worst[name] = max(self.worst[name], self.sums[name])
 
     def copy(self) -> _Windows:
-        """One that goes on by itself. Each part is copied in one step, which no other thread can interrupt."""
+        """An independent copy. Each part is copied in one step, which no other thread can interrupt."""
         return _Windows(self.window_ns, self.entries.copy(), self.sums.copy(), self.worst.copy())
 
     def restart(self) -> None:

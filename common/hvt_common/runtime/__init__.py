@@ -1,1 +1,1 @@
-"""What every process needs: clock, stopping, priorities, allocator, status line, latency statistics."""
+"""What every process needs: `clock`, `process` (signals, priority, allocator), `reporting`, `statistics`."""

@@ -1,4 +1,4 @@
-"""What a run says of itself: a status line while it goes on, a table and a JSON file at its end."""
+"""What a run reports: log, status line, and at its end a table and a JSON file."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ _PLAIN_EVERY = 5
 
 
 def start_log(program: str, *, quiet: bool) -> Callable[[], None]:
-    """Send the log to stderr, from when the returned function is called: until then it is held.
+    """Buffer the log until the returned function is called, then write it to stderr.
 
-    A start that fails says one sentence and nothing else. What runs each network is said unless ``quiet``.
+    So a start that fails writes one sentence and nothing else. Unless ``quiet``, the provider of each network is
+    logged.
     """
     stream = logging.StreamHandler()
     stream.setFormatter(logging.Formatter(f"{program}: %(message)s"))
@@ -41,14 +42,14 @@ def start_log(program: str, *, quiet: bool) -> Callable[[], None]:
 
 
 class _HeldLog(logging.handlers.MemoryHandler):
-    """Keeps what is logged until it is released; what is never released is never said."""
+    """Buffers records until `say_on`; without it they are discarded."""
 
     def __init__(self, target: logging.Handler) -> None:
         super().__init__(10_000, target=target, flushOnClose=False)
         self._free = False
 
     def say_on(self) -> None:
-        """Say what was held, and from now on everything at once."""
+        """Write the buffered records, and from now on each at once."""
         self._free = True
         self.flush()
 
@@ -57,15 +58,15 @@ class _HeldLog(logging.handlers.MemoryHandler):
         return self._free
 
     def flush(self) -> None:
-        """Logging itself flushes at exit: not what is still held."""
+        """Discard at exit what is still buffered: logging itself would write it."""
         if self._free:
             super().flush()
 
 
 class StatusLine:
-    """One line on a terminal, rewritten in place; elsewhere a line now and then, so that logs stay short.
+    """One line on a terminal, rewritten in place; elsewhere every fifth update is a line, so that logs stay short.
 
-    Where nobody reads any more (a closed pipe, a lost terminal, a full disk) the run goes on without a word.
+    A closed pipe, a lost terminal or a full disk silences it; the run goes on.
     """
 
     def __init__(self, *, quiet: bool) -> None:
@@ -87,7 +88,7 @@ class StatusLine:
                 self._updates += 1
 
     def note(self, text: str) -> None:
-        """Say something that stays, above the line."""
+        """Print a lasting line above the status line."""
         if not self._quiet:
             with _going_on(sys.stderr):
                 self._console.print(text, markup=False, soft_wrap=True)
@@ -114,7 +115,7 @@ class _Console(Console):
 
 @contextlib.contextmanager
 def _going_on(stream: TextIO) -> Iterator[None]:
-    """What cannot be said is not: from then on, nor is anything else."""
+    """After a failed write, send the stream to /dev/null and go on."""
     try:
         yield
         if stream is not None:  # None where the process was started with the stream closed
@@ -125,7 +126,7 @@ def _going_on(stream: TextIO) -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """Print a line on standard output."""
+    """Print a line on standard output, if it can be written."""
     with _going_on(sys.stdout):
         print(text)
 

@@ -1,1 +1,1 @@
-"""ByteTrack: Kalman filter, association, camera motion."""
+"""ByteTrack: others use `bytetrack`; Kalman filter, association and table are its parts."""

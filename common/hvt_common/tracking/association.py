@@ -42,7 +42,7 @@ def assign(cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
     and drop above the limit afterwards is something else: one hopeless row may push its neighbours aside.)
 
     A pair whose row and column have no other candidate under the limit is part of every optimum, and a row
-    without candidates of none: both are settled without the solver, which sees only what is contested.
+    without candidates of none: both are resolved without the solver, which gets only the rest.
     """
     rows, columns = (cost < limit).nonzero()
     by_row = np.bincount(rows, minlength=cost.shape[0])

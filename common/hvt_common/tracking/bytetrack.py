@@ -17,9 +17,9 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.camera_motion import CameraMotion
 from hvt_common.tracking import kalman
 from hvt_common.tracking.association import grown, overlaps, pair
-from hvt_common.tracking.camera_motion import CameraMotion
 from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, TrackerInput, TrackTable
 from hvt_common.values import Detections, Image, Tracks
 
@@ -111,7 +111,7 @@ def weak_confidence(confidence: float) -> float:
 
 
 class ByteTracker:
-    """Follows objects through consecutive frames of one camera at ``fps`` frames a second.
+    """Tracks objects through consecutive frames of one camera at ``fps`` frames a second.
 
     Call `update` for a frame that was searched for objects and `predict` for one that was not, with rising frame
     indices. Frames left out altogether are stepped over; an interruption longer than the lost buffer ends
@@ -151,17 +151,17 @@ class ByteTracker:
         seen = TrackerInput.of(detections, low_confidence=self._settings.low_confidence)
         self._advance(frame_index, image_bgr, hold_unconfirmed=True)
         self._forget_stale(frame_index)
-        self._make_room_for(seen)
+        self._widen_for(seen)
         first = self._updated_index is None
         match, free = self._match(seen, growth=self._growth(frame_index))
         self._updated_index = frame_index
         self._correct(seen, match, frame_index)
-        kept = self._retire(match, frame_index)
+        retained = self._retire(match, frame_index)
         self._start(seen.take(free), frame_index, confirmed=first)
-        kept = np.concatenate((kept, np.ones(len(self._table) - len(kept), bool)))
-        kept &= ~self._duplicates(kept)
-        if not kept.all():
-            self._table.keep(kept)
+        retained = np.concatenate((retained, np.ones(len(self._table) - len(retained), bool)))
+        retained &= ~self._duplicates(retained)
+        if not retained.all():
+            self._table.retain(retained)
         return self._listed(frame_index)
 
     def predict(self, *, frame_index: int, image_bgr: Image | None = None) -> Tracks:
@@ -197,7 +197,7 @@ class ByteTracker:
         affine = None if self._camera is None or image_bgr is None else self._camera.step(image_bgr)
         table = self._table
         if elapsed > self._buffer_frames + 1:
-            table.keep(np.zeros(len(table), bool))
+            table.retain(np.zeros(len(table), bool))
         if not len(table):
             return
         for _ in range(elapsed - 1):
@@ -223,9 +223,9 @@ class ByteTracker:
         table = self._table
         stale = (table.phase == LOST) & (frame_index - table.seen > self._buffer_frames + 2)
         if stale.any():
-            table.keep(~(stale & (table.lost_at != self._updated_index)))
+            table.retain(~(stale & (table.lost_at != self._updated_index)))
 
-    def _make_room_for(self, seen: TrackerInput) -> None:
+    def _widen_for(self, seen: TrackerInput) -> None:
         if len(seen):
             if seen.class_ids.min() < 0:
                 raise ValueError(f"class_ids holds {seen.class_ids.min()}, must not be negative")
@@ -313,7 +313,7 @@ class ByteTracker:
         self._table.append(born)
 
     def _duplicates(self, living: _Mask) -> _Mask:
-        """Of a tracked and a lost track at the same place, the one with the shorter past."""
+        """Of a tracked and a lost track at the same place, the younger one."""
         table = self._table
         duplicate = np.zeros(len(table), bool)
         present = (living & (table.phase != LOST)).nonzero()[0]
@@ -323,8 +323,8 @@ class ByteTracker:
         boxes = kalman.boxes_of(table.states)
         pairs = (1 - overlaps(boxes[present], boxes[lost]) < _DUPLICATE_COST_LIMIT).nonzero()
         a, b = present[pairs[0]], lost[pairs[1]]
-        past = table.seen - table.born
-        lost_is_shorter = past[a] > past[b]
+        age = table.seen - table.born
+        lost_is_shorter = age[a] > age[b]
         duplicate[b[lost_is_shorter]] = True
         duplicate[a[~lost_is_shorter]] = True
         return duplicate

@@ -110,10 +110,10 @@ class TrackTable:
             votes=votes,
         )
 
-    def keep(self, kept: _Mask) -> None:
+    def retain(self, mask: _Mask) -> None:
         """Drop all tracks but the marked ones."""
         for name in _COLUMNS:
-            setattr(self, name, getattr(self, name)[kept])
+            setattr(self, name, getattr(self, name)[mask])
 
     def append(self, other: TrackTable) -> None:
         """Add tracks with higher ids and as many classes."""
@@ -121,7 +121,7 @@ class TrackTable:
             setattr(self, name, np.concatenate((getattr(self, name), getattr(other, name))))
 
     def widen(self, classes: int) -> None:
-        """Make room for votes on classes up to ``classes``."""
+        """Extend the table by votes on classes up to ``classes``."""
         missing = classes - self.votes.shape[1]
         if missing > 0:
             self.votes = np.pad(self.votes, ((0, 0), (0, missing)))

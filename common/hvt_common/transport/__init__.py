@@ -1,1 +1,1 @@
-"""Zenoh: session, configuration, the queue between its callbacks and our threads."""
+"""HVT over Zenoh: `session` opens it, `inbox` queues what arrives, `doctor` explains why there is no link."""

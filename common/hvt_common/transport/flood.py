@@ -1,4 +1,4 @@
-"""Notices that far more messages come than anybody sends who means well. Pure: time is an argument."""
+"""Detects a flood: far more messages of one kind than a working peer sends. Pure: time is an argument."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ _AGAIN_NS = 60 * _SECOND_NS
 class FloodWatch:
     """Counts messages of each kind second by second; may be used by any thread.
 
-    Args:
-        most_per_s: so many of one kind in a second are no flood; at least twice what the busiest peer sends.
+    ``most_per_s`` of one kind in a second are no flood: at least twice what the busiest peer sends.
     """
 
     def __init__(self, *, most_per_s: int) -> None:

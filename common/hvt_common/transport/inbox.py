@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-__all__ = ["CAPACITY_BYTES", "Inbox", "Received", "Sink"]
+__all__ = ["CAPACITY_BYTES", "Inbox", "Received", "ReceivedQueue"]
 
 CAPACITY_BYTES = 64 * 2**20
 """What one inbox holds at most: minutes of a base stream, and sixteen of the largest messages there are."""
@@ -30,7 +30,7 @@ class Received:
         return len(self.payload) + len(self.attachment)
 
 
-class Sink(Protocol):
+class ReceivedQueue(Protocol):
     """Where Zenoh's callbacks put what came; must never block."""
 
     def put(self, item: Received) -> None:
@@ -41,7 +41,7 @@ class Sink(Protocol):
 class Inbox:
     """A bounded queue between Zenoh's callbacks and one of our threads; putting never blocks.
 
-    It is bounded in messages and in bytes: a payload may have megabytes. ``overflow`` says what gives way when it is
+    It is bounded in messages and in bytes: a payload may have megabytes. ``overflow`` says what is dropped when it is
     full: ``newest`` for the base stream (what is queued stays whole up to a gap), ``oldest`` where the latest value
     wins. A message that is larger than the whole inbox never enters. With a ``share`` below 1 no key may take more
     than that of it: a flood under one does not keep the others out.
@@ -55,7 +55,7 @@ class Inbox:
         capacity_bytes: int = CAPACITY_BYTES,
         share: float = 1.0,
     ) -> None:
-        assert share == 1.0 or overflow == "newest", "what makes room for its own key would be another rule"
+        assert share == 1.0 or overflow == "newest", "with a share the newest message is dropped"
         self._items: deque[Received] = deque()
         self._bytes = 0
         self._capacity = capacity
@@ -67,12 +67,12 @@ class Inbox:
         self._changed = threading.Condition()
         self._closed = False
         self.dropped = 0
-        """Messages that found no room."""
+        """Messages that did not fit."""
 
     def put(self, item: Received) -> None:
         """Add a message, or drop one."""
         with self._changed:
-            while not self._has_room(item):
+            while not self._fits(item):
                 self.dropped += 1
                 if self._overflow == "newest" or not self._items:
                     return
@@ -88,7 +88,7 @@ class Inbox:
             return self._take() if self._items else None
 
     def close(self) -> None:
-        """Wake whoever waits; what is queued can still be taken."""
+        """Wake the waiting thread; what is queued can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -110,7 +110,7 @@ class Inbox:
         else:
             del self._by_key[item.key]
 
-    def _has_room(self, item: Received) -> bool:
+    def _fits(self, item: Received) -> bool:
         count, held_bytes = self._by_key.get(item.key, (0, 0))
         return (
             len(self._items) < self._capacity

@@ -1,6 +1,6 @@
-"""What our own Zenoh configuration lets whom do: its access control, read as Zenoh reads it.
+"""The access control of our own Zenoh configuration, read as Zenoh reads it.
 
-Zenoh drops what is not allowed without a word. Who knows its own rules can at least say so.
+Zenoh drops silently what is not allowed; with its own rules a side can say so.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ class Rights:
         """
         if not self.enabled:
             return True
-        asked = zenoh.KeyExpr(key)
+        requested = zenoh.KeyExpr(key)
         said = {
             rule["permission"]
             for rule in self._rules_for(name)
             if flow in (rule.get("flows") or (flow,))
             and message in rule["messages"]
-            and any(zenoh.KeyExpr(one).includes(asked) for one in rule["key_exprs"])
+            and any(zenoh.KeyExpr(one).includes(requested) for one in rule["key_exprs"])
         }
         return "deny" not in said and ("allow" in said or self.default_allow)
 

@@ -1,7 +1,7 @@
-"""A Zenoh session as HVT wants it, and the few things publish and subscribe do with it.
+"""HVT's Zenoh session: opening it, publishers, subscribers, queries.
 
-Peers connect to named endpoints only: no multicast, no gossip, no shared memory (byte counts would lie), loopback
-unless told otherwise. Callbacks of Zenoh never block: they copy into an `Inbox`, which has a bound.
+Peers connect to named endpoints only: no multicast, no gossip, no shared memory (byte counts would be wrong),
+loopback by default. Callbacks of Zenoh never block: they copy into an `Inbox`, which has a bound.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import DELIVERIES, MSGPACK_ENCODING, Channel, EdgeKeys
 from hvt_common.transport.doctor.certificate import check_own_keys
 from hvt_common.transport.doctor.diagnose import visit
-from hvt_common.transport.inbox import Inbox, Received, Sink
+from hvt_common.transport.inbox import Inbox, Received, ReceivedQueue
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, configure, without_build_paths
 
 __all__ = [
@@ -27,9 +27,9 @@ __all__ = [
     "Inbox",
     "LinkSettings",
     "Received",
-    "ask",
     "declare_publisher",
     "open_session",
+    "query",
     "serve",
     "subscribe",
 ]
@@ -44,7 +44,7 @@ def open_session(settings: LinkSettings) -> Iterator[zenoh.Session]:
     """A running session; closed within a second on the way out, whatever state the link is in.
 
     A connecting side does not wait for the other: it goes on trying for as long as the session is open. Raises
-    UserError for endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh's own log is heard.
+    UserError for endpoints, files, keys and ports that cannot be used. With RUST_LOG set, Zenoh logs to stderr.
     """
     config, listen = configure(settings)
     check_own_keys(config, listen=listen, name=settings.name, now_s=time.time())
@@ -59,11 +59,11 @@ def open_session(settings: LinkSettings) -> Iterator[zenoh.Session]:
         _close(session)
 
 
-def declare_publisher(session: zenoh.Session, row: Channel, *, keys: EdgeKeys) -> zenoh.Publisher:
-    """A publisher of one row, delivered as the key table says. ``put`` may block on a ``BLOCK`` row: own a thread."""
-    delivery = DELIVERIES[row]
+def declare_publisher(session: zenoh.Session, channel: Channel, *, keys: EdgeKeys) -> zenoh.Publisher:
+    """A publisher of one channel, delivered as the key table says; ``put`` may block on a ``BLOCK`` channel."""
+    delivery = DELIVERIES[channel]
     return session.declare_publisher(
-        keys.key(row),
+        keys.key(channel),
         encoding=delivery.encoding,
         congestion_control=getattr(zenoh.CongestionControl, delivery.congestion),
         priority=getattr(zenoh.Priority, delivery.priority),
@@ -73,7 +73,7 @@ def declare_publisher(session: zenoh.Session, row: Channel, *, keys: EdgeKeys) -
 
 
 def subscribe(
-    session: zenoh.Session, key_expr: str, *, inbox: Sink, clock: Callable[[], int] = time.time_ns
+    session: zenoh.Session, key_expr: str, *, inbox: ReceivedQueue, clock: Callable[[], int] = time.time_ns
 ) -> zenoh.Subscriber[None]:
     """Copy every message of the key expression into the inbox, with its time by ``clock``; deletions are ignored."""
 
@@ -95,22 +95,22 @@ def subscribe(
     return session.declare_subscriber(key_expr, receive)
 
 
-def ask(
+def query(
     session: zenoh.Session,
-    row: Channel,
+    channel: Channel,
     *,
     keys: EdgeKeys,
     question: bytes,
     timeout_s: float,
     wanted: Callable[[bytes], bool] = lambda _answer: True,
 ) -> bytes | None:
-    """The first answer of a queryable row that is ``wanted``; None when there is none in time.
+    """The first answer of a queryable channel that is ``wanted``; None when there is none in time.
 
     Blocks for at most ``timeout_s``. Two edges of one id both answer.
     """
-    delivery = DELIVERIES[row]
+    delivery = DELIVERIES[channel]
     replies = session.get(
-        keys.key(row),
+        keys.key(channel),
         payload=question,
         timeout=timeout_s,
         target=zenoh.QueryTarget.ALL,
@@ -125,10 +125,10 @@ def ask(
 
 
 def serve(
-    session: zenoh.Session, row: Channel, *, keys: EdgeKeys, answer: Callable[[bytes], bytes | None]
+    session: zenoh.Session, channel: Channel, *, keys: EdgeKeys, answer: Callable[[bytes], bytes | None]
 ) -> zenoh.Queryable[None]:
-    """Answer a queryable row: ``answer(question)`` runs in Zenoh's callback and must be quick; None says nothing."""
-    key = keys.key(row)
+    """Answer a queryable channel; ``answer(question)`` runs in Zenoh's callback, must be quick, and may give None."""
+    key = keys.key(channel)
 
     def reply(query: zenoh.Query) -> None:
         with query:
@@ -151,7 +151,7 @@ def _open_failure(text: str, listen: tuple[str, ...], config: zenoh.Config) -> s
         return f"cannot listen on {endpoint}: this machine has no such address"
     if nobody := re.search(r"Unable to connect to any of \[(.+)\]", text):
         endpoints = ", ".join(re.findall(r"\(([^()]+)\)", nobody[1])) or nobody[1]
-        if "tls/" in endpoints:  # somebody may well answer, and refuse
+        if "tls/" in endpoints:  # the other side may answer, and refuse
             return "no link: " + "; ".join(visit(config))
         return f"nobody answers at {endpoints}: start a ground or a router there, or connect to where one is"
     where = f"cannot listen on {endpoint}" if listen else "cannot open the Zenoh session"

@@ -16,7 +16,7 @@ import zenoh
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
 
-__all__ = ["DEFAULT_ENDPOINT", "LinkSettings", "configure", "without_build_paths"]
+__all__ = ["DEFAULT_ENDPOINT", "LinkSettings", "configure", "connect_endpoints", "without_build_paths"]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -53,9 +53,9 @@ _DEFAULTS: Mapping[str, Any] = {
 _PRIORITIES = ("1-3", "4-7")
 """Of two links to one place: answers, status and reports on the first, pictures, stills and tracks on the second."""
 
-_ASKER: Mapping[str, Any] = {
+_CLIENT: Mapping[str, Any] = {
     "mode": "client",
-    # A client waits for its link when it starts; whoever asks wants to know soon that there is none.
+    # A client waits for its link when it starts; a query should fail soon where there is none.
     "connect/timeout_ms": 3000,
     "connect/exit_on_failure": True,
 }
@@ -65,11 +65,11 @@ _ASKER: Mapping[str, Any] = {
 class LinkSettings:
     """How a process takes part. With neither endpoint here nor in the file, a ground listens, the others connect.
 
-    An ``asker`` only asks: it never listens, and connects as Zenoh's *client*, so that a ground or a router that it
-    connects to passes on what it asks and what is answered.
+    A ``client`` only queries: it never listens, and connects in Zenoh's mode of that name, so that a ground or a
+    router that it connects to forwards its queries and the answers.
     """
 
-    role: Literal["edge", "ground", "asker"]
+    role: Literal["edge", "ground", "client"]
     listen: tuple[str, ...] = ()
     """Such as ``tcp/127.0.0.1:7447``; what is given here replaces what the file says."""
     connect: tuple[str, ...] = ()
@@ -87,7 +87,7 @@ class LinkSettings:
 def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     """Zenoh's configuration and the endpoints it will listen on; UserError for what cannot be used."""
     config, said = _read_config(settings.zenoh_config)
-    for path, value in {**_DEFAULTS, **(_ASKER if settings.role == "asker" else {})}.items():
+    for path, value in {**_DEFAULTS, **(_CLIENT if settings.role == "client" else {})}.items():
         if not _mentions(said, path):
             config.insert_json5(path, json.dumps(value))
     listen, connect = settings.listen, settings.connect
@@ -101,7 +101,7 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
         # Never Zenoh's own default: a peer that listens on every address.
         _insert_endpoints(config, "listen", listen)
     effective = listen or file_listen
-    two = settings.role != "asker" and (settings.links == 2 or _max_links(said) > 1)
+    two = settings.role != "client" and (settings.links == 2 or _max_links(said) > 1)
     if connect:
         _insert_endpoints(config, "connect", _split(connect) if two else connect)
     if settings.links == 2 or (effective and not _mentions(said, _MAX_LINKS)):
@@ -155,18 +155,28 @@ def _mentions(said: dict[str, Any], path: str) -> bool:
     return True
 
 
+def _value(said: dict[str, Any], path: str) -> Any:
+    """What the user's file says at this path; None for nothing."""
+    value: Any = said
+    for part in path.split("/"):
+        value = value.get(part) if isinstance(value, dict) else None
+    return value
+
+
 def _endpoints(said: dict[str, Any], side: str) -> tuple[str, ...]:
     """The endpoints of a file: a list, or one list for each of Zenoh's modes."""
-    section = said.get(side)
-    listed = section.get("endpoints") if isinstance(section, dict) else None
-    groups = listed.values() if isinstance(listed, dict) else [listed or []]
+    listed = _value(said, f"{side}/endpoints")
+    groups = listed.values() if isinstance(listed, dict) else [listed]
     return tuple(str(endpoint) for group in groups if isinstance(group, list) for endpoint in group)
 
 
+def connect_endpoints(config: zenoh.Config) -> tuple[str, ...]:
+    """The endpoints that a configuration connects to."""
+    return _endpoints({"connect": {"endpoints": json.loads(config.get_json("connect/endpoints"))}}, "connect")
+
+
 def _max_links(said: dict[str, Any]) -> int:
-    value: Any = said
-    for part in _MAX_LINKS.split("/"):
-        value = value.get(part) if isinstance(value, dict) else None
+    value = _value(said, _MAX_LINKS)
     return value if isinstance(value, int) else 1
 
 
@@ -225,10 +235,7 @@ def _is_loopback(host: str) -> bool:
 
 def _has_keys(said: dict[str, Any], endpoint: str) -> bool:
     """Whether whoever connects must show a certificate."""
-    value: Any = said
-    for part in ("transport", "link", "tls", "enable_mtls"):
-        value = value.get(part) if isinstance(value, dict) else None
-    return value is True and endpoint.startswith(("tls/", "quic/"))
+    return _value(said, "transport/link/tls/enable_mtls") is True and endpoint.startswith(("tls/", "quic/"))
 
 
 def without_build_paths(text: str) -> str:

@@ -1,1 +1,1 @@
-"""HEVC decoding, still codecs, and what the base shows of a crop."""
+"""Pixels and their codings: `hevc` (decoder), `still_codecs`, `base_crop` (what the base shows of a crop)."""

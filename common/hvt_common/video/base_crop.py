@@ -16,7 +16,7 @@ from hvt_common.values import Image, View
 __all__ = ["MAX_SIDE_PX", "base_crop", "coded_size"]
 
 MAX_SIDE_PX = 512
-"""A longer crop is coded smaller: an object that fills 512 pixels needs no more to be told apart."""
+"""A longer crop is coded smaller: an object that fills 512 pixels needs no more to be classified."""
 
 
 def coded_size(

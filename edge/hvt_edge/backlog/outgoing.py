@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from hvt_common.runtime.priority import lower_priority
+from hvt_common.runtime.process import lower_priority
 from hvt_edge.backlog.backfill import Chunk
 
 __all__ = ["Outgoing"]

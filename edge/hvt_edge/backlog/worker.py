@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, pack_backlog_still
-from hvt_common.runtime.priority import lower_priority
+from hvt_common.runtime.process import lower_priority
 from hvt_edge.backlog.backfill import Backfill, Chunk
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.entry import Entry

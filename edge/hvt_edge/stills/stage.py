@@ -11,8 +11,8 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from hvt_common.protocol.messages import StillResult
-from hvt_common.runtime.distinct import DistinctIds
-from hvt_common.runtime.priority import lower_priority
+from hvt_common.runtime.process import lower_priority
+from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.values import AccessUnit, Frame, Still, Tracks
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.link.transmitter import Transmitter

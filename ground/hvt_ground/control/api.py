@@ -30,7 +30,7 @@ from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest,
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.transport.rights import Rights
-from hvt_common.transport.session import ask, open_session, subscribe
+from hvt_common.transport.session import open_session, query, subscribe
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.values import Image
 from hvt_common.video.still_codecs import StillError
@@ -284,7 +284,7 @@ class RemoteEdge:
 
     def _query(self, row: Channel, question: bytes) -> bytes | None:
         try:
-            return ask(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
+            return query(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
         except zenoh.ZError:
             return None
 
@@ -319,7 +319,7 @@ class EdgeClient:
             UserError: where nobody answers within three seconds, or a setting cannot be used.
         """
         stack = ExitStack()
-        settings = LinkSettings(role="asker", connect=endpoints, zenoh_config=zenoh_config)
+        settings = LinkSettings(role="client", connect=endpoints, zenoh_config=zenoh_config)
         return cls(stack.enter_context(open_session(settings)), requester=Requester.of(settings), stack=stack)
 
     def nobody(self) -> str:

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvt_common.camera_motion import CameraMotion
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import StillResult
-from hvt_common.runtime.distinct import DistinctIds
+from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
-from hvt_common.tracking.camera_motion import CameraMotion
 from hvt_common.values import Image, Tracks, View
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath

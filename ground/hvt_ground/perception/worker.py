@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
-from hvt_common.runtime.priority import lower_priority
+from hvt_common.runtime.process import lower_priority
 from hvt_common.values import Tracks
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 

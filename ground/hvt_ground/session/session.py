@@ -23,7 +23,7 @@ from hvt_common.protocol.messages import (
     TrackStep,
     TrackStepDecoder,
 )
-from hvt_common.runtime.latency import LatencyStats
+from hvt_common.runtime.statistics import LatencyStats
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder

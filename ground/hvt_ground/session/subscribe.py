@@ -17,7 +17,7 @@ from hvt_common.runtime.clock import SteadyClock
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_common.transport.session import ask, declare_publisher, subscribe
+from hvt_common.transport.session import declare_publisher, query, subscribe
 
 __all__ = ["MAX_EDGES", "EdgePort", "GroundLink"]
 
@@ -75,7 +75,7 @@ class EdgePort:
             return found is not None
 
         try:
-            ask(
+            query(
                 self._session, Channel.INFO, keys=self._keys, question=b"", timeout_s=_ANSWER_S, wanted=wanted
             )
         except zenoh.ZError as error:

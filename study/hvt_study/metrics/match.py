@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from hvt_common.boxes import iou
+from hvt_common.values import iou
 
 __all__ = ["LEAST_IOU", "matched_rows"]
 

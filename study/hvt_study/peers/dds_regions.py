@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse.csgraph import connected_components
 
-from hvt_common.boxes import iou
 from hvt_common.inference.nms import suppress
-from hvt_common.values import Boxes, Detections, Image
+from hvt_common.values import Boxes, Detections, Image, iou
 from hvt_study.peers.dds_settings import DdsSettings
 
 __all__ = [

@@ -264,7 +264,7 @@ def plain_suppression(boxes: np.ndarray, scores: np.ndarray, classes: np.ndarray
 
 @given(seed=st.integers(0, 10_000), count=st.integers(0, 40))
 def test_suppression_keeps_what_the_definition_keeps(seed: int, count: int) -> None:
-    """Neighbouring cars would swallow each other, or one car be seen twice."""
+    """Neighbouring cars would hide each other, or one car be seen twice."""
     rng = np.random.default_rng(seed)
     centres, sides = rng.uniform(0, 60, (count, 2)), rng.uniform(5, 40, (count, 2))
     boxes = np.concatenate([centres - sides / 2, centres + sides / 2], axis=1).astype(np.float32)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
-from hvt_common.inference.embedded import CLASSIFIER, DETECTOR, EMBEDDED_MODELS, embedded_model
 from hvt_common.inference.runtimes.model import open_model
+from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, embedded_models
 from hvt_scene import Scene
 from hvt_train.crops import held_out_crops
 from hvt_train.evaluate import (
@@ -24,21 +23,15 @@ from hvt_train.evaluate import (
 
 def test_they_are_there_and_small_together():
     """A fresh installation would have no model, or a package too large for a thin link."""
-    sizes = [embedded_model(name).stat().st_size for name in EMBEDDED_MODELS]
+    sizes = [path.stat().st_size for path in embedded_models().values()]
     assert all(size > 10_000 for size in sizes)
     assert sum(sizes) < 4_000_000
 
 
-def test_an_unknown_name_says_which_there_are():
-    """A typing error would end in a traceback."""
-    with pytest.raises(UserError, match=r"'aerial-huge'.*aerial-nano and aerial-cls"):
-        embedded_model("aerial-huge")
-
-
-@pytest.mark.parametrize("name", EMBEDDED_MODELS)
+@pytest.mark.parametrize("name", embedded_models())
 def test_metadata_says_classes_licence_and_where_it_comes_from(name):
     """Nobody could tell what a file in the field is, or whether it may be passed on."""
-    metadata = open_model(embedded_model(name)).metadata
+    metadata = open_model(embedded_models()[name]).metadata
     assert metadata["model"] == name
     assert metadata["license"] == "Apache-2.0"
     assert len(metadata["hvt.training_commit"]) >= 7
@@ -48,13 +41,13 @@ def test_metadata_says_classes_licence_and_where_it_comes_from(name):
 
 def test_the_names_are_those_of_the_scene():
     """Ground truth of the demo and what the models say could not be compared."""
-    assert open_detector(str(embedded_model(DETECTOR))).class_names == Scene.class_names
-    assert open_classifier(str(embedded_model(CLASSIFIER))).class_names == Scene.class_names
+    assert open_detector(EMBEDDED_DETECTOR).class_names == Scene.class_names
+    assert open_classifier(EMBEDDED_CLASSIFIER).class_names == Scene.class_names
 
 
 def test_any_picture_size_goes_in():
     """A camera of another shape would end in an error of the runtime."""
-    detector = open_detector(str(embedded_model(DETECTOR)))
+    detector = open_detector(EMBEDDED_DETECTOR)
     for shape in ((64, 64, 3), (100, 333, 3), (720, 1280, 3)):
         found = detector.detect(np.full(shape, 90, np.uint8))
         assert len(found) <= 2  # an empty grey picture shows nothing to speak of
@@ -64,7 +57,7 @@ def test_detector_on_held_out_scenes():
     """The demo would show a detector that finds nothing, and a retrained file could be worse unseen."""
     floors = {CLEAN: 0.85, 800_000: 0.80}
     pictures = drawn_pictures(range(200, 203), moments=1, bitrates_bps=tuple(floors), coded_frames=5)
-    detector = open_detector(str(embedded_model(DETECTOR)), confidence=0.01)
+    detector = open_detector(EMBEDDED_DETECTOR, confidence=0.01)
     for bitrate_bps, floor in floors.items():
         assert evaluate_drawn(detector, pictures[bitrate_bps]).mean >= floor
 
@@ -73,7 +66,7 @@ def test_classifier_on_held_out_stills():
     """Stills would turn right classes into wrong ones."""
     stills = list(held_out_crops(range(200, 202), moments=1))
     assert len(stills) > 50
-    posteriors = open_classifier(str(embedded_model(CLASSIFIER))).classify([image for image, _ in stills])
+    posteriors = open_classifier(EMBEDDED_CLASSIFIER).classify([image for image, _ in stills])
     hits = [p.class_name == name for p, (_, name) in zip(posteriors, stills, strict=True)]
     assert np.mean(hits) >= 0.90
 
@@ -84,6 +77,6 @@ def test_vehicles_on_real_pixels(data):
     frames = list(clip_frames(data / "clips" / "drone_carpark.mp4", every=150))
     truth = reference_vehicles(data / "models" / "yolov5su_visdrone_736x1280.onnx", frames)
     assert sum(map(len, truth)) > 100
-    result = evaluate_real(open_detector(str(embedded_model(DETECTOR)), confidence=0.25), frames, truth)
+    result = evaluate_real(open_detector(EMBEDDED_DETECTOR, confidence=0.25), frames, truth)
     assert result.recall >= 0.80
     assert result.precision >= 0.75

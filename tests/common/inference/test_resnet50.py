@@ -17,12 +17,11 @@ import onnxruntime as ort
 import pytest
 from onnx import helper, numpy_helper
 
-from hvt_common.inference.class_names import kind_of
+from hvt_common.inference.class_names import IMAGENET_NAMES, kind_of
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
-from hvt_common.inference.imagenet_names import IMAGENET_NAMES
+from hvt_common.inference.cli import main
 from hvt_common.inference.labels import first_synonym, read_labels
 from hvt_common.inference.runtimes.openvino_model import find_openvino
-from hvt_common.inference.store.cli import main
 from hvt_common.inference.store.manifest import builtin_manifest
 from hvt_common.values import Image
 

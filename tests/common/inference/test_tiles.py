@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_common.boxes import iou
 from hvt_common.errors import UserError
-from hvt_common.inference.detect import open_detector
+from hvt_common.inference.detect import open_detector, warm_up
 from hvt_common.inference.nms import suppress
 from hvt_common.inference.tiles import (
     MOST_RUNS,
@@ -17,9 +16,8 @@ from hvt_common.inference.tiles import (
     parse_tiles,
     tile_boxes,
     tiled,
-    warm_up_source,
 )
-from hvt_common.values import Detections
+from hvt_common.values import Detections, iou
 
 MODEL = "yolov5su_visdrone_640.onnx"
 
@@ -159,9 +157,9 @@ def test_the_three_words_of_the_setting():
 def test_warming_up_runs_every_shape_once_and_leaves_motion_alone():
     """The first decision step of a flight would take a second."""
     network = Blobs()
-    warm_up_source(tiled(network, "3x2"), (640, 360))
+    warm_up(tiled(network, "3x2"), (640, 360))
     assert network.runs == 7
-    warm_up_source(open_detector("motion"), (640, 360))
+    warm_up(open_detector("motion"), (640, 360))
 
 
 @pytest.mark.realdata

@@ -19,14 +19,15 @@ import zenoh
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
+from hvt_common.protocol.ledger import STANDARD_ENCODINGS
 from hvt_common.protocol.messages import BaseHeader, Command, ControlAnswer, ControlRequest, Flags
 from hvt_common.transport.session import (
     Inbox,
     LinkSettings,
     Received,
-    ask,
     declare_publisher,
     open_session,
+    query,
     serve,
     subscribe,
 )
@@ -109,10 +110,10 @@ def test_questions_are_answered_and_silence_ends(endpoint):
         answers = {b"size?": b"1280x720"}
         queryable = serve(connector, Channel.INFO, keys=KEYS, answer=answers.get)
         wait_for(
-            lambda: ask(listener, Channel.INFO, keys=KEYS, question=b"size?", timeout_s=1) == b"1280x720"
+            lambda: query(listener, Channel.INFO, keys=KEYS, question=b"size?", timeout_s=1) == b"1280x720"
         )
-        assert ask(listener, Channel.INFO, keys=KEYS, question=b"other?", timeout_s=1) is None
-        assert ask(listener, Channel.CONTROL, keys=KEYS, question=b"size?", timeout_s=1) is None
+        assert query(listener, Channel.INFO, keys=KEYS, question=b"other?", timeout_s=1) is None
+        assert query(listener, Channel.CONTROL, keys=KEYS, question=b"size?", timeout_s=1) is None
         queryable.undeclare()
 
 
@@ -197,7 +198,7 @@ def test_two_links_by_priority_are_asked_for_only_where_wanted(tmp_path):
         *there[2:],
     ]
     assert _links(LinkSettings("edge", connect=there, links=2)) == (split, "2")
-    assert _links(LinkSettings("asker", connect=there))[0] == list(there)
+    assert _links(LinkSettings("client", connect=there))[0] == list(there)
     path = tmp_path / "two.json5"
     path.write_text("{ transport: { unicast: { max_links: 2 } } }")
     assert _links(LinkSettings("edge", connect=there, zenoh_config=path)) == (split, "2")
@@ -228,7 +229,7 @@ def test_two_links_to_one_port_carry_all_rows_each_by_its_priority(endpoint):
                 publisher.put(str(row).encode())
             came = {inbox.get(timeout_s=5).payload.decode() for _ in rows}
             assert came == {str(row) for row in rows}
-            assert ask(listener, Channel.INFO, keys=KEYS, question=b"who?", timeout_s=5) == b"who?"
+            assert query(listener, Channel.INFO, keys=KEYS, question=b"who?", timeout_s=5) == b"who?"
             queryable.undeclare()
         subscriber.undeclare()
 
@@ -349,7 +350,7 @@ LISTENER = """
     from hvt_common.protocol.channels import *
     with open_session(LinkSettings("ground", listen=(sys.argv[1],))) as session:
         inbox = Inbox(capacity=8, overflow="oldest")
-        subscriber = subscribe(session, selector(Row.BASE), inbox=inbox)
+        subscriber = subscribe(session, selector(Channel.BASE), inbox=inbox)
         print("up", flush=True)
         time.sleep(120)
 """
@@ -358,7 +359,7 @@ STUCK_SENDER = """
     from hvt_common.transport.session import *
     from hvt_common.protocol.channels import *
     with open_session(LinkSettings("edge", connect=(sys.argv[1],))) as session:
-        publisher = declare_publisher(session, Row.BASE, keys=EdgeKeys("uav-1"))
+        publisher = declare_publisher(session, Channel.BASE, keys=EdgeKeys("uav-1"))
         while not publisher.matching_status.matching:
             time.sleep(0.01)
         print("up", flush=True)
@@ -477,7 +478,5 @@ def test_the_subscriber_of_the_document_writes_the_video(endpoint, tmp_path):
 
 def test_zenoh_still_calls_the_encodings_as_the_ledger_does():
     """The overhead formula gives 1 byte to encodings that Zenoh has a number for."""
-    from hvt_common.protocol.ledger import _STANDARD_ENCODINGS
-
     known = {str(value) for value in vars(zenoh.Encoding).values() if isinstance(value, zenoh.Encoding)}
-    assert known >= _STANDARD_ENCODINGS
+    assert known >= STANDARD_ENCODINGS

@@ -22,14 +22,11 @@ from hvt_common.video.still_codecs import (
     still_codec,
     still_codec_names,
 )
-from hvt_common.video.still_codecs.avif import av1_data, av1_size, avif_file
-from hvt_common.video.still_codecs.jxl import jxl_size
-from hvt_common.video.still_codecs.webp import webp_size
+from hvt_common.video.still_codecs.plugins.avif import av1_data, av1_size, avif_file
+from hvt_common.video.still_codecs.plugins.jxl import jxl_size
+from hvt_common.video.still_codecs.plugins.webp import webp_size
 
-BUILT_IN = (
-    *("jpeg", "jpeg-lite", "webp", "avif", "avif-lite", "jxl", "h264-intra", "hevc-intra"),
-    "residual",
-)
+BUILT_IN = ("jpeg", "webp", "avif", "jxl", "h264-intra", "residual")
 SIZE = (56, 40)
 
 
@@ -158,7 +155,7 @@ def test_noise_only_raises_still_error(codec, noise):
     assert image.shape == crop.shape
 
 
-@pytest.mark.parametrize("name", ["jpeg", "webp", "avif", "avif-lite", "jxl"])
+@pytest.mark.parametrize("name", ["jpeg", "webp", "avif", "jxl"])
 @pytest.mark.parametrize("size", [(55, 40), (56, 41), (600, 400)])
 def test_a_header_of_another_size_is_refused(name, size):
     """A few bytes would make the ground allocate gigabytes, or paint a still over the wrong place."""
@@ -199,14 +196,11 @@ def test_avif_goes_both_ways_with_other_programs():
 
 
 @pytest.mark.skipif("avif" not in still_codec_names(), reason="OpenCV without AVIF")
-def test_avif_lite_is_the_same_picture_without_the_file_around_it():
-    """What saves the boxes would change the picture."""
-    crop = textured(*SIZE)
-    file = still_codec("avif").encode(crop, quality_pct=65).data
+def test_boxes_written_here_show_the_same_picture():
+    """A foreign AVIF file would be shown in other colours than it has."""
+    file = still_codec("avif").encode(textured(*SIZE), quality_pct=65).data
     data = av1_data(file)
     assert av1_size(data) == SIZE
-    assert len(file) - len(data) > 270
-    assert still_codec("avif-lite").encode(crop, quality_pct=65).data == data
     rebuilt = cv2.imdecode(np.frombuffer(avif_file(data, size=SIZE), np.uint8), cv2.IMREAD_COLOR)
     assert np.array_equal(rebuilt, still_codec("avif").decode(file, size=SIZE))
 

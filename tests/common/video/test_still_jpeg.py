@@ -13,10 +13,8 @@ from PIL import Image as Pillow
 
 from hvt_common.video.still_codecs import JpegCodec, StillError
 from hvt_common.video.still_codecs.jpeg import jpeg_size
-from hvt_common.video.still_codecs.jpeg_lite import JpegLiteCodec, whole_jpeg
 
 CODEC = JpegCodec()
-LITE = JpegLiteCodec()
 
 
 def textured(width: int, height: int, *, seed: int = 0) -> np.ndarray:
@@ -138,31 +136,3 @@ def test_an_orientation_tag_does_not_turn_the_still():
     exif[0x0112] = 6
     data = pillow_jpeg(textured(40, 20), exif=exif)
     assert CODEC.decode(data, size=(40, 20)).shape == (20, 40, 3)
-
-
-@pytest.mark.parametrize("quality_pct", [1, 35, 65, 90, 100])
-@pytest.mark.parametrize("size", [(1, 1), (117, 50), (64, 64), (33, 200)])
-def test_jpeg_lite_is_the_same_picture_for_fewer_bytes(quality_pct, size):
-    """What saves the headers would change the picture, and the two could not be compared."""
-    crop = textured(*size, seed=3)
-    whole = cv2.imencode(".jpg", crop, [cv2.IMWRITE_JPEG_QUALITY, quality_pct])[1]
-    lite = LITE.encode(crop, quality_pct=quality_pct).data
-    assert whole_jpeg(lite, size=size) == whole.tobytes()
-    assert np.array_equal(LITE.decode(lite, size=size), cv2.imdecode(whole, cv2.IMREAD_COLOR))
-    assert len(whole) - len(lite) >= 620
-
-
-@pytest.mark.parametrize("data", [b"", b"\x41", b"\x00abc", b"\x65abc", b"\xff\xd8\xff\xd9"])
-def test_jpeg_lite_refuses_what_is_none(data):
-    """Foreign bytes would be shown as a grey still that looks as if it were meant."""
-    with pytest.raises(StillError):
-        LITE.decode(data, size=(40, 30))
-
-
-def test_a_scan_cannot_bring_a_header_along():
-    """A second frame header in the scan would say any size, behind the check."""
-    header = coded(textured(32, 32)).replace(b"\xff\xd8", b"", 1)
-    whole = whole_jpeg(b"\x41" + header, size=(32, 32))
-    assert jpeg_size(whole) == (32, 32)
-    assert whole.count(b"\xff\xc0") == 1
-    assert whole.count(b"\xff\xda") == 1

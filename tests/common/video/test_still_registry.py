@@ -23,7 +23,7 @@ def installed(tmp_path, monkeypatch):
         forget()
 
     def forget() -> None:
-        registry._plug_ins.cache_clear()
+        registry.installed_codecs.cache_clear()
         still_codec.cache_clear()
 
     yield put
@@ -36,7 +36,7 @@ def installed(tmp_path, monkeypatch):
 def test_codecs_are_found_by_their_word_on_the_wire():
     """A still would be coded as one thing and announced as another."""
     names = still_codec_names()
-    assert {"jpeg", "jpeg-lite", "h264-intra", "hevc-intra", "residual"} <= set(names)
+    assert {"jpeg", "h264-intra", "residual"} <= set(names)
     for name in names:
         codec = still_codec(name)
         assert codec.name == name
@@ -46,15 +46,22 @@ def test_codecs_are_found_by_their_word_on_the_wire():
 
 def test_an_unknown_name_gets_the_choice():
     """A wrong --still-codec would end in a traceback instead of a sentence."""
-    with pytest.raises(UserError, match="still codec 'gif' is not known: choose one of jpeg, jpeg-lite"):
+    with pytest.raises(UserError, match="still codec 'gif' is not known: choose one of jpeg, h264-intra"):
         still_codec("gif")
+
+
+@pytest.mark.parametrize("name", ["jpeg-lite", "avif-lite", "hevc-intra"])
+def test_a_removed_codec_names_its_successor(name):
+    """A settings file of an earlier version would not say what to write instead."""
+    with pytest.raises(UserError, match=f"still codec '{name}' is no longer part of HVT: use h264-intra"):
+        still_codec(name)
 
 
 def test_what_is_not_installed_names_its_extra(monkeypatch):
     """A user without JPEG XL would not learn how to get it."""
     still_codec.cache_clear()
     monkeypatch.setitem(sys.modules, "pillow_jxl", None)
-    monkeypatch.setattr("hvt_common.video.still_codecs.jxl.find_spec", lambda _name: None)
+    monkeypatch.setattr("hvt_common.video.still_codecs.plugins.jxl.find_spec", lambda _name: None)
     assert "jxl" not in still_codec_names()
     with pytest.raises(UserError, match=r"'jxl' is not available: it comes with the extra hvt\[jxl\]"):
         still_codec("jxl")
@@ -64,7 +71,7 @@ def test_an_opencv_without_a_format_says_so(monkeypatch):
     """An older OpenCV on a drone would fail at the first still, in flight."""
     still_codec.cache_clear()
     monkeypatch.setattr("cv2.haveImageWriter", lambda _name: False)
-    assert not {"webp", "avif", "avif-lite"} & set(still_codec_names())
+    assert not {"webp", "avif"} & set(still_codec_names())
     with pytest.raises(UserError, match=r"'avif' is not available: OpenCV .* is built without avif"):
         still_codec("avif")
 
@@ -135,7 +142,7 @@ def test_two_packages_of_one_name_are_refused(installed, tmp_path):
     install(tmp_path / "second", {"acme-pixels": "PixelCodec"}, module="acme_other")
     sys.path.insert(0, str(tmp_path / "second"))
     try:
-        registry._plug_ins.cache_clear()
+        registry.installed_codecs.cache_clear()
         with pytest.raises(UserError, match="comes from both package acme_"):
             still_codec("acme-pixels")
     finally:

@@ -61,7 +61,7 @@ def test_what_cannot_be_had_is_none():
 
 
 def test_the_bounds_are_kept():
-    """A floor or a ceiling of quality would be a wish."""
+    """A floor or a ceiling of quality would not hold."""
     codec = still_codec("jpeg")
     fitting = best_fitting(codec, CROP, limit_bytes=10**6, low_pct=35, high_pct=90)
     reaching = smallest_reaching(codec, CROP, target_db=1, low_pct=35, high_pct=90)

@@ -225,9 +225,9 @@ def test_where_nobody_listens_it_says_so(free_port, capsys):
     assert f"nobody answers at tcp/127.0.0.1:{free_port}" in capsys.readouterr().err
 
 
-def test_an_asker_never_listens():
+def test_a_client_never_listens():
     """A command would open a door on the operator's machine."""
-    config, listen = configure(LinkSettings("asker"))
+    config, listen = configure(LinkSettings("client"))
     assert listen == ()
     assert config.get_json("mode") == '"client"'
     assert config.get_json("connect/endpoints") == '["tcp/127.0.0.1:7447"]'

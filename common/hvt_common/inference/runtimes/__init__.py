@@ -1,1 +1,1 @@
-"""What runs a network: ONNX Runtime and its providers, OpenVINO, the bounds on a model file."""
+"""What runs a network: `model` opens an ONNX file; settings take the names of providers from `providers`."""

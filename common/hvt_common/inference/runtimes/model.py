@@ -1,21 +1,18 @@
 """ONNX models, on onnxruntime or another runtime: the only file that imports onnxruntime.
 
-A model file comes from outside, so it is looked at before onnxruntime sees it: it must be a file, not too large,
-its bytes must walk as an ONNX protobuf with a graph in it, and all its weights must be in it. What it declares has
-bounds, too. It is read as ONNX whatever its name ends in, and no custom operator library is ever registered. A
-model that another runtime will run is opened by onnxruntime first all the same: it says the ports and the metadata,
-and no runtime gets a file that onnxruntime refuses.
+A model file comes from outside: `onnx_file` checks it first, and what it declares has bounds. It is read as ONNX
+whatever its name ends in, and no custom operator library is registered. A model that another runtime will run is
+opened by onnxruntime first: that gives ports and metadata, and no runtime gets a file that onnxruntime refuses.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,16 +20,13 @@ import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from hvt_common.errors import UserError
-from hvt_common.inference.runtimes.external_weights import external_weights, read_varint
+from hvt_common.inference.runtimes.onnx_file import check_onnx_file
 from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import ONNXRUNTIME_PROVIDERS, ProviderChoice, choose_provider
 
-__all__ = ["MAX_MODEL_BYTES", "ModelSettings", "OnnxModel", "Port", "open_model", "opset_versions"]
+__all__ = ["ModelSettings", "OnnxModel", "Port", "open_model"]
 
 _log = logging.getLogger(__name__)
-
-MAX_MODEL_BYTES = 1 << 30
-"""1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
 
 _MOST_PORTS = 64
 _MOST_AXES = 8
@@ -63,10 +57,6 @@ _ORT_ERRORS: tuple[type[Exception], ...] = tuple(
         "RuntimeException",
     )
 )
-# Field numbers of ModelProto in onnx.proto, and the one that holds the graph.
-_MODEL_FIELDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 14, 20, 25, 26})
-_GRAPH_FIELD = 7
-_OPSET_FIELD = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,13 +152,13 @@ def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxMode
     choice = choose_provider(
         settings.provider, onnxruntime=ort.get_available_providers(), openvino=find_openvino
     )
-    _check_file(path)
+    check_onnx_file(path)
     try:
         model = _open(path, settings, choice)
     except UserError as error:
-        if choice.asked or choice.provider == "cpu":
+        if choice.explicit or choice.provider == "cpu":
             raise
-        model = _open(path, settings, ProviderChoice("cpu", str(error), asked=False))
+        model = _open(path, settings, ProviderChoice("cpu", str(error), explicit=False))
     except UnicodeDecodeError as error:  # a name in the file, or the runtime's message that quotes it
         raise UserError(f"model {path} cannot be opened: a name in it is not text") from error
     _log.info("%s runs on %s: %s", path.name, model.provider.provider, model.provider.why)
@@ -213,7 +203,7 @@ def _session(
 
 
 def _check_ports(path: Path, session: ort.InferenceSession) -> None:
-    """Refuse a model whose ports nobody could feed or read."""
+    """Refuse a model whose ports are out of bounds."""
     for side, ports in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
         if not 1 <= len(ports) <= _MOST_PORTS:
             raise UserError(f"model {path} has {len(ports)} {side}; 1 to {_MOST_PORTS} are accepted")
@@ -236,103 +226,3 @@ def _reason(error: Exception) -> str:
     """The first line of onnxruntime's message without its code prefix, at most 200 characters."""
     lines = str(error).strip().splitlines()
     return (lines[0] if lines else type(error).__name__).rpartition("] : ")[2][:200]
-
-
-def _check_file(path: Path) -> None:
-    """Refuse, in one sentence, what is certainly no ONNX model, before onnxruntime parses it."""
-    if not path.exists():
-        raise UserError(f"model {path} does not exist; an ONNX file is expected")
-    if not path.is_file():
-        raise UserError(f"model {path} is not a file; an ONNX file is expected")
-    try:
-        with path.open("rb") as file:
-            size_bytes = os.fstat(file.fileno()).st_size
-            if size_bytes > MAX_MODEL_BYTES:
-                raise UserError(
-                    f"model {path} has {size_bytes} bytes; at most {MAX_MODEL_BYTES} are accepted"
-                )
-            try:
-                fields = {field for field, _, _ in _top_level_fields(file, size_bytes)}
-            except ValueError as error:
-                raise UserError(f"model {path} is not an ONNX file, or is cut short ({error})") from error
-    except OSError as error:
-        raise UserError(f"model {path} cannot be read: {error.strerror}") from error
-    if _GRAPH_FIELD not in fields:
-        raise UserError(f"model {path} is not an ONNX file (no graph in it)")
-    _check_whole(path)
-
-
-def _check_whole(path: Path) -> None:
-    try:
-        elsewhere = external_weights(path)
-    except ValueError as error:
-        raise UserError(f"model {path} is not an ONNX file, or is damaged ({error})") from error
-    except OSError as error:
-        raise UserError(f"model {path} cannot be read: {error.strerror}") from error
-    if elsewhere is not None:
-        raise UserError(
-            f"model {path} cannot be opened: it keeps weights in another file ({elsewhere!r:.80}); make it one file: "
-            "external_data=False in torch.onnx.export, or onnx.save(onnx.load(OLD), NEW)"
-        )
-
-
-def opset_versions(path: Path) -> dict[str, int]:
-    """The version of each operator set that a model imports, by domain; "" is ONNX itself.
-
-    Raises:
-        UserError: Not an ONNX model.
-    """
-    _check_file(path)
-    versions = {}
-    with path.open("rb") as file:
-        for field, start, end in list(_top_level_fields(file, path.stat().st_size)):
-            if field == _OPSET_FIELD:
-                file.seek(start)
-                domain, version = _opset(file.read(end - start))
-                versions[domain] = version
-    return versions
-
-
-def _opset(data: bytes) -> tuple[str, int]:
-    """Decode an OperatorSetIdProto: domain is field 1, version field 2."""
-    domain, version, position = "", 0, 0
-    while position < len(data):
-        tag, position = read_varint(data, position)
-        value, position = read_varint(data, position)
-        if tag == 0x0A:
-            domain = data[position : position + value].decode(errors="replace")
-            position += value
-        elif tag == 0x10:
-            version = value
-        else:
-            break
-    return domain, version
-
-
-def _top_level_fields(file: BinaryIO, size_bytes: int) -> Iterator[tuple[int, int, int]]:
-    """Field number, start and end of each field of a serialised ModelProto; ValueError where it is no such thing.
-
-    The contents are passed over, so a large file costs a few seeks.
-    """
-    position = 0
-    while position < size_bytes:
-        file.seek(position)
-        head = file.read(20)
-        tag, used = read_varint(head, 0)
-        field, wire_type = tag >> 3, tag & 7
-        if field not in _MODEL_FIELDS:
-            raise ValueError(f"unknown field {field} at byte {position}")
-        start = position
-        if wire_type == 0:
-            start += used
-            _, used = read_varint(head, used)
-        elif wire_type == 2:
-            length, used = read_varint(head, used)
-            start += used
-            used += length
-        else:
-            raise ValueError(f"unknown wire type {wire_type} at byte {position}")
-        position += used
-        if position > size_bytes:
-            raise ValueError(f"field {field} ends {position - size_bytes} bytes past the end")
-        yield field, start, position

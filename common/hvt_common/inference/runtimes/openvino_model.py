@@ -40,8 +40,8 @@ def find_openvino() -> OpenVinoCpu | None:
 class OpenVinoRunner:
     """One ONNX file on the processor through OpenVINO.
 
-    A network is compiled for each image size that comes (0.2 s; the last few are kept): with free sizes the same
-    network takes a fifth longer. A free batch stays free, for batches come in every size.
+    A network is compiled for each image size (0.2 s; the last four are cached): with free sizes the same network
+    takes a fifth longer. A free batch stays free, for batches come in every size.
 
     Args:
         path: The ONNX file.
@@ -86,6 +86,11 @@ class OpenVinoRunner:
                 f"model {self._path} does not run on a {shape} input with openvino: {_reason(error)}"
                 " (--provider cpu may)"
             ) from error
+
+    @property
+    def compiled_shapes(self) -> tuple[tuple[int, ...], ...]:
+        """The input shapes without the batch for which the network is compiled now."""
+        return tuple(self._requests)
 
     def _request(self, shape: tuple[int, ...]) -> Any:
         key = shape[1:]

@@ -57,14 +57,14 @@ class ProviderChoice:
     """One of `PROVIDERS`, never ``auto``."""
     why: str
     """Half a sentence."""
-    asked: bool
-    """The user named it; else ``auto`` did, and may fall back to cpu."""
+    explicit: bool
+    """The user named it; else ``auto`` chose it, and may fall back to cpu."""
 
 
 def choose_provider(
     wanted: str, *, onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]
 ) -> ProviderChoice:
-    """Settle ``wanted`` to a provider that is installed here.
+    """Resolve ``wanted`` to a provider that is installed here.
 
     Args:
         wanted: One of `PROVIDERS`.
@@ -81,9 +81,9 @@ def choose_provider(
     if wanted == "openvino":
         found = openvino()
         if found is not None:
-            return ProviderChoice(wanted, _openvino_text(found), asked=True)
+            return ProviderChoice(wanted, _openvino_text(found), explicit=True)
     elif ONNXRUNTIME_PROVIDERS[wanted][0] in onnxruntime:
-        return ProviderChoice(wanted, "as asked", asked=True)
+        return ProviderChoice(wanted, "as requested", explicit=True)
     raise UserError(
         f"--provider {wanted} is not installed here ({_HOW_TO_GET[wanted]}): choose auto or cpu, or install it"
     )
@@ -91,14 +91,14 @@ def choose_provider(
 
 def _best(onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]) -> ProviderChoice:
     if ONNXRUNTIME_PROVIDERS["cuda"][0] in onnxruntime:
-        return ProviderChoice("cuda", "onnxruntime-gpu is installed", asked=False)
+        return ProviderChoice("cuda", "onnxruntime-gpu is installed", explicit=False)
     found = openvino()
     if found is None:
-        return ProviderChoice("cpu", f"OpenVINO is not installed ({_HOW_TO_GET['openvino']})", asked=False)
+        return ProviderChoice("cpu", f"OpenVINO is not installed ({_HOW_TO_GET['openvino']})", explicit=False)
     if not found.bf16:
         why = f"this processor has no bf16, without which OpenVINO {found.version} is no faster"
-        return ProviderChoice("cpu", why, asked=False)
-    return ProviderChoice("openvino", _openvino_text(found), asked=False)
+        return ProviderChoice("cpu", why, explicit=False)
+    return ProviderChoice("openvino", _openvino_text(found), explicit=False)
 
 
 def _openvino_text(found: OpenVinoCpu) -> str:

@@ -1,5 +1,10 @@
-"""Models by name: those of the package, those that ``hvt-models`` fetched or was given, and plain files."""
+"""Gives the path of a model by name: of the package, fetched or added by ``hvt-models``, or a plain file."""
 
-from hvt_common.inference.store.resolve import resolve_model
+from hvt_common.inference.store.resolve import (
+    EMBEDDED_CLASSIFIER,
+    EMBEDDED_DETECTOR,
+    embedded_models,
+    resolve_model,
+)
 
-__all__ = ["resolve_model"]
+__all__ = ["EMBEDDED_CLASSIFIER", "EMBEDDED_DETECTOR", "embedded_models", "resolve_model"]

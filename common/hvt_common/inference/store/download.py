@@ -1,8 +1,7 @@
-"""One file over HTTP, in as many pieces as the link makes of it.
+"""Resumable download of one file over HTTP.
 
-pooch, the kept library for this, opens its target anew at each try and cannot go on from a part: on the links that
-HVT is made for that means starting 100 MB over and over. What is left to do is small: a Range header, and care with
-what the server makes of it (RFC 9110, sections 14 and 15.3.7).
+The usual library, pooch, cannot resume: on a thin link 100 MB would start over at each interruption. What is needed
+is a Range header and care with the server's answer (RFC 9110, sections 14 and 15.3.7).
 """
 
 from __future__ import annotations

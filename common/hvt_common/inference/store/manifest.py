@@ -41,8 +41,8 @@ class ModelEntry:
     classes: str = ""
     licence: str = ""
     preprocessing: Mapping[str, Any] | None = None
-    """channels, mean and scale (network value = (pixel - mean) * scale), fit. The adapters know it by themselves; it
-    stands here for whoever uses the file elsewhere, and a test holds both together."""
+    """channels, mean and scale (network value = (pixel - mean) * scale), fit. The adapters do not need it:
+    it is for use of the file elsewhere, and a test compares both."""
 
 
 def builtin_manifest() -> dict[str, ModelEntry]:

@@ -1,22 +1,32 @@
-"""From what the user wrote after ``--detector`` or ``--classifier`` to a file."""
+"""From what the user wrote after ``--detector`` or ``--classifier`` to a file.
+
+The embedded models come with the package: trained in this repository, Apache-2.0; see ``docs/models.md``.
+"""
 
 from __future__ import annotations
 
 import difflib
 import os
 from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.inference.embedded import EMBEDDED_MODELS, embedded_model
 from hvt_common.inference.store.store import Store
 
-__all__ = ["embedded_models", "resolve_model"]
+__all__ = ["EMBEDDED_CLASSIFIER", "EMBEDDED_DETECTOR", "embedded_models", "resolve_model"]
+
+EMBEDDED_DETECTOR = "aerial-nano"
+"""Finds vehicles and people from straight above or aslant."""
+EMBEDDED_CLASSIFIER = "aerial-cls"
+"""Names what a still shows."""
 
 
 def embedded_models() -> dict[str, Path]:
     """The models that come with the package, by name."""
-    return {name: embedded_model(name) for name in EMBEDDED_MODELS}
+    folder = resources.files("hvt_common") / "models"
+    assert isinstance(folder, Path), "the package is installed as files, not run from an archive"
+    return {name: folder / f"{name}.onnx" for name in (EMBEDDED_DETECTOR, EMBEDDED_CLASSIFIER)}
 
 
 def resolve_model(
@@ -25,10 +35,9 @@ def resolve_model(
     """The file of a model that is named or that is a file already; a model of the cache is checked first.
 
     Args:
-        spec: The name of an embedded model, of a model of the cache, or the path of a file. What has a folder or a
-            suffix in it is a path.
+        spec: The name of an embedded model, of one of the cache, or a path: what has a folder or a suffix in it.
         role: What the user calls it, for the sentence.
-        words: Words that mean no model and are handled before, for the sentence.
+        words: Further accepted words, for the sentence.
         store: The cache; else the usual one.
 
     Raises:

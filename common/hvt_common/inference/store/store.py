@@ -114,22 +114,19 @@ class Store:
         name: str,
         *,
         progress: Callable[[int], None] = lambda _: None,
-        waiting: Callable[[], None] = lambda: None,
+        on_wait: Callable[[], None] = lambda: None,
         pauses_s: Sequence[float] = (1.0, 2.0, 4.0),
     ) -> Path:
         """Get a model from its first address that gives it; nothing is done where it is there and right.
 
-        Args:
-            name: A name of `entries`.
-            progress: Gets the bytes held so far.
-            waiting: Called once where another process is fetching the same model; then this one waits for it.
-            pauses_s: Seconds to wait after each try that brought nothing.
+        ``progress`` gets the bytes held so far. ``on_wait`` is called once where another process is fetching the same
+        model; then this one waits for it. ``pauses_s`` are the seconds after each try that brought nothing.
 
         Raises:
             UserError: No address gives the pinned file, or the folder cannot be written.
         """
         entry, path = self.entry(name), self.path(name)
-        with self._lock(name, waiting):
+        with self._lock(name, on_wait):
             if path.exists() and not _what_is_wrong(path, entry):
                 return path
             part = self._part(entry)
@@ -144,16 +141,13 @@ class Store:
                 return path
         why = "; ".join(failures) or "no address is known for it"
         held = self.held_bytes(name)
-        kept = f" ({held} bytes are kept, and the same command goes on from there)" if held else ""
-        raise UserError(f"model {name} could not be fetched: {why}{kept}; {_by_hand(entry)}")
+        rest = f" ({held} bytes are kept, and the same command goes on from there)" if held else ""
+        raise UserError(f"model {name} could not be fetched: {why}{rest}; {_by_hand(entry)}")
 
     def add(self, file: Path, *, name: str, sha256: str | None = None) -> Path:
         """Copy a file that was brought by hand into the folder, if it is the pinned one.
 
-        Args:
-            file: An ONNX file.
-            name: A name of `entries`, or a new one.
-            sha256: Must be given for a new name, and pins it; for a built-in name it must agree with the manifest.
+        ``sha256`` must be given for a new name, and pins it; for a built-in name it must agree with the manifest.
 
         Raises:
             UserError: Another file than pinned, a missing pin, or the folder cannot be written.
@@ -207,14 +201,14 @@ class Store:
         return self.folder / f"{entry.name}-{entry.sha256[:12]}.part"
 
     @contextmanager
-    def _lock(self, name: str, waiting: Callable[[], None] = lambda: None) -> Iterator[None]:
+    def _lock(self, name: str, on_wait: Callable[[], None] = lambda: None) -> Iterator[None]:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = filelock.FileLock(self.folder / f".{name}.lock")
             try:
                 lock.acquire(timeout=0)
             except filelock.Timeout:
-                waiting()
+                on_wait()
                 lock.acquire()
         except OSError as error:
             raise UserError(

@@ -1,8 +1,8 @@
-"""What an edge kept while its link was away, and sends afterwards: objects on ``backlog``, in pieces, acknowledged.
+"""Store-and-forward: objects that an edge stored while its link was down, sent on ``backlog`` in chunks.
 
-An object is a still, a stretch of the base stream, or the facts of the session that both belong to. Each is bytes; it
-crosses in pieces that the budget has room for, in order, and the ground says in `Feedback.backlog` how much of it it
-holds. So neither a restart of either side nor a second outage costs more than the piece on its way.
+An object is a still, a segment of the base stream, or the `Info` of the session that both belong to. It crosses in
+chunks, in order, as the budget allows; the ground acknowledges ranges in `Feedback.backlog`. A restart of either side
+or a second outage costs no more than the chunk in flight.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import msgpack
 
 from hvt_common.protocol.messages.envelope import MAX_PAYLOAD_BYTES, Message
-from hvt_common.protocol.messages.fields import I63, U32, U64, Choice, Int, WireError, wire_field
+from hvt_common.protocol.messages.fields import I63, U32, U64, Int, OneOf, WireError, wire_field
 
 __all__ = [
     "MAX_ACKNOWLEDGED_RANGES",
@@ -52,42 +52,42 @@ class BacklogKind(StrEnum):
     """A run of `BacklogUnit`; its number is the frame index of the first."""
 
 
-_KIND = Choice(tuple(BacklogKind))
+_KIND = OneOf(tuple(BacklogKind))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BacklogHeader(Message):
-    """Attachment of ``backlog``; the payload is one piece of the object."""
+    """Attachment of ``backlog``; the payload is one chunk of the object."""
 
     MAX_BYTES: ClassVar[int] = 80
 
     session_id: int = wire_field(Int(0, U64))
-    """In which it was captured: this one, or one before the edge was started again."""
+    """In which it was captured: the current one, or one of an earlier start of the edge."""
     kind: str = wire_field(_KIND)
     """A `BacklogKind`."""
     number: int = wire_field(Int(0, U32))
     offset: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
-    """Where the piece lies in the object, bytes."""
+    """Where the chunk begins in the object, bytes."""
     total_bytes: int = wire_field(_SIZE)
     """Of the object."""
     send_ns: int = wire_field(Int(0, I63))
-    """When the piece was handed to Zenoh, the edge's clock."""
+    """When the chunk was handed to Zenoh, the edge's clock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcknowledgedRange:
-    """How much of an object a ground holds, without a hole from its beginning."""
+    """How much of an object a ground holds, contiguous from its beginning."""
 
     session_id: int = wire_field(Int(0, U64))
     kind: str = wire_field(_KIND)
     number: int = wire_field(Int(0, U32))
     acknowledged_bytes: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
-    """All of it: the edge may forget it. Less than was said before: begin again there."""
+    """The whole object: the edge may delete it. Less than before: send again from there."""
 
 
 @dataclass(frozen=True, slots=True)
 class BacklogStill:
-    """A still that was kept: what would have crossed on ``roi``."""
+    """A stored still: what would have crossed on ``roi``."""
 
     attachment: bytes
     """A `RoiHeader` with the flag `STORED`, sealed over ``payload``."""
@@ -98,7 +98,7 @@ class BacklogStill:
 
 @dataclass(frozen=True, slots=True)
 class BacklogUnit:
-    """One access unit that was kept."""
+    """One stored access unit."""
 
     frame_index: int
     capture_ns: int
@@ -114,13 +114,13 @@ def pack_backlog_still(still: BacklogStill) -> bytes:
 
 
 def parse_backlog_still(data: bytes) -> BacklogStill:
-    """Back; raises `WireError` and nothing else, for any bytes whatever. The attachment is not looked into."""
-    values = _unpack(data, "a past still")
+    """Unpack; raises `WireError` and nothing else, for any bytes. The attachment is not parsed."""
+    values = _unpack(data, "a stored still")
     if len(values) != 3 or [type(value) for value in values] != [bytes, str, bytes]:
-        raise WireError("a past still is not an attachment, an encoding and a payload")
+        raise WireError("a stored still is not an attachment, an encoding and a payload")
     attachment, encoding, payload = values
     if len(attachment) > _MAX_HEADER_BYTES or len(encoding) > _MAX_ENCODING_BYTES or not payload:
-        raise WireError("a past still has an attachment or encoding that is too long, or no payload")
+        raise WireError("a stored still has an attachment or encoding that is too long, or no payload")
     return BacklogStill(attachment, encoding, payload)
 
 
@@ -133,23 +133,23 @@ def pack_backlog_units(units: Sequence[BacklogUnit]) -> bytes:
 
 
 def parse_backlog_units(data: bytes) -> tuple[BacklogUnit, ...]:
-    """Back, in the order of capture; raises `WireError` and nothing else, for any bytes whatever."""
-    rows = _unpack(data, "past video")
+    """Unpack, in the order of capture; raises `WireError` and nothing else, for any bytes."""
+    rows = _unpack(data, "stored video")
     if not 1 <= len(rows) <= _MAX_UNITS:
-        raise WireError(f"past video of {len(rows)} frames: 1 to {_MAX_UNITS} are accepted")
+        raise WireError(f"stored video of {len(rows)} frames: 1 to {_MAX_UNITS} are accepted")
     units = tuple(_unit(row) for row in rows)
     for before, unit in pairwise(units):
         if unit.frame_index <= before.frame_index or unit.capture_ns <= before.capture_ns:
-            raise WireError("past video whose frames are not in order")
+            raise WireError("stored video whose frames are not in order")
     return units
 
 
 def _unit(row: Any) -> BacklogUnit:
     if type(row) is not list or [type(value) for value in row] != [int, int, bool, bytes]:
-        raise WireError("past video with a frame that is not an index, a time, a flag and bytes")
+        raise WireError("stored video with a frame that is not an index, a time, a flag and bytes")
     frame_index, capture_ns, keyframe, data = row
     if not (0 <= frame_index <= U32 and 0 <= capture_ns <= I63 and data):
-        raise WireError("past video with an index or a time out of bounds, or an empty frame")
+        raise WireError("stored video with an index or a time out of bounds, or an empty frame")
     return BacklogUnit(frame_index, capture_ns, keyframe, data)
 
 

@@ -1,4 +1,4 @@
-"""What the ground says: requests that the edge answers, and its running report."""
+"""Messages of the ground: control requests with their answers, and the receiver report."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ MAX_STILL_RESULTS = 32
 MAX_MISSING_STILLS = 32
 """How many one report names; of more, the newest."""
 MAX_TRACKS_NOW = 64
-"""How many tracks one answer lists; of more, those seen with the most confidence."""
+"""How many tracks one answer lists: the most confident."""
 _COUNT = Int(0, 2**53 - 1)
 _FAR_PX = 32767
 
 
 class Command(StrEnum):
-    """What a ground may ask for; an edge answers a command that it does not serve with a reason."""
+    """What a ground may request; an edge refuses a command that it does not serve, with a reason."""
 
     KEYFRAME = "keyframe"
     STILL = "still"
     STILL_OUTCOME = "still-outcome"
-    """What became of a still that was accepted."""
+    """The outcome of an accepted still."""
     TRACKS = "tracks"
     """What the edge tracks now, by its own ids."""
     SET_BUDGET = "set-budget"
     SET_METHOD = "set-method"
     SEND_BACKLOG = "send-backlog"
-    """Send what was kept of the base stream too, before what is left of the stills."""
+    """Send the stored base stream too, before the remaining stills."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,7 +115,7 @@ class StillResult:
     ground_track_id: int = wire_field(Int(-1, U32))
     """The ground's track that it refined; -1 where it matched none, or none yet."""
     again: bool = wire_field(Flag())
-    """The still names a base frame that this ground does not have: please send it once more, without the base."""
+    """The still names a base frame that this ground does not have: send it once more, without the base."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,7 +129,7 @@ class Feedback(Message):
     """Random, new at each start of the ground: several grounds may report on one edge."""
     sequence: int = wire_field(Int(0, U32))
     send_ns: int = wire_field(Int(0, I63))
-    """The ground's clock as it was at its start, carried on without steps."""
+    """The ground's clock, without steps since its start."""
     last_frame_index: int = wire_field(Int(-1, U32))
     """The last frame that the ground is done with; -1 before the first. A lockstep edge waits for it."""
     base_messages: int = wire_field(_COUNT)
@@ -137,17 +137,17 @@ class Feedback(Message):
     roi_messages: int = wire_field(_COUNT)
     roi_bytes: int = wire_field(_COUNT)
     lost: int = wire_field(_COUNT)
-    """Messages of base and roi that never came."""
+    """Messages of base and roi that were not received."""
     corrupt: int = wire_field(_COUNT)
     """Messages that came and could not be used."""
     base_sequence: int = wire_field(Int(-1, U32))
-    """The highest of ``base`` that has come; -1 for none. With what follows, the edge follows the link's rate."""
+    """The highest of ``base`` received; -1 for none. With the next field, it drives the edge's rate control."""
     base_held_us: int = wire_field(Int(0, U32))
-    """How long before ``send_ns`` it came: ``send_ns`` minus this is its time of arrival."""
+    """``send_ns`` minus its time of arrival."""
     still_sequence: int = wire_field(Int(-1, U32))
-    """The highest of ``roi`` that has come; -1 for none."""
+    """The highest of ``roi`` received; -1 for none."""
     missing_stills: tuple[int, ...] = wire_field(ListOf(Int(0, U32), MAX_MISSING_STILLS))
-    """Sequences of ``roi`` below it that have not come; the edge sends them again while they are worth it."""
+    """Sequences of ``roi`` below it that were not received; the edge may send them again."""
     delay_p50_ms: float = wire_field(Scaled(-1, 3_600_000, 10))
     """Median capture to receive since the last report, clocks reconciled; -1 where unknown."""
     clock_offset_ns: int = wire_field(Int(-I63, I63))
@@ -159,4 +159,4 @@ class Feedback(Message):
     backlog: tuple[AcknowledgedRange, ...] = wire_field(
         ListOf(Nested(AcknowledgedRange), MAX_ACKNOWLEDGED_RANGES)
     )
-    """Objects of which pieces came since the last report."""
+    """Objects of which chunks were received since the last report."""

@@ -28,7 +28,7 @@ __all__ = [
 
 WIRE_VERSION = 3
 MAX_PAYLOAD_BYTES = 4 * 2**20
-"""No access unit and no still is larger; a larger one is not looked at."""
+"""No access unit and no still is larger; a larger payload is refused unread."""
 
 _CRC_BYTES = 5
 _CRC_TAG = 0xCE
@@ -97,12 +97,12 @@ class Nested(Kind):
     def _encode(self, value: Any) -> Any:
         return [kind.encode(getattr(value, name)) for name, kind in kinds(self.of)]
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         if type(raw) is not list:
             raise WireError(f"{type(raw).__name__} in place of a {self.of.__name__}")
         return _from_values(self.of, raw)
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return self.of.__name__
 
 

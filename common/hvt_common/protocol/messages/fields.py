@@ -1,13 +1,14 @@
 """The kinds of field a message may have. Each one checks the same bounds when it packs and when it parses.
 
 `Kind.encode` takes one of our own values and raises ValueError when it is out of bounds: that is a bug here.
-`Kind.decode` takes whatever MessagePack held and raises `WireError`: that is somebody else's bad message.
+`Kind.decode` takes what MessagePack held and raises `WireError`: that is a bad message of the other side.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sized
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,12 +17,12 @@ __all__ = [
     "U32",
     "U64",
     "Blob",
-    "Choice",
     "Flag",
     "Int",
     "Kind",
     "ListOf",
     "MapOf",
+    "OneOf",
     "Real",
     "Scalar",
     "Scaled",
@@ -38,11 +39,11 @@ I63 = 2**63 - 1
 
 
 class WireError(Exception):
-    """A message that cannot be used; the text says what was wrong with it. Count it, skip it, go on."""
+    """A message that cannot be used; the text says why. Count it and skip it."""
 
 
 class Kind(ABC):
-    """A field's type, bounds and coding. Kinds say `_encode`, `_decode` and `_describe`."""
+    """A field's type, bounds and coding."""
 
     __slots__ = ()
 
@@ -50,27 +51,33 @@ class Kind(ABC):
         """The value as MessagePack is to hold it; ValueError when it is out of bounds."""
         try:
             raw = self._encode(value)
-            self._decode(raw)  # what we send is held to the same rules as what we receive
+            self.decode(raw)  # what we send is held to the same rules as what we receive
         except (WireError, TypeError, ValueError, OverflowError, AttributeError) as error:
             raise ValueError(f"{value!r} cannot be sent as {self.describe()}: {error}") from error
         return raw
 
+    @abstractmethod
     def decode(self, raw: Any) -> Any:
         """The value of what MessagePack held; WireError when of another type or out of bounds."""
-        return self._decode(raw)
 
+    @abstractmethod
     def describe(self) -> str:
         """Type and bounds in a few words, as docs/wire.md prints them."""
-        return self._describe()
 
     def _encode(self, value: Any) -> Any:
         return value
 
-    @abstractmethod
-    def _decode(self, raw: Any) -> Any: ...
 
-    @abstractmethod
-    def _describe(self) -> str: ...
+@dataclass(frozen=True, slots=True)
+class _Sequence(Kind):
+    inner: Kind
+
+    def _encode(self, value: Any) -> Any:
+        return [self.inner.encode(item) for item in value]
+
+    def _items(self, raw: Any, most: int) -> tuple[Any, ...]:
+        _check_size(raw, list, "list", most)
+        return tuple(self.inner.decode(item) for item in raw)
 
 
 def wire_field(kind: Kind) -> Any:
@@ -88,14 +95,14 @@ class Int(Kind):
     def _encode(self, value: Any) -> Any:
         return value.__index__()
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         if type(raw) is not int:
             raise WireError(f"{type(raw).__name__} in place of a whole number")
         if not self.low <= raw <= self.high:
             raise WireError(f"{raw} is outside {self.low}…{self.high}")
         return raw
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"int {_power(self.low)}…{_power(self.high)}"
 
 
@@ -110,14 +117,14 @@ class Scaled(Kind):
     def _encode(self, value: Any) -> Any:
         return round(float(value) * self.per)
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         if type(raw) is not int:
             raise WireError(f"{type(raw).__name__} in place of a whole number of 1/{self.per}")
         if not self.low * self.per <= raw <= self.high * self.per:
             raise WireError(f"{raw}/{self.per} is outside {self.low:g}…{self.high:g}")
         return raw / self.per
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"int, {self.per} for 1; {self.low:g}…{self.high:g}"
 
 
@@ -131,14 +138,14 @@ class Real(Kind):
     def _encode(self, value: Any) -> Any:
         return float(value)
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         if type(raw) is not float or not math.isfinite(raw):
             raise WireError(f"{raw!r:.40} in place of a finite float")
         if not self.low <= raw <= self.high:
             raise WireError(f"{raw:g} is outside {self.low:g}…{self.high:g}")
         return raw
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"float {self.low:g}…{self.high:g}"
 
 
@@ -146,12 +153,12 @@ class Real(Kind):
 class Flag(Kind):
     """True or False."""
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         if type(raw) is not bool:
             raise WireError(f"{type(raw).__name__} in place of a boolean")
         return raw
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return "bool"
 
 
@@ -164,7 +171,7 @@ class Text(Kind):
     def _encode(self, value: Any) -> Any:
         return value[:]  # also makes a plain str of a StrEnum
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         if type(raw) is not str:
             raise WireError(f"{type(raw).__name__} in place of text")
         if len(raw) > self.max_bytes or len(raw.encode("utf-8", "surrogatepass")) > self.max_bytes:
@@ -173,7 +180,7 @@ class Text(Kind):
             raise WireError(f"text {raw!r:.40} has characters that do not print")
         return raw
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"str ≤ {self.max_bytes} B"
 
 
@@ -183,14 +190,14 @@ class Blob(Kind):
 
     max_bytes: int
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         if type(raw) is not bytes:
             raise WireError(f"{type(raw).__name__} in place of bytes")
         if len(raw) > self.max_bytes:
             raise WireError(f"{len(raw)} bytes where at most {self.max_bytes} are allowed")
         return raw
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"bin ≤ {self.max_bytes} B"
 
 
@@ -201,7 +208,7 @@ def fitted_text(text: str, max_bytes: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice(Kind):
+class OneOf(Kind):
     """One of a few words, sent as its position."""
 
     words: tuple[str, ...]
@@ -209,10 +216,10 @@ class Choice(Kind):
     def _encode(self, value: Any) -> Any:
         return self.words.index(value)
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         return self.words[Int(0, len(self.words) - 1).decode(raw)]
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return "int: " + ", ".join(f"{number} {word}" for number, word in enumerate(self.words))
 
 
@@ -222,55 +229,43 @@ class Scalar(Kind):
 
     max_bytes: int = 64
 
-    def _decode(self, raw: Any) -> Any:
+    def decode(self, raw: Any) -> Any:
         if type(raw) is str:
             return Text(self.max_bytes).decode(raw)
         if type(raw) is float:
             return Real(-1e300, 1e300).decode(raw)
         return Int(-I63, I63).decode(raw)
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"int, finite float or str ≤ {self.max_bytes} B"
 
 
 @dataclass(frozen=True, slots=True)
-class ListOf(Kind):
+class ListOf(_Sequence):
     """At most ``max_items`` of one kind, as a tuple."""
 
-    inner: Kind
     max_items: int
 
-    def _encode(self, value: Any) -> Any:
-        return [self.inner.encode(item) for item in value]
+    def decode(self, raw: Any) -> Any:
+        return self._items(raw, self.max_items)
 
-    def _decode(self, raw: Any) -> Any:
-        if type(raw) is not list:
-            raise WireError(f"{type(raw).__name__} in place of a list")
-        if len(raw) > self.max_items:
-            raise WireError(f"list of {len(raw)} where at most {self.max_items} are allowed")
-        return tuple(self.inner.decode(item) for item in raw)
-
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"array ≤ {self.max_items} of {self.inner.describe()}"
 
 
 @dataclass(frozen=True, slots=True)
-class TupleOf(Kind):
+class TupleOf(_Sequence):
     """Exactly ``length`` of one kind."""
 
-    inner: Kind
     length: int
 
-    def _encode(self, value: Any) -> Any:
-        return [self.inner.encode(item) for item in value]
-
-    def _decode(self, raw: Any) -> Any:
-        items = ListOf(self.inner, self.length).decode(raw)
+    def decode(self, raw: Any) -> Any:
+        items = self._items(raw, self.length)
         if len(items) != self.length:
             raise WireError(f"{len(items)} numbers in place of {self.length}")
         return items
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"array of {self.length}: {self.inner.describe()}"
 
 
@@ -285,16 +280,20 @@ class MapOf(Kind):
     def _encode(self, value: Any) -> Any:
         return {key: self.inner.encode(item) for key, item in value.items()}
 
-    def _decode(self, raw: Any) -> Any:
-        if type(raw) is not dict:
-            raise WireError(f"{type(raw).__name__} in place of a map")
-        if len(raw) > self.max_items:
-            raise WireError(f"map of {len(raw)} where at most {self.max_items} are allowed")
+    def decode(self, raw: Any) -> Any:
+        _check_size(raw, dict, "map", self.max_items)
         name = Text(self.key_bytes)
         return {name.decode(key): self.inner.decode(item) for key, item in raw.items()}
 
-    def _describe(self) -> str:
+    def describe(self) -> str:
         return f"map ≤ {self.max_items}: str ≤ {self.key_bytes} B to {self.inner.describe()}"
+
+
+def _check_size(raw: Any, wanted: type[Sized], name: str, most: int) -> None:
+    if not isinstance(raw, wanted):
+        raise WireError(f"{type(raw).__name__} in place of a {name}")
+    if len(raw) > most:
+        raise WireError(f"{name} of {len(raw)} where at most {most} are allowed")
 
 
 def _power(number: int) -> str:

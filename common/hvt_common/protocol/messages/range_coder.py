@@ -9,11 +9,11 @@ decoder takes no notice of it and returns the one it reads. So a syntax is writt
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final, Protocol
+from typing import Final
 
 from hvt_common.protocol.messages.fields import WireError
 
-__all__ = ["Coder", "Context", "Decoder", "Encoder", "Numbers"]
+__all__ = ["Coder", "Context", "Decoder", "Encoder", "NumberContexts"]
 
 _ONE: Final = 1 << 16
 _SLOWEST: Final = 30
@@ -42,7 +42,7 @@ class Context:
             self.seen += 1
 
 
-class Numbers:
+class NumberContexts:
     """The contexts of one kind of whole number: is it zero, its sign, how many bits it has, the highest of them."""
 
     __slots__ = ("high", "length", "nonzero", "sign")
@@ -54,39 +54,24 @@ class Numbers:
         self.high = [Context() for _ in range(_LONGEST_PREFIX)]
 
 
-class Coder(Protocol):
-    """What `Encoder` and `Decoder` have in common."""
-
-    def bit(self, context: Context, bit: int) -> int:
-        """One decision, 0 or 1."""
-        ...
-
-    def plain(self, value: int, bits: int) -> int:
-        """A number below ``2 ** bits`` of which nothing is known."""
-        ...
-
-    def unsigned(self, numbers: Numbers, value: int) -> int:
-        """A whole number from 0 up to 2^33 - 2."""
-        ...
-
-    def signed(self, numbers: Numbers, value: int) -> int:
-        """A whole number of either sign."""
-        ...
-
-
-class _Syntax(ABC):
+class Coder(ABC):
     """Numbers as decisions; the same for both sides."""
 
     __slots__ = ()
 
     @abstractmethod
-    def bit(self, context: Context, bit: int) -> int: ...
+    def bit(self, context: Context, bit: int) -> int:
+        """Code one decision, 0 or 1."""
 
     @abstractmethod
-    def plain(self, value: int, bits: int) -> int: ...
+    def plain(self, value: int, bits: int) -> int:
+        """Code a number below ``2 ** bits`` of which nothing is known, highest bit first."""
 
-    def unsigned(self, numbers: Numbers, value: int) -> int:
-        """Elias gamma of ``value + 1``: its length in unary and its highest bits as decisions, the rest plain."""
+    def unsigned(self, numbers: NumberContexts, value: int) -> int:
+        """A whole number from 0 up to 2^33 - 2, as Elias gamma of ``value + 1``.
+
+        Its length in unary and its highest bits are decisions, the rest is plain.
+        """
         wanted = (value + 1).bit_length() - 1
         length = 0
         while self.bit(numbers.length[length], int(length < wanted)):
@@ -100,7 +85,7 @@ class _Syntax(ABC):
         low = self.plain((value + 1) & ((1 << rest) - 1), rest)
         return ((2 | high) << rest | low) - 1
 
-    def signed(self, numbers: Numbers, value: int) -> int:
+    def signed(self, numbers: NumberContexts, value: int) -> int:
         """Zero or not, the sign, and the distance from zero less one."""
         if not self.bit(numbers.nonzero, int(value != 0)):
             return 0
@@ -109,7 +94,7 @@ class _Syntax(ABC):
         return -size if negative else size
 
 
-class Encoder(_Syntax):
+class Encoder(Coder):
     """Writes decisions; `finish` gives the bytes."""
 
     __slots__ = ("_low", "_range", "_shifts")
@@ -121,7 +106,6 @@ class Encoder(_Syntax):
         self._shifts = 0
 
     def bit(self, context: Context, bit: int) -> int:
-        """Write one decision."""
         bound = (self._range >> 16) * context.zero
         if bit:
             self._low += bound
@@ -129,36 +113,35 @@ class Encoder(_Syntax):
         else:
             self._range = bound
         context.learn(bit)
-        self._renew()
+        self._normalise()
         return bit
 
     def plain(self, value: int, bits: int) -> int:
-        """Write ``bits`` bits, highest first."""
         for place in range(bits - 1, -1, -1):
             self._range >>= 1
             if value >> place & 1:
                 self._low += self._range
-            self._renew()
+            self._normalise()
         return value
 
     def finish(self) -> bytes:
         """The shortest bytes that stand for all that was written; the reader takes zeros for what follows."""
-        for kept in range(_WINDOW_BYTES + 1):
-            step = 1 << 8 * (_WINDOW_BYTES - kept)
+        for length in range(_WINDOW_BYTES + 1):
+            step = 1 << 8 * (_WINDOW_BYTES - length)
             value = -(-self._low // step) * step
             if value < self._low + self._range:
                 whole = value.to_bytes(self._shifts + _WINDOW_BYTES, "big")
-                return whole[: self._shifts + kept]
+                return whole[: self._shifts + length]
         raise AssertionError("four bytes always tell one number of 32 bits from the next")
 
-    def _renew(self) -> None:
+    def _normalise(self) -> None:
         while self._range < _TOP:
             self._low <<= 8
             self._range <<= 8
             self._shifts += 1
 
 
-class Decoder(_Syntax):
+class Decoder(Coder):
     """Reads decisions; whatever the bytes, it ends with values or a `WireError`."""
 
     __slots__ = ("_code", "_data", "_next", "_range")
@@ -170,7 +153,6 @@ class Decoder(_Syntax):
         self._range = _FULL
 
     def bit(self, context: Context, bit: int) -> int:  # noqa: ARG002 - what the encoder would write
-        """Read one decision."""
         bound = (self._range >> 16) * context.zero
         read = int(self._code >= bound)
         if read:
@@ -179,11 +161,10 @@ class Decoder(_Syntax):
         else:
             self._range = bound
         context.learn(read)
-        self._renew()
+        self._normalise()
         return read
 
     def plain(self, value: int, bits: int) -> int:  # noqa: ARG002 - what the encoder would write
-        """Read ``bits`` bits, highest first."""
         read = 0
         for _ in range(bits):
             self._range >>= 1
@@ -191,7 +172,7 @@ class Decoder(_Syntax):
             if one:
                 self._code -= self._range
             read = read << 1 | one
-            self._renew()
+            self._normalise()
         return read
 
     def finish(self) -> None:
@@ -201,7 +182,7 @@ class Decoder(_Syntax):
         if self._next < len(self._data):
             raise WireError(f"{len(self._data) - self._next} bytes too many after the coded boxes")
 
-    def _renew(self) -> None:
+    def _normalise(self) -> None:
         while self._range < _TOP:
             fresh = self._data[self._next] if self._next < len(self._data) else 0
             if self._next - len(self._data) >= _WINDOW_BYTES:

@@ -1,4 +1,4 @@
-"""What the edge says about itself: `Info` when asked, `Status` once a second."""
+"""Reports of the edge: `Info` as answer to a query, `Status` once a second."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from hvt_common.protocol.messages.fields import (
     I63,
     U32,
     U64,
-    Choice,
     Int,
     ListOf,
     MapOf,
+    OneOf,
     Real,
     Scaled,
     Text,
@@ -68,7 +68,7 @@ class Info(Message):
     """base = source x scale + offset, in base pixels."""
     fps: float = wire_field(Real(0.01, 1000))
     codec: str = wire_field(Text(24))
-    pace: str = wire_field(Choice(("realtime", "lockstep")))
+    pace: str = wire_field(OneOf(("realtime", "lockstep")))
     method: str = wire_field(Text(48))
     budget_bps: int = wire_field(_BPS)
     base_bps: int = wire_field(_BPS)
@@ -111,13 +111,13 @@ class Health:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status(Message):
-    """Payload of ``status``: the ledger's totals since the start, the fate of candidates, and health."""
+    """Payload of ``status``: the ledger's totals since the start, the outcomes of candidates, and health."""
 
     MAX_BYTES: ClassVar[int] = 2048
 
     session_id: int = wire_field(Int(0, U64))
     sequence: int = wire_field(Int(0, U32))
-    state: str = wire_field(Choice(("running", "ended")))
+    state: str = wire_field(OneOf(("running", "ended")))
     send_ns: int = wire_field(_TIME)
     media_ns: int = wire_field(_TIME)
     """Length of the stream so far: frames of the source rate, dropped ones included, in nanoseconds."""
@@ -127,7 +127,7 @@ class Status(Message):
     base_bytes: int = wire_field(_COUNT)
     roi_bytes: int = wire_field(_COUNT)
     backlog_bytes: int = wire_field(_COUNT)
-    """Pieces of what was kept while the link was away."""
+    """Chunks of store-and-forward."""
     meta_bytes: int = wire_field(_COUNT)
     overhead_bytes: int = wire_field(_COUNT)
     base_messages: int = wire_field(_COUNT)

@@ -1,4 +1,4 @@
-"""The attachments of the two streams: what rides beside each access unit and each still."""
+"""The attachments of the two streams: the headers of access units and stills."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _FAR_PX = 32767
 
 
 class Flags(IntFlag):
-    """Bits of ``flags``; unknown bits are kept and ignored."""
+    """Bits of ``flags``; unknown bits are ignored."""
 
     KEYFRAME = 1
     """Decoding can start here."""
@@ -42,7 +42,7 @@ class Flags(IntFlag):
     LOCKSTEP = 4
     """Sent as fast as the parts allow: capture times are media time and say nothing about delay."""
     STORED = 8
-    """Kept at the edge while the link was away, and sent afterwards."""
+    """Stored at the edge while the link was down, and sent afterwards."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,7 +95,7 @@ class RoiHeader(Message):
 
     MAX_BYTES: ClassVar[int] = 1024
     MAX_PAYLOAD: ClassVar[int] = 2**20
-    """The largest still, 512x512 pixels, has 768 KiB before it is coded; a ground keeps hundreds in its queues."""
+    """The largest still, 512x512 pixels, has 768 KiB before it is coded; a ground queues hundreds."""
 
     session_id: int = wire_field(Int(0, U64))
     sequence: int = wire_field(Int(0, U32))

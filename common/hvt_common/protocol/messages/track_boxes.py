@@ -1,4 +1,4 @@
-"""How the boxes of a track step become bytes: prediction with constant velocity, what is left range-coded.
+"""Codes the boxes of a track step: prediction with constant velocity, the residual range-coded.
 
 Both sides hold the same list of `CodedTrack` in whole numbers and bring it forward in the same way, so that nothing
 drifts apart. Positions and sizes count 1/16 of a base pixel; each track has a step of its own for either axis, a
@@ -16,7 +16,7 @@ from statistics import median_low
 from typing import Final
 
 from hvt_common.protocol.messages.fields import U32, WireError
-from hvt_common.protocol.messages.range_coder import Coder, Context, Decoder, Encoder, Numbers
+from hvt_common.protocol.messages.range_coder import Coder, Context, Decoder, Encoder, NumberContexts
 
 __all__ = [
     "CONFIDENCE_STEPS",
@@ -109,17 +109,17 @@ class _Walk:
         self._coder = coder
         self._frames = frames
         self._present = Context(), Context()
-        self._shared = Numbers(), Numbers()
-        self._move = Numbers(), Numbers()
-        self._grow = Numbers(), Numbers()
+        self._shared = NumberContexts(), NumberContexts()
+        self._move = NumberContexts(), NumberContexts()
+        self._grow = NumberContexts(), NumberContexts()
         self._changed = Context()
-        self._count, self._id = Numbers(), Numbers()
-        self._same_class, self._class = Context(), Numbers()
-        self._confidence = Numbers()
-        self._scale = Numbers(), Numbers()
-        self._side = Numbers(), Numbers()
-        self._place = Numbers(), Numbers()
-        self._drift = Numbers(), Numbers()
+        self._count, self._id = NumberContexts(), NumberContexts()
+        self._same_class, self._class = Context(), NumberContexts()
+        self._confidence = NumberContexts()
+        self._scale = NumberContexts(), NumberContexts()
+        self._side = NumberContexts(), NumberContexts()
+        self._place = NumberContexts(), NumberContexts()
+        self._drift = NumberContexts(), NumberContexts()
 
     def all(
         self, reference: Sequence[CodedTrack] | None, wanted: dict[int, CodedTrack] | None
@@ -157,7 +157,7 @@ class _Walk:
         shared = self._shared_motion(reference, goals) if any(here) else (0, 0)
         for track, goal, present in zip(reference, goals, here, strict=True):
             if present:
-                state.append(self._followed(track, goal, shared))
+                state.append(self._continued(track, goal, shared))
             elif track.missed < _PATIENCE:
                 x, y = track.moved(self._frames)
                 state.append(
@@ -181,7 +181,7 @@ class _Walk:
         )
         return x, y
 
-    def _followed(self, track: CodedTrack, goal: CodedTrack | None, shared: tuple[int, int]) -> CodedTrack:
+    def _continued(self, track: CodedTrack, goal: CodedTrack | None, shared: tuple[int, int]) -> CodedTrack:
         x, y = track.moved(self._frames)
         x, y = x + shared[0], y + shared[1]
         step_x, step_y = 1 << track.scale_x, 1 << track.scale_y
@@ -240,7 +240,7 @@ class _Walk:
     def _born(
         self, before: CodedTrack, common: tuple[int, int], goal: CodedTrack | None, *, moving: bool
     ) -> CodedTrack:
-        """A new track; its numbers are told by how they differ from the one ``before`` it."""
+        """A new track; its numbers are coded as differences from the track ``before`` it."""
         coder, to = self._coder, goal or before
         track_id = (
             before.track_id + 1 + coder.unsigned(self._id, to.track_id - before.track_id - 1 if goal else 0)

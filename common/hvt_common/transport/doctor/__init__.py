@@ -1,1 +1,1 @@
-"""Why a link does not come up, in one sentence."""
+"""Explains in one sentence why there is no link: others use `diagnose`, `certificate` and `probe` serve it."""

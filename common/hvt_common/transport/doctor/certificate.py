@@ -1,11 +1,11 @@
-"""Our own keys as the Zenoh configuration names them, and whether they are fit for use: checked before the start.
+"""Checks, before the start, the keys that the Zenoh configuration names.
 
-Certificates are read by Python's own ``ssl``: a TLS handshake in memory, both ends of it here, shows what the other
-side would see. So neither side needs a package for certificates.
+Python's own ``ssl`` reads the certificates, by a TLS handshake in memory: no package for certificates is needed.
 """
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import logging
 import ssl
@@ -19,12 +19,13 @@ from typing import Any
 import zenoh
 
 from hvt_common.errors import UserError
+from hvt_common.transport.zenoh_config import connect_endpoints
 
-__all__ = ["Certificate", "KeyPair", "TlsFiles", "check_own_keys", "dated", "plain_key_only"]
+__all__ = ["NO_CHECK_TIME", "Certificate", "KeyPair", "TlsFiles", "check_own_keys", "dated", "plain_key_only"]
 
 _log = logging.getLogger(__name__)
 
-_NO_CHECK_TIME = ssl.VerifyFlags(0x200000)
+NO_CHECK_TIME = ssl.VerifyFlags(0x200000)
 """X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which ``ssl`` passes on but does not name."""
 _SOON_S = 30 * 86_400.0
 _SECURED = ("tls/", "quic/")
@@ -45,7 +46,7 @@ class Certificate:
 
     @classmethod
     def of(cls, said: dict[str, Any]) -> Certificate:
-        """From what ``SSLSocket.getpeercert`` tells."""
+        """From the answer of ``SSLSocket.getpeercert``."""
         names = [value for group in said.get("subject", ()) for key, value in group if key == "commonName"]
         return cls(
             name=names[0] if names else "",
@@ -64,10 +65,10 @@ class KeyPair:
     certificate: Path
     key: Path
 
-    def read(self, *, listens: bool) -> Certificate:
+    def read(self, *, as_server: bool) -> Certificate:
         """What the other side would see; UserError for files that cannot be used. Says nothing of time or CA."""
         try:
-            said = _shown(self, listens=listens)
+            said = _shown(self, as_server=as_server)
         except ssl.SSLError as error:
             raise UserError(_unusable(self, error)) from None
         return Certificate.of(said)
@@ -99,7 +100,7 @@ class TlsFiles:
 
 
 def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float) -> None:
-    """Raise UserError for keys with which nobody would let us in; warn of what will soon be, or may be, a fault.
+    """Raise UserError for keys that no other side would accept; warn of what will soon be, or may be, a fault.
 
     Args:
         config: the configuration in use.
@@ -108,19 +109,16 @@ def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | N
         now_s: Unix time.
     """
     files = TlsFiles.of(config)
-    connect = json.loads(config.get_json("connect/endpoints")) or []
-    if isinstance(connect, dict):
-        connect = [one for group in connect.values() for one in group]
-    listens, connects = _any_secured(listen), _any_secured(connect)
-    if not (listens or connects):
+    listening, connecting = _any_secured(listen), _any_secured(connect_endpoints(config))
+    if not (listening or connecting):
         return
     if files.root_ca is not None:
         _check_readable(files.root_ca, setting="root_ca_certificate")
         _check_ca(files.root_ca)
-    for pair, in_use, side in ((files.listen, listens, "listen"), (files.connect, connects, "connect")):
+    for pair, in_use, side in ((files.listen, listening, "listen"), (files.connect, connecting, "connect")):
         if pair is not None and in_use:
             _check_pair(pair, side=side, name=name, now_s=now_s)
-    if listens and files.listen is None and not _in_base64(config, "listen"):
+    if listening and files.listen is None and not _in_base64(config, "listen"):
         raise UserError(
             f"listening on {next(one for one in listen if one.startswith(_SECURED))} takes listen_certificate and "
             "listen_private_key in --zenoh-config: hvt-ground keys makes them"
@@ -129,13 +127,11 @@ def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | N
 
 def dated(time_s: float) -> str:
     """A moment as people read it, UTC."""
-    import datetime as dt  # noqa: PLC0415
-
     return dt.datetime.fromtimestamp(time_s, dt.UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def plain_key_only() -> str:
-    """For ``load_cert_chain``: without it an encrypted key would ask for its password on the terminal, for ever."""
+    """For ``load_cert_chain``: an encrypted key would wait for a password on the terminal, for ever."""
     raise _EncryptedKeyError
 
 
@@ -170,7 +166,7 @@ def _check_pair(pair: KeyPair, *, side: str, name: str | None, now_s: float) -> 
     _check_readable(pair.key, setting=f"{side}_private_key")
     if pair.key.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
         _log.warning("%s: every user of this machine can read this key; chmod 640 %s", pair.key, pair.key)
-    certificate = pair.read(listens=side == "listen")
+    certificate = pair.read(as_server=side == "listen")
     if certificate.not_after_s < now_s:
         raise UserError(
             f"{pair.certificate}: this certificate expired on {dated(certificate.not_after_s)} (it is "
@@ -218,17 +214,17 @@ def _check_ca(path: Path) -> None:
         ) from None
 
 
-def _shown(pair: KeyPair, *, listens: bool) -> dict[str, Any]:
+def _shown(pair: KeyPair, *, as_server: bool) -> dict[str, Any]:
     """The pair shown in a handshake in memory to a side that trusts just this certificate, whatever the date."""
     server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     client.check_hostname = False
     client.verify_mode = ssl.CERT_NONE
     for context in (server, client):
         context.load_cert_chain(pair.certificate, pair.key, password=plain_key_only)
-    judge = client if listens else server
+    judge = client if as_server else server
     judge.load_verify_locations(pair.certificate)
     judge.verify_mode = ssl.CERT_REQUIRED
-    judge.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME
+    judge.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN | NO_CHECK_TIME
     to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
     ends = (
         client.wrap_bio(to_client, to_server, server_side=False),
@@ -238,7 +234,7 @@ def _shown(pair: KeyPair, *, listens: bool) -> dict[str, Any]:
         for end in ends:
             with suppress(ssl.SSLWantReadError):
                 end.do_handshake()
-    return ends[0 if listens else 1].getpeercert() or {}
+    return ends[0 if as_server else 1].getpeercert() or {}
 
 
 def _unusable(pair: KeyPair, error: ssl.SSLError) -> str:

@@ -1,13 +1,11 @@
-"""Says in plain words why there is no link, and who is linked without the rights to be of use.
+"""Explains why there is no link, and which peer is linked without the rights that it needs.
 
-Zenoh tells a program nothing of this: a connection that is refused is tried again for ever, a message without
-permission is dropped. So a thread looks now and then whether links stand and whose they are, and visits the endpoints
-(`probe`) where none does.
+Zenoh reports neither: a refused connection is retried for ever, a message without permission is dropped. So a thread
+checks the links and their peers, and probes the endpoints (`probe`) where there is no link.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import threading
@@ -24,13 +22,13 @@ from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.doctor.certificate import TlsFiles
 from hvt_common.transport.doctor.probe import why_no_link
 from hvt_common.transport.rights import Rights
-from hvt_common.transport.zenoh_config import LinkSettings, configure
+from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 
-__all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit", "why_unlinked"]
+__all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit"]
 
 _log = logging.getLogger(__name__)
 
-_LOOK_S = 1.0
+_CHECK_S = 1.0
 PATIENCE_S = 4.0
 _FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
 """From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
@@ -39,15 +37,10 @@ _MAX_NAMES = 256
 """Names that are remembered. Each takes a certificate of the CA, so a fleet of that size comes first."""
 
 
-def why_unlinked(settings: LinkSettings) -> list[str]:
-    """One sentence for each endpoint that we would connect to. Blocks for some seconds an endpoint."""
-    return visit(configure(settings)[0])
-
-
 def control_unanswered(edge: str, *, who: str = "this ground") -> str:
-    """What to tell a user whose question on ``control`` came to nothing while the edge is there.
+    """The sentence for a request on ``control`` without an answer, while the edge is present.
 
-    The edge itself, or a ground or a router on the way, may have dropped it: all of them check.
+    The edge itself, or a ground or a router on the way, may have dropped it: all of them check rights.
     """
     return (
         f"{edge} does not answer on control: {who} may lack the right to command it (hvt-ground keys list shows who "
@@ -57,7 +50,7 @@ def control_unanswered(edge: str, *, who: str = "this ground") -> str:
 
 
 class LinkWatch:
-    """A context manager with a thread of its own, which looks after one session until it closes.
+    """Watches the links of one session, in a thread of its own; a context manager.
 
     Args:
         session: the session that was opened with these settings.
@@ -65,6 +58,7 @@ class LinkWatch:
         served: whether a machine of that name has shown life to us, or we to it: an edge that has appeared, a ground
             that subscribes. Called from the thread.
         patience_s: a link that is merely slow to come, or to be of use, needs no explanation.
+        examine: gives one sentence for each endpoint that this configuration connects to; may block for seconds.
     """
 
     def __init__(
@@ -74,9 +68,11 @@ class LinkWatch:
         *,
         served: Callable[[str], bool],
         patience_s: float = PATIENCE_S,
+        examine: Callable[[zenoh.Config], list[str]] | None = None,
     ) -> None:
         self._session = session
         self._patience_s = patience_s
+        self._examine = examine or visit
         self._config = configure(settings)[0]
         self._file = settings.zenoh_config
         self._edge = settings.name
@@ -84,7 +80,7 @@ class LinkWatch:
         self._rights = Rights.of(self._config)
         self._trouble = ""
         self._said_s = 0.0
-        self._two_links = _asked_for_twice(self._config)
+        self._two_links = _connected_twice(self._config)
         """Places that are called twice."""
         self._had_two: set[str] = set()
         self._halved_s: float | None = None
@@ -93,7 +89,7 @@ class LinkWatch:
         self._named: set[str] = set()
         self._stop = threading.Event()
         self._using = threading.Lock()
-        """Held while the session is asked: it must not be closed under our hands."""
+        """Held while the session is used, so that it is not closed meanwhile."""
         self._thread = threading.Thread(target=self._run, name="hvt-link-watch", daemon=True)
 
     @property
@@ -117,7 +113,7 @@ class LinkWatch:
         self._stop.set()
         with self._using:
             pass
-        # A visit in progress asks nothing of the session and ends by itself, within seconds: nobody waits for it.
+        # A probe in progress does not use the session and ends by itself within seconds: it is not waited for.
         self._thread.join(0.1)
 
     # The thread
@@ -125,16 +121,16 @@ class LinkWatch:
     def _run(self) -> None:
         linked_s = time.monotonic()
         next_visit_s, pause_s = linked_s + self._patience_s, _FIRST_PAUSE_S
-        while not self._stop.wait(min(_LOOK_S, self._patience_s)):
+        while not self._stop.wait(min(_CHECK_S, self._patience_s)):
             now_s = time.monotonic()
-            if self._look(now_s):
+            if self._check(now_s):
                 self._trouble = ""
                 next_visit_s, pause_s = now_s + self._patience_s, _FIRST_PAUSE_S
             elif now_s >= next_visit_s:
                 self._explain()
                 next_visit_s, pause_s = time.monotonic() + pause_s, min(2 * pause_s, _LAST_PAUSE_S)
 
-    def _look(self, now_s: float) -> bool:
+    def _check(self, now_s: float) -> bool:
         """Whether there is a link; what is wrong with those at its other end is said."""
         with self._using:
             if self._stop.is_set():
@@ -142,9 +138,9 @@ class LinkWatch:
             try:
                 links = self._session.info.links()
                 if links:
-                    self._look_at(self._names(links), now_s)
-                self._look_for_halves(links, now_s)
-            except zenoh.ZError:  # somebody else closed it
+                    self._check_names(self._names(links), now_s)
+                self._check_second_link(links, now_s)
+            except zenoh.ZError:  # closed elsewhere
                 return True
             return bool(links)
 
@@ -153,7 +149,7 @@ class LinkWatch:
         routers = {str(zid) for zid in self._session.info.routers_zid()}
         return {link.auth_identifier: str(link.zid) in routers for link in links if link.auth_identifier}
 
-    def _look_for_halves(self, links: list[zenoh.Link], now_s: float) -> None:
+    def _check_second_link(self, links: list[zenoh.Link], now_s: float) -> None:
         """Zenoh does not reopen one link before all are lost, and says nothing of one that is refused."""
         if not self._is_halved(links):
             self._halved_s = None
@@ -182,7 +178,7 @@ class LinkWatch:
         return any(zid in self._had_two | called for zid in standing.keys() - twice)
 
     def _explain(self) -> None:
-        reasons = visit(self._config)
+        reasons = self._examine(self._config)
         if self._stop.is_set() or not reasons:
             return
         trouble = "; ".join(reasons)
@@ -192,7 +188,7 @@ class LinkWatch:
             _log.warning("no link: %s", trouble)
         self._trouble = trouble
 
-    def _look_at(self, names: dict[str, bool], now_s: float) -> None:
+    def _check_names(self, names: dict[str, bool], now_s: float) -> None:
         if not self._rights.enabled:
             return
         for name, router in names.items():
@@ -245,21 +241,16 @@ def visit(config: zenoh.Config) -> list[str]:
     """One sentence for each endpoint that this configuration connects to. Blocks for some seconds an endpoint."""
     try:
         files = TlsFiles.of(config)
-        return [why_no_link(endpoint, files) for endpoint in dict.fromkeys(map(_bare, _connects_to(config)))]
+        return [
+            why_no_link(endpoint, files) for endpoint in dict.fromkeys(map(_bare, connect_endpoints(config)))
+        ]
     except UserError as error:
         return [str(error)]
 
 
-def _asked_for_twice(config: zenoh.Config) -> set[str]:
-    places = Counter(map(_bare, _connects_to(config)))
+def _connected_twice(config: zenoh.Config) -> set[str]:
+    places = Counter(map(_bare, connect_endpoints(config)))
     return {place for place, count in places.items() if count > 1}
-
-
-def _connects_to(config: zenoh.Config) -> list[str]:
-    endpoints = json.loads(config.get_json("connect/endpoints")) or []
-    return (
-        [one for group in endpoints.values() for one in group] if isinstance(endpoints, dict) else endpoints
-    )
 
 
 def _bare(endpoint: str) -> str:

@@ -1,7 +1,6 @@
-"""Why an endpoint does not let us in, in one sentence: a short visit beside Zenoh, which says "Timeout" at most.
+"""Probes an endpoint beside Zenoh and explains in one sentence why it gives no link.
 
-A probe connects, shakes hands with the very files that Zenoh uses, hears whether the other side sends an alert, and
-leaves. It sends nothing of HVT's.
+A probe connects, does the TLS handshake with the files that Zenoh uses, waits for an alert, and leaves.
 """
 
 from __future__ import annotations
@@ -15,7 +14,13 @@ from contextlib import closing
 from dataclasses import dataclass
 
 from hvt_common.errors import UserError
-from hvt_common.transport.doctor.certificate import Certificate, TlsFiles, dated, plain_key_only
+from hvt_common.transport.doctor.certificate import (
+    NO_CHECK_TIME,
+    Certificate,
+    TlsFiles,
+    dated,
+    plain_key_only,
+)
 
 __all__ = ["why_no_link"]
 
@@ -23,9 +28,6 @@ _STEP_S = 3.0
 """Longest wait for a connection, and again for each answer."""
 _ALERT_S = 1.0
 """A refusal of our certificate comes after the handshake is over for us (TLS 1.3, RFC 8446 section 4.4.2.4)."""
-_NO_CHECK_TIME = ssl.VerifyFlags(0x200000)
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL."""
-
 _TCP = re.compile(r"(?P<protocol>tcp|tls|ws)/(?P<host>\[[^\]]+\]|[^:/]+):(?P<port>\d{1,5})([?#].*)?")
 
 # Verification errors of OpenSSL, x509_vfy.h.
@@ -84,16 +86,12 @@ def _unreachable(place: _Place, error: OSError) -> str:
     return f"no connection ({error.strerror or error})"
 
 
-def _connected(place: _Place) -> socket.socket:
-    return socket.create_connection((place.host, place.port), timeout=_STEP_S)
-
-
 # Plain
 
 
 def _plain(place: _Place, protocol: str) -> str:
-    with closing(_connected(place)) as tcp:
-        if _speaks_tls(tcp, place):
+    with closing(socket.create_connection((place.host, place.port), timeout=_STEP_S)) as tcp:
+        if _is_tls(tcp, place):
             return (
                 f"this is a TLS port, and plain {protocol} does not get in: connect to tls/… with the keys of this "
                 "machine in --zenoh-config"
@@ -101,8 +99,10 @@ def _plain(place: _Place, protocol: str) -> str:
     return "somebody listens there, but no Zenoh link comes of it: is it the other side of HVT?"
 
 
-def _speaks_tls(tcp: socket.socket, place: _Place) -> bool:
-    context = _blind_context()
+def _is_tls(tcp: socket.socket, place: _Place) -> bool:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
     try:
         with context.wrap_socket(tcp, server_hostname=place.host):
             return True
@@ -117,7 +117,7 @@ def _speaks_tls(tcp: socket.socket, place: _Place) -> bool:
 
 def _tls(place: _Place, files: TlsFiles) -> str:
     context = _context(files)
-    tcp = _connected(place)
+    tcp = socket.create_connection((place.host, place.port), timeout=_STEP_S)
     try:
         tls = context.wrap_socket(tcp, server_hostname=place.host)
     except ssl.SSLCertVerificationError as error:
@@ -160,7 +160,7 @@ def _their_certificate(place: _Place, files: TlsFiles, error: ssl.SSLCertVerific
             f"its certificate was not signed by the CA in {files.root_ca or 'this system'} (a CA of the same name "
             "may still be another): both sides need the ca.pem of one fleet"
         )
-    seen = _seen(place, files)
+    seen = _shown_certificate(place, files)
     whose = f" of {seen.name!r}" if seen is not None and seen.name else ""
     if code == _EXPIRED:
         when = f" on {dated(seen.not_after_s)}" if seen is not None else ""
@@ -179,13 +179,16 @@ def _their_certificate(place: _Place, files: TlsFiles, error: ssl.SSLCertVerific
     return f"its certificate is not accepted ({error.verify_message})"
 
 
-def _seen(place: _Place, files: TlsFiles) -> Certificate | None:
+def _shown_certificate(place: _Place, files: TlsFiles) -> Certificate | None:
     """The other side's certificate, whatever its host and date say; it must be of our CA all the same."""
     context = _context(files)
     context.check_hostname = False
-    context.verify_flags |= _NO_CHECK_TIME
+    context.verify_flags |= NO_CHECK_TIME
     try:
-        with closing(_connected(place)) as tcp, context.wrap_socket(tcp) as tls:
+        with (
+            closing(socket.create_connection((place.host, place.port), timeout=_STEP_S)) as tcp,
+            context.wrap_socket(tcp) as tls,
+        ):
             said = tls.getpeercert()
     except OSError:
         return None
@@ -228,11 +231,4 @@ def _context(files: TlsFiles) -> ssl.SSLContext:
         raise UserError(
             f"the keys of this machine can no longer be read ({error.strerror or error})"
         ) from None
-    return context
-
-
-def _blind_context() -> ssl.SSLContext:
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
     return context

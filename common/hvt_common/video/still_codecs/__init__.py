@@ -1,6 +1,4 @@
-"""Still codecs behind one small contract; see `contract`, and docs/still-codecs.md for the table of them."""
-
-from __future__ import annotations
+"""Still codecs behind one small contract (`contract.py`); docs/still-codecs.md has the table of them."""
 
 from hvt_common.video.still_codecs.contract import (
     NO_PARAMETERS,

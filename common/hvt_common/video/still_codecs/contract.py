@@ -1,12 +1,18 @@
 """What a still codec is: a crop to bytes at the edge, the bytes back to a crop at the ground.
 
-A codec is a frozen value without state that may be used by several threads. Its ``decode`` is fed by the network, so
-it looks at the dimensions in the header before it decodes a single block, and answers anything it does not like with
-`StillError`.
+A codec is a frozen value without state that may be used by several threads. Its ``decode`` gets bytes from the
+network. It reads the dimensions in the header before it decodes a block, and raises `StillError` for any malformed
+input.
+
+All codecs share one scale of quality: at the same percentage a still is about as good as JPEG at that quality, so
+that a setting (``--jpeg-quality 65``), a floor and a ceiling keep their meaning when the codec changes. Each codec
+has a ladder from it to its own measure: the mean Y-PSNR of 26 crops of drone_carpark, linear between the rows.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -14,7 +20,20 @@ from typing import Protocol
 
 from hvt_common.values import Image
 
-__all__ = ["NO_PARAMETERS", "BaseMissingError", "CodedCrop", "Parameters", "StillCodec", "StillError"]
+__all__ = [
+    "MAX_QP",
+    "NO_PARAMETERS",
+    "BaseMissingError",
+    "CodedCrop",
+    "IntraCodec",
+    "Parameters",
+    "StillCodec",
+    "StillError",
+    "on_ladder",
+    "qp_of",
+]
+
+MAX_QP = 51
 
 Parameters = Mapping[str, int | float | str]
 """At most 5 of them, keys of at most 16 bytes: they cross the link in the still's header, and cost bytes there."""
@@ -40,7 +59,7 @@ class CodedCrop:
 
 
 class StillCodec(Protocol):
-    """What the edge and the ground ask of a codec."""
+    """What the edge and the ground need of a codec."""
 
     @property
     def name(self) -> str:
@@ -78,3 +97,59 @@ class StillCodec(Protocol):
         where ``base_bgr`` is needed and is None or another than the edge had.
         """
         ...
+
+
+_QP = (
+    (1, 50),
+    (5, 46.5),
+    (20, 37),
+    (35, 33.4),
+    (50, 31.2),
+    (65, 29),
+    (80, 25.4),
+    (90, 21.2),
+    (97, 14),
+    (100, 10),
+)
+"""(quality in percent, QP of H.264)."""
+
+
+def qp_of(quality_pct: int) -> int:
+    """The QP at which x264 codes as well as JPEG does at that quality."""
+    return round(on_ladder(_QP, quality_pct))
+
+
+def on_ladder(rows: tuple[tuple[int, float], ...], quality_pct: int) -> float:
+    """The second column at ``quality_pct``, between rows whose first column runs from 1 to 100."""
+    at = min(bisect_right([row[0] for row in rows], quality_pct), len(rows) - 1)
+    (low, start), (high, end) = rows[at - 1], rows[at]
+    return start + (end - start) * (quality_pct - low) / (high - low)
+
+
+class IntraCodec(ABC):
+    """A `StillCodec` that needs no base and no parameters: a crop to bytes, and back."""
+
+    name: str
+    media_type: str
+    needs_base = False
+
+    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
+        """See `StillCodec`."""
+        return CodedCrop(self._encoded(crop_bgr, quality_pct))
+
+    def decode(
+        self,
+        data: bytes,
+        *,
+        size: tuple[int, int],
+        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
+        base_bgr: Image | None = None,  # noqa: ARG002
+    ) -> Image:
+        """See `StillCodec`."""
+        return self._decoded(data, size)
+
+    @abstractmethod
+    def _encoded(self, crop_bgr: Image, quality_pct: int) -> bytes: ...
+
+    @abstractmethod
+    def _decoded(self, data: bytes, size: tuple[int, int]) -> Image: ...

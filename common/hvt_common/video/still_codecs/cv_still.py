@@ -31,10 +31,10 @@ def imencoded(ending: str, image_bgr: Image, flags: Sequence[int]) -> bytes:
 def imdecoded(data: bytes, *, size: tuple[int, int], what: str) -> Image:
     """BGR of ``size``; an EXIF orientation is ignored.
 
-    The caller has looked at the header; `StillError` for what is wrong behind it.
+    The caller has checked the header; `StillError` for what is wrong behind it.
     """
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    # It would write a line for each broken picture, and whoever sends those would fill the log.
+    # It would write a line for each broken picture, and a flood of them would fill the log.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
 
 import cv2
 
 from hvt_common.values import Image
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, CodedCrop, Parameters, StillError
+from hvt_common.video.still_codecs.contract import IntraCodec, StillError
 from hvt_common.video.still_codecs.cv_still import imdecoded, imencoded
 
 __all__ = ["JpegCodec", "jpeg_size"]
@@ -23,32 +22,21 @@ _MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """Whatever ends a scan: stuffing, restarts and fill bytes do not."""
 
 
-@dataclass(frozen=True, slots=True)
-class JpegCodec:
+class JpegCodec(IntraCodec):
     """Baseline JPEG, 4:2:0, with Huffman tables made for the picture: the paper's setting.
 
     OpenCV with ``OPTIMIZE`` writes what Pillow writes with ``optimize=True`` at the same quality, to the byte count.
     """
 
-    name: str = field(default="jpeg", init=False)
-    media_type: str = field(default="image/jpeg", init=False)
-    needs_base: bool = field(default=False, init=False)
+    name = "jpeg"
+    media_type = "image/jpeg"
 
-    def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:  # noqa: ARG002
-        """Code a crop of at least one pixel."""
+    def _encoded(self, crop_bgr: Image, quality_pct: int) -> bytes:
         flags = [cv2.IMWRITE_JPEG_QUALITY, quality_pct, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
         flags += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
-        return CodedCrop(imencoded(".jpg", crop_bgr, flags))
+        return imencoded(".jpg", crop_bgr, flags)
 
-    def decode(
-        self,
-        data: bytes,
-        *,
-        size: tuple[int, int],
-        parameters: Parameters = NO_PARAMETERS,  # noqa: ARG002
-        base_bgr: Image | None = None,  # noqa: ARG002
-    ) -> Image:
-        """The crop again; an EXIF orientation is ignored, so that the size is the one in the header."""
+    def _decoded(self, data: bytes, size: tuple[int, int]) -> Image:
         width, height = jpeg_size(data)
         if (width, height) != size:
             raise StillError(f"JPEG of {width}x{height} in place of {size[0]}x{size[1]}")

@@ -1,24 +1,24 @@
-"""Every still codec by its name on the wire: those of this package, and those that others install.
+"""Every still codec by its name on the wire: HVT's own, and those that other packages install.
 
-A third party's codec is an entry point of the group ``hvt.still_codecs``: its name is the codec's word on the wire,
-its object satisfies `contract.StillCodec`, or is called without arguments to give one. Nothing is imported before it
-is asked for by name, so that a broken plug-in hinders nobody who does not use it.
+A third party's codec is an entry point of the group ``hvt.still_codecs``: its name is the codec's name on the wire,
+its object satisfies `contract.StillCodec`, or is called without arguments to give one. A third party's package is
+imported when its codec is requested by name, so that a broken plug-in matters only where it is used.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
+from typing import Any
 
 from hvt_common.errors import UserError
 from hvt_common.video.still_codecs.contract import StillCodec
 
-__all__ = ["GROUP", "still_codec", "still_codec_names"]
+__all__ = ["GROUP", "installed_codecs", "still_codec", "still_codec_names"]
 
 GROUP = "hvt.still_codecs"
 """The entry points' group."""
@@ -27,77 +27,66 @@ _NAME = re.compile(r"[a-z0-9-]{1,24}")
 _MEDIA_TYPE = re.compile(r"[a-z]+/[a-z0-9.+-]{1,60}")
 
 
-@dataclass(frozen=True, slots=True)
-class _BuiltIn:
-    module: str
-    attribute: str
-    lacking: Callable[[], str | None] = lambda: None
-    """Why it cannot work on this machine, or None."""
-
-
-def _opencv(ending: str) -> Callable[[], str | None]:
-    def lacking() -> str | None:
-        from hvt_common.video.still_codecs import cv_still  # noqa: PLC0415 - only when asked
-
-        return cv_still.lacking(ending)
-
-    return lacking
-
-
-def _jxl() -> str | None:
-    from hvt_common.video.still_codecs.jxl import jxl_lacking  # noqa: PLC0415 - only when asked
-
-    return jxl_lacking()
-
-
-_BUILT_IN: Mapping[str, _BuiltIn] = MappingProxyType(
+_PACKAGE = "hvt_common.video.still_codecs"
+_BUILT_IN: Mapping[str, str] = MappingProxyType(
     {
-        "jpeg": _BuiltIn("jpeg", "JpegCodec"),
-        "jpeg-lite": _BuiltIn("jpeg_lite", "JpegLiteCodec"),
-        "webp": _BuiltIn("webp", "WebpCodec", _opencv(".webp")),
-        "avif": _BuiltIn("avif", "AvifCodec", _opencv(".avif")),
-        "avif-lite": _BuiltIn("avif", "AvifLiteCodec", _opencv(".avif")),
-        "jxl": _BuiltIn("jxl", "JxlCodec", _jxl),
-        "h264-intra": _BuiltIn("h264_intra", "H264IntraCodec"),
-        "hevc-intra": _BuiltIn("hevc_intra", "HevcIntraCodec"),
-        "residual": _BuiltIn("residual", "ResidualCodec"),
+        "jpeg": f"{_PACKAGE}.jpeg:JpegCodec",
+        "h264-intra": f"{_PACKAGE}.h264_intra:H264IntraCodec",
+        "residual": f"{_PACKAGE}.residual:ResidualCodec",
     }
 )
+_PLUGINS: Mapping[str, str] = MappingProxyType(
+    {
+        "webp": f"{_PACKAGE}.plugins.webp:WebpCodec",
+        "avif": f"{_PACKAGE}.plugins.avif:AvifCodec",
+        "jxl": f"{_PACKAGE}.plugins.jxl:JxlCodec",
+    }
+)
+"""These need a library that may be missing; ``lacking`` of the class says which."""
+_REMOVED = ("jpeg-lite", "avif-lite", "hevc-intra")
+"""Codecs of earlier versions; h264-intra takes their place."""
 
 
 def still_codec_names() -> tuple[str, ...]:
-    """What `still_codec` takes on this machine: the built-in ones, then the plug-ins by name. Loads none."""
-    own = [name for name, built_in in _BUILT_IN.items() if built_in.lacking() is None]
-    return (*own, *sorted(_plug_ins().keys() - _BUILT_IN.keys()))
+    """What `still_codec` takes on this machine: HVT's own first, then the plug-ins of others by name, none loaded."""
+    own = [*_BUILT_IN, *(name for name, target in _PLUGINS.items() if _loaded(target).lacking() is None)]
+    return (*own, *sorted(installed_codecs().keys() - _BUILT_IN.keys() - _PLUGINS.keys()))
 
 
 @cache
 def still_codec(name: str) -> StillCodec:
     """The codec of that name; `UserError` where there is none, or where it does not work here."""
-    found = _plug_ins().get(name, ())
-    built_in = _BUILT_IN.get(name)
-    if found and built_in is not None:
+    found = installed_codecs().get(name, ())
+    target = _BUILT_IN.get(name) or _PLUGINS.get(name)
+    if found and target is not None:
         raise UserError(
             f"still codec {name!r} is built in, and {_origin(found[0])} brings another of that name: "
             "remove that package"
         )
-    if built_in is not None:
-        return _own(name, built_in)
+    if target is not None:
+        return _own(name, target)
     if len(found) > 1:
         raise UserError(
             f"still codec {name!r} comes from both {_origin(found[0])} and {_origin(found[1])}: remove one of them"
         )
+    if not found and name in _REMOVED:
+        raise UserError(f"still codec {name!r} is no longer part of HVT: use h264-intra")
     if not found:
         raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(still_codec_names())}")
     return _foreign(name, found[0])
 
 
-def _own(name: str, built_in: _BuiltIn) -> StillCodec:
-    lacking = built_in.lacking()
+def _loaded(target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def _own(name: str, target: str) -> StillCodec:
+    codec_class = _loaded(target)
+    lacking = codec_class.lacking() if name in _PLUGINS else None
     if lacking is not None:
         raise UserError(f"still codec {name!r} is not available: {lacking}")
-    module = import_module(f"hvt_common.video.still_codecs.{built_in.module}")
-    codec: StillCodec = getattr(module, built_in.attribute)()
+    codec: StillCodec = codec_class()
     return codec
 
 
@@ -130,8 +119,9 @@ def _faults(name: str, codec: object) -> str | None:
     return f"it has no {' and no '.join(missing)}" if missing else None
 
 
-@cache  # unknown names come from the network too, and a look at all packages takes tens of milliseconds
-def _plug_ins() -> dict[str, tuple[EntryPoint, ...]]:
+@cache  # unknown names come from the network too, and a search of all packages takes tens of milliseconds
+def installed_codecs() -> dict[str, tuple[EntryPoint, ...]]:
+    """The entry points of third parties by name; more than one where two packages bring the same name."""
     # One installed package can be found twice, by two paths of sys.path: same value, same codec.
     found: dict[str, dict[str, EntryPoint]] = {}
     for entry in entry_points(group=GROUP):

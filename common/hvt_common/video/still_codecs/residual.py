@@ -13,13 +13,18 @@ slice data is parsed without them. Another picture is found out by its checksum 
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from hvt_common.values import Image
 from hvt_common.video.still_codecs.av_still import decoded, encoded
-from hvt_common.video.still_codecs.contract import NO_PARAMETERS, BaseMissingError, CodedCrop, Parameters
+from hvt_common.video.still_codecs.contract import (
+    NO_PARAMETERS,
+    BaseMissingError,
+    CodedCrop,
+    Parameters,
+    qp_of,
+)
 from hvt_common.video.still_codecs.h264_intra import split_payload, x264_options
 from hvt_common.video.still_codecs.h264_syntax import (
     cabac_data,
@@ -27,7 +32,6 @@ from hvt_common.video.still_codecs.h264_syntax import (
     parameter_sets,
     verbatim_picture,
 )
-from hvt_common.video.still_codecs.ladder import qp_of
 from hvt_common.video.still_codecs.yuv420 import difference_bgr, filled_outside, padded_size, to_planar
 
 __all__ = ["CHECKSUM", "ResidualCodec"]
@@ -39,13 +43,12 @@ _REFERENCE_QP = 4
 """The base crop in x264: within 0.3 levels of the base itself."""
 
 
-@dataclass(frozen=True, slots=True)
 class ResidualCodec:
     """The payload is one byte with the QP, then the slice's CABAC data."""
 
-    name: str = field(default="residual", init=False)
-    media_type: str = field(default="application/vnd.hvt.residual", init=False)
-    needs_base: bool = field(default=True, init=False)
+    name = "residual"
+    media_type = "application/vnd.hvt.residual"
+    needs_base = True
 
     def encode(self, crop_bgr: Image, *, quality_pct: int, base_bgr: Image | None = None) -> CodedCrop:
         """Code what ``base_bgr``, of the crop's shape, lacks of the crop."""

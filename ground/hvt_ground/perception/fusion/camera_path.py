@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.tracking.camera_motion import Affine
+from hvt_common.camera_motion import Affine
 
 __all__ = ["CameraPath"]
 

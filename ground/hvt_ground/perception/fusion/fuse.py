@@ -38,9 +38,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.boxes import iou
 from hvt_common.tracking.association import assign
-from hvt_common.values import Detections, Tracks
+from hvt_common.values import Detections, Tracks, iou
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, Witness
 from hvt_ground.perception.fusion.object_list import FusedTracks, FusionRules, far_boxes, list_entities

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.boxes import iou
-from hvt_common.values import Tracks
+from hvt_common.values import Tracks, iou
 from hvt_ground.events import Origin
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.entity import Entity, Witness

@@ -9,10 +9,9 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.boxes import iou
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, OnnxDetector
-from hvt_common.values import Boxes, Detections, Image, Posterior, View
+from hvt_common.values import Boxes, Detections, Image, Posterior, View, iou
 from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import Box, DecodedStill
 

@@ -23,8 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from hvt_common.boxes import iou
-from hvt_common.values import Boxes, Tracks
+from hvt_common.values import Boxes, Tracks, iou
 
 __all__ = ["Matcher", "StillToMatch", "TrackMatch"]
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from hvt_common.errors import UserError
-from hvt_common.inference.runtimes.model import MAX_MODEL_BYTES, ModelSettings, open_model
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
+from hvt_common.inference.runtimes.onnx_file import MAX_MODEL_BYTES
 from onnx_models import colour_detector, constant_model
 
 

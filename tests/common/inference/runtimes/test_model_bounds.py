@@ -13,7 +13,6 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from hvt_common.errors import UserError
-from hvt_common.inference.runtimes.external_weights import external_weights
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from onnx_models import constant_model
 
@@ -152,8 +151,6 @@ def test_messages_nested_without_end_are_refused(tmp_path):
         body = field + _varint(len(body)) + body
     path = tmp_path / "deep.onnx"
     path.write_bytes(b"\x08\x08\x3a" + _varint(len(body)) + body)
-    with pytest.raises(ValueError, match="deep"):
-        external_weights(path)
     assert "deep" in sentence(path)
 
 

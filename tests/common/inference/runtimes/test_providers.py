@@ -15,11 +15,11 @@ from onnx import helper
 
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.cli import main
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from hvt_common.inference.runtimes.openvino_model import find_openvino
+from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import PROVIDERS, OpenVinoCpu, choose_provider
-from hvt_common.inference.store.cli import main
 from hvt_common.values import Detections
 from hvt_edge.config import EdgeConfig
 from hvt_edge.wiring import make_detector
@@ -65,7 +65,7 @@ def test_auto_takes_the_fastest_that_is_here_and_says_why(
     """Half the speed of a machine would lie idle, or nobody could tell what computes."""
     choice = choose_provider("auto", onnxruntime=onnxruntime, openvino=openvino)
     assert choice.provider == provider
-    assert not choice.asked
+    assert not choice.explicit
     assert re.search(why, choice.why), choice.why
 
 
@@ -190,7 +190,10 @@ def test_a_classifier_takes_every_batch_with_openvino(tmp_path: Path, dtype: typ
     for count in (1, 5, 40):
         for one, other in zip(ours.classify(crops[:count]), theirs.classify(crops[:count]), strict=True):
             np.testing.assert_allclose(other.probabilities, one.probabilities, atol=0.02)
-    assert len(theirs.model._runner._requests) == 1
+    runner = OpenVinoRunner(path, threads=1, bf16=False)
+    for count in (1, 5, 40):
+        runner.run(np.zeros((count, *theirs.model.inputs[0].shape[1:]), dtype))
+    assert len(runner.compiled_shapes) == 1
 
 
 @needs_openvino

@@ -20,13 +20,12 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.cli import main
 from hvt_common.inference.detect import OnnxDetector, open_detector
+from hvt_common.inference.inspect import inspect_model
 from hvt_common.inference.runtimes.model import open_model
-from hvt_common.inference.store import resolve_model
-from hvt_common.inference.store.cli import main
-from hvt_common.inference.store.inspect import inspect_model
+from hvt_common.inference.store import embedded_models, resolve_model
 from hvt_common.inference.store.manifest import builtin_manifest, parse_manifest
-from hvt_common.inference.store.resolve import embedded_models
 from hvt_common.inference.store.store import Store, cache_folder
 from onnx_models import colour_classifier, colour_detector, constant_model
 
@@ -318,7 +317,7 @@ def test_a_folder_that_cannot_be_written_is_one_sentence(
 def test_a_full_disk_is_one_sentence_and_keeps_what_came(origin: Origin, folder: Path) -> None:
     """A fetch that fills the disk would leave a file that looks whole."""
     store = known(folder, origin.url)
-    command = f"ulimit -f 200; exec {sys.executable} -m hvt_common.inference.store.cli fetch made"
+    command = f"ulimit -f 200; exec {sys.executable} -m hvt_common.inference.cli fetch made"
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "made-" in done.stderr
@@ -335,7 +334,7 @@ def test_two_processes_fetch_one_model_once(origin: Origin, folder: Path) -> Non
     origin.plan = ["hold"]
 
     def start() -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "hvt_common.inference.store.cli", "fetch", "made"]
+        command = [sys.executable, "-m", "hvt_common.inference.cli", "fetch", "made"]
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     first = start()

@@ -49,12 +49,12 @@ from hvt_common.protocol.messages.fields import (
     U32,
     U64,
     Blob,
-    Choice,
     Flag,
     Int,
     Kind,
     ListOf,
     MapOf,
+    OneOf,
     Real,
     Scalar,
     Scaled,
@@ -93,7 +93,7 @@ def value_of(kind: Kind) -> SearchStrategy:  # noqa: C901, PLR0911, PLR0912 - on
             return st.binary(max_size=min(max_bytes, 300))
         case Text(max_bytes):
             return st.text(st.characters(codec="utf-8").filter(str.isprintable), max_size=max_bytes // 4)
-        case Choice(words):
+        case OneOf(words):
             return st.sampled_from(words)
         case Scalar(max_bytes):
             return st.integers(-I63, I63) | st.floats(-1e300, 1e300) | value_of(Text(max_bytes))

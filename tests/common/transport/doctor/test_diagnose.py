@@ -18,7 +18,7 @@ import zenoh
 from fleet_keys import EXPIRED, Fleet
 from hvt_common.errors import UserError
 from hvt_common.transport.doctor.certificate import KeyPair, TlsFiles
-from hvt_common.transport.doctor.diagnose import LinkWatch, why_unlinked
+from hvt_common.transport.doctor.diagnose import LinkWatch, visit
 from hvt_common.transport.doctor.probe import why_no_link
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.session import open_session
@@ -127,7 +127,7 @@ def test_keys_that_vanish_during_a_flight_are_a_sentence(fleet: Fleet, tmp_path:
     with _server(b"") as port:
         settings = other.settings("uav-1", "edge", connect=(f"tls/127.0.0.1:{port}",))
         (other.folder / "uav-1.key").unlink()
-        assert why_unlinked(settings) == [
+        assert visit(configure(settings)[0]) == [
             "the keys of this machine can no longer be read (No such file or directory)"
         ]
 
@@ -135,7 +135,7 @@ def test_keys_that_vanish_during_a_flight_are_a_sentence(fleet: Fleet, tmp_path:
 def test_two_links_to_one_place_are_explained_once(free_port: int) -> None:
     """The two endpoints by priority would say the same sentence twice."""
     endpoints = tuple(f"tcp/127.0.0.1:{free_port}?prio={prio}#so_sndbuf=8192" for prio in ("1-3", "4-7"))
-    (said,) = why_unlinked(LinkSettings("edge", connect=endpoints))
+    (said,) = visit(configure(LinkSettings("edge", connect=endpoints))[0])
     assert said.startswith(f"tcp/127.0.0.1:{free_port}: nobody")
 
 
@@ -145,7 +145,7 @@ def test_two_links_to_one_place_are_explained_once(free_port: int) -> None:
 def test_the_watch_explains_once_and_is_quiet_when_the_link_comes(
     free_port: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A line a second in the journal of a drone that waits for its ground hides everything else."""
+    """A line a second in the log of a drone that waits for its ground hides everything else."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     settings = LinkSettings("edge", connect=(endpoint,), name="uav-1")
     with open_session(settings) as session, LinkWatch(session, settings, served=lambda _: True) as watch:
@@ -212,27 +212,22 @@ def _watching() -> bool:
     return any(one.name == "hvt-link-watch" for one in threading.enumerate())
 
 
-def test_the_watch_ends_with_its_session_and_holds_nobody_up(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_watch_ends_with_its_session_and_holds_nobody_up(fleet: Fleet) -> None:
     """Ctrl-C during a visit to a dead address has to end the program at once."""
     _until(lambda: not _watching())
-    visiting = threading.Event()
+    visiting, gone = threading.Event(), threading.Event()
 
-    def noted(endpoint: str, files: TlsFiles) -> str:
+    def dead(_config: zenoh.Config) -> list[str]:
         visiting.set()
-        return why_no_link(endpoint, files)
+        gone.wait(60)
+        return []
 
-    monkeypatch.setattr("hvt_common.transport.doctor.diagnose.why_no_link", noted)
-    monkeypatch.setattr(
-        "hvt_common.transport.doctor.probe._STEP_S", 60.0
-    )  # the visit lasts until the server goes
-    with _server(None) as port:
-        settings = fleet.settings("uav-1", "edge", connect=(f"tls/127.0.0.1:{port}",))
-        with open_session(settings) as session:
-            with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2):
-                assert visiting.wait(25)
-            assert _watching(), "nobody has waited for the visit"
+    settings = fleet.settings("uav-1", "edge", connect=("tls/127.0.0.1:9",))
+    with open_session(settings) as session:
+        with LinkWatch(session, settings, served=lambda _: True, patience_s=0.2, examine=dead):
+            assert visiting.wait(25)
+        assert _watching(), "nobody has waited for the visit"
+    gone.set()
     _until(lambda: not _watching())
 
 
@@ -379,7 +374,7 @@ def test_keys_that_are_not_used_are_not_looked_at(fleet: Fleet, free_port: int) 
 def test_a_certificate_reads_the_same_from_both_ends(fleet: Fleet) -> None:
     """Its name is what access control goes by: read wrongly, a good edge would be refused."""
     pair = KeyPair(fleet.folder / "base.pem", fleet.folder / "base.key")
-    here, there = pair.read(listens=True), pair.read(listens=False)
+    here, there = pair.read(as_server=True), pair.read(as_server=False)
     assert here == there
     assert (here.name, here.hosts) == ("base", ("base", "127.0.0.1"))
     assert here.not_after_s - here.not_before_s == pytest.approx(825 * 86_400 + 3600, abs=2)

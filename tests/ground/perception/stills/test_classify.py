@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hvt_common.boxes import iou
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
-from hvt_common.values import Detections, Image, View
+from hvt_common.values import Detections, Image, View, iou
 from hvt_ground.perception.stills.classify import (
     CropReader,
     DecodedStill,

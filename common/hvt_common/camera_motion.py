@@ -1,0 +1,149 @@
+"""How the camera moved between two frames, from the image alone."""
+
+from __future__ import annotations
+
+from typing import Final, Literal, cast
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Image
+
+__all__ = ["Affine", "CameraMotion", "Method"]
+
+Affine = npt.NDArray[np.float64]
+"""(2, 3) float64: ``current = affine[:, :2] @ previous + affine[:, 2]``, both in pixels of the full image."""
+
+Method = Literal["flow", "ecc"]
+"""``flow`` follows corners (fast, large motion, similarity); ``ecc`` aligns all pixels (slower, general affine)."""
+
+_Gray = npt.NDArray[np.uint8]
+_Points = npt.NDArray[np.float32]
+
+_WORKING_SIDE_PX: Final = 320
+_MAX_CORNERS: Final = 250
+_CORNER_QUALITY: Final = 0.01
+_CORNER_DISTANCE_PX: Final = 7
+_FLOW_WINDOW_PX: Final = 15
+_FLOW_LEVELS: Final = 3
+_RANSAC_PX: Final = 1.0
+# Fewer corners that agree than this, or a smaller share of them, is chance: objects, noise, an empty sky.
+_LEAST_INLIERS: Final = 12
+_LEAST_INLIER_SHARE: Final = 0.3
+_ECC_STEPS: Final = 50
+_ECC_PRECISION: Final = 1e-4
+_ECC_BLUR_PX: Final = 5
+# No camera zooms or rolls this far between two frames: such an estimate is wrong.
+_SCALE_RANGE: Final = (0.5, 2.0)
+
+
+class CameraMotion:
+    """Estimates the camera's motion from frame to frame on a downscaled gray image.
+
+    ``scale`` in 0…1 is the size of that image relative to the frame: smaller is faster and less precise. None brings
+    the longer side to 320 pixels, which a tracker needs no more than: 0.1 of them is the median error.
+    """
+
+    def __init__(self, method: Method = "flow", *, scale: float | None = 0.5) -> None:
+        if method not in ("flow", "ecc"):
+            raise ValueError(f"camera motion method is {method!r}, must be 'flow' or 'ecc'")
+        if scale is not None and not 0 < scale <= 1:
+            raise ValueError(f"camera motion scale is {scale}, must be above 0 and at most 1")
+        self._estimate = _by_flow if method == "flow" else _by_ecc
+        self._scale = scale
+        self._previous: _Gray | None = None
+
+    def step(self, image_bgr: Image) -> Affine:
+        """The map from the image of the last call to this one, (2, 3) float64 in pixels of the full image.
+
+        The identity at the first call, after a change of size, and where no motion can be estimated.
+        """
+        full_size = (image_bgr.shape[1], image_bgr.shape[0])
+        scale = min(1.0, _WORKING_SIDE_PX / max(full_size)) if self._scale is None else self._scale
+        small_size = (max(1, round(full_size[0] * scale)), max(1, round(full_size[1] * scale)))
+        small = cv2.resize(image_bgr, small_size, interpolation=cv2.INTER_AREA)
+        current = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
+        previous, self._previous = self._previous, current
+        if previous is None or previous.shape != current.shape:
+            return _identity()
+        estimate = self._estimate(previous, current)
+        if estimate is None or not _plausible(estimate):
+            return _identity()
+        return _at_full_size(estimate, full_size=full_size, small_size=small_size)
+
+    def reset(self) -> None:
+        """Forget the last image: the next call gives the identity."""
+        self._previous = None
+
+
+def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
+    """Corners of the previous image, followed by pyramidal Lucas-Kanade, and the similarity most agree on."""
+    # OpenCV's own types do not say that there may be no corner at all.
+    corners = cast(
+        "_Points | None",
+        cv2.goodFeaturesToTrack(previous, _MAX_CORNERS, _CORNER_QUALITY, _CORNER_DISTANCE_PX),
+    )
+    if corners is None or len(corners) < _LEAST_INLIERS:
+        return None
+    window = (_FLOW_WINDOW_PX, _FLOW_WINDOW_PX)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        previous, current, corners, np.empty_like(corners), winSize=window, maxLevel=_FLOW_LEVELS
+    )
+    tracked = found.ravel() == 1
+    if np.count_nonzero(tracked) < _LEAST_INLIERS:
+        return None
+    affine, inliers = cast(
+        "tuple[Affine | None, _Gray]",
+        cv2.estimateAffinePartial2D(
+            corners[tracked], moved[tracked], method=cv2.RANSAC, ransacReprojThreshold=_RANSAC_PX
+        ),
+    )
+    if affine is None:
+        return None
+    agreeing = np.count_nonzero(inliers)
+    if agreeing < max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * np.count_nonzero(tracked)):
+        return None
+    return np.asarray(affine, np.float64)
+
+
+def _by_ecc(previous: _Gray, current: _Gray) -> Affine | None:
+    """The affine map that maximises the enhanced correlation coefficient (Evangelidis and Psarakis, 2008).
+
+    ECC only finds optima nearby, so it starts from the translation found by phase correlation.
+    """
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ECC_STEPS, _ECC_PRECISION)
+    everywhere = np.full_like(previous, 255)
+    try:
+        window = cv2.createHanningWindow((previous.shape[1], previous.shape[0]), cv2.CV_32F)
+        shift, _ = cv2.phaseCorrelate(previous.astype(np.float32), current.astype(np.float32), window)
+        start = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+        _, affine = cv2.findTransformECC(
+            previous, current, start, cv2.MOTION_AFFINE, stop, everywhere, _ECC_BLUR_PX
+        )
+    except cv2.error:  # did not converge: no texture, no overlap left, or hardly any pixels
+        return None
+    return np.asarray(affine, np.float64)
+
+
+def _plausible(affine: Affine) -> bool:
+    if not np.isfinite(affine).all():
+        return False
+    stretch = np.linalg.svd(affine[:, :2], compute_uv=False)
+    mirrored = np.linalg.det(affine[:, :2]) <= 0
+    return bool(not mirrored and stretch[-1] >= _SCALE_RANGE[0] and stretch[0] <= _SCALE_RANGE[1])
+
+
+def _at_full_size(affine: Affine, *, full_size: tuple[int, int], small_size: tuple[int, int]) -> Affine:
+    """The same motion between full images, whose pixel centres map as ``small = full * k + (k - 1) / 2``."""
+    ratio = np.array(small_size, np.float64) / np.array(full_size, np.float64)
+    to_small = np.eye(3)
+    to_small[:2, :2] = np.diag(ratio)
+    to_small[:2, 2] = (ratio - 1) / 2
+    small = np.vstack((affine, [0.0, 0.0, 1.0]))
+    full = np.linalg.inv(to_small) @ small @ to_small
+    return np.asarray(full[:2], np.float64)
+
+
+def _identity() -> Affine:
+    return np.eye(2, 3)

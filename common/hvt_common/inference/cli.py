@@ -1,0 +1,197 @@
+"""``hvt-models``: which models there are, and getting them onto this machine."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.inference.store import embedded_models, resolve_model
+from hvt_common.inference.store.manifest import ModelEntry
+from hvt_common.inference.store.store import Store, file_digest
+
+__all__ = ["main"]
+
+_PROGRAM = "hvt-models"
+_INTERRUPTED = 130
+_SHOWN_CLASSES = 12
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the arguments in one sentence, without the usage above it."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; see {self.prog} --help")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``hvt-models``; 0, or 2 after one sentence on stderr where the user can mend something."""
+    try:
+        return exit_with_sentence(_run, program=_PROGRAM, argv=argv)
+    except KeyboardInterrupt:
+        print(f"{_PROGRAM}: stopped; the same command goes on from there", file=sys.stderr)
+        return _INTERRUPTED
+
+
+def _run(argv: Sequence[str] | None) -> int:
+    arguments = _parser().parse_args(argv)
+    code: int = arguments.run(arguments)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog=_PROGRAM,
+        description="Models for --detector and --classifier: fetched once, checked at each use. "
+        "They lie in the folder that HVT_MODELS names, else in the platform's cache folder.",
+    )
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    one = commands.add_parser("list", help="every model that has a name, and what is here of it")
+    one.set_defaults(run=_list)
+
+    one = commands.add_parser("fetch", help="download models; goes on where a download broke off")
+    one.add_argument("names", nargs="+", metavar="NAME")
+    one.set_defaults(run=_fetch)
+
+    one = commands.add_parser(
+        "verify", help="check size and SHA-256 of models, by default of all that are here"
+    )
+    one.add_argument("names", nargs="*", metavar="NAME")
+    one.set_defaults(run=_verify)
+
+    one = commands.add_parser("path", help="check a model and print where it lies")
+    one.add_argument("name", metavar="NAME")
+    one.set_defaults(run=_path)
+
+    one = commands.add_parser("add", help="take in a file that was brought by hand")
+    one.add_argument("file", type=Path, metavar="FILE")
+    one.add_argument(
+        "--name", required=True, help="a name of 'hvt-models list', or a new one: a-z, 0-9 and -"
+    )
+    one.add_argument("--sha256", help="what its origin says; needed for a new name, which it pins")
+    one.set_defaults(run=_add)
+
+    one = commands.add_parser("info", help="ports, adapter, classes and speed of a model")
+    one.add_argument("file", metavar="FILE", help="an ONNX file or the name of a model")
+    one.add_argument("--provider", default="cpu", help="what runs it: auto, cpu, openvino … [cpu]")
+    one.add_argument("--threads", type=int, choices=range(1, 65), default=2, metavar="N", help="threads [2]")
+    one.set_defaults(run=_info)
+    return parser
+
+
+def _list(_: argparse.Namespace) -> int:
+    store = Store()
+    table = Table(title=f"models in {store.folder}", title_justify="left", title_style="bold")
+    for column in ("name", "task", "MB", "licence", "here", "about"):
+        table.add_column(column, justify="right" if column == "MB" else "left", no_wrap=column == "name")
+    for name, path in embedded_models().items():
+        table.add_row(name, "", f"{path.stat().st_size / 1e6:.1f}", "Apache-2.0", "yes", "part of HVT")
+    for name, entry in store.entries.items():
+        held = store.held_bytes(name)
+        here = "yes" if store.is_there(name) else f"{100 * held // entry.size_bytes} %" if held else "no"
+        table.add_row(
+            name,
+            entry.task,
+            f"{entry.size_bytes / 1e6:.1f}",
+            entry.licence,
+            here,
+            entry.about or "added by hand",
+        )
+    Console(highlight=False).print(table)
+    return 0
+
+
+def _fetch(arguments: argparse.Namespace) -> int:
+    store = Store()
+    entries = [
+        store.entry(name) for name in arguments.names
+    ]  # a wrong name is said before anything is fetched
+    console = Console(stderr=True, highlight=False)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    for entry in entries:
+        with Progress(*columns, console=console) as bar:
+            print(_with_progress(store, entry, bar))
+    return 0
+
+
+def _with_progress(store: Store, entry: ModelEntry, bar: Progress) -> Path:
+    task = bar.add_task(entry.name, total=entry.size_bytes)
+
+    def say_waits() -> None:
+        bar.console.print(f"another process fetches {entry.name}; waiting for it")
+
+    path = store.fetch(entry.name, progress=lambda held: bar.update(task, completed=held), on_wait=say_waits)
+    bar.update(task, completed=entry.size_bytes)
+    return path
+
+
+def _verify(arguments: argparse.Namespace) -> int:
+    store = Store()
+    names = arguments.names or [name for name in store.entries if store.is_there(name)]
+    if not names:
+        print(f"no models in {store.folder}")
+    wrong = 0
+    for name in names:
+        try:
+            store.verified(name)
+            print(f"{name}: size and SHA-256 are right")
+        except UserError as error:
+            print(f"{_PROGRAM}: {error}", file=sys.stderr)
+            wrong += 1
+    return 2 if wrong else 0
+
+
+def _path(arguments: argparse.Namespace) -> int:
+    print(resolve_model(arguments.name).absolute())
+    return 0
+
+
+def _add(arguments: argparse.Namespace) -> int:
+    print(Store().add(arguments.file, name=arguments.name, sha256=arguments.sha256))
+    return 0
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from hvt_common.inference.inspect import inspect_model  # noqa: PLC0415  (the other commands open no model)
+
+    report = inspect_model(
+        resolve_model(arguments.file), provider=arguments.provider, threads=arguments.threads
+    )
+    names = report.class_names
+    shown = ", ".join(names[:_SHOWN_CLASSES]) + (" …" if len(names) > _SHOWN_CLASSES else "")
+    rows = [
+        ("file", str(report.path)),
+        ("size", f"{report.size_bytes} bytes"),
+        ("SHA-256", file_digest(report.path)),
+        ("opset", ", ".join(f"{domain or 'ai.onnx'} {version}" for domain, version in report.opsets.items())),
+        *(("input", str(port)) for port in report.inputs),
+        *(("output", str(port)) for port in report.outputs),
+        *((f"metadata {key}", value[:80]) for key, value in report.metadata.items()),
+        ("adapter", report.adapter),
+        ("because", report.because),
+        ("classes", f"{len(names)}: {shown}" if names else "none"),
+        ("provider", report.provider),
+    ]
+    if report.median_ms is not None:
+        rows.append(
+            ("time here", f"{report.median_ms:.1f} ms for {report.timing} ({arguments.threads} threads)")
+        )
+    table = Table(show_header=False, box=None)
+    table.add_column(style="cyan", no_wrap=True)
+    table.add_column(overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    Console(highlight=False, markup=False).print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,131 @@
+"""What a model file is: its ports, the adapter that fits it, its classes, and its speed on this machine."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.inference.classify import OnnxClassifier
+from hvt_common.inference.detect import OnnxDetector
+from hvt_common.inference.detect_heads import EndToEndHead, UltralyticsHead, YoloxHead
+from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, Port, open_model
+from hvt_common.inference.runtimes.onnx_file import opset_versions
+
+__all__ = ["ModelReport", "inspect_model"]
+
+_HEADS: Mapping[type, str] = {YoloxHead: "YOLOX", UltralyticsHead: "Ultralytics", EndToEndHead: "end-to-end"}
+_ROUNDS = 9
+_TIME_LIMIT_S = 3.0
+_FREE_SIZE = (640, 384)
+"""(width, height) at which a detector of any size is timed."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelReport:
+    """What `inspect_model` found."""
+
+    path: Path
+    size_bytes: int
+    opsets: dict[str, int]
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    metadata: dict[str, str]
+    adapter: str
+    """detector, classifier or none."""
+    because: str
+    """The head and the preparation of pixels, or why no adapter fits."""
+    class_names: tuple[str, ...]
+    provider: str
+    timing: str
+    """What was timed; empty where nothing was."""
+    median_ms: float | None
+
+
+def inspect_model(path: Path, *, provider: str = "cpu", threads: int = 2) -> ModelReport:
+    """Open a model, try it as a detector and as a classifier, and time it.
+
+    Raises:
+        UserError: Not an ONNX model, or not one that this provider opens.
+    """
+    model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
+    adapter, because, class_names, once, timing = _fitted(model)
+    return ModelReport(
+        path=path,
+        size_bytes=path.stat().st_size,
+        opsets=opset_versions(path),
+        inputs=model.inputs,
+        outputs=model.outputs,
+        metadata=model.metadata,
+        adapter=adapter,
+        because=because,
+        class_names=class_names,
+        provider=f"{model.provider.provider} ({model.provider.why})",
+        timing=timing,
+        median_ms=None if once is None else _median_ms(once),
+    )
+
+
+def _fitted(model: OnnxModel) -> tuple[str, str, tuple[str, ...], Callable[[], object] | None, str]:
+    noise = np.random.default_rng(0).integers(0, 256, (_FREE_SIZE[1], _FREE_SIZE[0], 3), dtype=np.uint8)
+    refusals = []
+    try:
+        detector = OnnxDetector(model)
+        width, height = detector.input_size(_FREE_SIZE)
+        return (
+            "detector",
+            _detector_text(detector),
+            detector.class_names,
+            lambda: detector.detect(noise),
+            f"one {_FREE_SIZE[0]}x{_FREE_SIZE[1]} image at a network input of {width}x{height}",
+        )
+    except UserError as error:
+        refusals.append(_short(error))
+    try:
+        classifier = OnnxClassifier(model)
+        return (
+            "classifier",
+            _classifier_text(classifier),
+            classifier.class_names,
+            lambda: classifier.classify([noise[:200, :200]]),
+            "one crop",
+        )
+    except UserError as error:
+        refusals.append(_short(error))
+    return "none", "; ".join(refusals), (), None, ""
+
+
+def _detector_text(detector: OnnxDetector) -> str:
+    head = detector.head
+    order = "RGB" if head.rgb else "BGR"
+    pixels = "0…1" if head.gain < 1 else "0…255"
+    return f"{_HEADS[type(head)]} head; {order} {pixels}, letterbox {head.anchor}, filled with 114"
+
+
+def _classifier_text(classifier: OnnxClassifier) -> str:
+    preparation = classifier.preparation
+    mean, divisor = (
+        " ".join(f"{value:.6g}" for value in values)
+        for values in (preparation.mean, tuple(1 / scale for scale in preparation.scale))
+    )
+    return f"one row of scores a crop; {'RGB' if preparation.rgb else 'BGR'}, (pixel - {mean}) / {divisor}, stretched"
+
+
+def _short(error: UserError) -> str:
+    """Without the ports and the accepted forms in brackets: the report shows the ports itself."""
+    return str(error).partition(": ")[2].partition(" (")[0] or str(error)
+
+
+def _median_ms(once: Callable[[], object]) -> float:
+    once()
+    times: list[float] = []
+    while len(times) < _ROUNDS and sum(times) < _TIME_LIMIT_S:
+        start = time.perf_counter()
+        once()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times) * 1e3

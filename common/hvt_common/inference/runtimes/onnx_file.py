@@ -1,0 +1,174 @@
+"""Checks an ONNX file by walking its protobuf without any library, before a runtime parses it.
+
+A model file comes from outside. It must be a file, not too large, walk as an ONNX protobuf with a graph, and hold all
+its weights: external weights make a runtime open files by the names that stand in the model (ONNX Runtime does so
+even for a model given as bytes, relative to the working folder).
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from hvt_common.errors import UserError
+
+__all__ = ["MAX_MODEL_BYTES", "check_onnx_file", "opset_versions"]
+
+MAX_MODEL_BYTES = 1 << 30
+"""1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
+
+_DEEPEST = 100
+"""Messages in messages; protobuf itself stops here."""
+_EXTERNAL = 1
+"""`TensorProto.DataLocation`."""
+
+# Field numbers of ModelProto in onnx.proto.
+_MODEL_FIELDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 14, 20, 25, 26})
+_GRAPH_FIELD = 7
+_OPSET_FIELD = 8
+# Fields of onnx.proto that lead to tensors: message → field number → message.
+_INSIDE: Mapping[str, Mapping[int, str]] = MappingProxyType(
+    {
+        "Model": {7: "Graph", 20: "Training", 25: "Function"},
+        "Training": {1: "Graph", 2: "Graph"},
+        "Function": {7: "Node", 11: "Attribute"},
+        "Graph": {1: "Node", 5: "Tensor", 15: "Sparse"},
+        "Node": {5: "Attribute"},
+        "Attribute": {5: "Tensor", 6: "Graph", 10: "Tensor", 11: "Graph", 22: "Sparse", 23: "Sparse"},
+        "Sparse": {1: "Tensor", 2: "Tensor"},
+        "Tensor": {},
+    }
+)
+_TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION = 13, 14
+_FIXED_BYTES = {1: 8, 5: 4}
+
+_Bytes = bytes | mmap.mmap
+
+
+def check_onnx_file(path: Path) -> None:
+    """Raise `UserError` in one sentence for what is certainly no ONNX model, or not a whole one."""
+    if not path.exists():
+        raise UserError(f"model {path} does not exist; an ONNX file is expected")
+    if not path.is_file():
+        raise UserError(f"model {path} is not a file; an ONNX file is expected")
+    try:
+        with path.open("rb") as file:
+            size_bytes = os.fstat(file.fileno()).st_size
+            if size_bytes > MAX_MODEL_BYTES:
+                raise UserError(
+                    f"model {path} has {size_bytes} bytes; at most {MAX_MODEL_BYTES} are accepted"
+                )
+            if not size_bytes:
+                raise UserError(f"model {path} is not an ONNX file (it is empty)")
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                _check(path, data)
+    except OSError as error:
+        raise UserError(f"model {path} cannot be read: {error.strerror}") from error
+
+
+def opset_versions(path: Path) -> dict[str, int]:
+    """The version of each operator set that a checked model imports, by domain; "" is ONNX itself."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        return dict(
+            _opset(data[begin:end])
+            for field, _, _, begin, end in _fields(data, 0, len(data))
+            if field == _OPSET_FIELD
+        )
+
+
+def _check(path: Path, data: mmap.mmap) -> None:
+    try:
+        fields = set(_model_fields(data))
+        location = _external_location(data, 0, len(data), "Model", depth=0)
+    except ValueError as error:
+        raise UserError(f"model {path} is not an ONNX file, or is cut short ({error})") from error
+    if _GRAPH_FIELD not in fields:
+        raise UserError(f"model {path} is not an ONNX file (no graph in it)")
+    if location is not None:
+        raise UserError(
+            f"model {path} cannot be opened: it keeps weights in another file ({location!r:.80}); make it one file: "
+            "external_data=False in torch.onnx.export, or onnx.save(onnx.load(OLD), NEW)"
+        )
+
+
+def _model_fields(data: _Bytes) -> Iterator[int]:
+    for field, wire_type, _, begin, _ in _fields(data, 0, len(data)):
+        if field not in _MODEL_FIELDS or wire_type not in (0, 2):
+            raise ValueError(f"unknown field {field} of type {wire_type} before byte {begin}")
+        yield field
+
+
+def _external_location(data: _Bytes, start: int, end: int, kind: str, *, depth: int) -> str | None:
+    """Where the first tensor with data outside the file says that they are; None where there is none."""
+    if depth > _DEEPEST:
+        raise ValueError(f"messages nested {depth} deep")
+    if kind == "Tensor":
+        return _tensor_location(data, start, end)
+    for field, wire_type, _, begin, stop in _fields(data, start, end):
+        inner = _INSIDE[kind].get(field)
+        if inner is not None and wire_type == 2:
+            location = _external_location(data, begin, stop, inner, depth=depth + 1)
+            if location is not None:
+                return location
+    return None
+
+
+def _tensor_location(data: _Bytes, start: int, end: int) -> str | None:
+    external, location = False, ""
+    for field, wire_type, value, begin, stop in _fields(data, start, end):
+        if field == _TENSOR_DATA_LOCATION and wire_type == 0:
+            external = value == _EXTERNAL
+        elif field == _TENSOR_EXTERNAL_DATA and wire_type == 2:
+            external = True
+            entry = {number: data[a:b] for number, _, _, a, b in _fields(data, begin, stop)}
+            if entry.get(1) == b"location":
+                location = entry.get(2, b"")[:200].decode(errors="replace")
+    return location if external else None
+
+
+def _opset(data: bytes) -> tuple[str, int]:
+    """Decode an OperatorSetIdProto: domain is field 1, version field 2."""
+    domain, version = "", 0
+    for field, _, value, begin, end in _fields(data, 0, len(data)):
+        if field == 1:
+            domain = data[begin:end].decode(errors="replace")
+        elif field == 2:
+            version = value
+    return domain, version
+
+
+def _fields(data: _Bytes, start: int, end: int) -> Iterator[tuple[int, int, int, int, int]]:
+    """Number, wire type, value (of a varint), begin and end of each field of a message; ValueError if malformed."""
+    at = start
+    while at < end:
+        head = data[at : min(end, at + 20)]
+        tag, used = _varint(head, 0)
+        wire_type, value, begin = tag & 7, 0, at + used
+        if wire_type == 0:
+            value, after = _varint(head, used)
+            stop = at + after
+        elif wire_type == 2:
+            length, after = _varint(head, used)
+            begin = at + after
+            stop = begin + length
+        elif wire_type in _FIXED_BYTES:
+            stop = begin + _FIXED_BYTES[wire_type]
+        else:
+            raise ValueError(f"unknown wire type {wire_type} at byte {at}")
+        if stop > end:
+            raise ValueError(f"field {tag >> 3} ends {stop - end} bytes past the end")
+        yield tag >> 3, wire_type, value, begin, stop
+        at = stop
+
+
+def _varint(data: bytes, start: int) -> tuple[int, int]:
+    """Decode a protobuf varint: (value, position after it)."""
+    value = 0
+    for count, byte in enumerate(data[start : start + 10]):
+        value |= (byte & 0x7F) << (7 * count)
+        if byte < 0x80:
+            return value, start + count + 1
+    raise ValueError("a number without an end")

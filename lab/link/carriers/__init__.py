@@ -1,0 +1,1 @@
+"""What plays a script between two processes: a relay, two network namespaces, or a tunnel."""

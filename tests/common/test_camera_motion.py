@@ -1,0 +1,177 @@
+"""Camera motion: measured with a virtual camera over a real aerial picture, and used by the tracker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.camera_motion import CameraMotion
+from hvt_common.tracking import kalman
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.values import Detections
+
+WIDTH, HEIGHT = 640, 360
+
+
+@pytest.fixture(scope="module")
+def ground(data: Path) -> np.ndarray:
+    """A real aerial photograph, 1068 x 580."""
+    return cv2.imread(str(data / "aerial_highway.jpg"))
+
+
+def view(x: float, y: float, zoom: float, degrees: float) -> np.ndarray:
+    """World to image: (x, y) is the point of the world in the middle of the image."""
+    angle = np.deg2rad(degrees)
+    turn = zoom * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.column_stack((turn, [WIDTH / 2, HEIGHT / 2] - turn @ [x, y]))
+
+
+def shot(ground: np.ndarray, camera: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What the camera sees, with sensor noise."""
+    image = cv2.warpAffine(ground, camera, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
+    return np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)
+
+
+def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The true map from the image of camera a to that of b."""
+    square = [np.vstack((camera, [0, 0, 1])) for camera in (a, b)]
+    return (square[1] @ np.linalg.inv(square[0]))[:2]
+
+
+def worst_corner_px(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """How far apart the two maps put a corner of the image, at worst."""
+    corners = np.array([[0, 0, 1], [WIDTH, 0, 1], [0, HEIGHT, 1], [WIDTH, HEIGHT, 1]]).T
+    return float(np.linalg.norm((estimate - truth) @ corners, axis=0).max())
+
+
+def flight(*, steps: int, pan_px: float, zoom: float, turn: float, seed: int) -> Iterator[np.ndarray]:
+    """Cameras that wander from the middle of the picture."""
+    rng = np.random.default_rng(seed)
+    pose = np.array([534.0, 290.0, 1.0, 0.0])
+    for _ in range(steps):
+        yield view(*pose)
+        pose[:2] += rng.uniform(-pan_px, pan_px, 2)
+        pose[2] *= 1 + rng.uniform(-zoom, zoom)
+        pose[3] += rng.uniform(-turn, turn)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("method", "scale", "median_px", "worst_px"),
+    [("flow", 1.0, 0.1, 0.2), ("flow", 0.5, 0.2, 0.5), ("ecc", 0.5, 0.2, 0.8)],
+)
+def test_known_motion_is_measured(
+    ground: np.ndarray, method: str, scale: float, median_px: float, worst_px: float
+) -> None:
+    """Tracks and moving-object masks would be shifted against the ground by the error, every frame."""
+    rng, motion = np.random.default_rng(3), CameraMotion(method, scale=scale)
+    errors, last = [], None
+    for camera in flight(steps=16, pan_px=20, zoom=0.02, turn=1.0, seed=5):
+        estimate = motion.step(shot(ground, camera, rng))
+        assert estimate.shape == (2, 3)
+        assert estimate.dtype == np.float64
+        if last is None:
+            np.testing.assert_array_equal(estimate, np.eye(2, 3))
+        else:
+            errors.append(worst_corner_px(estimate, between(last, camera)))
+        last = camera
+    assert np.median(errors) < median_px
+    assert max(errors) < worst_px
+
+
+@pytest.mark.realdata
+def test_moving_objects_do_not_pull_the_estimate(ground: np.ndarray) -> None:
+    """A street full of cars would look like a moving camera."""
+    rng, motion = np.random.default_rng(3), CameraMotion("flow")
+    cameras = list(flight(steps=2, pan_px=8, zoom=0.01, turn=0.3, seed=2))
+    cars = rng.integers(0, 255, (12, 24, 24, 3))
+    for k, camera in enumerate(cameras):
+        image = shot(ground, camera, rng)
+        for n, car in enumerate(cars):
+            x, y = 40 + 45 * n + 9 * k, 60 + 20 * n
+            image[y : y + 24, x : x + 24] = car
+        estimate = motion.step(image)
+    assert worst_corner_px(estimate, between(*cameras)) < 0.5
+
+
+@pytest.mark.parametrize("method", ["flow", "ecc"])
+def test_without_texture_the_camera_stands_still(method: str) -> None:
+    """A black or blurred frame would stop the tracker, or throw all tracks across the picture."""
+    rng = np.random.default_rng(0)
+    pictures = [
+        np.zeros((90, 160, 3), np.uint8),
+        np.full((90, 160, 3), 127, np.uint8),
+        np.zeros((1, 1, 3), np.uint8),
+        np.zeros((1, 1, 3), np.uint8),
+        rng.integers(0, 255, (90, 160, 3)).astype(np.uint8),
+        rng.integers(0, 255, (45, 80, 3)).astype(np.uint8),  # another size
+    ]
+    motion = CameraMotion(method)
+    for picture in pictures:
+        np.testing.assert_array_equal(motion.step(picture), np.eye(2, 3))
+
+
+def test_a_cut_to_another_scene_is_no_motion() -> None:
+    """After a cut, chance matches would be taken for a camera movement."""
+    rng, motion = np.random.default_rng(1), CameraMotion("flow")
+    for _ in range(4):
+        noise = cv2.GaussianBlur(rng.integers(0, 255, (180, 320, 3)).astype(np.uint8), (0, 0), 2)
+        np.testing.assert_array_equal(motion.step(noise), np.eye(2, 3))
+
+
+def test_wrong_settings_are_refused() -> None:
+    """A misspelt method would silently do nothing."""
+    with pytest.raises(ValueError, match="magic"):
+        CameraMotion("magic")
+    with pytest.raises(ValueError, match="scale is 0"):
+        CameraMotion("flow", scale=0)
+
+
+def test_warp_moves_boxes_as_the_picture_moves() -> None:
+    """With a turning and zooming camera, boxes and their velocities would point the wrong way."""
+    states = kalman.initiate(np.array([[100.0, 50.0, 0.5, 40.0]]))
+    states[:, kalman.VELOCITY] = [3.0, 0.0, 0.01, 0.5]
+    before = states.copy()
+    kalman.warp(states, np.array([[0.0, -2.0, 10.0], [2.0, 0.0, 20.0]]))  # a quarter turn, twice the size
+    np.testing.assert_allclose(states[0, kalman.POSITION], [-90, 220, 0.5, 80])
+    np.testing.assert_allclose(states[0, kalman.VELOCITY], [0, 6, 0.01, 1.0], atol=1e-12)
+    np.testing.assert_allclose(
+        states[0, kalman.VAR_P :] / before[0, kalman.VAR_P :].clip(1e-30),
+        [[4, 4, 1, 4], [0, 0, 0, 0], [4, 4, 1, 4]],  # lengths by the square of the scale; no covariance yet
+    )
+
+
+def follow(ground: np.ndarray, *, camera_motion: str, every: int) -> list[list[int]]:
+    """The ids listed at each frame for six parked cars under a shaking camera."""
+    rng = np.random.default_rng(4)
+    world = np.array([[420, 200], [500, 260], [600, 240], [460, 350], [560, 330], [650, 310]], float)
+    tracker = ByteTracker(TrackerSettings(camera_motion=camera_motion), fps=15)
+    listed = []
+    for k, camera in enumerate(flight(steps=25, pan_px=30, zoom=0.02, turn=1.5, seed=9)):
+        image = shot(ground, camera, rng)
+        centre = world @ camera[:, :2].T + camera[:, 2] + rng.normal(0, 0.5, world.shape)
+        half = np.array([10, 8])
+        boxes = np.hstack((centre - half, centre + half)).astype(np.float32)
+        seen = Detections(boxes, np.full(6, 0.9, np.float32), np.zeros(6, np.int32))
+        if k % every == 0:
+            tracks = tracker.update(seen, frame_index=k, image_bgr=image)
+        else:
+            tracks = tracker.predict(frame_index=k, image_bgr=image)
+        listed.append(tracks.ids.tolist())
+    return listed
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("every", [1, 3])
+@pytest.mark.parametrize("method", ["flow", "ecc"])
+def test_ids_survive_a_shaking_camera(ground: np.ndarray, method: str, every: int) -> None:
+    """In gusts every object would get a new id with each frame, and each would be sent as new."""
+    steady = follow(ground, camera_motion=method, every=every)
+    assert all(ids == [1, 2, 3, 4, 5, 6] for ids in steady)
+    shaken = follow(ground, camera_motion="off", every=every)
+    kept = sum(len(set(ids) & set(range(1, 7))) for ids in shaken) / (6 * len(shaken))
+    assert kept < 0.5
