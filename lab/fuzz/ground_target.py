@@ -24,7 +24,6 @@ __all__ = ["TARGETS"]
 _CHANNELS = ("base", "roi", "tracks", "status", "backlog")
 _ATTACHED = ("base", "roi", "backlog")
 _PACES = ("realtime", "lockstep")
-_PATIENCE_S = 12.0
 _UNHARMED = 2
 """So many access units come unharmed before the rest."""
 
