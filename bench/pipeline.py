@@ -24,6 +24,8 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder_settings import encoder_settings
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_ground.config import GroundConfig
+from hvt_ground.link.packets import BasePacket
+from hvt_ground.link.reassemble import Arrival
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.wiring import Models, make_pipeline
@@ -97,16 +99,14 @@ def _ground(units: list[AccessUnit]) -> float:
         path = Path(folder) / "bench.rrd"
         session = GroundSession(
             info,
-            recorder=Recorder(_recorder_settings(path, info)),
-            recording=path,
+            sinks=[Recorder(_recorder_settings(path, info))],
             pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
-            to_local_ns=lambda at_ns: at_ns,
             clock=time.time_ns,
-            report=lambda: None,
         )
         began = time.perf_counter()
         for number, (header, item) in enumerate(items):
-            session.base(header, item, decode=True, starts_run=number == 0)
+            unit = Arrival("decode", header, item.payload, item.received_ns, starts_run=number == 0)
+            session.base(BasePacket(unit, item, on_time=True))
         took = time.perf_counter() - began
         session.close()
     return took / len(items)

@@ -1,1 +1,1 @@
-"""The ground side: link to recording."""
+"""The ground side: what edges send over the link becomes tracks, tables and recordings; `app.Ground` is all of it."""

@@ -31,10 +31,10 @@ def _run(argv: Sequence[str] | None) -> int:
 
         return keys.run(words[1:])
     if words and not words[0].startswith("-"):
-        from hvt_ground.control import command as asking  # noqa: PLC0415
+        from hvt_ground.control import command as control  # noqa: PLC0415
 
-        if words[0] in asking.COMMANDS:
-            return asking.run(words)
+        if words[0] in control.COMMANDS:
+            return control.run(words)
     try:  # only now: without Rerun this is a sentence, not a traceback
         from hvt_ground.app import Ground  # noqa: PLC0415
         from hvt_ground.status import table  # noqa: PLC0415
@@ -42,8 +42,8 @@ def _run(argv: Sequence[str] | None) -> int:
         raise UserError(
             f"the package {error.name!r} is missing: install HVT with its extra, 'hvt[ground]'"
         ) from None
-    config, asked = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
-    if asked.print_config:
+    config, requested = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
+    if requested.print_config:
         print(to_toml(config), end="")
         return 0
     config = check(config)

@@ -1,15 +1,35 @@
-"""What a ground says of a session: the JSON for programs, the table for people."""
+"""What a ground says of its sessions: the JSON for programs, the table and the status line for people."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from hvt_common.units import bitrate_text
+from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 
-__all__ = ["summary", "table"]
+__all__ = ["status_text", "summary", "table"]
+
+
+def status_text(edges: Iterable[tuple[str, EdgeSessions]]) -> str:
+    """The status line: what comes of each edge now; empty without one."""
+    parts = []
+    for edge, sessions in edges:
+        session = sessions.session
+        if session is None:
+            parts.append(f"{edge}: {'ended' if sessions.done else 'waiting for a keyframe'}")
+            continue
+        latency_ms = session.overlay_latency.percentile(50)
+        age = "" if latency_ms is None or session.lockstep else f"  {latency_ms:.0f} ms"
+        total = session.ledger.summary(session.duration_s).total_bps
+        parts.append(
+            f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
+            f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}  tracks "
+            f"{session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
+        )
+    return " | ".join(parts)
 
 
 def summary(
@@ -18,15 +38,15 @@ def summary(
     """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do.
 
     ``unusable`` counts messages of the edge that were skipped, over all its sessions; ``backlog_recordings`` are of
-    sessions that it kept things of, and that were over when they came.
+    former sessions, of which a backlog came.
     """
     info, pipeline, counters = session.info, session.pipeline, session.counters
     account = session.ledger.summary(session.duration_s)
     worst = account.worst_window_bps
     unread = pipeline.outcomes.get("unread", 0)
-    backlog = session.backlog
+    backlog = session.backlog.totals
     came = session.stills_received + backlog.stills
-    waiting = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
+    deferred = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
     return {
         "edge": info.edge,
         "session": f"{info.session_id:016x}",
@@ -49,7 +69,7 @@ def summary(
         "worst_window_bps": {"base": worst.base, "roi": worst.roi, "total": worst.total},
         "stills": {
             "received": session.stills_received,
-            "deferred": waiting,
+            "deferred": deferred,
             "dropped": sum(session.stills_dropped.values()),
             "unread": unread,
             "reasons": {
@@ -81,7 +101,7 @@ def summary(
         "latency_ms": session.overlay_latency.as_dict(),
         "receive_latency_ms": session.receive_latency.as_dict(),
         "recording": str(session.recording) if session.recording is not None else None,
-        "recording_bytes": session.recorder.size_bytes if session.recorder is not None else 0,
+        "recording_bytes": _size_bytes(session.recording),
     }
 
 
@@ -127,3 +147,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     if content["recording"]:
         rows.append(("recording", f"{content['recording']}, {content['recording_bytes'] / 1e6:.2f} MB"))
     return rows
+
+
+def _size_bytes(path: Path | None) -> int:
+    return path.stat().st_size if path is not None and path.exists() else 0

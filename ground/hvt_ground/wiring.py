@@ -1,128 +1,132 @@
-"""From settings to stages: everything at the ground that is made for one session and needs no network."""
+"""From settings to objects: what is made for each session of an edge, as one tree."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from itertools import chain
+from itertools import count as count_from
 from pathlib import Path
 from typing import Literal, cast
 
 from hvt_common.camera_motion import CameraMotion
-from hvt_common.inference.classify import Classifier, open_classifier
-from hvt_common.inference.detect import Detector, open_detector, warm_up
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import Info
-from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.units import bitrate_text
 from hvt_ground.backlog.perception import BacklogPerception
-from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Event
+from hvt_ground.backlog.recordings import BacklogRecording
+from hvt_ground.config import DETECTOR, GroundConfig
+from hvt_ground.events import Event
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.models import Models
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import Sink
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.timing import SessionTiming, TimingTable
+from hvt_ground.sinks.tracks_table import TrackTable
 
-__all__ = ["Models", "backlog_path", "make_backlog_perception", "make_pipeline", "output_path"]
+__all__ = ["Models", "SessionFactory", "make_backlog_perception", "make_pipeline", "output_path"]
 
 
-_USUAL_SIZE = (1280, 720)
-"""Of base streams; what an edge really sends is known only when its first picture waits to be seen."""
+class SessionFactory:
+    """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
+    Args:
+        config: of the ground.
+        models: they share.
+        clock: Unix nanoseconds without steps.
+        live_url: of a viewer; None shows nothing live.
+        timing: the table of ``--timing``.
+    """
 
-_Set = tuple[Detector, Classifier | None]
-
-
-class Models:
-    """Opens detector and classifier once to check them; one set serves one session at a time, for its buffers."""
-
-    def __init__(self, config: GroundConfig) -> None:
+    def __init__(
+        self,
+        config: GroundConfig,
+        models: Models,
+        *,
+        clock: Callable[[], int],
+        live_url: str | None,
+        timing: TimingTable | None,
+    ) -> None:
         self._config = config
-        self._ready: list[_Set] = [self._open()]
-        self._serving: dict[str, _Set] = {}
-        """By edge, what the session that is open has."""
-
-    def take(self, edge: str | None = None) -> _Set:
-        """A detector, and a classifier where one is wanted, that no other session uses."""
-        try:
-            taken = self._ready.pop()
-        except IndexError:
-            taken = self._open()
-        if edge is not None:
-            self._serving[edge] = taken
-        return taken
-
-    def give_back(self, detector: Detector, classifier: Classifier | None) -> None:
-        """Take them back from a session that has ended; a network keeps nothing of it, the motion detector does."""
-        for edge, serving in list(self._serving.items()):
-            if serving[0] is detector:
-                del self._serving[edge]
-        if self._config.detector != MOTION:
-            self._ready.append((detector, classifier))
-
-    @contextmanager
-    def checkout(self, edge: str) -> Iterator[_Set]:
-        """What the open session of an edge has, for something else that is done in the thread that sees for it.
-
-        Only a motion detector is a new one: it keeps what it saw, and opening it costs nothing.
-        """
-        serving = self._serving.get(edge)
-        if serving is None:
-            taken = self.take()
-            try:
-                yield taken
-            finally:
-                self.give_back(*taken)
-        elif self._config.detector == MOTION:
-            yield self._open_detector(), serving[1]
-        else:
-            yield serving
-
-    def pool(self, edge: str) -> ModelPool:
-        """The same, for one edge."""
-        return ModelPool(self, edge)
-
-    def _open_detector(self) -> Detector:
-        config = self._config
-        return open_detector(
-            config.detector,
-            labels=config.detector_labels,
-            confidence=weak_confidence(config.confidence),
-            nms_iou=config.nms_iou,
-            threads=config.threads,
-            provider=config.provider,
-        )
-
-    def _open(self) -> _Set:
-        config = self._config
-        detector = self._open_detector()
-        warm_up(detector, _USUAL_SIZE)
-        if config.classifier in (None, DETECTOR, NONE):
-            return detector, None
-        return detector, open_classifier(
-            config.classifier, labels=config.labels, threads=config.threads, provider=config.provider
-        )
-
-
-class ModelPool:
-    """Lends what serves one edge. For the thread that sees."""
-
-    def __init__(self, models: Models, edge: str) -> None:
         self._models = models
-        self._edge = edge
+        self._clock = clock
+        self._live_url = live_url
+        self._timing = timing
+        self._paths: set[Path] = set()
+        """Taken by this process."""
 
-    def checkout(self) -> AbstractContextManager[_Set]:
-        """See `Models.checkout`."""
-        return self._models.checkout(self._edge)
+    def open_session(self, info: Info, reports: ReceiverReports) -> GroundSession:
+        """A session with its perception and its sinks."""
+        config, models = self._config, self._models
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        path = output_path(config.record, suffix=".rrd", edge=info.edge, stamp=stamp, taken=self._paths)
+        settings = self._recorder_settings(info, path)
+        sinks: list[Sink] = [Recorder(settings)]
+        if self._live_url is not None:
+            sinks.append(Recorder(replace(settings, path=None, live_url=self._live_url)))
+        if config.tracks is not None:
+            table = output_path(config.tracks, suffix=".csv", edge=info.edge, stamp=stamp, taken=self._paths)
+            sinks.append(TrackTable(table))
+        if self._timing is not None:
+            sinks.append(SessionTiming(self._timing, edge=info.edge, session_id=info.session_id))
+        return GroundSession(
+            info,
+            sinks=sinks,
+            recording=path,
+            pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
+            clock=self._clock,
+            reports=reports,
+            backlog_perception=make_backlog_perception(config, models, info=info),
+        )
+
+    def open_backlog(self, info: Info) -> BacklogRecording:
+        """The recording of a session that is over; not shown live, for the viewer shows what is now."""
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        path = _backlog_path(self._config.record, edge=info.edge, stamp=stamp, taken=self._paths)
+        sink = Recorder(replace(self._recorder_settings(info, path), clocked=False))
+        perception = make_backlog_perception(self._config, self._models, info=info)
+        return BacklogRecording(info, path=path, sink=sink, perception=perception)
+
+    def _recorder_settings(self, info: Info, path: Path) -> RecorderSettings:
+        config = self._config
+        return RecorderSettings(
+            path=path,
+            edge_id=info.edge,
+            session=f"{info.session_id:016x}",
+            base_size=info.base_size,
+            fps=info.fps,
+            budget_bps=info.budget_bps,
+            facts={
+                "method": info.method,
+                "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
+                "source": f"{info.source_size[0]}x{info.source_size[1]}",
+                "base": f"{info.base_size[0]}x{info.base_size[1]} at {info.fps:g} fps, {info.codec}",
+                "detector": Path(config.detector).name,
+                "classifier": Path(config.classifier or "none").name,
+            },
+            clocked=info.pace == "realtime",
+        )
 
 
 def make_pipeline(
     config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]
 ) -> Pipeline:
-    """The eyes of one session."""
+    """The pipeline of one session."""
     detector, classifier = models.take(info.edge)
     reader = _reader(config, detector, classifier, info=info)
     motion = cast('Literal["off", "flow", "ecc"]', config.camera_motion)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
-    path = CameraPath(ahead_ticks=max(1, round(info.fps)))
+    path = CameraPath(ahead_frames=max(1, round(info.fps)))
     parts = PipelineParts(
         detector=detector,
         tracker=_tracker(config, info),
@@ -149,10 +153,10 @@ def make_pipeline(
 
 
 def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info) -> BacklogPerception:
-    """What looks at what was kept of a session."""
+    """What analyzes the stored video and stills of a session."""
     return BacklogPerception(
         info,
-        models=models.pool(info.edge),
+        checkout=partial(models.checkout, info.edge),
         tracker_of=lambda: _tracker(config, info),
         reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
         detect_every=config.detect_every,
@@ -174,42 +178,37 @@ def _reader(
     return NoReader()
 
 
-def output_path(wish: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:
+def output_path(target: Path | None, *, suffix: str, edge: str, stamp: str, taken: set[Path]) -> Path:
     """Where a file of one session goes, and note it in ``taken``.
 
-    ``wish`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file is
-    written anew, but each session of this process gets one of its own: the first takes the name, others have the
+    ``target`` is the file or folder that the user named; ``stamp`` the time of the session's beginning. A named file
+    is written anew, but each session of this process gets one of its own: the first takes the name, others have the
     edge's id in it. A file that nobody named is never overwritten.
     """
-    if wish is None or wish.is_dir() or wish.suffix != suffix:
-        first = (wish or Path()) / f"hvt-{edge}-{stamp}{suffix}"
-        further = first
+    if target is None or target.is_dir() or target.suffix != suffix:
+        first = further = (target or Path()) / f"hvt-{edge}-{stamp}{suffix}"
     else:
-        first, further = wish, wish.with_name(f"{wish.stem}-{edge}{suffix}")
-    count, path = 1, first
-    while path in taken or (path != wish and path.exists()):
-        path = (
-            further
-            if count == 1 and further != first
-            else further.with_name(f"{further.stem}-{count}{suffix}")
-        )
-        count += 1
-    taken.add(path)
-    return path
+        first, further = target, target.with_name(f"{target.stem}-{edge}{suffix}")
+    names = [first] if further == first else [first, further]
+    return _take(names, taken, number=len(names), may_exist=target)
 
 
-def backlog_path(wish: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
-    """Where goes what was kept of a session that is over, beside the recording of the one that is open.
+def _backlog_path(target: Path | None, *, edge: str, stamp: str, taken: set[Path]) -> Path:
+    """Where the backlog of a session that is over goes, beside the recording of the one that is open.
 
     Never over another file: its edge has forgotten what is in there.
     """
-    if wish is not None and wish.suffix == ".rrd" and not wish.is_dir():
-        first = wish.with_name(f"{wish.stem}-{edge}-backlog.rrd")
-    else:
-        first = (wish or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"
-    count, path = 1, first
-    while path in taken or path.exists():
-        count += 1
-        path = first.with_name(f"{first.stem}-{count}.rrd")
+    if target is not None and target.suffix == ".rrd" and not target.is_dir():
+        return _take([target.with_name(f"{target.stem}-{edge}-backlog.rrd")], taken, number=2)
+    return _take([(target or Path()) / f"hvt-{edge}-{stamp}-backlog.rrd"], taken, number=2)
+
+
+def _take(names: list[Path], taken: set[Path], *, number: int, may_exist: Path | None = None) -> Path:
+    """The first that is free of the names and of the last one with a number from ``number`` on; it is taken."""
+    last = names[-1]
+    numbered = (last.with_name(f"{last.stem}-{count}{last.suffix}") for count in count_from(number))
+    path = next(
+        one for one in chain(names, numbered) if one not in taken and (one == may_exist or not one.exists())
+    )
     taken.add(path)
     return path

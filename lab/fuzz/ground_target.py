@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from random import Random
 from typing import NamedTuple
@@ -12,7 +12,8 @@ from unittest.mock import patch
 from flight import Flight, Port, pipeline_of
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Received
-from hvt_ground.session.receiver import EdgeReceiver
+from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from lab.fuzz.contract import Target, scratch
@@ -23,7 +24,6 @@ __all__ = ["TARGETS"]
 _CHANNELS = ("base", "roi", "tracks", "status", "backlog")
 _ATTACHED = ("base", "roi", "backlog")
 _PACES = ("realtime", "lockstep")
-_PATIENCE_S = 12.0
 _UNHARMED = 2
 """So many access units come unharmed before the rest."""
 
@@ -54,7 +54,7 @@ _flight = cache(_new_flight)
 """What the edge answers, and its first access units: nothing of it changes with use."""
 
 
-def _opened(info: Info, receiver: EdgeReceiver) -> GroundSession:
+def _opened(info: Info, reports: ReceiverReports) -> GroundSession:
     settings = RecorderSettings(
         path=scratch() / "flight.rrd",
         edge_id="uav-1",
@@ -65,40 +65,29 @@ def _opened(info: Info, receiver: EdgeReceiver) -> GroundSession:
     )
     return GroundSession(
         info,
-        recorder=Recorder(settings),
-        recording=settings.path,
+        sinks=[Recorder(settings)],
         pipeline_of=pipeline_of,
-        to_local_ns=receiver.clock_offset.to_local_ns,
         clock=time.time_ns,
-        report=receiver.report_now,
+        reports=reports,
     )
-
-
-def _until(true: Callable[[], bool]) -> None:
-    """Wait, on a busy machine too: the receiver itself drops what it has not read within its time to close."""
-    deadline_s = time.monotonic() + _PATIENCE_S
-    while not true() and time.monotonic() < deadline_s:
-        time.sleep(0.001)
 
 
 def _session(data: bytes) -> None:
     pace, *messages = parted(data, least=1)
     port = Port()
     flight = port.flight = _flight(_PACES[len(pace) % len(_PACES)])
+    edge = EdgeSessions(port, open_session=_opened)  # type: ignore[arg-type]
     for index in range(_UNHARMED):
-        port.inbox.put(flight.base(index))
+        edge.handle(flight.base(index))
+        edge.housekeep(pending=False)
     for one in map(_Item.parse, messages):
         key = f"hvt/uav-1/{one.channel}"
-        port.inbox.put(Received(key, one.payload, one.attachment, "", time.time_ns()))
-    with patch("hvt_ground.sinks.rerun.recorder.add_footer"):  # a process of its own for each input
-        receiver = EdgeReceiver(port, open_session=_opened)  # type: ignore[arg-type]
-        _until(lambda: len(port.inbox) == 0 or receiver.error is not None)
-        receiver.close()
-        _until(lambda: bool(receiver.done) or receiver.error is not None)
-    if receiver.error is not None:
-        raise receiver.error
-    assert receiver.done, "the unharmed messages alone are a session"
-    assert all(len(session.take_results(10_000)) < 5000 for session in receiver.done)
+        edge.handle(Received(key, one.payload, one.attachment, "", time.time_ns()))
+        edge.housekeep(pending=False)
+    with patch("hvt_ground.sinks.rerun.rrd_file.add_footer"):  # a process of its own for each input
+        edge.close()
+    assert edge.done, "the unharmed messages alone are a session"
+    assert all(len(session.take_results(10_000)) < 5000 for session in edge.done)
 
 
 def _changed(data: bytes, rng: Random, raw: Bytes) -> bytes:

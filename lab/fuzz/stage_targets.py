@@ -44,7 +44,7 @@ def _base_messages(data: bytes) -> Iterator[tuple[_Header, int]]:
 
 
 def _reassembly(data: bytes) -> None:
-    core: Reassembler[_Header] = Reassembler()
+    core: Reassembler = Reassembler()
     now_ns, last = 5_000 * _MS, None
     for header, wait_ms in _base_messages(data):
         now_ns += wait_ms * _MS
@@ -56,7 +56,7 @@ def _reassembly(data: bytes) -> None:
         assert len(core._left) <= 16
 
 
-def _checked(arrival: Arrival[_Header], last: _Header | None) -> _Header | None:
+def _checked(arrival: Arrival, last: _Header | None) -> _Header | None:
     """A decoder gets runs that begin with a keyframe and have no hole."""
     if arrival.verdict != "decode":
         return last

@@ -16,7 +16,7 @@ from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
-from hvt_ground.pki.roster import Ground, Roster, Router
+from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
 from lab.fuzz.contract import Target, scratch
 
 __all__ = ["TARGETS"]
@@ -94,8 +94,8 @@ def _roster(data: bytes) -> None:
 def _roster_seed() -> bytes:
     roster = Roster(
         edges=("uav-1", "uav-2"),
-        grounds=(Ground("ground", ("192.0.2.1",), edges="uav-*"),),
-        routers=(Router("hub", ("hub.example",)),),
+        grounds=(GroundMember("ground", ("192.0.2.1",), edges="uav-*"),),
+        routers=(RouterMember("hub", ("hub.example",)),),
     )
     roster.write(scratch())
     return (scratch() / "fleet.json").read_bytes()

@@ -24,9 +24,11 @@ from hvt_common.protocol.messages import (
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
 from hvt_ground.config import GroundConfig
-from hvt_ground.events.events import Event, Overlay, Refinement
-from hvt_ground.perception.pipeline import Picture, ReceivedStill
-from hvt_ground.perception.worker import LockstepWorker, Read, See, Step
+from hvt_ground.events import Event, Overlay, Refinement
+from hvt_ground.link.packets import BasePacket
+from hvt_ground.link.reassemble import Arrival as AccessUnitArrival
+from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
+from hvt_ground.perception.worker import Analyze, LockstepWorker, Read, Step
 from hvt_ground.session.session import GroundSession
 from hvt_ground.wiring import Models, make_pipeline
 from hvt_study.flight_record import FlightRecord, Watch
@@ -71,12 +73,12 @@ class SharedModels(Models):
 class _Worker(LockstepWorker):
     """Sees at once; stills that come within one tick are read together, as in real time."""
 
-    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
-        super().__init__(see, step, read, name=name)
+    def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
+        super().__init__(analyze, step, read, name=name)
         self._worker = InlineExecutor()
         self._gathered: list[ReceivedStill] = []
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: DecodedFrame) -> None:
         self.read_gathered()
         super().picture(picture)
 
@@ -96,19 +98,6 @@ class _Worker(LockstepWorker):
             self._read(gathered)
 
 
-class _Session(GroundSession):
-    """Sees in the thread that brings the messages."""
-
-    def __init__(self, info: Info, **named: Any) -> None:
-        super().__init__(info, recorder=None, recording=None, **named)
-        self._inline = _Worker(self._see, self._step, self._read, name=info.edge)
-        self._worker = self._inline
-
-    def read_stills(self) -> None:
-        """Read those that have come since the last picture."""
-        self._inline.read_gathered()
-
-
 class GroundSide:
     """Takes what arrives over ``link`` as time goes on; keeps the list of every tick, in source pixels.
 
@@ -124,12 +113,11 @@ class GroundSide:
         self._models = models
         detector, classifier = self._borrowed = models.take()
         shared = SharedModels(detector, classifier)
-        self._session = _Session(
+        self._session = GroundSession(
             info,
             pipeline_of=lambda emit: make_pipeline(config, shared, info=info, emit=self._heard_by(emit)),
-            to_local_ns=lambda at_ns: at_ns,
             clock=lambda: self._now_ns,
-            report=lambda: None,
+            worker_of=self._make_worker,
         )
         self._watch = Watch(self._session.pipeline)
         self._record = FlightRecord(
@@ -168,7 +156,7 @@ class GroundSide:
             self.arrivals.append(arrival)
             self._receive(arrival)
             self._answer(arrival)
-        self._session.read_stills()
+        self._worker.read_gathered()
         if self.arrivals:
             self._answer(self.arrivals[-1])
         self._take_uncoded(until_ns=now_ns)
@@ -181,6 +169,10 @@ class GroundSide:
             last = max(self.lists)
             self.lists[last] = self._record.complete(self.lists[last], lists=self.lists)
         self._models.give_back(*self._borrowed)
+
+    def _make_worker(self, analyze: Analyze, step: Step, read: Read) -> _Worker:
+        self._worker = _Worker(analyze, step, read, name=self._info.edge)
+        return self._worker
 
     def _receive(self, arrival: Arrival[Received]) -> None:
         """As `hvt_ground.session.receiver` hands on what is whole and in order."""
@@ -242,7 +234,9 @@ class GroundSide:
         self.shown_ns.append((arrival.arrival_ns, header.capture_ns))
         starts = not self._decoded
         self._decoded = True
-        whole = self._session.base(header, arrival.message, decode=True, starts_run=starts)
+        item = arrival.message
+        unit = AccessUnitArrival("decode", header, item.payload, arrival.arrival_ns, starts_run=starts)
+        whole = self._session.base(BasePacket(unit, item, on_time=True))
         assert whole, f"the base frame {header.frame_index} cannot be decoded"
         self._answer(arrival)
         found = self._watch.take_found()

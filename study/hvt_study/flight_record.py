@@ -17,10 +17,10 @@ from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View, iou
-from hvt_ground.events.events import Overlay, Refinement
+from hvt_ground.events import Overlay, Refinement
 from hvt_ground.perception.pipeline import Pipeline
-from hvt_ground.perception.stills.classify import Decoded, object_crops
-from hvt_ground.perception.stills.refine import Refiner, Shown
+from hvt_ground.perception.stills.classify import DecodedStill, object_crops
+from hvt_ground.perception.stills.refine import Refiner, ShownClasses
 from hvt_study.metrics.contract import NO_ID, FrameView
 from hvt_study.metrics.proxy import score_entropy_nats
 from hvt_study.metrics.seen import ObservedFrame
@@ -40,7 +40,7 @@ class Watch:
         parts = pipeline._parts  # noqa: SLF001 - events say neither raw detections nor confidences without refinement
         self._detector = _WatchedDetector(parts.detector)
         self._refiner = _WatchedRefiner(parts.refiner)
-        refiner = cast("Refiner[Any]", self._refiner)
+        refiner = cast("Refiner", self._refiner)
         pipeline._parts = replace(parts, detector=self._detector, refiner=refiner)  # noqa: SLF001
 
     @property
@@ -76,15 +76,15 @@ class _WatchedDetector:
 
 
 class _WatchedRefiner:
-    def __init__(self, refiner: Refiner[Any]) -> None:
+    def __init__(self, refiner: Refiner) -> None:
         self._refiner = refiner
         self.listed: Tracks | None = None
 
-    def shown(self, tracks: Tracks) -> Shown:
+    def shown(self, tracks: Tracks) -> ShownClasses:
         self.listed = tracks
         return self._refiner.shown(tracks)
 
-    def preview(self, tracks: Tracks) -> Shown:
+    def preview(self, tracks: Tracks) -> ShownClasses:
         self.listed = tracks
         return self._refiner.preview(tracks)
 
@@ -221,7 +221,7 @@ class FlightRecord:
         also = (event.box_base_px,) if header.also else ()  # one of several has to be cut out
         crops = [
             object_crops(
-                Decoded(image, header.crop_source_px, event.box_base_px, header.frame_index, also),
+                DecodedStill(image, header.crop_source_px, event.box_base_px, header.frame_index, also),
                 view=self._view,
             )[0]
             for image in (event.base_crop_bgr, event.still_bgr)

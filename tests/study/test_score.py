@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_ground.events.events import Notice, Overlay
+from hvt_ground.events import Notice, Overlay
 from hvt_ground.sinks.tracks_table import TrackTable
 from hvt_scene import Scene
 from hvt_study.cli import main

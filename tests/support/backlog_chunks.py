@@ -1,4 +1,4 @@
-"""What an edge sends of what it kept, as the link delivers it: objects of a real flight, cut into pieces."""
+"""What an edge sends of what it kept, as the link delivers it: objects of a real flight, cut into chunks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def info_object(flight: Flight) -> bytes:
 def chunks(
     session_id: int, kind: str, number: int, data: bytes, *, chunk_bytes: int = 1400
 ) -> list[Received]:
-    """The object in pieces, in order."""
+    """The object in chunks, in order."""
     items = []
     for offset in range(0, len(data), chunk_bytes):
         payload = data[offset : offset + chunk_bytes]

@@ -28,10 +28,10 @@ from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.values import Detections, Image, Posterior, Tracks, View
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
-from hvt_ground.perception.stills.classify import Decoded, Reading, Readings
+from hvt_ground.perception.stills.classify import DecodedStill, FrameReadings, ObjectReading
 from hvt_ground.perception.stills.refine import Refiner
 
 __all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "pipeline_of", "square_box", "tracks_at"]
@@ -93,12 +93,12 @@ class SameAnswer:
     at: tuple[float, float, float, float] | None = None
     """Where it sees every object."""
 
-    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:
+    def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:
         """The same for each."""
         self.had_base += [base_bgr is not None] * len(stills)
         answer = Posterior(self.class_names[1], 0.9, 0.3, np.array([0.1, 0.9], np.float32))
-        reading = Reading(answer, self.at) if self.knows else Reading()
-        return Readings(tuple((reading,) * len(one.boxes_base_px) for one in stills), self.found)
+        reading = ObjectReading(answer, self.at) if self.knows else ObjectReading()
+        return FrameReadings(tuple((reading,) * len(one.boxes_base_px) for one in stills), self.found)
 
 
 def pipeline_of(
@@ -113,7 +113,7 @@ def pipeline_of(
     """The perception pipeline of a session of this flight."""
     reader = reader or SameAnswer()
     names, places = unified_names(CLASSES, edge_classes)
-    path = CameraPath(ahead_ticks=15)
+    path = CameraPath(ahead_frames=15)
     parts = PipelineParts(
         detector=detector or RedSquares(),
         tracker=ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
@@ -272,15 +272,16 @@ class Port:
         self.inbox = Inbox(capacity=1024, overflow="newest")
         self.present = threading.Event()
         self.present.set()
+        self.used = threading.Event()
         self.flight: Flight | None = None
         """Who answers; None is silence."""
-        self.asked = 0
+        self.requested = 0
         self.keyframe_requests = 0
         self.reports: list[Feedback] = []
 
-    def ask_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
+    def query_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
         """The flight's facts, where it is the one that is asked for."""
-        self.asked += 1
+        self.requested += 1
         now = time.time_ns()
         if self.flight is None or session_id not in (None, self.flight.session_id):
             return None

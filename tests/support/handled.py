@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_ground.session.receiver import EdgeReceiver
+from hvt_ground.session.edge_sessions import EdgeThread
 
 __all__ = ["WatchedInbox", "end"]
 
@@ -33,10 +33,8 @@ class WatchedInbox(Inbox):
             return super().get(timeout_s=timeout_s)
 
 
-def end(receiver: EdgeReceiver, *, failing: bool) -> None:
+def end(thread: EdgeThread, *, failing: bool) -> None:
     """Close it, and raise what ended it; ``failing``: the test has failed already, and that is what is to be seen."""
-    receiver.close()
-    receiver._thread.join(60)  # on a busy machine it takes longer than `close` waits
-    assert not receiver._thread.is_alive(), "the receiver did not end"
-    if not failing and receiver.error is not None:
-        raise receiver.error
+    assert thread.close(timeout_s=60), "the thread of the edge did not end"
+    if not failing and thread.error is not None:
+        raise thread.error

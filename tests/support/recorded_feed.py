@@ -9,7 +9,7 @@ import av
 import cv2
 import numpy as np
 
-from hvt_ground.events.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 
 __all__ = ["START_NS", "STEP_NS", "coded", "drawn_frames", "moving_boxes", "session"]
 

@@ -25,7 +25,7 @@ class ReadBox:
     class_after: str
     confidence_pct: int
     refined: bool
-    told: bool
+    reported: bool
     origin: int | None
     label: str
 
@@ -86,7 +86,7 @@ class Recording:
     def boxes(self, frame: int) -> dict[int, ReadBox]:
         """Every track a viewer shows at a frame, by its id."""
         found: dict[int, ReadBox] = {}
-        for layer in ("tracks", "told", "refined"):
+        for layer in ("tracks", "reported", "refined"):
             found |= self._layer(layer, frame)
         return found
 
@@ -103,8 +103,8 @@ class Recording:
         return found
 
     def _layer(self, layer: str, frame: int) -> dict[int, ReadBox]:
-        entity, refined, told = f"/base/{layer}", layer == "refined", layer == "told"
-        shape = "Ellipses2D" if told else "Boxes2D"
+        entity, refined, reported = f"/base/{layer}", layer == "refined", layer == "reported"
+        shape = "Ellipses2D" if reported else "Boxes2D"
         ids = self.latest(entity, "track_id", frame) or []
         centres = self.latest(entity, f"{shape}:centers", frame) or []
         halves = self.latest(entity, f"{shape}:half_sizes", frame) or []
@@ -122,7 +122,7 @@ class Recording:
                 class_after=names[a],
                 confidence_pct=p,
                 refined=refined,
-                told=told,
+                reported=reported,
                 origin=origin,
                 label=label,
             )

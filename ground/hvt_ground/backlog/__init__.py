@@ -1,4 +1,4 @@
-"""What an edge kept while its link was away: put together, delivered, shown at its own time."""
+"""What an edge stored while its link was down: put together, delivered, shown at its own time."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Puts together again what an edge kept while the link was away: pieces in, whole objects and acknowledgements out.
+"""Puts together again what an edge stored while the link was down: chunks in, whole objects and acknowledgements out.
 
-Pure, and bounded whatever comes. Of an object is held what has come without a hole from its beginning: a piece beyond
-that is not kept, and the edge hears how far it got. Where room is short the object that has waited longest for its
-next piece goes; its edge begins it again. What has been delivered is remembered, so that a repetition is acknowledged
+Pure, and bounded whatever comes. Of an object is held what has come without a hole from its beginning: a chunk beyond
+that is not taken, and the edge learns how far it got. Where space is short the object that has waited longest for its
+next chunk goes; its edge begins it again. What has been delivered is remembered, so that a repetition is acknowledged
 and nothing more.
 
 An object is acknowledged when it is where it belongs, and not before: its edge forgets it then. While it is being
@@ -34,7 +34,7 @@ __all__ = ["BacklogAssembly", "BacklogContent", "BacklogKey", "StoredStill", "ba
 BacklogKey = tuple[int, str, int]
 """Session id, kind, number."""
 
-_MAX_UNSAID = 512
+_MAX_UNREPORTED = 512
 _MAX_REFUSALS = 256
 _PATIENCE = 3
 """An object that is unusable so often is unusable for good: it is acknowledged, so that it does not take the link."""
@@ -42,7 +42,7 @@ _PATIENCE = 3
 
 @dataclass(frozen=True, slots=True)
 class StoredStill:
-    """A still that was kept, as it would have come on ``roi``."""
+    """A still that was stored, as it would have come on ``roi``."""
 
     header: RoiHeader
     """Carries the flag `STORED`."""
@@ -88,7 +88,7 @@ class BacklogAssembly:
         self._open: OrderedDict[BacklogKey, _Open] = OrderedDict()
         self._done: OrderedDict[BacklogKey, int] = OrderedDict()
         self._refusals: OrderedDict[BacklogKey, int] = OrderedDict()
-        self._unsaid: OrderedDict[BacklogKey, int] = OrderedDict()
+        self._unreported: OrderedDict[BacklogKey, int] = OrderedDict()
         self.refused = 0
         """Objects that were complete and unusable."""
 
@@ -103,33 +103,33 @@ class BacklogAssembly:
         return len(self._open)
 
     def chunk(self, header: BacklogHeader, payload: bytes, *, may_finish: bool = True) -> bytes | None:
-        """Take a piece; the object's bytes where it is the last one that was missing, to be `settle`d later.
+        """Take a chunk; the object's bytes where it is the last one that was missing, to be `settle`d later.
 
-        With ``may_finish`` False a piece that would complete its object is not taken, and will come again.
+        With ``may_finish`` False a chunk that would complete its object is not taken, and will come again.
 
         Raises:
-            WireError: the piece cannot be one.
+            WireError: the chunk cannot be one.
         """
         _check(header, payload)
         key = _key(header)
         if self._done.get(key) == header.total_bytes:
             self._done.move_to_end(key)
-            self._say(key, header.total_bytes)
+            self._report(key, header.total_bytes)
             return None
         entry = self._entry(key, header.total_bytes)
         if entry.handed:
-            self._say_busy(key, entry, header.total_bytes)
+            self._report_busy(key, entry, header.total_bytes)
             return None
         fresh = payload[len(entry.data) - header.offset :] if header.offset <= len(entry.data) else b""
         finishes = len(entry.data) + len(fresh) == header.total_bytes
-        if fresh and (may_finish or not finishes) and self._make_room(key, len(fresh)):
+        if fresh and (may_finish or not finishes) and self._make_space(key, len(fresh)):
             entry.data += fresh
         if len(entry.data) == header.total_bytes:
             entry.handed, whole = True, bytes(entry.data)
             entry.data = bytearray()
-            self._say_busy(key, entry, header.total_bytes)
+            self._report_busy(key, entry, header.total_bytes)
             return whole
-        self._say(key, len(entry.data))
+        self._report(key, len(entry.data))
         if not entry.data:
             del self._open[key]
         return None
@@ -150,35 +150,35 @@ class BacklogAssembly:
             return
         self._refusals[key] = times
         _trim(self._refusals, _MAX_REFUSALS)
-        self._say(key, 0)
+        self._report(key, 0)
 
     def drop(self, key: BacklogKey) -> None:
         """Forget an object that was handed out and cannot be taken: another ground may, or this one later."""
         entry = self._open.get(key)
         if entry is not None and entry.handed:
             del self._open[key]
-            self._unsaid.pop(key, None)
+            self._unreported.pop(key, None)
 
     def drop_handed(self) -> int:
         """Forget objects that were handed out to somebody who is gone: the edge sends them again. How many."""
         handed = [key for key, entry in self._open.items() if entry.handed]
         for key in handed:
             del self._open[key]
-            self._say(key, 0)
+            self._report(key, 0)
         return len(handed)
 
     def want_info(self, session_id: int) -> None:
         """Ask for the facts of a session: without them nothing can be made of its objects."""
-        self._say((session_id, BacklogKind.INFO, 0), 0)
+        self._report((session_id, BacklogKind.INFO, 0), 0)
 
     @property
-    def unsaid(self) -> int:
-        """How many acknowledgements the edge has not heard yet."""
-        return len(self._unsaid)
+    def unreported(self) -> int:
+        """How many acknowledgements the edge has not been sent yet."""
+        return len(self._unreported)
 
     def take_acknowledged_ranges(self, most: int) -> tuple[AcknowledgedRange, ...]:
-        """Return and forget up to ``most`` acknowledgements that the edge has not heard yet, oldest first."""
-        taken = [self._unsaid.popitem(last=False) for _ in range(min(most, len(self._unsaid)))]
+        """Return and forget up to ``most`` acknowledgements that the edge has not been sent yet, oldest first."""
+        taken = [self._unreported.popitem(last=False) for _ in range(min(most, len(self._unreported)))]
         return tuple(
             AcknowledgedRange(
                 session_id=session_id, kind=kind, number=number, acknowledged_bytes=acknowledged_range
@@ -194,7 +194,7 @@ class BacklogAssembly:
         self._open.move_to_end(key)
         return entry
 
-    def _make_room(self, key: BacklogKey, more_bytes: int) -> bool:
+    def _make_space(self, key: BacklogKey, more_bytes: int) -> bool:
         """Whether there is room for so much more of this object, which may cost others theirs."""
         while len(self._open) > self._max_objects or self.size_bytes + more_bytes > self._max_bytes:
             victim = next((one for one, entry in self._open.items() if one != key and not entry.handed), None)
@@ -209,15 +209,15 @@ class BacklogAssembly:
             self._done[key] = total_bytes
             self._done.move_to_end(key)
             _trim(self._done, self._remember)
-        self._say(key, total_bytes)
+        self._report(key, total_bytes)
 
-    def _say_busy(self, key: BacklogKey, entry: _Open, total_bytes: int) -> None:
+    def _report_busy(self, key: BacklogKey, entry: _Open, total_bytes: int) -> None:
         """Of another object of the same name nothing is here."""
-        self._say(key, entry.total_bytes - 1 if entry.total_bytes == total_bytes else 0)
+        self._report(key, entry.total_bytes - 1 if entry.total_bytes == total_bytes else 0)
 
-    def _say(self, key: BacklogKey, acknowledged_bytes: int) -> None:
-        self._unsaid[key] = acknowledged_bytes
-        _trim(self._unsaid, _MAX_UNSAID)
+    def _report(self, key: BacklogKey, acknowledged_bytes: int) -> None:
+        self._unreported[key] = acknowledged_bytes
+        _trim(self._unreported, _MAX_UNREPORTED)
 
 
 def backlog_content(key: BacklogKey, data: bytes, *, edge: str) -> BacklogContent:
@@ -241,11 +241,11 @@ def _info(session_id: int, data: bytes, *, edge: str) -> Info:
 
 
 def _still(session_id: int, number: int, data: bytes) -> StoredStill:
-    kept = parse_backlog_still(data)
-    header = RoiHeader.parse(kept.attachment, kept.payload)
+    stored = parse_backlog_still(data)
+    header = RoiHeader.parse(stored.attachment, stored.payload)
     if header.session_id != session_id or header.sequence != number:
         raise WireError(f"past still {number} is another one inside")
-    return StoredStill(replace(header, flags=header.flags | Flags.STORED), kept.payload, kept.encoding)
+    return StoredStill(replace(header, flags=header.flags | Flags.STORED), stored.payload, stored.encoding)
 
 
 def _check(header: BacklogHeader, payload: bytes) -> None:

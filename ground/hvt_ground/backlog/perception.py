@@ -1,14 +1,12 @@
-"""Looks at what was kept of one session: boxes in stretches of its video, and stills of one that is over.
+"""Analyzes what was stored of one session: boxes in stretches of its video, and stills of one that is over.
 
-With the models of now, borrowed while it looks, for it is done in the thread that sees: neither the tracks of now nor
-a detector's memory are touched.
+Neither the tracks of the open session nor a detector's memory are touched.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
 
 import numpy as np
 
@@ -17,32 +15,25 @@ from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import Image
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Event, Overlay
-from hvt_ground.events.history import History
+from hvt_ground.events import Event, Overlay
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from hvt_ground.perception.history import History
+from hvt_ground.perception.models import ModelSet
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner
-from hvt_ground.perception.stills.stage import Moment, StillStage
+from hvt_ground.perception.stills.stage import Progress, StillStage
 
-__all__ = ["FIRST_TRACK_ID", "BacklogPerception", "ModelCheckout", "Watch"]
+__all__ = ["FIRST_TRACK_ID", "BacklogPerception", "StretchTracker"]
 
 FIRST_TRACK_ID = 1_000_001
-"""Tracks of kept video are others than those of the session, and told apart by their numbers."""
+"""Of the first track in stored video: these tracks are others than those of the live stream."""
 
 Emit = Callable[[Event], None]
 
 
-class ModelCheckout(Protocol):
-    """Where models come from."""
-
-    def checkout(self) -> AbstractContextManager[tuple[Detector, Classifier | None]]:
-        """A set that may be used meanwhile, by turns with what else is done in the thread that sees."""
-        ...
-
-
-class Watch:
+class StretchTracker:
     """Detects and tracks along one stretch of video."""
 
     def __init__(
@@ -56,7 +47,7 @@ class Watch:
         self._detected: int | None = None
         self.next_id = first_id
 
-    def see(self, frame_index: int, capture_ns: int, image_bgr: Image) -> None:
+    def analyze(self, frame_index: int, capture_ns: int, image_bgr: Image) -> None:
         """Take the next frame; frames rise."""
         if self._detected is None or frame_index - self._detected >= self._detect_every:
             self._detected = frame_index
@@ -87,33 +78,33 @@ class BacklogPerception:
 
     Args:
         info: of the session.
-        models: lends detector and classifier.
+        checkout: gives the models for the time of a job.
         tracker_of: makes a tracker for one stretch.
         reader_of: makes of detector and classifier what names stills.
-        detect_every: ticks from one detection to the next, at least.
+        detect_every: frames from one detection to the next, at least.
     """
 
     def __init__(
         self,
         info: Info,
         *,
-        models: ModelCheckout,
+        checkout: Callable[[], AbstractContextManager[ModelSet]],
         tracker_of: Callable[[], ByteTracker],
         reader_of: Callable[[Detector, Classifier | None], StillReader],
         detect_every: int,
     ) -> None:
         self._info = info
-        self._models = models
+        self._checkout = checkout
         self._tracker_of = tracker_of
         self._reader_of = reader_of
         self._detect_every = detect_every
         self._next_id = FIRST_TRACK_ID
 
     @contextmanager
-    def watch(self, emit: Emit) -> Iterator[Watch]:
-        """What follows one stretch of video."""
-        with self._models.checkout() as (detector, _):
-            watch = Watch(
+    def track(self, emit: Emit) -> Iterator[StretchTracker]:
+        """Give a tracker for one stretch of video, with the models meanwhile."""
+        with self._checkout() as (detector, _):
+            tracker = StretchTracker(
                 detector,
                 self._tracker_of(),
                 first_id=self._next_id,
@@ -121,14 +112,14 @@ class BacklogPerception:
                 emit=emit,
             )
             try:
-                yield watch
+                yield tracker
             finally:
-                self._next_id = watch.next_id
+                self._next_id = tracker.next_id
 
     def read(self, still: ReceivedStill, *, emit: Emit) -> None:
         """Decode, name and give out a still of a session that is over: no track of it is here to be matched."""
         info = self._info
-        with self._models.checkout() as (detector, classifier):
+        with self._checkout() as (detector, classifier):
             reader = self._reader_of(detector, classifier)
             names, edge_classes = unified_names(detector.class_names, info.class_names)
             stage = StillStage(
@@ -137,13 +128,13 @@ class BacklogPerception:
                     "replace", fps=info.fps, detector_classes=names, classifier_classes=reader.class_names
                 ),
                 history=History(),
-                fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_ticks=1)),
+                fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_frames=1)),
                 view=info.view,
                 wants_base=False,
-                gap_ticks=1,
+                gap_frames=1,
                 emit=emit,
             )
             header = still.header
-            moment = Moment(header.frame_index, header.capture_ns, picture_index=header.frame_index)
+            moment = Progress(header.frame_index, header.capture_ns, picture_index=header.frame_index)
             stage.take([still], moment)
             stage.end(moment)

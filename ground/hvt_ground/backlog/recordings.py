@@ -1,6 +1,6 @@
-"""What an edge kept before it was started again goes into recordings of its own, one for each session.
+"""What an edge stored before it was started again goes into recordings of its own, one for each session.
 
-So many files at most, and of those so many open at a time, whatever an edge says that it kept: one that is started
+So many files at most, and of those so many open at a time, whatever an edge says that it stored: one that is started
 over and over, or somebody in its name, would fill the disk with them.
 """
 
@@ -9,19 +9,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from hvt_common.protocol.messages import Info
-from hvt_ground.backlog.fill import BacklogFill, Work
 from hvt_ground.backlog.perception import BacklogPerception
-from hvt_ground.events.events import Notice
-from hvt_ground.link.sequence_window import SequenceWindow
+from hvt_ground.backlog.session_backlog import SessionBacklog
+from hvt_ground.events import Notice
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.sinks.rerun.recorder import Recorder
+from hvt_ground.sinks import Sink
 
 __all__ = ["MOST_FILES", "MOST_OPEN", "BacklogRecording", "BacklogRecordings"]
 
@@ -32,42 +29,30 @@ _CLOSE_S = 1.0
 
 
 class BacklogRecording:
-    """One session's. `still` is for the thread that sees, `fill` for the one that receives."""
+    """The recording of one session that is over."""
 
-    def __init__(self, info: Info, *, path: Path | None, recorder: Recorder, look: BacklogPerception) -> None:
-        self.info = info
+    def __init__(self, info: Info, *, path: Path | None, sink: Sink, perception: BacklogPerception) -> None:
         self.path = path
-        self._recorder = recorder
-        self._look = look
-        self._stills = SequenceWindow()
-        self.fill = BacklogFill(info, log=recorder.log, look=look)
+        self.users = 0
+        """Jobs that have it in hand, or wait to."""
+        self._sink = sink
+        self._perception = perception
+        self.backlog = SessionBacklog(info, log=sink.log, perception=perception, read=self._read)
 
-    def still(self, still: ReceivedStill) -> Work:
-        """Decode, name and log one, once."""
-        if self._stills.add([still.header.sequence]):
-            self.fill.note_still(still.header.frame_index, still.header.capture_ns)
-            self._look.read(still, emit=self._recorder.log)
-        yield
-        return True
+    def close(self, *, quickly: bool = False) -> None:
+        """Say what has come and close the file; ``quickly`` without its footer."""
+        totals = self.backlog.totals
+        if totals.first is not None:
+            text = f"{totals.amount()} of this session arrived after it had ended"
+            self._sink.log(Notice(*totals.first, "info", text))
+        self._sink.close(quickly=quickly)
 
-    def close(self, *, footer: bool = True) -> None:
-        """Say what has come and close the file."""
-        arrived = self.fill.arrived
-        if arrived.first is not None:
-            text = f"{arrived.amount()} of this session arrived after it had ended"
-            self._recorder.log(Notice(*arrived.first, "info", text))
-        self._recorder.close(footer=footer)
-
-
-@dataclass(slots=True)
-class _Open:
-    recording: BacklogRecording
-    users: int = 0
-    """Work that has it in hand, or waits to."""
+    def _read(self, still: ReceivedStill) -> None:
+        self._perception.read(still, emit=self._sink.log)
 
 
 class BacklogRecordings:
-    """Of one edge: opened when something comes of a session. For the threads that receive and see.
+    """Of one edge: opened when something comes of a session. Safe for threads.
 
     Where too many are open, the one that nothing came for the longest is closed, in a thread of its own, for a footer
     may take seconds. One that is in use is not: should all be, one more is open for the time being. When more comes
@@ -90,7 +75,7 @@ class BacklogRecordings:
         self._most = most
         self._left = most_files
         self._lock = threading.Lock()
-        self._open: OrderedDict[int, _Open] = OrderedDict()
+        self._open: OrderedDict[int, BacklogRecording] = OrderedDict()
         self._closer = ThreadPoolExecutor(1, thread_name_prefix="hvt-backlog-close")
         self._closing: list[Future[None]] = []
         self._stop_ns: int | None = None
@@ -98,37 +83,44 @@ class BacklogRecordings:
         self.paths: list[Path] = []
         """All files, in the order of opening."""
 
+    @property
+    def open_sessions(self) -> list[int]:
+        """Session ids of the recordings that are open, the one that was used last at the end."""
+        with self._lock:
+            return list(self._open)
+
     def takes(self, session_id: int) -> bool:
         """Whether there is a recording for this session, or may be one."""
         with self._lock:
             return self._stop_ns is None and (self._left > 0 or session_id in self._open)
 
-    @contextmanager
-    def using(self, info: Info) -> Iterator[BacklogRecording | None]:
-        """The session's recording, which stays open meanwhile; None where `takes` says no.
+    def acquire(self, info: Info) -> SessionBacklog | None:
+        """The backlog of that session's recording, which stays open until `release`; None where `takes` says no.
 
         Raises:
             UserError: its file cannot be made, or another could not be closed as it should.
         """
-        held = self._hold(info)
-        try:
-            yield None if held is None else held.recording
-        finally:
-            if held is not None:
-                self._release(held)
-
-    def kept(self, recording: BacklogRecording, work: Work) -> Work:
-        """The work, for which a recording that is in use now stays open until it is done, or `release_all`."""
+        self._raise_error()
         with self._lock:
-            held = next(one for one in self._open.values() if one.recording is recording)
-            held.users += 1
-        return self._released_after(held, work)
+            recording = self._open.get(info.session_id)
+            if recording is None:
+                if self._stop_ns is not None or self._left <= 0:
+                    return None
+                self._close_surplus()
+                self._left -= 1
+                recording = self._open[info.session_id] = self._open_one(info)
+                if recording.path is not None:
+                    self.paths.append(recording.path)
+            self._open.move_to_end(info.session_id)
+            recording.users += 1
+            return recording.backlog
 
-    def release_all(self) -> None:
-        """No work goes on: those that did it are gone."""
+    def release(self, backlog: SessionBacklog) -> None:
+        """The user is done with it."""
         with self._lock:
-            for held in self._open.values():
-                held.users = 0
+            for recording in self._open.values():
+                if recording.backlog is backlog:
+                    recording.users -= 1
 
     def close(self) -> None:
         """Close all that are open."""
@@ -139,42 +131,16 @@ class BacklogRecordings:
         self._closer.shutdown()
         self._raise_error(wait=True)
 
-    def _hold(self, info: Info) -> _Open | None:
-        self._raise_error()
-        with self._lock:
-            held = self._open.get(info.session_id)
-            if held is None:
-                if self._stop_ns is not None or self._left <= 0:
-                    return None
-                self._make_room()
-                self._left -= 1
-                held = self._open[info.session_id] = _Open(self._open_one(info))
-                if held.recording.path is not None:
-                    self.paths.append(held.recording.path)
-            self._open.move_to_end(info.session_id)
-            held.users += 1
-            return held
-
-    def _release(self, held: _Open) -> None:
-        with self._lock:
-            held.users = max(0, held.users - 1)
-
-    def _released_after(self, held: _Open, work: Work) -> Work:
-        try:
-            return (yield from work)
-        finally:
-            self._release(held)
-
-    def _make_room(self) -> None:
-        unused = [session_id for session_id, held in self._open.items() if not held.users]
+    def _close_surplus(self) -> None:
+        unused = [session_id for session_id, recording in self._open.items() if not recording.users]
         for session_id in unused[: max(0, len(self._open) + 1 - self._most)]:
             self._close_later(self._open.pop(session_id))
 
-    def _close_later(self, held: _Open) -> None:
-        self._closing.append(self._closer.submit(self._close, held.recording))
+    def _close_later(self, recording: BacklogRecording) -> None:
+        self._closing.append(self._closer.submit(self._close, recording))
 
     def _close(self, recording: BacklogRecording) -> None:
-        recording.close(footer=self._stop_ns is None or time.monotonic_ns() < self._stop_ns)
+        recording.close(quickly=self._stop_ns is not None and time.monotonic_ns() >= self._stop_ns)
 
     def _raise_error(self, *, wait: bool = False) -> None:
         for closing in self._closing:

@@ -1,4 +1,4 @@
-"""Stretches of the base stream that were kept: which of their frames can be shown, and what they show.
+"""Stretches of the base stream that were stored: which of their frames can be shown, and what they show.
 
 A stretch that begins with a keyframe stands by itself. The first one of an outage need not: it goes on from the last
 picture that came over the link, so the units since the last keyframe before each gap are remembered.

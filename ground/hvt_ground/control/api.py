@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -29,17 +29,17 @@ from hvt_common.protocol.channels import Channel, EdgeKeys, parse_key, selector
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, Info, RoiHeader, WireError
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.inbox import Inbox, Received
+from hvt_common.transport.rights import Rights
 from hvt_common.transport.session import open_session, query, subscribe
-from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_common.values import Image
 from hvt_common.video.still_codecs import StillError
-from hvt_ground.control.unanswered import Requester, who_is_seen_by_way_of
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still
 
 __all__ = ["EdgeClient", "EdgeTrack", "RefusedError", "RemoteEdge", "RequestedStill"]
 
 _ANSWER_S = 2.0
-_LOOK_S = 0.3
+_POLL_S = 0.3
 _OUTCOME_S = 2.0
 """So often the edge is asked what became of a still that does not come."""
 _INBOX_MESSAGES = 64
@@ -101,6 +101,48 @@ def check_suffix(path: Path) -> None:
         raise UserError(f"{path} is not a picture that can be written: name it {', '.join(_SUFFIXES)}")
 
 
+@dataclass(frozen=True, slots=True)
+class Requester:
+    """What our own file lets us do."""
+
+    file: Path | None = None
+    rights: Rights = field(default_factory=Rights)
+
+    @classmethod
+    def of(cls, settings: LinkSettings) -> Requester:
+        """From the settings of the session; `UserError` where they cannot be used."""
+        return cls(settings.zenoh_config, Rights.of(configure(settings)[0]))
+
+    def refusal(self, edge: str) -> str:
+        """Why ``control`` of this edge need not be tried; empty where our own file allows it."""
+        key = EdgeKeys(edge).key(Channel.CONTROL)
+        if self.rights.allow_somebody(flow="egress", message="query", key=key):
+            return ""
+        if self.rights.allow_somebody(flow="egress", message="query", key=EdgeKeys(edge).key(Channel.INFO)):
+            return (
+                f"{self.file} lets us watch {edge}, not command it: a key that hvt-ground keys add-ground makes "
+                "without --watch-only may"
+            )
+        return (
+            f"{self.file} does not name {edge}: hvt-ground keys list shows who may watch it, and a file that was "
+            "written before the edge was added has to be copied again"
+        )
+
+
+def _link_hint(session: zenoh.Session) -> str:
+    """Where an edge that does not show itself may be stopped: what stands at the other end of our links, by its key.
+
+    Empty where there are no keys. An asker has one link.
+    """
+    names = sorted({link.auth_identifier for link in session.info.links() if link.auth_identifier})
+    if not names:
+        return ""
+    return (
+        f"; {names[0]}, to which we are linked, passes on only what its file lets our key see (hvt-ground keys list; "
+        f"a {names[0]}.json5 from before our key was made does not name it)"
+    )
+
+
 class RemoteEdge:
     """One edge, at the other end of the link.
 
@@ -108,15 +150,15 @@ class RemoteEdge:
     where it says no.
     """
 
-    def __init__(self, session: zenoh.Session, edge: str, *, asker: Requester | None = None) -> None:
+    def __init__(self, session: zenoh.Session, edge: str, *, requester: Requester | None = None) -> None:
         self.name = edge
         self._session = session
         self._keys = EdgeKeys(edge)
-        self._asker = asker or Requester()
+        self._requester = requester or Requester()
 
     def info(self) -> Info:
         """What the edge says of its session."""
-        answer = self._ask(Channel.INFO, b"")
+        answer = self._query(Channel.INFO, b"")
         if answer is None:
             raise UserError(self._absent())
         return self._parsed(Info.parse, answer)
@@ -195,7 +237,7 @@ class RemoteEdge:
         self._check_may_command()
         answer = self._commanded(command, arguments or {})
         if answer is None:
-            present = self._ask(Channel.INFO, b"") is not None
+            present = self._query(Channel.INFO, b"") is not None
             raise UserError(control_unanswered(self.name, who="this key") if present else self._absent())
         return answer
 
@@ -203,20 +245,20 @@ class RemoteEdge:
         self, inbox: Inbox, answer: ControlAnswer, *, until_s: float, timeout_s: float
     ) -> tuple[RoiHeader, Received]:
         """The still of that number; in between the edge is asked whether it is still to come."""
-        ask_s = time.monotonic() + _OUTCOME_S
+        query_s = time.monotonic() + _OUTCOME_S
         while (now_s := time.monotonic()) < until_s:
-            item = inbox.get(timeout_s=min(_LOOK_S, until_s - now_s))
+            item = inbox.get(timeout_s=min(_POLL_S, until_s - now_s))
             header = None if item is None else _header(item)
             if item is not None and header is not None and _is_answer(header, answer):
                 return header, item
-            if now_s >= ask_s:
+            if now_s >= query_s:
                 try:
                     self._commanded(Command.STILL_OUTCOME, {"ask": answer.still_request})
                 except RefusedError:
                     raise
                 except UserError:
                     pass  # an answer that cannot be used, as no answer: the still itself may come all the same
-                ask_s = now_s + _OUTCOME_S
+                query_s = now_s + _OUTCOME_S
         raise UserError(
             f"{self.name} accepted the still, but it did not come within {timeout_s:g} s: "
             "the budget or the link is full"
@@ -228,7 +270,7 @@ class RemoteEdge:
             question = ControlRequest(session_id=0, command=command, arguments=arguments).pack()
         except ValueError as error:
             raise UserError(f"{command}: {error}") from None
-        data = self._ask(Channel.CONTROL, question)
+        data = self._query(Channel.CONTROL, question)
         if data is None:
             return None
         answer = self._parsed(ControlAnswer.parse, data)
@@ -237,10 +279,10 @@ class RemoteEdge:
         return answer
 
     def _check_may_command(self) -> None:
-        if refusal := self._asker.refusal(self.name):
+        if refusal := self._requester.refusal(self.name):
             raise UserError(refusal)
 
-    def _ask(self, row: Channel, question: bytes) -> bytes | None:
+    def _query(self, row: Channel, question: bytes) -> bytes | None:
         try:
             return query(self._session, row, keys=self._keys, question=question, timeout_s=_ANSWER_S)
         except zenoh.ZError:
@@ -249,7 +291,7 @@ class RemoteEdge:
     def _absent(self) -> str:
         return (
             f"edge {self.name!r} does not answer: is it flying, and does this link reach it?"
-            f"{who_is_seen_by_way_of(self._session)}"
+            f"{_link_hint(self._session)}"
         )
 
     def _parsed(self, parse: Callable[[bytes], _Answer], data: bytes) -> _Answer:
@@ -263,10 +305,10 @@ class EdgeClient:
     """The edges that can be reached from one place; a context manager. ``client["uav-1"]`` is one of them."""
 
     def __init__(
-        self, session: zenoh.Session, *, asker: Requester | None = None, stack: ExitStack | None = None
+        self, session: zenoh.Session, *, requester: Requester | None = None, stack: ExitStack | None = None
     ) -> None:
         self._session = session
-        self._asker = asker
+        self._requester = requester
         self._stack = stack or ExitStack()
 
     @classmethod
@@ -278,11 +320,11 @@ class EdgeClient:
         """
         stack = ExitStack()
         settings = LinkSettings(role="client", connect=endpoints, zenoh_config=zenoh_config)
-        return cls(stack.enter_context(open_session(settings)), asker=Requester.of(settings), stack=stack)
+        return cls(stack.enter_context(open_session(settings)), requester=Requester.of(settings), stack=stack)
 
     def nobody(self) -> str:
         """What to tell a user where `names` is empty."""
-        return f"no edge is there{who_is_seen_by_way_of(self._session)}"
+        return f"no edge is there{_link_hint(self._session)}"
 
     def names(self) -> list[str]:
         """The edges that are there now."""
@@ -291,7 +333,7 @@ class EdgeClient:
         return sorted({key[0] for key in keys if key is not None})
 
     def __getitem__(self, edge: str) -> RemoteEdge:
-        return RemoteEdge(self._session, edge, asker=self._asker)
+        return RemoteEdge(self._session, edge, requester=self._requester)
 
     def close(self) -> None:
         """Leave the link."""

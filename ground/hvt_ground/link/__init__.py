@@ -1,1 +1,1 @@
-"""What comes off the link, put in order and counted. Pure: no Zenoh, no threads, time is an argument."""
+"""What comes off the link, put in order and counted: `Reassembler`, statistics, packets, windows of numbers. Pure."""

@@ -13,13 +13,13 @@ keyframe never waits: what is missing before it no longer matters.
 *Sessions.* An edge that restarts has a new session id and counts from 0. It is adopted with a keyframe, once
 the present session has been silent for `SILENCE_NS` (or three of its own frames), and not more than once in
 `ADOPTION_INTERVAL_NS`: late units of the old session or a flood of invented ids cannot make the picture jump to
-and fro. Where the present session still goes on `DUPLICATE_AFTER_NS` after another was first heard, that is no
-restart but a second edge of the same name: a *rival*, which is shown only when the first has been silent for
+and fro. Where the present session still goes on `DUPLICATE_AFTER_NS` after another first came, that is no
+restart but a second edge of the same name: a *duplicate*, which is shown only when the first has been silent for
 `DUPLICATE_SILENCE_NS`. A session that was left may come back, but only beyond where it had been. One that the edge
 does not know (`Reassembler.disown`) is nobody's, and the one before it goes on.
 
 *Plausibility.* A sequence number or frame index that is further ahead than `MAX_RATE_HZ` allows since the last
-progress (plus some slack) is not believed, so that one flipped bit cannot make all that follows look old. If
+progress (plus some slack) does not count, so that one flipped bit cannot make all that follows look old. If
 nothing else comes for `RESTART_SILENCE_NS` it was we who were wrong, and the next keyframe starts afresh. So it is
 where nothing comes but old numbers that have not been here: somebody else has counted on in the edge's name.
 """
@@ -27,11 +27,12 @@ where nothing comes but old numbers that have not been here: somebody else has c
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Hashable
 from dataclasses import dataclass, fields, replace
-from typing import Generic, Literal, Protocol, TypeVar
+from typing import Literal
 
-__all__ = ["AccessUnitHeader", "Arrival", "Counters", "Reassembler", "Verdict"]
+from hvt_common.protocol.messages import BaseHeader
+
+__all__ = ["Arrival", "Reassembler", "StreamCounters", "Verdict"]
 
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
 """What to do with an access unit:
@@ -75,35 +76,12 @@ _COUNTER_OF: dict[Verdict, str] = {
 }
 
 
-class AccessUnitHeader(Protocol):
-    """What is needed of the header of a base message."""
-
-    @property
-    def session_id(self) -> Hashable:
-        """Random, once for each start of the edge."""
-
-    @property
-    def sequence(self) -> int:
-        """0, 1, 2 … counts messages of the session, without holes at the sender."""
-
-    @property
-    def frame_index(self) -> int:
-        """Rises with the sequence; has holes where the edge dropped frames before encoding."""
-
-    @property
-    def keyframe(self) -> bool:
-        """True where a decoder can start."""
-
-
-H = TypeVar("H", bound=AccessUnitHeader)
-
-
 @dataclass(frozen=True, slots=True)
-class Arrival(Generic[H]):
+class Arrival:
     """One access unit and its verdict. A unit that waited comes out later, in a later call's list."""
 
     verdict: Verdict
-    header: H
+    header: BaseHeader
     payload: bytes
     received_ns: int
     """``now_ns`` of the call that brought it."""
@@ -118,7 +96,7 @@ class Arrival(Generic[H]):
 
 
 @dataclass(slots=True)
-class Counters:
+class StreamCounters:
     """Totals since the start, over all sessions. Units still waiting behind a hole are in ``received`` only."""
 
     received: int = 0
@@ -136,34 +114,37 @@ class Counters:
     corrupt: int = 0
     """Reported by the caller: the header could not be read, or the CRC was wrong."""
     sessions: int = 0
-    """Adopted; one that starts afresh after numbers that could not be believed counts again."""
+    """Adopted; one that starts afresh after implausible numbers counts again."""
     keyframe_requests: int = 0
 
-    def since(self, before: Counters) -> Counters:
+    def since(self, before: StreamCounters) -> StreamCounters:
         """What was counted after ``before`` was copied."""
-        return Counters(
-            **{one.name: getattr(self, one.name) - getattr(before, one.name) for one in fields(Counters)}
+        return StreamCounters(
+            **{
+                one.name: getattr(self, one.name) - getattr(before, one.name)
+                for one in fields(StreamCounters)
+            }
         )
 
 
-class Reassembler(Generic[H]):
+class Reassembler:
     """Order, gaps, duplicates and sessions of the base stream of one edge.
 
     ``now_ns`` is any clock that does not go back (monotonic); the same one in all calls.
     """
 
     def __init__(self) -> None:
-        self.counters = Counters()
-        self._session: Hashable = None
+        self.counters = StreamCounters()
+        self._session: int | None = None
         self._adopted_ns: int | None = None
-        self._left: OrderedDict[Hashable, int] = OrderedDict()  # session id → the sequence it had reached
-        self._outsiders: OrderedDict[Hashable, int] = OrderedDict()  # session id → when it was first heard
-        self._disowned: OrderedDict[Hashable, None] = OrderedDict()
+        self._left: OrderedDict[int | None, int] = OrderedDict()  # session id → the sequence it had reached
+        self._outsiders: OrderedDict[int | None, int] = OrderedDict()  # session id → when it first came
+        self._disowned: OrderedDict[int | None, None] = OrderedDict()
         self._first = 0
         self._next = 0
         self._last_frame = -1
         self._recent = 0  # bit i: the sequence _next - 1 - i has been here
-        self._held: dict[int, Arrival[H]] = {}
+        self._held: dict[int, Arrival] = {}
         self._synced = False
         self._progress_ns = 0
         self._interval_ns = 0  # about the time between two units of the present session
@@ -172,11 +153,16 @@ class Reassembler(Generic[H]):
         self._requests_in_gap = 0
 
     @property
-    def session_id(self) -> Hashable:
+    def held(self) -> int:
+        """How many units wait behind a hole."""
+        return len(self._held)
+
+    @property
+    def session_id(self) -> int | None:
         """Of the session that is shown; None before the first keyframe. Stills of others are not wanted."""
         return self._session
 
-    def accept(self, header: H, payload: bytes, *, now_ns: int) -> list[Arrival[H]]:
+    def accept(self, header: BaseHeader, payload: bytes, *, now_ns: int) -> list[Arrival]:
         """Take one access unit whose CRC is right; return all that is now settled, in order."""
         self.counters.received += 1
         unit = Arrival("decode", header, payload, now_ns)
@@ -242,9 +228,9 @@ class Reassembler(Generic[H]):
 
     # Within the session: a hole waits, then is given up.
 
-    def _release(self, now_ns: int) -> list[Arrival[H]]:
+    def _release(self, now_ns: int) -> list[Arrival]:
         """Everything that need not wait any longer: at most ``REORDER_UNITS`` units stay behind a hole."""
-        released: list[Arrival[H]] = []
+        released: list[Arrival] = []
         keyframe = max(
             (sequence for sequence, unit in self._held.items() if unit.header.keyframe), default=-1
         )
@@ -272,7 +258,7 @@ class Reassembler(Generic[H]):
         self._next += lost
         self._synced = False
 
-    def _take(self, unit: Arrival[H], now_ns: int) -> Verdict:
+    def _take(self, unit: Arrival, now_ns: int) -> Verdict:
         """The unit that is due: to the decoder, or skipped until a keyframe."""
         header = unit.header
         self._recent = (self._recent << 1 | 1) & _WINDOW_MASK
@@ -288,7 +274,7 @@ class Reassembler(Generic[H]):
             return "skip"
         return "decode"
 
-    def _settle_old(self, unit: Arrival[H]) -> Arrival[H]:
+    def _settle_old(self, unit: Arrival) -> Arrival:
         return self._judged(unit, "duplicate" if self._has_been(unit.header.sequence) else "stale")
 
     def _has_been(self, sequence: int) -> bool:
@@ -296,7 +282,7 @@ class Reassembler(Generic[H]):
         age = self._next - 1 - sequence  # negative: waiting behind a hole, so it is here already
         return age < 0 or (age < SEQUENCE_SLACK and bool(self._recent >> age & 1))
 
-    def _plausible(self, header: H, now_ns: int) -> bool:
+    def _plausible(self, header: BaseHeader, now_ns: int) -> bool:
         ahead = (now_ns - self._progress_ns) * MAX_RATE_HZ // 1_000_000_000
         steps = header.sequence - self._next, header.frame_index - self._last_frame
         return 0 <= steps[0] <= SEQUENCE_SLACK + ahead and 0 < steps[1] <= FRAME_SLACK + ahead
@@ -306,8 +292,8 @@ class Reassembler(Generic[H]):
 
     # Between sessions.
 
-    def _is_duplicate(self, session_id: Hashable, now_ns: int) -> bool:
-        """Whether the present session has gone on for a while since that one was first heard."""
+    def _is_duplicate(self, session_id: int, now_ns: int) -> bool:
+        """Whether the present session has gone on for a while since that one first came."""
         if self._adopted_ns is None:
             return False
         since_ns = self._outsiders.setdefault(session_id, now_ns)
@@ -317,8 +303,8 @@ class Reassembler(Generic[H]):
         return self._progress_ns - since_ns > DUPLICATE_AFTER_NS
 
     def _accept_outsider(
-        self, unit: Arrival[H], refusal: Verdict, *, patience_ns: int, duplicate: bool = False
-    ) -> list[Arrival[H]]:
+        self, unit: Arrival, refusal: Verdict, *, patience_ns: int, duplicate: bool = False
+    ) -> list[Arrival]:
         """A unit that does not continue the session: adopted with a keyframe when the session is silent."""
         header, now_ns = unit.header, unit.received_ns
         if header.sequence < self._left.get(header.session_id, 0):
@@ -337,14 +323,14 @@ class Reassembler(Generic[H]):
         verdict = self._take(unit, now_ns)
         return [*resolved, self._judged(unit, verdict, starts_session=True)]
 
-    def _leave(self) -> list[Arrival[H]]:
+    def _leave(self) -> list[Arrival]:
         """End the present session, if any; what waited behind a hole is skipped."""
         resolved = [self._judged(unit, "skip") for _, unit in sorted(self._held.items())]
         self._held.clear()
         self._synced = False
         return resolved
 
-    def _adopt(self, header: H, now_ns: int) -> None:
+    def _adopt(self, header: BaseHeader, now_ns: int) -> None:
         if self._adopted_ns is not None and header.session_id != self._session:
             self._left[self._session] = self._next
             self._left.move_to_end(self._session)
@@ -360,13 +346,13 @@ class Reassembler(Generic[H]):
 
     def _judged(
         self,
-        unit: Arrival[H],
+        unit: Arrival,
         verdict: Verdict,
         *,
         lost_before: int = 0,
         starts_session: bool = False,
         duplicate: bool = False,
-    ) -> Arrival[H]:
+    ) -> Arrival:
         """The unit with its verdict, counted."""
         name = _COUNTER_OF[verdict]
         setattr(self.counters, name, getattr(self.counters, name) + 1)

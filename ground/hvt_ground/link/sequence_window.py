@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Iterable
 
-__all__ = ["SequenceWindow"]
+__all__ = ["SequenceWindow", "StillSequenceWindow"]
 
 _PAGE_BITS = 12
+_MOST_SENT = 512
+"""Stills whose second copy is still known for one: those of the last seconds."""
+_NEVER_NS = -(2**64)
+"""When a still was sent that has come with the backlog only."""
 
 
 class SequenceWindow:
@@ -41,3 +46,39 @@ class SequenceWindow:
     def __contains__(self, number: int) -> bool:
         """Whether it has been, as far as is remembered."""
         return bool(self._pages.get(number >> _PAGE_BITS, 0) >> (number & (1 << _PAGE_BITS) - 1) & 1)
+
+
+class StillSequenceWindow:
+    """Which stills have come: each is shown once, and counted as often as it crossed. Safe for threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._seen = SequenceWindow()
+        self._sent_ns: dict[int, int] = {}
+        """Sequence → when a still was sent of which no second copy has come."""
+
+    def is_new(self, sequence: int, *, send_ns: int) -> bool:
+        """Whether a still on ``roi`` has not come before."""
+        with self._lock:
+            if not self._seen.add([sequence]):
+                return False
+            self._sent_ns[sequence] = send_ns
+            while len(self._sent_ns) > _MOST_SENT:
+                del self._sent_ns[next(iter(self._sent_ns))]
+            return True
+
+    def is_copy(self, sequence: int, *, send_ns: int) -> bool:
+        """Whether one that is not new is the copy that the edge sent for want of an acknowledgement; once.
+
+        What bears the time of the first is a replay. Of one that came with the backlog, the first on ``roi`` is such
+        a copy.
+        """
+        with self._lock:
+            if send_ns <= self._sent_ns.get(sequence, send_ns):
+                return False
+            del self._sent_ns[sequence]
+            return True
+
+    def is_new_stored(self, sequence: int) -> bool:
+        """Whether a still of the backlog has not come before."""
+        return self.is_new(sequence, send_ns=_NEVER_NS)

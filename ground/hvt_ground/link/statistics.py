@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
 
-__all__ = ["REPORT_LINE_BYTES", "Measured", "ReceptionStatistics"]
+__all__ = ["REPORT_LINE_BYTES", "LinkMeasurement", "ReceptionStatistics", "Uptime"]
 
 _MS = 1_000_000
 _SECOND_NS = 1_000_000_000
@@ -29,7 +29,7 @@ _MISSED_NS = 6 * _SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class LinkMeasurement:
     """What a report says of the link."""
 
     base_sequence: int
@@ -83,12 +83,12 @@ class ReceptionStatistics:
             self._note(size_bytes, arrived_ns)
 
     def backlog(self, *, size_bytes: int, arrived_ns: int) -> None:
-        """A piece of what was kept while the link was away has arrived."""
+        """A chunk of the backlog has arrived."""
         with self._lock:
             self._note(size_bytes, arrived_ns)
 
     def stored_still(self, sequence: int) -> None:
-        """A still that never came on ``roi`` came afterwards, with what was kept."""
+        """A still that never came on ``roi`` came afterwards, with the backlog."""
         with self._lock:
             self._missing.pop(sequence, None)
 
@@ -114,7 +114,7 @@ class ReceptionStatistics:
             return _MOST_NS
         return min(_MOST_NS, max(_LEAST_NS, round(REPORT_LINE_BYTES / (_SHARE * arriving))))
 
-    def take(self, now_ns: int) -> Measured:
+    def take(self, now_ns: int) -> LinkMeasurement:
         """What to report now; delays begin anew."""
         with self._lock:
             delays = list(self._delays_ms)
@@ -122,7 +122,7 @@ class ReceptionStatistics:
             self._news = False
             self._reported_ns = now_ns
             held_us = max(0, now_ns - self._arrived_ns) // 1000 if self._base_sequence >= 0 else 0
-            return Measured(
+            return LinkMeasurement(
                 base_sequence=self._base_sequence,
                 base_held_us=min(held_us, _HELD_US),
                 still_sequence=self._still_sequence,
@@ -154,3 +154,33 @@ class ReceptionStatistics:
     def _forget(self, now_ns: int) -> None:
         while self._sizes and (self._sizes[0][0] <= now_ns - _RATE_OVER_NS or len(self._sizes) > 4096):
             self._size_bytes -= self._sizes.popleft()[1]
+
+
+class Uptime:
+    """Counts a gap between two messages only as far as both their arrival and their handling show it.
+
+    While the thread was away the sender was not silent, so by arrival the gap is small. And a sender that waited for
+    this side's answer in the meantime was not silent either: by handling that gap is small. Both clocks are one.
+    """
+
+    def __init__(self) -> None:
+        self._lived_ns = 0
+        self._arrived_ns: int | None = None
+        self._handled_ns = 0
+
+    def handle(self, *, arrived_ns: int, now_ns: int) -> int:
+        """Return the time of the message that is taken up now; never less than before."""
+        arrived_ns = min(arrived_ns, now_ns)
+        if self._arrived_ns is None:
+            self._lived_ns = now_ns
+        else:
+            self._lived_ns += max(0, min(arrived_ns - self._arrived_ns, now_ns - self._handled_ns))
+            arrived_ns = max(arrived_ns, self._arrived_ns)
+        self._arrived_ns, self._handled_ns = arrived_ns, now_ns
+        return self._lived_ns
+
+    def at(self, now_ns: int, *, pending: bool) -> int:
+        """Return the time now; with messages ``waiting`` it is still that of the last one taken up."""
+        if self._arrived_ns is None:
+            return now_ns
+        return self._lived_ns + (0 if pending else max(0, now_ns - self._handled_ns))

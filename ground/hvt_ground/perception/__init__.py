@@ -1,1 +1,1 @@
-"""Decoded base in, tracks out: the pipeline, and the worker that it runs in."""
+"""Decoded base in, tracks out: a `Pipeline` for each session, the worker it runs in, the `Models` they share."""

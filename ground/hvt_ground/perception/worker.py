@@ -1,4 +1,4 @@
-"""When things are seen: beside the receiving thread, so that decoding never waits for detection.
+"""When things are analyzed: beside the receiving thread, so that decoding never waits for detection.
 
 In real time what comes too fast is passed over, newest first; in lockstep nothing is, and the order is always the
 same: the same input gives the same tracks.
@@ -6,147 +6,152 @@ same: the same input gives the same tracks.
 
 from __future__ import annotations
 
-import queue
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol
 
 from hvt_common.runtime.process import lower_priority
 from hvt_common.values import Tracks
-from hvt_ground.perception.pipeline import Picture, ReceivedStill
+from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 
-__all__ = ["LockstepWorker", "PerceptionWorker", "RealtimeWorker"]
+__all__ = ["Analyze", "Job", "LockstepWorker", "PerceptionWorker", "Read", "RealtimeWorker", "Step"]
 
-_WAITING_PICTURES = 24
+_MOST_PICTURES = 24
 """How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
 _BEHIND_PICTURES = 1
 _STILLS_AT_ONCE = 16
-_WAITING_STILLS = 256
-_WAITING_STILL_BYTES = 32 * 2**20
-_WAITING_STEPS = 8
+_MOST_STILLS = 256
+_MOST_STILL_BYTES = 32 * 2**20
+_MOST_STEPS = 8
 """Reports of the edge's tracks: the newest count, each says all."""
-_LATER = 4096
-"""Pieces of work that can wait."""
-_AT_LEISURE = 8
-"""Those that come after them: each holds a stretch of video."""
-_LATER_S = 0.25
-"""On a machine that never comes to rest it still gets one step in so long."""
+_MOST_JOBS = 4096
+_MOST_LAST_JOBS = 8
+"""Of those that come last: each holds a stretch of video."""
+_JOB_STEP_S = 0.1
+"""On a machine that never comes to rest jobs still get one step in so long."""
 _STEP_LAG = 2
-"""In lockstep a step counts from so many ticks on. It is sent right before the next access unit, which may overtake
+"""In lockstep a step counts from so many frames on. It is sent right before the next access unit, which may overtake
 it by microseconds: this is what makes the order the same in every run."""
 _FINISH_S = 1.5
 _LEAVE_S = 1.0
 _AHEAD = 2
 
-See = Callable[[Picture, bool], None]
+Analyze = Callable[[DecodedFrame, bool], None]
 """Called with a picture, and whether to hurry."""
 Step = Callable[[Tracks, int], None]
-"""Called with what the edge tracked at one tick, and that tick's capture time."""
+"""Called with what the edge tracked at one frame, and that frame's capture time."""
 Read = Callable[[Sequence[ReceivedStill]], None]
-Work = Generator[None, None, object]
-"""Done step by step."""
 
 
-class PerceptionWorker(Protocol):
-    """Where the receiving thread hands over what is to be seen."""
+class Job:
+    """Work that can wait, done step by step while nothing newer is there. For the worker's thread."""
 
-    untracked: int
-    """Pictures that were passed over."""
-    dropped: Counter[str]
-    """Stills that were passed over, by reason."""
+    def step(self) -> bool:
+        """Do one step; True once there is none left."""
+        raise NotImplementedError
 
-    @property
-    def idle(self) -> bool:
-        """Nothing waits, and nothing is in hand."""
-        ...
-
-    def picture(self, picture: Picture) -> None:
-        """Hand over a decoded frame."""
-        ...
-
-    def step(self, tracks: Tracks, capture_ns: int) -> None:
-        """Hand over what the edge tracked at one tick."""
-        ...
-
-    def still(self, still: ReceivedStill) -> None:
-        """Hand over a still."""
-        ...
-
-    def later(self, work: Work) -> bool:
-        """Hand over work that can wait, done step by step while nothing else is to be seen; False: no room."""
-        ...
-
-    def at_leisure(self, work: Work) -> bool:
-        """Hand over work that gives way even to what is done `later`, between any two steps; False: no room."""
-        ...
-
-    @property
-    def has_room(self) -> bool:
-        """Whether `later` takes another."""
-        ...
-
-    def close(self) -> bool:
-        """Finish what waits, for a second or two; False where the thread did not come back."""
-        ...
-
-    def raise_error(self) -> None:
-        """Raise what went wrong while seeing."""
-        ...
+    def close(self) -> None:
+        """Release what it holds, done or not; called once."""
 
 
-class RealtimeWorker:
-    """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still."""
+class PerceptionWorker(ABC):
+    """Where the receiving thread hands over what is to be analyzed, and where jobs are done.
 
-    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
-        self._see = see
+    Args:
+        analyze: takes pictures.
+        step: takes the edge's tracks.
+        read: takes stills.
+    """
+
+    def __init__(self, analyze: Analyze, step: Step, read: Read) -> None:
+        self._analyze = analyze
         self._step = step
         self._read = read
         self.untracked = 0
+        """Pictures that were passed over."""
         self.dropped: Counter[str] = Counter()
-        self._pictures: queue.Queue[Picture] = queue.Queue(_WAITING_PICTURES)
-        self._stills: queue.Queue[ReceivedStill] = queue.Queue(_WAITING_STILLS)
-        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
-        self._later: deque[Work] = deque()
-        self._leisure: deque[Work] = deque()
-        self._later_s = 0.0
-        """When some of it was done last."""
+        """Stills that were passed over, by reason."""
+
+    @property
+    @abstractmethod
+    def idle(self) -> bool:
+        """Nothing is queued, and nothing is in hand."""
+
+    @property
+    def accepts_jobs(self) -> bool:
+        """Whether `submit` takes another."""
+        return True
+
+    @abstractmethod
+    def picture(self, picture: DecodedFrame) -> None:
+        """Hand over a decoded frame."""
+
+    @abstractmethod
+    def step(self, tracks: Tracks, capture_ns: int) -> None:
+        """Hand over what the edge tracked at one frame."""
+
+    @abstractmethod
+    def still(self, still: ReceivedStill) -> None:
+        """Hand over a still."""
+
+    @abstractmethod
+    def submit(self, job: Job, *, last: bool = False) -> bool:
+        """Hand over a job; one that comes ``last`` lets all others go before it, between any two steps.
+
+        False where too many are queued: it is not taken.
+        """
+
+    @abstractmethod
+    def close(self) -> bool:
+        """Finish what is queued, for a second or two; False where the thread did not come back."""
+
+    def raise_error(self) -> None:  # noqa: B027 - errors may come out of the other methods instead
+        """Raise what ended the thread."""
+
+
+class RealtimeWorker(PerceptionWorker):
+    """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still."""
+
+    def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
+        super().__init__(analyze, step, read)
+        self._lock = threading.Lock()
+        self._pictures: deque[DecodedFrame] = deque(maxlen=_MOST_PICTURES)
+        self._stills: deque[ReceivedStill] = deque()
+        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
+        self._jobs: deque[Job] = deque()
+        self._last_jobs: deque[Job] = deque()
+        self._job_step_s = 0.0
+        """When the last step of one was done."""
         self._wake = threading.Event()
         self._ending = threading.Event()
         self._given_up = threading.Event()
         self._in_hand = False
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name=f"hvt-sight-{name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"hvt-perception-{name}", daemon=True)
         self._thread.start()
 
     @property
     def idle(self) -> bool:
         """Nothing waits, and nothing is in hand."""
         # What is in hand is asked for last: it is taken from what waits, and never put back.
-        return not (self._has_news() or self._later or self._leisure or self._in_hand)
+        return not (self._has_news() or self._jobs or self._last_jobs or self._in_hand)
 
     @property
-    def has_room(self) -> bool:
-        """Whether `later` takes another."""
-        return len(self._later) < _LATER
+    def accepts_jobs(self) -> bool:
+        """Whether `submit` takes another."""
+        return len(self._jobs) < _MOST_JOBS
 
     def _has_news(self) -> bool:
-        return bool(self._steps) or not (self._pictures.empty() and self._stills.empty())
+        return bool(self._steps or self._pictures or self._stills)
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: DecodedFrame) -> None:
         """Queue a frame; where the queue is full the oldest goes untracked."""
-        while True:
-            try:
-                self._pictures.put_nowait(picture)
-                break
-            except queue.Full:
-                try:
-                    self._pictures.get_nowait()
-                    self.untracked += 1
-                except queue.Empty:
-                    continue
+        with self._lock:
+            self.untracked += len(self._pictures) == _MOST_PICTURES
+            self._pictures.append(picture)
         self._wake.set()
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
@@ -156,29 +161,20 @@ class RealtimeWorker:
 
     def still(self, still: ReceivedStill) -> None:
         """Queue a still; where the queue is full it is dropped."""
-        waiting_bytes = sum(len(one.data) for one in tuple(self._stills.queue))
-        try:
-            if waiting_bytes + len(still.data) <= _WAITING_STILL_BYTES:
-                self._stills.put_nowait(still)
+        with self._lock:
+            queued_bytes = sum(len(one.data) for one in self._stills)
+            if len(self._stills) < _MOST_STILLS and queued_bytes + len(still.data) <= _MOST_STILL_BYTES:
+                self._stills.append(still)
             else:
                 self.dropped["overflow"] += 1
-        except queue.Full:
-            self.dropped["overflow"] += 1
         self._wake.set()
 
-    def later(self, work: Work) -> bool:
-        """Queue work that can wait."""
-        if not self.has_room:
+    def submit(self, job: Job, *, last: bool = False) -> bool:
+        """Queue a job."""
+        queued, most = (self._last_jobs, _MOST_LAST_JOBS) if last else (self._jobs, _MOST_JOBS)
+        if len(queued) >= most:
             return False
-        self._later.append(work)
-        self._wake.set()
-        return True
-
-    def at_leisure(self, work: Work) -> bool:
-        """Queue work that can wait for long."""
-        if len(self._leisure) >= _AT_LEISURE:
-            return False
-        self._leisure.append(work)
+        queued.append(job)
         self._wake.set()
         return True
 
@@ -189,8 +185,8 @@ class RealtimeWorker:
         self._thread.join(_FINISH_S)
         self._given_up.set()
         self._thread.join(_LEAVE_S)
-        self.dropped["ended"] += self._stills.qsize()
-        self.untracked += self._pictures.qsize()
+        self.dropped["ended"] += len(self._stills)
+        self.untracked += len(self._pictures)
         return not self._thread.is_alive()
 
     def raise_error(self) -> None:
@@ -213,101 +209,83 @@ class RealtimeWorker:
         except BaseException as error:  # noqa: BLE001 - handed to the receiving thread, which ends the process
             self._error = error
         finally:
-            for waiting in (self._later, self._leisure):
-                while waiting:  # whatever one in the middle holds is let go of here
-                    waiting.popleft().close()
+            for jobs in (self._jobs, self._last_jobs):
+                while jobs:
+                    jobs.popleft().close()
 
     def _work_off(self) -> None:
-        """See all pictures that came before the stills taken here, then the edge's tracks, then read the stills."""
-        stills: list[ReceivedStill] = []
-        while len(stills) < _STILLS_AT_ONCE and not self._stills.empty():
-            stills.append(self._stills.get_nowait())
+        """Analyze the pictures that came before the stills taken here, then take the edge's tracks, then read."""
+        with self._lock:
+            stills = [self._stills.popleft() for _ in range(min(len(self._stills), _STILLS_AT_ONCE))]
         # Those that come meanwhile are not among them, or on a slow machine stills would wait for ever.
-        for _ in range(self._pictures.qsize()):
+        for _ in range(len(self._pictures)):
             if self._given_up.is_set():
                 break
-            try:
-                picture = self._pictures.get_nowait()
-            except queue.Empty:
-                break
-            self._see(picture, self._pictures.qsize() > _BEHIND_PICTURES)
+            with self._lock:
+                picture = self._pictures.popleft()
+            self._analyze(picture, len(self._pictures) > _BEHIND_PICTURES)
         while self._steps and not self._given_up.is_set():
             self._step(*self._steps.popleft())
         if stills:
             self._read(stills)
-        self._work_later()
+        self._do_jobs()
         if self._has_news():
             self._wake.set()
 
-    def _work_later(self) -> None:
+    def _do_jobs(self) -> None:
         """Do what can wait, until something comes that cannot."""
-        while (waiting := self._later or self._leisure) and not self._given_up.is_set():
-            if self._has_news() and time.monotonic() - self._later_s < _LATER_S:
+        while (jobs := self._jobs or self._last_jobs) and not self._given_up.is_set():
+            if self._has_news() and time.monotonic() - self._job_step_s < _JOB_STEP_S:
                 return
-            try:
-                next(waiting[0])
-            except StopIteration:
-                waiting.popleft()
-            self._later_s = time.monotonic()
+            if jobs[0].step():
+                jobs.popleft().close()
+            self._job_step_s = time.monotonic()
 
 
-class LockstepWorker:
-    """Sees one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
+class LockstepWorker(PerceptionWorker):
+    """Analyzes one frame while the next is decoded, in order, waiting for it rather than passing anything over."""
 
-    def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
-        self._see = see
-        self._step = step
-        self._read = read
-        self.untracked = 0
-        self.dropped: Counter[str] = Counter()
+    def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
+        super().__init__(analyze, step, read)
         self._pending: deque[Future[None]] = deque()
         self._early: list[ReceivedStill] = []
-        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_WAITING_STEPS)
+        self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
         self._newest_frame = -1
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-sight-{name}")
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"hvt-perception-{name}")
 
     @property
     def idle(self) -> bool:
         """Nothing waits, and nothing is in hand."""
         return all(future.done() for future in self._pending)
 
-    def picture(self, picture: Picture) -> None:
-        """See a frame, and read the stills of it that overtook it on the link."""
+    def picture(self, picture: DecodedFrame) -> None:
+        """Analyze a frame, and read the stills of it that overtook it on the link."""
         self._take_steps(before=picture.frame_index - _STEP_LAG + 1)
         self._newest_frame = picture.frame_index
-        self._submit(self._worker.submit(self._see, picture, False))
+        self._submit(self._worker.submit(self._analyze, picture, False))
         known = [one for one in self._early if one.header.frame_index <= self._newest_frame]
         if known:
             self._early = [one for one in self._early if one.header.frame_index > self._newest_frame]
             self._submit(self._worker.submit(self._read, known))
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
-        """Take in a report of tracks before the frame that comes so many ticks later."""
+        """Take in a report of tracks before the frame that comes so many frames later."""
         self._steps.append((tracks, capture_ns))
 
     def still(self, still: ReceivedStill) -> None:
-        """Read a still once its frame has been seen."""
+        """Read a still once its frame has been analyzed."""
         if still.header.frame_index <= self._newest_frame:
             self._submit(self._worker.submit(self._read, [still]))
             return
         self._early.append(still)
-        if len(self._early) > _WAITING_STILLS:
+        if len(self._early) > _MOST_STILLS:
             self._early.pop(0)
             self.dropped["overflow"] += 1
 
-    @property
-    def has_room(self) -> bool:
-        """Always: it is done before the next is seen."""
-        return True
-
-    def later(self, work: Work) -> bool:
+    def submit(self, job: Job, *, last: bool = False) -> bool:  # noqa: ARG002 - one after the other
         """Do it after what was handed over before."""
-        self._submit(self._worker.submit(_exhaust, work))
+        self._submit(self._worker.submit(_do, job))
         return True
-
-    def at_leisure(self, work: Work) -> bool:
-        """Likewise: here nothing gives way to anything."""
-        return self.later(work)
 
     def close(self) -> bool:
         """Finish what waits."""
@@ -320,9 +298,6 @@ class LockstepWorker:
             self.dropped["ended"] += len(self._early)
         return True
 
-    def raise_error(self) -> None:
-        """Errors come out of `picture`, `still` and `close`."""
-
     def _take_steps(self, *, before: int | None) -> None:
         while self._steps and (before is None or self._steps[0][0].frame_index < before):
             self._submit(self._worker.submit(self._step, *self._steps.popleft()))
@@ -333,6 +308,9 @@ class LockstepWorker:
             self._pending.popleft().result()
 
 
-def _exhaust(work: Work) -> None:
-    for _ in work:
-        pass
+def _do(job: Job) -> None:
+    try:
+        while not job.step():
+            pass
+    finally:
+        job.close()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
-from hvt_ground.pki.roster import Ground, Roster, Router
+from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
 from hvt_ground.pki.zenoh_files import KEYS_FOLDER, edge_file, ground_file, router_file
 
 if TYPE_CHECKING:
@@ -73,10 +73,12 @@ def _changed(roster: Roster, arguments: argparse.Namespace) -> Roster:
     if arguments.command != "remove":
         _refuse_known(roster, name, kind=arguments.command.removeprefix("add-"))
     if arguments.command == "add-router":
-        return roster.with_router(Router(name, tuple(arguments.host)))
+        return roster.with_router(RouterMember(name, tuple(arguments.host)))
     if arguments.command == "add-ground":
         command = not arguments.watch_only
-        return roster.with_ground(Ground(name, tuple(arguments.host), command=command, edges=arguments.edges))
+        return roster.with_ground(
+            GroundMember(name, tuple(arguments.host), command=command, edges=arguments.edges)
+        )
     return roster.without(name)
 
 
@@ -93,7 +95,7 @@ def _hosts_of(roster: Roster, name: str) -> tuple[str, ...]:
     """Where others connect to a machine of the roster."""
     if name not in roster.names:
         raise UserError(f"{name!r} is not in this fleet: hvt-ground keys list shows who is")
-    machines: list[Ground | Router] = [*roster.grounds, *roster.routers]
+    machines: list[GroundMember | RouterMember] = [*roster.grounds, *roster.routers]
     return next((one.hosts for one in machines if one.name == name), ())
 
 
@@ -133,19 +135,19 @@ def _parser() -> argparse.ArgumentParser:
     add_edge = commands.add_parser("add-edge", help="a key for an edge; NAME is its --edge-id")
     add_ground = commands.add_parser("add-ground", help="a key for a ground")
     add_router = commands.add_parser("add-router", help="a key for a router between them")
-    renew = commands.add_parser(
+    reissue = commands.add_parser(
         "renew", help="a new key for a machine of the fleet, with the rights that it has"
     )
     remove = commands.add_parser("remove", help="take all rights from a machine, such as one that is lost")
     listing = commands.add_parser("list", help="who belongs to the fleet, and until when")
-    for one in (new_ca, add_edge, add_ground, add_router, renew, remove, listing):
+    for one in (new_ca, add_edge, add_ground, add_router, reissue, remove, listing):
         one.add_argument("--dir", type=Path, default=_DIR, help=f"folder of the fleet's keys [{_DIR}]")
-    for one in (add_edge, add_ground, add_router, renew, remove):
+    for one in (add_edge, add_ground, add_router, reissue, remove):
         one.add_argument("name", metavar="NAME")
         one.add_argument(
             "--keys-folder", default=KEYS_FOLDER, help=f"where the keys lie on the machines [{KEYS_FOLDER}]"
         )
-    for one in (add_edge, add_ground, add_router, renew):
+    for one in (add_edge, add_ground, add_router, reissue):
         one.add_argument(
             "--host",
             action="append",

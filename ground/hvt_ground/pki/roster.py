@@ -9,7 +9,7 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import EdgeKeys, check_edge_pattern, matches
 
-__all__ = ["Ground", "Roster", "Router"]
+__all__ = ["GroundMember", "Roster", "RouterMember"]
 
 _FILE = "fleet.json"
 _RESERVED = ("ca", "fleet")
@@ -17,7 +17,7 @@ _RESERVED = ("ca", "fleet")
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class GroundMember:
     """A ground and its rights."""
 
     name: str
@@ -34,7 +34,7 @@ class Ground:
 
 
 @dataclass(frozen=True, slots=True)
-class Router:
+class RouterMember:
     """A router: it sees everything, and lets each through to what is theirs."""
 
     name: str
@@ -46,8 +46,8 @@ class Roster:
     """Edges, grounds and routers; no two have the same name."""
 
     edges: tuple[str, ...] = ()
-    grounds: tuple[Ground, ...] = field(default_factory=tuple)
-    routers: tuple[Router, ...] = field(default_factory=tuple)
+    grounds: tuple[GroundMember, ...] = field(default_factory=tuple)
+    routers: tuple[RouterMember, ...] = field(default_factory=tuple)
 
     @classmethod
     def read(cls, folder: Path) -> Roster:
@@ -57,7 +57,7 @@ class Roster:
             said = json.loads(path.read_text(encoding="utf-8"))
             edges = tuple(EdgeKeys(str(one)).edge for one in said["edges"])
             grounds = tuple(
-                Ground(
+                GroundMember(
                     str(one["name"]),
                     tuple(map(str, one["hosts"])),
                     command=bool(one["command"]),
@@ -66,7 +66,7 @@ class Roster:
                 for one in said["grounds"]
             )
             routers = tuple(
-                Router(str(one["name"]), tuple(map(str, one["hosts"]))) for one in said["routers"]
+                RouterMember(str(one["name"]), tuple(map(str, one["hosts"]))) for one in said["routers"]
             )
         except FileNotFoundError:
             return cls()
@@ -98,14 +98,14 @@ class Roster:
         self._check(name, kind="edge")
         return replace(self, edges=tuple(sorted({*self.edges, name})))
 
-    def with_ground(self, ground: Ground) -> Roster:
+    def with_ground(self, ground: GroundMember) -> Roster:
         """The same with this ground, in place of an older one of its name."""
         self._check(ground.name, kind="ground")
         check_edge_pattern(ground.edges)
         others = [one for one in self.grounds if one.name != ground.name]
         return replace(self, grounds=tuple(sorted([*others, ground], key=lambda one: one.name)))
 
-    def with_router(self, router: Router) -> Roster:
+    def with_router(self, router: RouterMember) -> Roster:
         """The same with this router, in place of an older one of its name."""
         self._check(router.name, kind="router")
         others = [one for one in self.routers if one.name != router.name]

@@ -14,7 +14,7 @@ from typing import Any
 
 from hvt_common.protocol.channels import DELIVERIES, ROOT, Channel, Direction, EdgeKeys
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
-from hvt_ground.pki.roster import Ground, Roster, Router
+from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
 
 __all__ = ["KEYS_FOLDER", "edge_file", "ground_file", "router_file"]
 
@@ -57,7 +57,7 @@ def edge_file(name: str, roster: Roster, *, folder: str = KEYS_FOLDER) -> str:
     return _text(head, {}, name=name, grants=grants, folder=folder)
 
 
-def ground_file(ground: Ground, roster: Roster, *, folder: str = KEYS_FOLDER) -> str:
+def ground_file(ground: GroundMember, roster: Roster, *, folder: str = KEYS_FOLDER) -> str:
     """``--zenoh-config`` of a ground, JSON5: it lets the edges that it may watch in, each to its own keys."""
     edges = [edge for edge in roster.edges if ground.may_watch(edge)]
     grants = {edge: _toward_edge(edge, command=ground.command) for edge in edges}
@@ -74,7 +74,7 @@ def ground_file(ground: Ground, roster: Roster, *, folder: str = KEYS_FOLDER) ->
     return _text(head, {}, name=ground.name, grants=grants, folder=folder)
 
 
-def router_file(router: Router, roster: Roster, *, folder: str = KEYS_FOLDER) -> str:
+def router_file(router: RouterMember, roster: Roster, *, folder: str = KEYS_FOLDER) -> str:
     """The configuration of a router, JSON5: it lets each edge and each ground through to what is theirs."""
     grants = {edge: _toward_edge(edge, command=True) for edge in roster.edges}
     for ground in roster.grounds:
@@ -94,7 +94,7 @@ def router_file(router: Router, roster: Roster, *, folder: str = KEYS_FOLDER) ->
 def _toward_edge(edge: str, *, command: bool) -> list[_Rule]:
     """What passes where an edge is at the other end."""
     keys = EdgeKeys(edge)
-    asked = [keys.key(Channel.INFO), *([keys.key(Channel.CONTROL)] if command else [])]
+    requested = [keys.key(Channel.INFO), *([keys.key(Channel.CONTROL)] if command else [])]
     return [
         _rule("subscribe", "egress", ["declare_subscriber"], [_EVERYBODY]),
         _rule("watch", "egress", ["declare_liveliness_subscriber", "liveliness_query"], [_EVERYBODY]),
@@ -103,14 +103,14 @@ def _toward_edge(edge: str, *, command: bool) -> list[_Rule]:
         _rule(f"{edge}-is-present", "ingress", ["liveliness_token"], [keys.key(Channel.ALIVE)]),
         _rule(f"{edge}-listens", "ingress", ["declare_subscriber"], [keys.key(Channel.FEEDBACK)]),
         _rule(f"{edge}-is-told", "egress", ["put"], [keys.key(Channel.FEEDBACK)]),
-        _rule(f"{edge}-is-asked", "egress", ["query"], asked),
+        _rule(f"{edge}-is-asked", "egress", ["query"], requested),
     ]
 
 
 def _toward_ground(edges: Sequence[str], *, command: bool, label: str) -> list[_Rule]:
     """What passes where a ground is at the other end that may watch these edges."""
     keys = [EdgeKeys(edge) for edge in edges]
-    asked = [Channel.INFO, *([Channel.CONTROL] if command else [])]
+    requested = [Channel.INFO, *([Channel.CONTROL] if command else [])]
     named = f"{label}-{'commands' if command else 'watches'}"
     return [
         _rule("subscribed", "ingress", ["declare_subscriber"], [_EVERYBODY]),
@@ -122,7 +122,7 @@ def _toward_ground(edges: Sequence[str], *, command: bool, label: str) -> list[_
             f"{label}-is-heard", "egress", ["declare_subscriber"], [one.key(Channel.FEEDBACK) for one in keys]
         ),
         _rule(f"{label}-reports", "ingress", ["put"], [one.key(Channel.FEEDBACK) for one in keys]),
-        _rule(named, "ingress", ["query"], [one.key(row) for one in keys for row in asked]),
+        _rule(named, "ingress", ["query"], [one.key(row) for one in keys for row in requested]),
     ]
 
 

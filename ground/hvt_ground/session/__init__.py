@@ -1,1 +1,1 @@
-"""One edge's flight: subscriptions, its receiver, its receiver reports, its sessions."""
+"""From the link of one edge to its sessions: `GroundLink`, `EdgeThread`, `EdgeSessions` and `GroundSession`."""

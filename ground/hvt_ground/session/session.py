@@ -1,4 +1,4 @@
-"""One session of one edge at the ground: account, decoder, eyes and recording, from its first keyframe to its end."""
+"""One session of one edge: account, decoder, perception and sinks, from its first keyframe to its end."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import (
+    MAX_STILL_RESULTS,
     BacklogHeader,
-    BacklogUnit,
+    BacklogKind,
     BaseHeader,
     Info,
     RoiHeader,
@@ -25,18 +27,19 @@ from hvt_common.runtime.statistics import LatencyStats
 from hvt_common.transport.inbox import Received
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
-from hvt_ground.backlog.fill import Arrived, BacklogFill, Work
 from hvt_ground.backlog.perception import BacklogPerception
-from hvt_ground.events.events import Event, Notice, Traffic, VideoSample
-from hvt_ground.link.reassemble import Counters
-from hvt_ground.perception.pipeline import Picture, Pipeline, ReceivedStill
-from hvt_ground.perception.stills.numbers import StillSequenceWindow
-from hvt_ground.perception.worker import LockstepWorker, PerceptionWorker, RealtimeWorker
-from hvt_ground.sinks.rerun.recorder import Recorder
-from hvt_ground.sinks.timing import SessionTiming
-from hvt_ground.sinks.tracks_table import TrackTable
+from hvt_ground.backlog.session_backlog import SessionBacklog
+from hvt_ground.events import Event, MessageTiming, Notice, StillsRead, Traffic, VideoSample
+from hvt_ground.link.packets import BasePacket
+from hvt_ground.link.reassemble import StreamCounters
+from hvt_ground.link.sequence_window import StillSequenceWindow
+from hvt_ground.link.statistics import ReceptionStatistics
+from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
+from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
+from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.sinks import Sink
 
-__all__ = ["GroundSession"]
+__all__ = ["GroundSession", "WorkerFactory"]
 
 _SECOND_NS = 1_000_000_000
 _MILLION = 1_000_000
@@ -45,35 +48,41 @@ _ANEW_NS = 5 * _SECOND_NS
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
 
+WorkerFactory = Callable[[Analyze, Step, Read], PerceptionWorker]
+
 
 class GroundSession:
-    """Fed by the receiving thread in order; sees in a thread of its own, so that decoding never waits for detection.
+    """Fed by the receiving thread in order; a worker analyzes, so that decoding never waits for detection.
 
-    In lockstep it sees in the receiving thread instead: nothing is skipped, and the same input gives the same tracks.
+    In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input gives
+    the same tracks.
 
-    ``pipeline_of(emit)`` builds the eyes. ``report()`` is called when there is something for the edge to hear.
-    ``backlog_perception`` finds boxes in video that was kept while the link was away.
+    Args:
+        info: of the session.
+        sinks: take its events.
+        pipeline_of: makes its perception; called with what takes the events.
+        clock: Unix nanoseconds without steps.
+        reports: to the edge; without it nothing is reported, and the edge's clock is this one.
+        recording: the file of its recording, for its summary.
+        backlog_perception: finds boxes in video that was stored while the link was down.
+        worker_of: makes the worker that analyzes; by default by the session's pace.
     """
 
     def __init__(
         self,
         info: Info,
         *,
-        recorder: Recorder | None,
-        recording: Path | None,
-        tables: Sequence[TrackTable] = (),
-        timing: SessionTiming | None = None,
+        sinks: Sequence[Sink] = (),
         pipeline_of: Callable[[Callable[[Event], None]], Pipeline],
-        to_local_ns: Callable[[int], int],
         clock: Callable[[], int],
-        report: Callable[[], None],
+        reports: ReceiverReports | None = None,
+        recording: Path | None = None,
         backlog_perception: BacklogPerception | None = None,
+        worker_of: WorkerFactory | None = None,
     ) -> None:
+        self._sinks = sinks
         self.info = info
-        self.recorder = recorder
         self.recording = recording
-        self._tables = tables
-        self._timing = timing
         self.lockstep = info.pace == "lockstep"
         self.ledger = Ledger(window_ns=info.window_ns)
         self.pipeline = pipeline_of(self._emit)
@@ -86,18 +95,19 @@ class GroundSession:
         """Reports of the edge's tracks."""
         self.last_frame_index = -1
         """The last frame that was decoded, tracked and drawn."""
-        self.last_status: Status | None = None
-        self.counters = Counters()
-        """What the reassembly counted in this session; filled in when it ends."""
+        self.counters = StreamCounters()
+        """What the reassembly counted in this session."""
+        self._clock = clock
+        self._reports = reports
+        self._report_lock = threading.Lock()
+        self._statistics = ReceptionStatistics(lockstep=self.lockstep)
         self._keys = EdgeKeys(info.edge)
         self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
+        self.last_status: Status | None = None
         self._last_step = -1
-        self._stepped_ns = self._reported_ns = 0
+        self._stepped_ns = self._status_ns = 0
         """When the newest report of tracks came, and the newest status."""
-        self._to_local_ns = to_local_ns
-        self._clock = clock
-        self._report = report
         self._first_index: int | None = None
         self._last_index = -1
         self._last_capture_ns = 0
@@ -105,30 +115,38 @@ class GroundSession:
         self._results: list[StillResult] = []
         self._results_lock = threading.Lock()
         self._still_window = StillSequenceWindow()
-        self._backlog = BacklogFill(info, log=self._log_backlog, look=backlog_perception)
-        worker = LockstepWorker if self.lockstep else RealtimeWorker
-        self._worker: PerceptionWorker = worker(self._see, self._step, self._read, name=info.edge)
+        if worker_of is None:
+            worker_of = partial(LockstepWorker if self.lockstep else RealtimeWorker, name=info.edge)
+        self.worker = worker_of(self._analyze, self._step, self._read)
+        self.backlog = SessionBacklog(
+            info,
+            log=self._emit,
+            perception=backlog_perception,
+            read=lambda still: self._read([still]),
+            stills=self._still_window,
+        )
+        """What of this session was stored at the edge while the link was down."""
 
     # What the receiving thread brings
 
-    def base(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
+    def base(self, packet: BasePacket) -> bool:
         """Take one access unit; False where the decoder could make nothing of it."""
-        good = self._access_unit(header, item, decode=decode, starts_run=starts_run)
-        if self._timing is not None:
-            self._timing.message(
-                Channel.BASE,
-                item,
-                sequence=header.sequence,
-                frame_index=header.frame_index,
-                capture_ns=header.capture_ns,
-                send_ns=header.send_ns,
-                shown=good and decode,
+        header, item = packet.arrival.header, packet.item
+        decode = packet.arrival.verdict == "decode"
+        if packet.on_time:  # of one that waited behind a hole the time says nothing
+            delay_ms = None
+            if not self.lockstep:
+                delay_ms = max(0.0, (item.received_ns - self._to_local_ns(header.capture_ns)) / _MILLION)
+            self._statistics.base(
+                header, size_bytes=item.size_bytes, arrived_ns=item.received_ns, delay_ms=delay_ms
             )
+        good = self._access_unit(header, item, decode=decode, starts_run=packet.arrival.starts_run)
+        self._time(Channel.BASE, item, header, handled=good and decode)
         return good
 
     def _access_unit(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
         at_ns = header.send_ns
-        self._count(Channel.BASE, Account.BASE, item, at_ns=at_ns)
+        self._account(Channel.BASE, Account.BASE, item, at_ns=at_ns)
         self.frames_received += 1
         if self._first_index is None:
             self._first_index = header.frame_index
@@ -142,36 +160,29 @@ class GroundSession:
             return False
         self.frames_decoded += 1
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
-        self._backlog.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
+        self.backlog.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
         reference_ns = item.received_ns if self.lockstep else self._to_local_ns(header.capture_ns)
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
-        self._worker.picture(Picture(header.frame_index, header.capture_ns, reference_ns, image))
+        self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, image))
         self._traffic(at_ns)
         return True
 
     def still(self, header: RoiHeader, item: Received, *, media_type: str) -> None:
         """Take one still; a second one of the same number is counted and not shown, a third ignored."""
+        self._statistics.still(header.sequence, size_bytes=item.size_bytes, arrived_ns=item.received_ns)
         if not self._still_window.is_new(header.sequence, send_ns=header.send_ns):
             if self._still_window.is_copy(header.sequence, send_ns=header.send_ns):
-                self._count(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
+                self._account(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
             return
-        self._count(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
-        if self._timing is not None:
-            self._timing.still(
-                item,
-                sequence=header.sequence,
-                frame_index=header.frame_index,
-                capture_ns=header.capture_ns,
-                send_ns=header.send_ns,
-            )
+        self._account(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
+        self._time(Channel.ROI, item, header, handled=None)
         self.stills_received += 1
         self.ledger.record_outcome("received", header.reason)
-        still = ReceivedStill(header, item.payload, media_type)
-        self._worker.still(still)
+        self.worker.still(ReceivedStill(header, item.payload, media_type))
 
     def tracks(self, step: TrackStep, item: Received) -> None:
-        """Take what the edge tracked at one tick; one that is not newer than the last is ignored.
+        """Take what the edge tracked at one frame; one that is not newer than the last is ignored.
 
         Raises:
             WireError: its boxes make no sense.
@@ -182,79 +193,40 @@ class GroundSession:
                 return
             self._step_decoder = TrackStepDecoder()
         self._last_step, self._stepped_ns = step.sequence, now_ns
-        self._count(Channel.TRACKS, Account.META, item, at_ns=step.send_ns)
+        self._account(Channel.TRACKS, Account.META, item, at_ns=step.send_ns)
         self.steps_received += 1
         tracks = self._step_decoder.decode(step)
-        if self._timing is not None:
-            self._timing.message(
-                Channel.TRACKS,
-                item,
-                sequence=step.sequence,
-                frame_index=step.frame_index,
-                capture_ns=step.capture_ns,
-                send_ns=step.send_ns,
-                shown=tracks is not None,
-            )
+        self._time(Channel.TRACKS, item, step, handled=tracks is not None)
         if tracks is not None:
-            self._worker.step(tracks, step.capture_ns)
+            self.worker.step(tracks, step.capture_ns)
 
     def status(self, status: Status, item: Received) -> None:
         """Take the edge's report; one that is not newer than the last is ignored."""
         now_ns = self._clock()
         old = self.last_status is not None and status.sequence <= self.last_status.sequence
-        if old and now_ns - self._reported_ns < _ANEW_NS:
+        if old and now_ns - self._status_ns < _ANEW_NS:
             return
-        self._reported_ns = now_ns
-        self._count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
-        if self._timing is not None:
-            self._timing.message(Channel.STATUS, item, sequence=status.sequence, send_ns=status.send_ns)
+        self._status_ns = now_ns
+        self._account(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
+        self._time(Channel.STATUS, item, status, handled=True)
         self.last_status = status
 
-    # What was kept while the link was away
-
-    @property
-    def backlog(self) -> Arrived:
-        """How much of it has come."""
-        return self._backlog.arrived
-
-    @property
-    def has_room(self) -> bool:
-        """Whether `later` takes more."""
-        return self._worker.has_room
-
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
-        """Count a piece, of whichever session; ``delivered``: with it an object was whole, and is of use."""
-        self._count(Channel.BACKLOG, Account.BACKLOG, item, at_ns=header.send_ns)
-        if self._timing is not None:
-            self._timing.message(
-                f"{Channel.BACKLOG}-{header.kind}",
-                item,
-                sequence=header.number,
-                send_ns=header.send_ns,
-                shown=delivered,
-            )
+        """Count a chunk, of whichever session; ``delivered``: with it an object was whole, and is of use."""
+        self._statistics.backlog(size_bytes=item.size_bytes, arrived_ns=item.received_ns)
+        self._account(Channel.BACKLOG, Account.BACKLOG, item, at_ns=header.send_ns)
+        kind = f"{Channel.BACKLOG}-{header.kind}"
+        self._time(kind, item, header, handled=delivered)
+        if delivered and header.kind == BacklogKind.STILL and header.session_id == self.info.session_id:
+            self._statistics.stored_still(header.number)
 
-    def stored_still(self, still: ReceivedStill) -> Work | None:
-        """What the eyes are to do with a still of this session; None where it has come before, on whichever way."""
-        if not self._still_window.is_new_stored(still.header.sequence):
-            return None
-        return self._read_stored(still)
-
-    def stored_video(self, units: Sequence[BacklogUnit]) -> Work:
-        """What the receiving thread is to do with a stretch of this session's base stream, when nothing comes."""
-        return self._backlog.fill(units, boxes=self.at_leisure)
-
-    def later(self, work: Work) -> bool:
-        """Let the eyes do it, as far as the picture of now leaves them time; False where too much waits already."""
-        return self._worker.later(work)
-
-    def at_leisure(self, work: Work) -> bool:
-        """The same for what gives way to that, too."""
-        return self._worker.at_leisure(work)
+    def count(self, counters: StreamCounters) -> None:
+        """Note what the reassembly has counted in this session so far."""
+        self.counters = counters
 
     def report_backlog(self) -> None:
-        """Put a line into the recording's log on what has come since the last one."""
-        news = self._backlog.take_news()
+        """Say in the recording how much of the backlog has come since the last time."""
+        news = self.backlog.take_news()
         if news.first is not None:
             at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // _SECOND_NS))
             self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
@@ -264,11 +236,20 @@ class GroundSession:
         assert level in ("info", "warning", "error")
         self._emit(Notice(max(0, self._last_index), self._last_capture_ns, level, text))  # type: ignore[arg-type]
 
-    def take_results(self, most: int) -> tuple[StillResult, ...]:
-        """Return and forget up to ``most`` results that the edge has not heard yet."""
-        with self._results_lock:
-            taken, self._results = self._results[:most], self._results[most:]
-            return tuple(taken)
+    def close(self) -> None:
+        """Finish what is queued (for a second or two), close the sinks, raise what ended the worker."""
+        try:
+            if self.worker.close():
+                self.pipeline.end()
+            self.report_backlog()
+            self._decoder.reset()
+            self.note("info", f"session {self.info.session_id:016x} ended")
+        finally:
+            for sink in self._sinks:
+                sink.close()
+        self.raise_error()
+
+    # What is known of it
 
     @property
     def newest_index(self) -> int:
@@ -282,87 +263,135 @@ class GroundSession:
             return 0.0
         return (self._last_index - self._first_index + 1) / self.info.fps
 
-    def close(self) -> None:
-        """Finish what waits (for a second or two), close the recording, raise what went wrong in the thread."""
-        try:
-            if self._worker.close():
-                self.pipeline.end()
-            self.report_backlog()
-            self._decoder.reset()
-            self.note("info", f"session {self.info.session_id:016x} ended")
-        finally:
-            if self._timing is not None:
-                self._timing.close()
-            for table in self._tables:
-                table.close()
-            if self.recorder is not None:
-                self.recorder.close()
-        self.raise_error()
+    @property
+    def is_whole(self) -> bool:
+        """Whether all has come that the edge counted in its newest report."""
+        last, messages = self.last_status, self.ledger.messages
+        if last is None:
+            return False
+        counted = (
+            (self.frames_received, last.base_messages),
+            (messages(Account.ROI), last.roi_messages),
+            (messages(Account.BACKLOG), last.backlog_messages),
+            # A report does not count itself.
+            (messages(Account.META), last.meta_messages + 1),
+        )
+        return all(received >= sent for received, sent in counted)
 
     @property
     def frames_untracked(self) -> int:
         """Frames that were decoded, and passed over by detection and tracking."""
-        return self._worker.untracked
+        return self.worker.untracked
 
     @property
     def stills_dropped(self) -> Counter[str]:
         """Stills of which nothing was made, by reason."""
-        return +(self.pipeline.stills_dropped + self._worker.dropped)
+        return +(self.pipeline.stills_dropped + self.worker.dropped)
 
     @property
     def idle(self) -> bool:
-        """Nothing waits to be seen."""
-        return self._worker.idle
+        """Nothing waits to be analyzed."""
+        return self.worker.idle
 
     def raise_error(self) -> None:
-        """Raise what went wrong while seeing."""
-        self._worker.raise_error()
+        """Raise what went wrong while analyzing."""
+        self.worker.raise_error()
 
-    # Seeing, in the thread of the eyes
+    # Reports
 
-    def _see(self, picture: Picture, hurry: bool) -> None:  # noqa: FBT001 - called by the eyes only
-        self.pipeline.see(picture, hurry=hurry)
-        self.last_frame_index = picture.frame_index
-        self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
-        self._hear_results()
-        if self.lockstep:
-            self._report()
+    def report_if_due(self) -> None:
+        """Report to the edge, as often as what has arrived is worth it."""
+        if self._statistics.due(now_ns=self._clock()):
+            self.report()
 
-    def _step(self, tracks: Tracks, capture_ns: int) -> None:
-        self.pipeline.edge_step(tracks, capture_ns=capture_ns)
-        self._hear_results()
+    def report(self) -> None:
+        """Report to the edge now."""
+        if self._reports is None:
+            return
+        with self._report_lock:
+            self._reports.send(
+                session_id=self.info.session_id,
+                last_frame_index=self.last_frame_index,
+                base=(self.frames_received, self.ledger.base_bytes),
+                roi=(self.stills_received, self.ledger.roi_bytes),
+                lost=self.counters.lost,
+                corrupt=self.counters.corrupt,
+                measured=self._statistics.take(self._clock()),
+                stills=self.take_results(MAX_STILL_RESULTS),
+            )
 
-    def _read(self, stills: Sequence[ReceivedStill]) -> None:
-        self.pipeline.read(stills)
-        if self._timing is not None:
-            self._timing.read(one.header.sequence for one in stills)
-        self._hear_results()
-        self._report()
+    def take_results(self, most: int) -> tuple[StillResult, ...]:
+        """Return and forget up to ``most`` results that the edge has not been sent yet."""
+        with self._results_lock:
+            taken, self._results = self._results[:most], self._results[most:]
+            return tuple(taken)
 
-    def _read_stored(self, still: ReceivedStill) -> Work:
-        self.pipeline.read([still])
-        self._backlog.note_still(still.header.frame_index, still.header.capture_ns)
-        self._hear_results()
-        self._report()
-        yield
-        return True
-
-    def _hear_results(self) -> None:
+    def _collect_results(self) -> None:
         with self._results_lock:
             self._results = (self._results + self.pipeline.take_results())[-_MOST_RESULTS:]
 
-    # Account
+    # In the worker's thread
 
-    def _count(self, row: Channel, channel: Account, item: Received, *, at_ns: int) -> None:
-        encoding = item.encoding
+    def _analyze(self, picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - called by the worker only
+        self.pipeline.analyze(picture, hurry=hurry)
+        self.last_frame_index = picture.frame_index
+        self.overlay_latency.add(max(0.0, (self._clock() - picture.reference_ns) / _MILLION))
+        self._collect_results()
+        if self.lockstep:
+            self.report()
+
+    def _step(self, tracks: Tracks, capture_ns: int) -> None:
+        self.pipeline.edge_step(tracks, capture_ns=capture_ns)
+        self._collect_results()
+
+    def _read(self, stills: Sequence[ReceivedStill]) -> None:
+        self.pipeline.read(stills)
+        self._emit(StillsRead(tuple(one.header.sequence for one in stills), self._clock()))
+        self._collect_results()
+        self.report()
+
+    # Account and events
+
+    def _to_local_ns(self, edge_ns: int) -> int:
+        return edge_ns if self._reports is None else self._reports.clock_offset.to_local_ns(edge_ns)
+
+    def _account(self, row: Channel, account: Account, item: Received, *, at_ns: int) -> None:
+        size, extra = len(item.payload), len(item.attachment)
         self.ledger.count(
-            channel,
-            payload_bytes=len(item.payload),
-            attachment_bytes=len(item.attachment),
-            overhead_bytes=overhead_bytes(
-                len(item.payload), len(item.attachment), key=self._keys.key(row), encoding=encoding
-            ),
+            account,
+            payload_bytes=size,
+            attachment_bytes=extra,
+            overhead_bytes=overhead_bytes(size, extra, key=self._keys.key(row), encoding=item.encoding),
             at_ns=at_ns,
+        )
+
+    def _time(
+        self,
+        kind: str,
+        item: Received,
+        header: BaseHeader | RoiHeader | TrackStep | Status | BacklogHeader,
+        *,
+        handled: bool | None,
+    ) -> None:
+        """Give out when a message came; ``handled``: something was made of it, None is said later."""
+        size, extra = len(item.payload), len(item.attachment)
+        line = size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding)
+        offset_ns = 0 if self._reports is None else self._reports.clock_offset.offset_ns or 0
+        frame_index, capture_ns = -1, 0
+        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
+            frame_index, capture_ns = header.frame_index, header.capture_ns
+        self._emit(
+            MessageTiming(
+                kind=kind,
+                sequence=header.number if isinstance(header, BacklogHeader) else header.sequence,
+                frame_index=frame_index,
+                capture_ns=capture_ns,
+                send_ns=header.send_ns,
+                received_ns=item.received_ns,
+                handled_ns=None if handled is None else self._clock() if handled else 0,
+                line_bytes=line,
+                clock_offset_ns=offset_ns,
+            )
         )
 
     def _traffic(self, at_ns: int) -> None:
@@ -386,13 +415,6 @@ class GroundSession:
             )
         )
 
-    def _log_backlog(self, event: Event) -> None:
-        """Into the recording only: a table of tracks is in the order of frames."""
-        if self.recorder is not None:
-            self.recorder.log(event)
-
     def _emit(self, event: Event) -> None:
-        if self.recorder is not None:
-            self.recorder.log(event)
-        for table in self._tables:
-            table.log(event)
+        for sink in self._sinks:
+            sink.log(event)

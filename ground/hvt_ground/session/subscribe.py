@@ -32,7 +32,7 @@ _INBOX_SHARE = 0.75
 _MOST_PER_S = 2000
 """Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
 _SUBSCRIBED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.BACKLOG, Channel.STATUS)
-_ASK_S = 1.0
+_ANSWER_S = 1.0
 _UNANSWERED = 3
 """So many questions on control in a row without an answer are no accident."""
 
@@ -47,25 +47,25 @@ class EdgePort:
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self.present = threading.Event()
         """Set while the edge's liveliness token is there."""
-        self.in_use: Callable[[], bool] = lambda: False
-        """Whether there is more to this edge than messages under its name: a session, or one that has ended."""
+        self.used = threading.Event()
+        """Set once there is more to this edge than messages under its name: a session."""
         self._unanswered = 0
         self._session = session
         self._keys = EdgeKeys(edge)
         self._feedback = declare_publisher(session, Channel.FEEDBACK, keys=self._keys)
 
-    def ask_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
+    def query_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
         """Return the session's facts with the times of asking and hearing (ns); None without an answer in time.
 
         With ``session_id`` only that one's answer counts: two edges may bear the same id.
         """
-        asked_ns = self._clock()
-        heard_ns = 0
+        requested_ns = self._clock()
+        answered_ns = 0
         found: Info | None = None
 
         def wanted(data: bytes) -> bool:
-            nonlocal heard_ns, found
-            heard_ns = self._clock()
+            nonlocal answered_ns, found
+            answered_ns = self._clock()
             try:
                 info = Info.parse(data)
             except WireError as error:
@@ -75,10 +75,12 @@ class EdgePort:
             return found is not None
 
         try:
-            query(self._session, Channel.INFO, keys=self._keys, question=b"", timeout_s=_ASK_S, wanted=wanted)
+            query(
+                self._session, Channel.INFO, keys=self._keys, question=b"", timeout_s=_ANSWER_S, wanted=wanted
+            )
         except zenoh.ZError as error:
             _log.warning("%s: it could not be asked for info: %s", self.edge, error)
-        return None if found is None else (found, asked_ns, heard_ns)
+        return None if found is None else (found, requested_ns, answered_ns)
 
     def put(self, item: Received, row: Channel) -> None:
         """Take a message in; what finds no room is dropped."""
@@ -101,7 +103,7 @@ class EdgePort:
         )
         try:
             self._session.get(
-                self._keys.key(Channel.CONTROL), handler, payload=request.pack(), timeout=_ASK_S
+                self._keys.key(Channel.CONTROL), handler, payload=request.pack(), timeout=_ANSWER_S
             )
         except zenoh.ZError as error:
             _log.debug("%s: keyframe request not sent: %s", self.edge, error)
@@ -155,7 +157,7 @@ class GroundLink:
         with self._lock:
             return list(self._ports.values())
 
-    def sees(self, edge: str) -> bool:
+    def is_known(self, edge: str) -> bool:
         """Whether this edge has shown itself, by its token or a message."""
         with self._lock:
             return edge in self._ports
@@ -187,17 +189,17 @@ class GroundLink:
         with self._lock:
             port = self._ports.get(edge)
             if port is None:
-                if len(self._ports) >= MAX_EDGES and not (alive and self._make_room()):
+                if len(self._ports) >= MAX_EDGES and not (alive and self._make_space()):
                     self.foreign += 1
                     self._say_refused(edge)
                     return None
                 port = self._ports[edge] = EdgePort(self._session, edge, clock=self._clock)
             return port
 
-    def _make_room(self) -> bool:
+    def _make_space(self) -> bool:
         """Leave one that is not there and never was more than a name."""
         for edge, port in self._ports.items():
-            if not port.present.is_set() and not port.in_use():
+            if not port.present.is_set() and not port.used.is_set():
                 del self._ports[edge]
                 port.close()
                 return True

@@ -6,7 +6,7 @@ The columns, in this order (times are Unix nanoseconds, 0 where there is none):
 - ``sequence``: the message's own number; ``frame_index``: of the frame it is about, -1 where it is about none
 - ``capture_ns``, ``send_ns``: by the edge's clock; ``received_ns``, ``shown_ns``: by this one
 - ``shown_ns``: when it was decoded and recorded (base), read by the classifier (roi), or taken in; 0: never, or
-  a piece of the past that did not complete an object, or one of no use
+  a chunk of the past that did not complete an object, or one of no use
 - ``line_bytes``: what it cost on the line, headers of Zenoh, TCP and IP included
 - ``clock_offset_ns``: the edge's clock less this one, as known then: the delay of a message is
   ``received_ns - (capture_ns - clock_offset_ns)``
@@ -17,12 +17,11 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.ledger import overhead_bytes
-from hvt_common.transport.inbox import Received
+from hvt_ground.events import Event, MessageTiming, StillsRead
 
 __all__ = ["COLUMNS", "SessionTiming", "TimingTable"]
 
@@ -66,7 +65,7 @@ class TimingTable:
         """Append one line; after `close` nothing."""
         text = ",".join(map(str, values)) + "\n"
         with self._lock:
-            if self._file is None:  # a receiver that did not end in time still speaks
+            if self._file is None:  # a receiver that did not end in time still writes
                 return
             try:
                 os.write(self._file, text.encode("ascii"))
@@ -84,68 +83,49 @@ class TimingTable:
 
 
 class SessionTiming:
-    """The lines of one session. ``clock`` gives Unix nanoseconds, ``offset_ns`` the edge's clock less this one."""
+    """The lines of one session, of its `MessageTiming` and `StillsRead` events."""
 
-    def __init__(
-        self,
-        table: TimingTable,
-        *,
-        edge: str,
-        session_id: int,
-        clock: Callable[[], int],
-        offset_ns: Callable[[], int],
-    ) -> None:
+    def __init__(self, table: TimingTable, *, edge: str, session_id: int) -> None:
         self._table = table
         self._whose = (edge, f"{session_id:016x}")
-        self._clock = clock
-        self._offset_ns = offset_ns
         self._lock = threading.Lock()
-        self._unread: dict[int, tuple[object, ...]] = {}
+        self._unread: dict[int, MessageTiming] = {}
 
-    def message(
-        self,
-        kind: str,
-        item: Received,
-        *,
-        sequence: int,
-        send_ns: int,
-        frame_index: int = -1,
-        capture_ns: int = 0,
-        shown: bool = True,
-    ) -> None:
-        """A message that has been dealt with; ``shown``: something was made of it."""
-        facts = self._facts(kind, item, sequence, frame_index, capture_ns, send_ns)
-        self._write(facts, shown_ns=self._clock() if shown else 0)
-
-    def still(
-        self, item: Received, *, sequence: int, frame_index: int, capture_ns: int, send_ns: int
-    ) -> None:
-        """A still that came; its line is written when it has been read."""
+    def log(self, event: Event) -> None:
+        """Write a message that has been dealt with; a still's line is written when it has been read."""
+        if not isinstance(event, MessageTiming | StillsRead):
+            return
         with self._lock:
-            self._unread[sequence] = self._facts("roi", item, sequence, frame_index, capture_ns, send_ns)
-            if len(self._unread) > _MOST_UNREAD:
-                self._write(self._unread.pop(next(iter(self._unread))), shown_ns=0)
+            if isinstance(event, StillsRead):
+                for sequence in event.sequences:
+                    if (still := self._unread.pop(sequence, None)) is not None:
+                        self._write(still, handled_ns=event.at_ns)
+            elif event.handled_ns is not None:
+                self._write(event, handled_ns=event.handled_ns)
+            else:
+                self._unread[event.sequence] = event
+                if len(self._unread) > _MOST_UNREAD:
+                    self._write(self._unread.pop(next(iter(self._unread))), handled_ns=0)
 
-    def read(self, sequences: Iterable[int]) -> None:
-        """These stills have been read."""
-        now_ns = self._clock()
-        with self._lock:
-            for sequence in sequences:
-                if (facts := self._unread.pop(sequence, None)) is not None:
-                    self._write(facts, shown_ns=now_ns)
-
-    def close(self) -> None:
+    def close(self, *, quickly: bool = False) -> None:  # noqa: ARG002 - it is always quick
         """What was not read, never will be."""
         with self._lock:
-            for facts in self._unread.values():
-                self._write(facts, shown_ns=0)
+            for still in self._unread.values():
+                self._write(still, handled_ns=0)
             self._unread.clear()
 
-    def _facts(self, kind: str, item: Received, *numbers: int) -> tuple[object, ...]:
-        size, extra = len(item.payload), len(item.attachment)
-        line = size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding)
-        return (kind, *numbers, item.received_ns, line)
-
-    def _write(self, facts: tuple[object, ...], *, shown_ns: int) -> None:
-        *numbers, line_bytes = facts
-        self._table.line((*numbers, shown_ns, line_bytes, self._offset_ns(), *self._whose))
+    def _write(self, message: MessageTiming, *, handled_ns: int) -> None:
+        self._table.line(
+            (
+                message.kind,
+                message.sequence,
+                message.frame_index,
+                message.capture_ns,
+                message.send_ns,
+                message.received_ns,
+                handled_ns,
+                message.line_bytes,
+                message.clock_offset_ns,
+                *self._whose,
+            )
+        )

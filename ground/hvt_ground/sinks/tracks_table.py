@@ -6,15 +6,15 @@ import csv
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_ground.events.events import Event, Overlay
+from hvt_ground.events import Event, Overlay
 
 __all__ = ["COLUMNS", "TrackTable"]
 
 COLUMNS = ("frame", "id", "x", "y", "w", "h", "confidence", "base_class", "class", "refined", "origin")
 """``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``base_class`` is what the detectors
-say without stills, ``class`` the same after refinement, ``refined`` 1 once a still has spoken, ``origin`` who knows
-of the track: ``base``, ``edge``, ``edge+base`` or ``still``. A tick that the base stream left out has lines too where
-the edge reported it."""
+say without stills, ``class`` the same after refinement, ``refined`` 1 once a still has refined it; ``origin``:
+``base``, ``edge``, ``edge+base`` or ``still``. A source frame that the base stream left out has lines too where the
+edge reported it."""
 
 
 class TrackTable:
@@ -31,8 +31,8 @@ class TrackTable:
         self._writer.writerow(COLUMNS)
 
     def log(self, event: Event) -> None:
-        """Append the tracks of an overlay."""
-        if not isinstance(event, Overlay):
+        """Append the tracks of an overlay; one of the backlog would not be in the order of frames."""
+        if not isinstance(event, Overlay) or event.stored:
             return
         origins = event.origins or ("base",) * len(event.track_ids)
         for row, track_id in enumerate(event.track_ids.tolist()):
@@ -53,6 +53,6 @@ class TrackTable:
                 )
             )
 
-    def close(self) -> None:
+    def close(self, *, quickly: bool = False) -> None:  # noqa: ARG002 - it is always quick
         """Write what is buffered."""
         self._file.close()

@@ -41,7 +41,7 @@ class ObservedFrame(Listed):
     confidences_before: npt.NDArray[np.float32] = field(default_factory=_none_32)
     """(N,) of the last detection that was matched."""
     origins: tuple[str, ...] = ()
-    """N words of `hvt_ground.events.events.Origin`: who knows of the track."""
+    """N words of `hvt_ground.events.Origin`: who knows of the track."""
     detections: FrameView | None = None
     """What the ground's detector said of this decoded frame, from the tracker's weak confidence on, before any
     tracking; None at ticks that were not coded or not detected on."""

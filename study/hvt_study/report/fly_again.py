@@ -21,7 +21,7 @@ from hvt_common.transport.inbox import Received
 from hvt_common.values import Image, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.still_codecs import psnr_y_db
-from hvt_ground.events.events import Event, Refinement
+from hvt_ground.events import Event, Refinement
 from hvt_study.compare_clip import NOMINAL_FPS, Clip
 from hvt_study.flight import Flight, FlightPlan, FlightReport
 from hvt_study.flight_ground import GroundSide, SharedModels

@@ -17,14 +17,24 @@ from backlog_chunks import chunks, info_object, still_object, video_object
 from flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from handled import WatchedInbox, end
 from hvt_common.protocol.ledger import Account, overhead_bytes
-from hvt_common.protocol.messages import AcknowledgedRange, BacklogUnit, Feedback, Info, pack_backlog_units
+from hvt_common.protocol.messages import (
+    AcknowledgedRange,
+    BacklogUnit,
+    Feedback,
+    Info,
+    RoiHeader,
+    pack_backlog_units,
+)
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
-from hvt_ground.perception.worker import RealtimeWorker
-from hvt_ground.session.receiver import EdgeReceiver
+from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.worker import Job, RealtimeWorker
+from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.timing import SessionTiming, TimingTable
 from hvt_ground.status import summary, table
@@ -40,7 +50,7 @@ def wait_for(condition, *, timeout_s: float = 30) -> None:
 
 
 class Models:
-    """Lends red-square detectors."""
+    """Gives red-square detectors."""
 
     @contextmanager
     def checkout(self):
@@ -64,7 +74,7 @@ def look_of(info: Info, models=None) -> BacklogPerception:
     """What looks at kept things."""
     return BacklogPerception(
         info,
-        models=models or Models(),
+        checkout=(models or Models()).checkout,
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,
@@ -74,7 +84,9 @@ def look_of(info: Info, models=None) -> BacklogPerception:
 class Rig:
     """A receiver with a port; sessions and former sessions with recordings in a folder."""
 
-    def __init__(self, folder: Path, flight: Flight, *, pipeline=pipeline_of, models=None, timing=None):
+    def __init__(
+        self, folder: Path, flight: Flight, *, pipeline=pipeline_of, models=None, timing=None, most_files=32
+    ):
         self.folder = folder
         self._models = models or Models()
         self._pipeline = pipeline
@@ -86,32 +98,32 @@ class Rig:
         self.opened: list[GroundSession] = []
         self._backlog_numbers = itertools.count()
         self.live: list[Received] = []
-        self.receiver = EdgeReceiver(self.port, open_session=self._open, open_backlog=self._open_backlog)
+        self.recordings = BacklogRecordings(self._open_backlog, most_files=most_files)
+        self.receiver = EdgeSessions(self.port, open_session=self._open, recordings=self.recordings)
+        self.thread = EdgeThread(self.receiver)
 
-    def _open(self, info: Info, receiver: EdgeReceiver) -> GroundSession:
+    def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         path = self.folder / f"{len(self.opened)}.rrd"
+        sinks: list[Sink] = [Recorder(settings(info, path))]
+        if self._timing is not None:
+            sinks.append(SessionTiming(self._timing, edge=info.edge, session_id=info.session_id))
         session = GroundSession(
             info,
-            recorder=Recorder(settings(info, path)),
+            sinks=sinks,
             recording=path,
             pipeline_of=self._pipeline,
-            timing=None if self._timing is None else self._lines(self._timing, info),
-            to_local_ns=receiver.clock_offset.to_local_ns,
             clock=time.time_ns,
-            report=receiver.report_now,
+            reports=reports,
             backlog_perception=look_of(info, self._models),
         )
         self.opened.append(session)
         return session
 
-    def _lines(self, table: TimingTable, info: Info) -> SessionTiming:
-        return SessionTiming(
-            table, edge=info.edge, session_id=info.session_id, clock=time.time_ns, offset_ns=lambda: 0
-        )
-
     def _open_backlog(self, info: Info) -> BacklogRecording:
         path = self.folder / f"backlog-{next(self._backlog_numbers)}.rrd"
-        return BacklogRecording(info, path=path, recorder=Recorder(settings(info, path)), look=look_of(info))
+        return BacklogRecording(
+            info, path=path, sink=Recorder(settings(info, path)), perception=look_of(info)
+        )
 
     def put(self, *items: Received) -> None:
         """What Zenoh's callback does, and then all of it is handled and seen."""
@@ -119,14 +131,16 @@ class Rig:
         for item in items:
             self.inbox.put(item)
         self._wait_for(lambda: self.inbox.handled)
-        self._wait_for(lambda: self.receiver.backlog.idle)  # the receiving thread hands boxes on to the eyes
+        self._wait_for(
+            lambda: self.receiver.backlog.working == 0
+        )  # the receiving thread hands boxes on to perception
         for session in self.opened:
             self._wait_for(lambda one=session: one.idle)
 
     def _wait_for(self, condition) -> None:
-        wait_for(lambda: condition() or self.receiver.error is not None)
-        if self.receiver.error is not None:
-            raise self.receiver.error
+        wait_for(lambda: condition() or self.thread.error is not None)
+        if self.thread.error is not None:
+            raise self.thread.error
 
     def base(self, *indices: int) -> None:
         """Access units as they come."""
@@ -154,7 +168,7 @@ class Rig:
         return self
 
     def __exit__(self, kind, *_) -> None:
-        end(self.receiver, failing=kind is not None)
+        end(self.thread, failing=kind is not None)
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +178,7 @@ def flight() -> Flight:
 
 
 def backlog(flight: Flight, kind: str, number: int, data: bytes, **cut) -> list[Received]:
-    """An object of the flight in pieces."""
+    """An object of the flight in chunks."""
     return chunks(flight.session_id, kind, number, data, **cut)
 
 
@@ -202,8 +216,8 @@ def test_the_hole_of_an_outage_is_filled(flight, tmp_path):
         for index in range(75, 80):  # one by one: a burst would leave out detections
             rig.base(index)
         assert rig.session.pipeline.tracks == tracks, "the tracker of now went on undisturbed"
-        assert rig.session.backlog.frames == 40
-        assert rig.session.backlog.left_out == 0, "what leads up to them is no frame of the outage"
+        assert rig.session.backlog.totals.frames == 40
+        assert rig.session.backlog.totals.left_out == 0, "what leads up to them is no frame of the outage"
         assert rig.session.frames_decoded == 40
     recording = Recording(tmp_path / "0.rrd")
     expected = [(u.frame_index, u.capture_ns, u.data) for u in flight.units[:80]]
@@ -224,7 +238,7 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
         before = Recording(tmp_path / "0.rrd")
         rig.put(*backlog(flight, "base", 40, video_object(flight, range(40, 60))))
         rig.put(*backlog(flight, "base", 25, video_object(flight, range(25, 40))))
-        assert rig.session.backlog.left_out == 0, "what leads up to a stretch is none of it"
+        assert rig.session.backlog.totals.left_out == 0, "what leads up to a stretch is none of it"
         rig.base(*range(75, 90))
     after = Recording(tmp_path / "0.rrd")
     for frame in (3, 20, 24, 65, 66, 74):
@@ -242,9 +256,9 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 
 @pytest.mark.parametrize("compact_bytes", [6_000, 1 << 30])
 def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, monkeypatch, compact_bytes):
-    """Rows that come late would be lost or doubled where the journal is written again, or when the file is closed."""
+    """Rows that come late would be lost or doubled where the append log is compacted, or when the file is closed."""
     monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.COMPACT_BYTES", compact_bytes)
-    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd.footer._MOST_GROWTH", 10)
+    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd_file._MOST_GROWTH", 10)
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(25))
         rig.base(*range(65, 90))
@@ -292,7 +306,7 @@ def test_a_still_on_both_ways_is_shown_once(flight, tmp_path):
         rig.put(*backlog(flight, "still", 1, still_object(flight, 11, 1)))
         rig.put(*backlog(flight, "still", 0, still_object(flight, 10, 0)))
         rig.put(flight.still(11, 1))
-        assert (rig.session.stills_received, rig.session.backlog.stills) == (2, 1)
+        assert (rig.session.stills_received, rig.session.backlog.totals.stills) == (2, 1)
         assert rig.session.ledger.messages(Account.ROI) == 3
         assert rig.reported().missing_stills == ()
     texts = [text for _, _, text in Recording(tmp_path / "0.rrd").events() if text.startswith("still #")]
@@ -302,7 +316,8 @@ def test_a_still_on_both_ways_is_shown_once(flight, tmp_path):
 def test_a_still_at_a_frame_that_is_known_speaks_on_its_track(flight, tmp_path):
     """A still that a short outage held up would be lost on its track."""
     with Rig(tmp_path, flight) as rig:
-        rig.base(*range(25))
+        for index in range(25):  # one by one: a worker that is behind leaves detection out
+            rig.base(index)
         rig.put(*backlog(flight, "still", 0, still_object(flight, 15, 0)))
         assert rig.session.pipeline.outcomes["matched"] == 1
         assert rig.session.pipeline.refined == 1
@@ -341,7 +356,7 @@ def test_pieces_are_in_the_account_to_the_byte(flight, tmp_path):
 
 def test_the_end_waits_for_the_last_piece(flight, tmp_path, monkeypatch):
     """The last still of an outage would be cut off, though it is on the line."""
-    monkeypatch.setattr("hvt_ground.session.receiver._ENDED_PATIENCE_NS", 3_600_000_000_000)
+    monkeypatch.setattr("hvt_ground.session.edge_sessions._ENDED_PATIENCE_NS", 3_600_000_000_000)
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(5))
         data = still_object(flight, 2, 0)
@@ -351,7 +366,7 @@ def test_the_end_waits_for_the_last_piece(flight, tmp_path, monkeypatch):
         assert not rig.receiver.idle
         rig.put(two)
         wait_for(lambda: rig.receiver.done)
-        assert rig.receiver.done[0].backlog.stills == 1
+        assert rig.receiver.done[0].backlog.totals.stills == 1
 
 
 def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path):
@@ -362,9 +377,9 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(20))
         rig.put(*chunks(sid, "still", 3, still, chunk_bytes=200))
-        asked = rig.acknowledged_ranges()
-        assert AcknowledgedRange(session_id=sid, kind="info", number=0, acknowledged_bytes=0) in asked
-        assert not any(one.kind == "still" and one.acknowledged_bytes == len(still) for one in asked)
+        requested = rig.acknowledged_ranges()
+        assert AcknowledgedRange(session_id=sid, kind="info", number=0, acknowledged_bytes=0) in requested
+        assert not any(one.kind == "still" and one.acknowledged_bytes == len(still) for one in requested)
         assert list(tmp_path.glob("backlog-*")) == []
         rig.put(*chunks(sid, "info", 0, info_object(former)))
         rig.put(*chunks(sid, "still", 3, still, chunk_bytes=200))
@@ -374,7 +389,7 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
             size = {one.acknowledged_bytes for one in said if (one.kind, one.number) == (kind, number)}
             assert size
             assert data is None or len(data) in size
-        assert rig.session.backlog.stills == 0
+        assert rig.session.backlog.totals.stills == 0
     first, recording = Recording(tmp_path / "0.rrd"), Recording(tmp_path / "backlog-0.rrd")
     assert [frame for frame, _, _ in first.video()] == list(range(20))
     assert [frame for frame, _, _ in recording.video()] == list(range(20, 45))
@@ -398,7 +413,7 @@ def test_recordings_of_former_sessions_are_bounded(flight, tmp_path):
         for former in formers:
             rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
             rig.put(*chunks(former.session_id, "still", 0, still_object(former, 1, 0)))
-        assert len(rig.receiver.backlog._recordings._open) == 4
+        assert len(rig.recordings.open_sessions) == 4
     for number in range(6):
         assert [frame for frame, _ in Recording(tmp_path / f"backlog-{number}.rrd").stills()] == [1]
 
@@ -407,9 +422,8 @@ def test_no_more_files_are_made_than_the_bound(flight, tmp_path):
     """Whoever makes up former sessions would fill the disk, and the edge would forget what nobody wrote down."""
     formers = [Flight(2) for _ in range(3)]
     stills = [still_object(former, 1, 0) for former in formers]
-    with Rig(tmp_path, flight) as rig:
+    with Rig(tmp_path, flight, most_files=2) as rig:
         rig.base(*range(5))
-        rig.receiver.backlog._recordings._left = 2
         for former, still in zip(formers, stills, strict=True):
             rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
             rig.put(*chunks(former.session_id, "still", 0, still))
@@ -421,6 +435,11 @@ def test_no_more_files_are_made_than_the_bound(flight, tmp_path):
     assert len(Recording(tmp_path / "backlog-0.rrd").stills()) == 2, "what is open goes on"
 
 
+def received(item: Received) -> ReceivedStill:
+    """A still as it is handed on."""
+    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload, item.encoding)
+
+
 class Slow(BacklogRecording):
     """Closing it takes its time; knows who did it."""
 
@@ -428,11 +447,11 @@ class Slow(BacklogRecording):
         super().__init__(*args, **kwargs)
         self.may_end, self.closed_by = may_end, ""
 
-    def close(self, *, footer: bool = True) -> None:
+    def close(self, *, quickly: bool = False) -> None:
         """Wait."""
         assert self.may_end.wait(20)
         self.closed_by = threading.current_thread().name
-        super().close(footer=footer)
+        super().close(quickly=quickly)
 
 
 def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp_path):
@@ -442,48 +461,38 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
     def open_one(info: Info) -> Slow:
         path = tmp_path / f"{len(made)}.rrd"
         recorder = Recorder(settings(info, path))
-        made.append(Slow(info, path=path, recorder=recorder, look=look_of(info), may_end=may_end))
+        made.append(Slow(info, path=path, sink=recorder, perception=look_of(info), may_end=may_end))
         return made[-1]
 
     recordings = BacklogRecordings(open_one, most=2)
-    still = flight.still(10, 0)
-
-    def boxes():
-        yield
-        made[0].fill.note_still(1, 1)
-        return True
-
-    with recordings.using(formers[0].info()) as first:
-        waiting = recordings.kept(first, boxes())
+    first = recordings.acquire(formers[0].info())
     for former in formers[1:]:
-        with recordings.using(former.info()) as other:
-            assert other is made[-1]
+        other = recordings.acquire(former.info())
+        assert other is made[-1].backlog
+        recordings.release(other)
     assert [one.closed_by for one in made] == [""] * 4, "closing waits, and nobody waits for it"
-    assert list(recordings._open) == [formers[0].session_id, formers[3].session_id]
+    assert recordings.open_sessions == [formers[0].session_id, formers[3].session_id]
+    first.read_still(received(formers[0].still(1, 1)))
+    recordings.release(first)
     may_end.set()
-    for _ in waiting:
-        pass
-    with recordings.using(flight.info()) as last:
-        assert last is made[4]
-    assert list(recordings._open) == [formers[3].session_id, flight.session_id], "done with, it may go"
+    assert recordings.acquire(flight.info()) is made[4].backlog
+    assert recordings.open_sessions == [formers[3].session_id, flight.session_id], "done with, it may go"
     recordings.close()
     assert {one.closed_by.rpartition("_")[0] for one in made} == {"hvt-backlog-close"}
     assert "1 still of this session arrived after it had ended" in [
         text for _, _, text in Recording(tmp_path / "0.rrd").events()
     ]
-    assert still.payload
-    with recordings.using(flight.info()) as none:
-        assert none is None
+    assert recordings.acquire(flight.info()) is None
     few = BacklogRecordings(open_one, most_files=1)
-    with few.using(formers[0].info()) as one, few.using(formers[1].info()) as none:
-        assert (one, none) == (made[5], None), (
-            "so many came at once that the last could not be refused before"
-        )
+    assert few.acquire(formers[0].info()) is made[5].backlog
+    assert few.acquire(formers[1].info()) is None, (
+        "so many came at once that the last could not be refused before"
+    )
     few.close()
 
 
 def test_damaged_and_foreign_pieces_are_counted_and_skipped(flight, tmp_path):
-    """One bad piece would end the ground."""
+    """One bad chunk would end the ground."""
     with Rig(tmp_path, flight) as rig:
         rig.put(*backlog(flight, "still", 0, still_object(flight, 1, 0)))  # no session is open yet
         assert rig.receiver.unusable == 1
@@ -498,13 +507,13 @@ def test_damaged_and_foreign_pieces_are_counted_and_skipped(flight, tmp_path):
         garbage = video_object(flight, range(65, 70))
         noise = garbage.replace(flight.units[66].data, bytes(len(flight.units[66].data)))
         rig.put(*backlog(flight, "base", 65, noise))
-        assert rig.receiver.error is None
-        assert rig.session.backlog.frames == 1, "what follows a broken frame is no picture"
-        assert rig.session.backlog.left_out == 4
+        assert rig.thread.error is None
+        assert rig.session.backlog.totals.frames == 1, "what follows a broken frame is no picture"
+        assert rig.session.backlog.totals.left_out == 4
         third = flight.units[3].data
         broken = video_object(flight, range(2, 5)).replace(third, bytes(len(third)))
         rig.put(*backlog(flight, "base", 2, broken))
-        assert rig.session.backlog.left_out == 4, "they came at once, and are shown"
+        assert rig.session.backlog.totals.left_out == 4, "they came at once, and are shown"
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -526,7 +535,7 @@ def test_the_last_moment_there_is_can_be_shown(flight, tmp_path, own):
             kept = still_object(sender, 12, sequence, **changes)
             rig.put(*chunks(sender.session_id, "still", sequence, kept))
         rig.base(*range(65, 75))
-        assert rig.receiver.error is None
+        assert rig.thread.error is None
         assert rig.session.frames_decoded == 35
         assert rig.receiver.backlog.refused == 0
     recording = Recording(tmp_path / ("0.rrd" if own else "backlog-0.rrd"))
@@ -553,11 +562,11 @@ def test_a_still_is_acknowledged_when_it_was_read_and_not_before(flight, tmp_pat
         for _ in range(3):  # two seconds, in which its last byte is sent again
             rig.inbox.put(backlog(flight, "still", 4, still, chunk_bytes=len(still) - 1)[-1])
             assert {one.acknowledged_bytes for one in rig.acknowledged_ranges()} == {len(still) - 1}
-        assert rig.session.backlog.stills == 0
+        assert rig.session.backlog.totals.stills == 0
         may_read.set()
-        wait_for(lambda: rig.receiver.backlog.idle)
+        wait_for(lambda: rig.receiver.backlog.working == 0)
         assert rig.acknowledged_ranges()[-1] == full(flight, "still", 4, still)
-        assert rig.session.backlog.stills == 1
+        assert rig.session.backlog.totals.stills == 1
     assert [frame for frame, _ in Recording(tmp_path / "0.rrd").stills()] == [15]
 
 
@@ -577,11 +586,11 @@ def test_what_a_session_left_unread_comes_again_and_is_shown(flight, tmp_path):
             *backlog(flight, "still", 4, still),
         ):
             rig.inbox.put(item)
-        wait_for(lambda: rig.receiver.backlog._working == 2)
+        wait_for(lambda: rig.receiver.backlog.working == 2)
         rig.inbox.put(flight.status(base=25, state="ended"))
-        wait_for(lambda: rig.receiver.done and rig.receiver.backlog.idle, timeout_s=15)
-        told = [one for report in rig.port.reports for one in report.backlog]
-        assert full(flight, "still", 4, still) not in told
+        wait_for(lambda: rig.receiver.done and not rig.receiver.backlog.working, timeout_s=15)
+        reported = [one for report in rig.port.reports for one in report.backlog]
+        assert full(flight, "still", 4, still) not in reported
         may_read.set()
         second = Flight(10)
         rig.port.flight = rig.flight = second
@@ -639,21 +648,21 @@ def test_a_still_is_read_in_the_middle_of_a_stretch(flight, tmp_path):
             order.append("still")
             return super().read(stills, base_bgr)
 
-    class Lent:
+    class Stepped:
         @contextmanager
         def checkout(self):
             yield Stepwise(), None
 
     with Rig(
-        tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), models=Lent()
+        tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), models=Stepped()
     ) as rig:
         rig.base(*range(25))
         for item in backlog(flight, "base", 40, video_object(flight, range(40, 60))):
             rig.inbox.put(item)
-        wait_for(lambda: order and rig.receiver.backlog.idle)
+        wait_for(lambda: order and rig.receiver.backlog.working == 0)
         for item in backlog(flight, "still", 4, still_object(flight, 45, 4)):
             rig.inbox.put(item)
-        wait_for(lambda: rig.receiver.backlog._working == 1)
+        wait_for(lambda: rig.receiver.backlog.working == 1)
         steps.release()
         wait_for(lambda: "still" in order)
         assert order[:2] == ["boxes", "still"]
@@ -662,50 +671,61 @@ def test_a_still_is_read_in_the_middle_of_a_stretch(flight, tmp_path):
         assert order.count("boxes") == 7
 
 
-def test_stills_do_not_wait_for_boxes_in_kept_video():
+class Steps(Job):
+    """Runs a generator, a step each; tells when it is closed."""
+
+    def __init__(self, steps, *, on_close=lambda: None) -> None:
+        self._steps = steps
+        self._on_close = on_close
+
+    def step(self) -> bool:
+        """One."""
+        return next(self._steps, "end") == "end"
+
+    def close(self) -> None:
+        """Tell."""
+        self._on_close()
+
+
+def test_stills_do_not_wait_for_boxes_in_stored_video():
     """Boxes of a stretch take a slow ground half a minute: for so long no still of the outage would be read."""
-    order, held, read = [], [], threading.Event()
+    order, closed, read = [], [], threading.Event()
 
     def boxes():
-        held.append(1)
-        try:
-            for _ in range(400):
-                if read.is_set():
-                    break
-                order.append("boxes")
-                time.sleep(0.01)
-                yield
-            order.append("boxes ended")
-            while True:
-                yield
-        finally:
-            held.clear()
+        for _ in range(400):
+            if read.is_set():
+                break
+            order.append("boxes")
+            time.sleep(0.01)
+            yield
+        order.append("boxes ended")
+        while True:
+            yield
 
     def still():
         order.append("still")
         read.set()
         yield
-        return True
 
     worker = RealtimeWorker(lambda *_: None, lambda *_: None, lambda _stills: None, name="stretch")
     try:
-        assert worker.at_leisure(boxes())
+        assert worker.submit(Steps(boxes(), on_close=lambda: closed.append(1)), last=True)
         wait_for(lambda: order)
-        assert worker.later(still())
+        assert worker.submit(Steps(still()))
         wait_for(lambda: "boxes ended" in order)
         assert order.index("still") < order.index("boxes ended")
         assert order[0] == "boxes", "it was in the middle of one"
-        waiting = [worker.at_leisure(boxes()) for _ in range(9)]
-        assert (waiting.count(True), waiting[-1]) == (7, False), "each holds a stretch of video"
-        assert held
+        taken = [worker.submit(Steps(boxes()), last=True) for _ in range(9)]
+        assert (taken.count(True), taken[-1]) == (7, False), "each holds a stretch of video"
+        assert not closed
     finally:
         worker.close()
     worker.raise_error()
-    assert not held, "the models that one in the middle has borrowed would never be given back"
+    assert closed, "the models that one in the middle has checked out would never be given back"
 
 
-def test_eyes_are_not_idle_while_they_see():
-    """Whoever waits for them would count what they have not made anything of yet."""
+def test_a_worker_is_not_idle_while_it_analyzes():
+    """Whoever waits for it would count what it has not made anything of yet."""
     began, may_end = threading.Event(), threading.Event()
 
     def see(_picture, _hurry) -> None:
@@ -727,24 +747,26 @@ def test_eyes_are_not_idle_while_they_see():
 
 def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
     """On a slow machine the stills of an outage would be acknowledged, and never shown."""
-    done, at_rest = [], []
+    done, pending, at_rest = [], [], []
 
     def see(_picture, _hurry) -> None:
+        pending.pop()
         time.sleep(0.03)
         if len(done) < 3:
+            pending.append(1)
             worker.picture(None)  # there is always another
 
     def work():
         for step in range(3):
-            at_rest.append(worker._pictures.empty())
+            at_rest.append(not pending)
             done.append(step)
             yield
-        return True
 
     worker = RealtimeWorker(see, lambda *_: None, lambda _stills: None, name="busy")
     try:
+        pending.append(1)
         worker.picture(None)
-        assert worker.later(work())
+        assert worker.submit(Steps(work()))
         wait_for(lambda: len(done) == 3, timeout_s=20)
     finally:
         worker.close()
@@ -755,18 +777,16 @@ def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
 def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path, monkeypatch):
     """Ctrl-C would throw away an acknowledged stretch."""
     # What a second or two are enough for is the machine's affair.
-    monkeypatch.setattr("hvt_ground.session.receiver._DRAIN_NS", 20_000_000_000)
-    monkeypatch.setattr("hvt_ground.backlog.delivery._FINISH_NS", 20_000_000_000)
+    monkeypatch.setattr("hvt_ground.session.edge_sessions._DRAIN_NS", 20_000_000_000)
+    monkeypatch.setattr("hvt_ground.perception.worker._LEAVE_S", 20.0)
     monkeypatch.setattr("hvt_ground.perception.worker._FINISH_S", 20.0)
     rig = Rig(tmp_path, flight)
     rig.base(*range(25))
     rig.base(*range(65, 70))
     for item in backlog(flight, "base", 40, video_object(flight, range(40, 65))):
         rig.inbox.put(item)
-    rig.receiver.close()
-    rig.receiver._thread.join(60)
-    assert not rig.receiver._thread.is_alive()
-    assert rig.receiver.error is None
+    assert rig.thread.close(timeout_s=60)
+    assert rig.thread.error is None
     assert len(Recording(tmp_path / "0.rrd").video()) == 30 + 25
     (last,) = [one for report in rig.port.reports for one in report.backlog if one.acknowledged_bytes][-1:]
     assert last.kind == "base"

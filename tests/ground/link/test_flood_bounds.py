@@ -10,6 +10,9 @@ import pytest
 
 from flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, TrackStep
+from hvt_ground.events import MessageTiming
+from hvt_ground.link.packets import BasePacket
+from hvt_ground.link.reassemble import Arrival
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.session.session import GroundSession
@@ -24,24 +27,32 @@ def flight() -> Flight:
     return Flight(15, pace="lockstep")
 
 
+class Events(list):
+    """A sink that lists what it gets."""
+
+    log = list.append
+
+    def close(self, *, quickly: bool = False) -> None:
+        """Nothing."""
+
+
 class Rig:
     """A session whose clock the test turns."""
 
     def __init__(self, flight: Flight) -> None:
+        self.events = Events()
         self.now_ns = 1_790_000_000 * SECOND_NS
         self.session = GroundSession(
             flight.info(),
-            recorder=None,
-            recording=None,
+            sinks=[self.events],
             pipeline_of=pipeline_of,
-            to_local_ns=int,
             clock=lambda: self.now_ns,
-            report=lambda: None,
         )
         for index in range(3):
             item = flight.base(index)
             header = BaseHeader.parse(item.attachment, item.payload)
-            assert self.session.base(header, item, decode=True, starts_run=index == 0)
+            unit = Arrival("decode", header, item.payload, item.received_ns, starts_run=index == 0)
+            assert self.session.base(BasePacket(unit, item, on_time=True))
 
     def step(self, item, **lies) -> int:
         """Take a report of tracks; how many there have been."""
@@ -78,7 +89,10 @@ def test_a_forged_step_number_does_not_end_the_tracks_for_good(rig, flight):
     rig.now_ns += 6 * SECOND_NS
     assert rig.step(items[1]) == 1, "it builds on one that is not known"
     assert rig.step(items[0], sequence=40, frame_index=50) == 2
-    assert rig.session._step_decoder.predicted(frame_index=50).ids.tolist() == [1]
+    handled = [
+        one.handled_ns for one in rig.events if isinstance(one, MessageTiming) and one.kind == "tracks"
+    ]
+    assert [bool(at_ns) for at_ns in handled] == [True, True], "the tracks of both are known"
 
 
 def test_results_that_nobody_fetches_do_not_pile_up(rig, flight):
@@ -93,14 +107,11 @@ def test_results_that_nobody_fetches_do_not_pile_up(rig, flight):
 
 def test_broken_stills_are_not_all_looked_into(rig, flight):
     """Each costs a line in the recording and one on stderr; a few thousand a second would fill both."""
-    notices = []
-    rig.session._emit = notices.append
-    rig.session.pipeline._stills._emit = notices.append
     for sequence in range(200):
         item = flight.still(1, sequence, data=b"no picture")
         rig.session.still(RoiHeader.parse(item.attachment, item.payload), item, media_type="image/jpeg")
     rig.session.close()
-    assert sum("cannot be decoded" in getattr(one, "text", "") for one in notices) == 32
+    assert sum("cannot be decoded" in getattr(one, "text", "") for one in rig.events) == 32
 
 
 def test_stills_that_wait_to_be_read_have_a_bound_in_bytes():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvt_ground.link.uptime import Uptime
+from hvt_ground.link.statistics import Uptime
 
 MS = 1_000_000
 
@@ -14,7 +14,7 @@ def test_gaps_count_as_far_as_both_arrival_and_handling_show_them():
     def handle(arrived_ms: int, now_ms: int) -> int:
         return (time.handle(arrived_ns=start + arrived_ms * MS, now_ns=start + now_ms * MS) - start) // MS
 
-    assert time.at(start, waiting=False) == start
+    assert time.at(start, pending=False) == start
     assert handle(0, 0) == 0
     assert handle(60, 61) == 60
     # Away for eight seconds, in which messages came as ever: they are taken up in one go.
@@ -25,8 +25,8 @@ def test_gaps_count_as_far_as_both_arrival_and_handling_show_them():
     # A true silence of three seconds.
     before = handle(12_060, 12_060)
     assert handle(15_060, 15_060) == before + 3_000
-    assert (time.at(start + 16_060 * MS, waiting=False) - start) // MS == before + 4_000
-    assert (time.at(start + 16_060 * MS, waiting=True) - start) // MS == before + 3_000
+    assert (time.at(start + 16_060 * MS, pending=False) - start) // MS == before + 4_000
+    assert (time.at(start + 16_060 * MS, pending=True) - start) // MS == before + 3_000
 
 
 def test_it_never_goes_back():

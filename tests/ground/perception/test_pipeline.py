@@ -14,9 +14,9 @@ from hvt_common.values import Detections, Posterior, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import still_codec
-from hvt_ground.events.events import Notice, Overlay, Refinement
-from hvt_ground.perception.pipeline import Picture, Pipeline, ReceivedStill
-from hvt_ground.perception.stills.classify import Reading, Readings
+from hvt_ground.events import Notice, Overlay, Refinement
+from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
+from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading
 
 
 @pytest.fixture(scope="module")
@@ -26,17 +26,17 @@ def flight() -> Flight:
 
 
 @pytest.fixture(scope="module")
-def pictures(flight) -> list[Picture]:
+def pictures(flight) -> list[DecodedFrame]:
     """As the decoder gives them."""
     decoder = BaseDecoder()
     return [
-        Picture(unit.frame_index, unit.capture_ns, unit.capture_ns, decoder.decode(unit.data))
+        DecodedFrame(unit.frame_index, unit.capture_ns, unit.capture_ns, decoder.decode(unit.data))
         for unit in flight.units
     ]
 
 
 class Rig:
-    """Eyes, and all that they emitted."""
+    """Perception, and all that they emitted."""
 
     def __init__(self, **options) -> None:
         self.events: list = []
@@ -58,7 +58,7 @@ def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures
     """Boxes would lag behind the picture or be missing from some frames."""
     rig = Rig(detect_every=3)
     for picture in pictures:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     overlays = rig.of(Overlay)
     assert [one.frame_index for one in overlays] == list(range(30))
     assert rig.pipeline.detections_run == 10
@@ -73,7 +73,7 @@ def test_in_a_hurry_detection_waits_but_the_track_goes_on(pictures):
     """Boxes would vanish whenever the machine is busy."""
     rig = Rig()
     for picture in pictures:
-        rig.pipeline.see(picture, hurry=picture.frame_index % 4 != 0)
+        rig.pipeline.analyze(picture, hurry=picture.frame_index % 4 != 0)
     assert rig.pipeline.detections_run == 8
     assert all(len(one.track_ids) == 1 for one in rig.of(Overlay)[8:])
 
@@ -82,9 +82,9 @@ def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
     """The whole point: the sharp still says bus, and the track would go on being called car."""
     rig = Rig()
     for picture in pictures[:12]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     rig.pipeline.read([received(flight, 8, 0)])
-    rig.pipeline.see(pictures[12], hurry=False)
+    rig.pipeline.analyze(pictures[12], hurry=False)
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_before, refinement.class_after) == (1, "car", "bus")
     assert (refinement.still_sequence, refinement.edge_track_id, refinement.frame_index) == (0, 1, 11)
@@ -103,7 +103,7 @@ def test_the_edge_hears_of_every_still_once(flight, pictures):
     """A lockstep edge would wait in vain; M3 would count an answer twice."""
     rig = Rig()
     for picture in pictures[:10]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     rig.pipeline.read(
         [received(flight, 8, 0), received(flight, 9, 1, data=b"broken"), received(flight, 9, 2)]
     )
@@ -132,7 +132,7 @@ def test_the_edge_hears_of_every_still_once(flight, pictures):
 def test_a_still_that_lies_about_itself_is_dropped(flight, pictures, changes):
     """One message could make the ground reserve gigabytes, or end it."""
     rig = Rig()
-    rig.pipeline.see(pictures[0], hurry=False)
+    rig.pipeline.analyze(pictures[0], hurry=False)
     rig.pipeline.read([received(flight, 0, 0, **changes)])
     assert dict(rig.pipeline.stills_dropped) == {"undecodable": 1}
 
@@ -143,10 +143,10 @@ def test_a_name_of_any_language_and_length_goes_back_to_the_edge(flight, picture
     class Wordy(SameAnswer):
         def read(self, stills, base_bgr):
             wordy = Posterior("乗用車\n" * 30, 1.0, 0.0, np.array([0.0, 1.0], np.float32))
-            return Readings(((Reading(wordy),),) * len(stills))
+            return FrameReadings(((ObjectReading(wordy),),) * len(stills))
 
     rig = Rig(reader=Wordy())
-    rig.pipeline.see(pictures[0], hurry=False)
+    rig.pipeline.analyze(pictures[0], hurry=False)
     rig.pipeline.read([received(flight, 0, 0)])
     (result,) = rig.pipeline.take_results()
     assert len(result.class_name.encode()) <= 64
@@ -157,7 +157,7 @@ def test_a_still_that_nobody_can_read_is_shown_all_the_same(flight, pictures):
     """Without a classifier the operator would not even see the sharp picture."""
     rig = Rig(reader=SameAnswer(knows=False))
     for picture in pictures[:6]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     rig.pipeline.read([received(flight, 4, 0)])
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_before, refinement.class_after) == (None, "car", "car")
@@ -169,7 +169,7 @@ def test_what_still_waits_at_the_end_is_given_out(flight, pictures):
     """The last stills of a flight would be missing from its recording."""
     rig = Rig()
     for picture in pictures[:3]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     rig.pipeline.read([received(flight, 9, 0)])  # its frame will not come
     assert rig.of(Refinement) == []
     rig.pipeline.end()
@@ -179,10 +179,10 @@ def test_what_still_waits_at_the_end_is_given_out(flight, pictures):
 
 
 def test_a_picture_without_objects_is_an_empty_overlay(flight):
-    """An empty scene would crash the eyes, or show boxes of the past for ever."""
+    """An empty scene would crash perception, or show boxes of the past for ever."""
     grey = np.full((192, 320, 3), 120, np.uint8)
     rig = Rig(detector=RedSquares())
-    rig.pipeline.see(Picture(0, 0, 0, grey), hurry=False)
+    rig.pipeline.analyze(DecodedFrame(0, 0, 0, grey), hurry=False)
     (overlay,) = rig.of(Overlay)
     assert overlay.boxes_base_px.shape == (0, 4)
     assert (overlay.classes, rig.pipeline.tracks) == ((), 0)
@@ -192,7 +192,9 @@ def test_a_picture_without_objects_is_an_empty_overlay(flight):
 # Residual stills
 
 
-def residual(flight: Flight, pictures: list[Picture], index: int, sequence: int, **changes) -> ReceivedStill:
+def residual(
+    flight: Flight, pictures: list[DecodedFrame], index: int, sequence: int, **changes
+) -> ReceivedStill:
     """A still of the red square that builds on the decoded frame, as the edge makes it."""
     crop = tuple(int(side) for side in square_box(index))
     sharp = flight.pictures[index][crop[1] : crop[3], crop[0] : crop[2]]
@@ -207,7 +209,7 @@ def test_a_residual_is_undone_on_the_frame_that_it_names(flight, pictures):
     """The still would be painted onto another moment: garbage that looks like a picture."""
     rig = Rig()
     for picture in pictures[:12]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     still = residual(flight, pictures, 6, 0)
     rig.pipeline.read([still])
     (refinement,) = rig.of(Refinement)
@@ -225,11 +227,11 @@ def test_a_residual_whose_frame_is_not_at_hand_is_asked_for_again_once(flight, p
     """The operator would never see the still; or the edge would send it for ever."""
     rig = Rig()
     for picture in [*pictures[:5], *pictures[7:12]]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     lost = residual(flight, pictures, 6, 4)
     wrong = residual(flight, pictures, 8, 5, parameters={"b": 1}, data=lost.data)
     rig.pipeline.read([lost, wrong])
-    rig.pipeline.see(pictures[12], hurry=False)
+    rig.pipeline.analyze(pictures[12], hurry=False)
     rig.pipeline.end()
     results = rig.pipeline.take_results()
     assert [(one.still_sequence, one.track_id, one.class_name, one.again) for one in results] == [
@@ -248,15 +250,15 @@ def test_a_residual_before_its_frame_waits_for_it(flight, pictures):
     """Each residual that overtakes its frame in the decoder's queue would cost an intra still more."""
     rig = Rig()
     for picture in pictures[:6]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     rig.pipeline.read([residual(flight, pictures, 7, 0), residual(flight, pictures, 8, 1)])
     assert rig.pipeline.take_results() == []
-    rig.pipeline.see(pictures[6], hurry=False)
+    rig.pipeline.analyze(pictures[6], hurry=False)
     assert rig.pipeline.take_results() == []
-    rig.pipeline.see(pictures[7], hurry=False)
+    rig.pipeline.analyze(pictures[7], hurry=False)
     (result,) = rig.pipeline.take_results()
     assert (result.still_sequence, result.class_name, result.again) == (0, "bus", False)
-    rig.pipeline.see(pictures[9], hurry=False)  # frame 8 was lost
+    rig.pipeline.analyze(pictures[9], hurry=False)  # frame 8 was lost
     (result,) = rig.pipeline.take_results()
     assert (result.still_sequence, result.again) == (1, True)
 
@@ -264,7 +266,7 @@ def test_a_residual_before_its_frame_waits_for_it(flight, pictures):
 def test_stills_that_wait_are_bounded(flight, pictures):
     """A peer that names frames of the future would fill the memory."""
     rig = Rig()
-    rig.pipeline.see(pictures[0], hurry=False)
+    rig.pipeline.analyze(pictures[0], hurry=False)
     one = residual(flight, pictures, 5, 0)
     rig.pipeline.read([ReceivedStill(replace(one.header, sequence=i), one.data, "") for i in range(70)])
     assert [result.still_sequence for result in rig.pipeline.take_results()] == list(range(6))
@@ -274,11 +276,11 @@ def test_a_reader_that_wants_the_picture_gets_it(flight, pictures):
     """Re-detection would be given a still without surroundings, and say nothing."""
     rig = Rig(wants_base=True)
     for picture in pictures[:4]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     rig.pipeline.read([received(flight, 5, 0)])
     assert rig.reader.had_base == []
-    rig.pipeline.see(pictures[4], hurry=False)
-    rig.pipeline.see(pictures[6], hurry=False)  # tick 5 has no picture: that of tick 4 serves
+    rig.pipeline.analyze(pictures[4], hurry=False)
+    rig.pipeline.analyze(pictures[6], hurry=False)  # frame 5 has no picture: that of frame 4 serves
     assert rig.reader.had_base == [True]
 
 
@@ -289,7 +291,7 @@ def test_each_object_in_a_still_gets_its_own_answer(flight, pictures):
     """The neighbours in a shared still would stay unrefined, and the edge would send them again."""
     rig = Rig()
     for picture in pictures[:10]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     here = square_box(8)
     rig.pipeline.edge_step(tracks_at(8, {1: here, 7: (200.0, 20.0, 240.0, 60.0)}))
     also = (AlsoShown(track_id=7, box_source_px=(200.0, 20.0, 240.0, 60.0)),)
@@ -314,7 +316,7 @@ def test_new_objects_and_boxes_of_a_still_enter_the_list(flight, pictures):
     x1, y1, x2, y2 = square_box(8)
     rig = Rig(reader=SameAnswer(found=found, at=(x1 + 8, y1, x2 + 8, y2)))
     for picture in pictures[:9]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     before = rig.pipeline.list_at(9).boxes_base_px[0, 0]
     rig.pipeline.read([received(flight, 8, 0)])
     last = rig.pipeline.list_at(9)
@@ -332,7 +334,7 @@ def test_the_edges_tracks_and_ours_are_one_list(pictures):
     rig = Rig()
     far = (220.0, 20.0, 250.0, 50.0)
     for picture in pictures[:12]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
         if picture.frame_index == 6:
             rig.pipeline.edge_step(tracks_at(5, {31: square_box(5), 32: far}))
     overlays = rig.of(Overlay)
@@ -351,7 +353,7 @@ def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures)
     far = (220.0, 20.0, 250.0, 50.0)
     rig = Rig()
     for picture in pictures[:9]:
-        rig.pipeline.see(picture, hurry=False)
+        rig.pipeline.analyze(picture, hurry=False)
     rig.pipeline.edge_step(tracks_at(6, {32: far}))
     crop = (216, 16, 254, 54)
     data = cv2.imencode(".jpg", flight.pictures[6][16:54, 216:254])[1].tobytes()
@@ -359,7 +361,7 @@ def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures)
     rig.pipeline.read([still])
     (refinement,) = rig.of(Refinement)
     assert (refinement.track_id, refinement.class_after) == (2, "bus")
-    rig.pipeline.see(pictures[9], hurry=False)
+    rig.pipeline.analyze(pictures[9], hurry=False)
     last = rig.of(Overlay)[-1]
     assert (last.classes[1], last.refined.tolist(), last.origins[1]) == ("bus", [False, True], "edge")
 
@@ -367,14 +369,14 @@ def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures)
 def test_a_step_of_a_tick_without_a_picture_is_shown(pictures):
     """At one frame a second on the base the boxes would move once a second."""
     rig = Rig()
-    rig.pipeline.see(pictures[0], hurry=False)
-    rig.pipeline.see(pictures[5], hurry=False)
+    rig.pipeline.analyze(pictures[0], hurry=False)
+    rig.pipeline.analyze(pictures[5], hurry=False)
     rig.pipeline.edge_step(tracks_at(8, {31: square_box(8)}), capture_ns=123)
     rig.pipeline.edge_step(tracks_at(7, {31: square_box(7)}))  # older than the last
-    rig.pipeline.see(pictures[7], hurry=False)  # its picture was late
-    rig.pipeline.see(pictures[10], hurry=False)
+    rig.pipeline.analyze(pictures[7], hurry=False)  # its picture was late
+    rig.pipeline.analyze(pictures[10], hurry=False)
     rig.pipeline.edge_step(tracks_at(2**32 - 1, {31: square_box(10)}))  # nonsense: nothing could follow it
-    rig.pipeline.see(pictures[11], hurry=False)
+    rig.pipeline.analyze(pictures[11], hurry=False)
     overlays = rig.of(Overlay)
     assert [one.frame_index for one in overlays] == [0, 5, 8, 10, 11]
     assert overlays[2].capture_ns == 123
@@ -387,22 +389,22 @@ def test_a_still_of_a_tick_without_a_picture_finds_its_track(flight, pictures):
     """Where the base has few frames most stills would match nothing."""
     rig = Rig()
     for index in (0, 3, 6, 9, 12):
-        rig.pipeline.see(pictures[index], hurry=False)
+        rig.pipeline.analyze(pictures[index], hurry=False)
     rig.pipeline.read([received(flight, 8, 0)])
     (refinement,) = rig.of(Refinement)
     assert refinement.track_id == 1
 
 
 def test_looking_ahead_tells_what_would_be_shown_and_changes_nothing(pictures):
-    """A study that asks at every tick would measure another ground than the one that flies."""
+    """A study that asks at every frame would measure another ground than the one that flies."""
     plain, asked = Rig(detect_every=5), Rig(detect_every=5)
     for rig in (plain, asked):
-        rig.pipeline.see(pictures[0], hurry=False)
+        rig.pipeline.analyze(pictures[0], hurry=False)
         for picture in pictures[1:20]:
             if rig is asked:
                 ahead = rig.pipeline.list_at(picture.frame_index + 3)
                 assert ahead.frame_index == picture.frame_index + 3
-            rig.pipeline.see(picture, hurry=False)
+            rig.pipeline.analyze(picture, hurry=False)
             if picture.frame_index % 6 == 0:
                 rig.pipeline.edge_step(tracks_at(picture.frame_index, {31: square_box(picture.frame_index)}))
     for a, b in zip(plain.of(Overlay), asked.of(Overlay), strict=True):
@@ -411,6 +413,6 @@ def test_looking_ahead_tells_what_would_be_shown_and_changes_nothing(pictures):
     now = asked.pipeline.list_at(19)
     np.testing.assert_allclose(now.boxes_base_px, asked.of(Overlay)[-1].boxes_base_px)
     np.testing.assert_allclose(asked.pipeline.list_at(22).boxes_base_px[0], square_box(22), atol=8)
-    with pytest.raises(ValueError, match="tick 18 lies before"):
+    with pytest.raises(ValueError, match="frame 18 lies before"):
         asked.pipeline.list_at(18)
     assert len(Rig().pipeline.list_at(0).track_ids) == 0

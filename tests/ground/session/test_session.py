@@ -14,7 +14,8 @@ from handled import WatchedInbox, end
 from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_ground.session.receiver import EdgeReceiver
+from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.status import summary, table
 
@@ -29,7 +30,7 @@ def wait_for(condition, *, timeout_s: float = 30) -> None:
 
 def never_gives_up(monkeypatch) -> None:
     """A session ends because all of it has come, and for no other reason."""
-    monkeypatch.setattr("hvt_ground.session.receiver._ENDED_PATIENCE_NS", 3_600_000_000_000)
+    monkeypatch.setattr("hvt_ground.session.edge_sessions._ENDED_PATIENCE_NS", 3_600_000_000_000)
 
 
 class Rig:
@@ -41,17 +42,15 @@ class Rig:
         self.reader = reader or SameAnswer()
         self.detector = detector
         self.opened: list[GroundSession] = []
-        self.receiver = EdgeReceiver(self.port, open_session=self._open, patience_s=patience_s, clock=clock)
+        self.receiver = EdgeSessions(self.port, open_session=self._open, patience_s=patience_s, clock=clock)
+        self.thread = EdgeThread(self.receiver)
 
-    def _open(self, info: Info, receiver: EdgeReceiver) -> GroundSession:
+    def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         session = GroundSession(
             info,
-            recorder=None,
-            recording=None,
             pipeline_of=lambda emit: pipeline_of(emit, detector=self.detector, reader=self.reader),
-            to_local_ns=receiver.clock_offset.to_local_ns,
             clock=time.time_ns,
-            report=receiver.report_now,
+            reports=reports,
         )
         self.opened.append(session)
         return session
@@ -63,17 +62,17 @@ class Rig:
 
     def settle(self) -> None:
         """All that was put has been handled and seen."""
-        wait_for(lambda: self.inbox.handled or self.receiver.error is not None)
+        wait_for(lambda: self.inbox.handled or self.thread.error is not None)
         for session in self.opened:
-            wait_for(lambda one=session: one.idle or self.receiver.error is not None)
-        if self.receiver.error is not None:
-            raise self.receiver.error
+            wait_for(lambda one=session: one.idle or self.thread.error is not None)
+        if self.thread.error is not None:
+            raise self.thread.error
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind, *_) -> None:
-        end(self.receiver, failing=kind is not None)
+        end(self.thread, failing=kind is not None)
 
 
 @pytest.fixture(scope="module")
@@ -197,11 +196,11 @@ def test_after_a_loss_a_keyframe_is_asked_for_and_the_picture_resumes(flight):
         assert session.frames_decoded == 3 + 10
         assert session.frames_received == 28
         assert session.last_frame_index == 29
-        asked = rig.port.keyframe_requests
+        requested = rig.port.keyframe_requests
         time.sleep(0.4)
-        assert rig.port.keyframe_requests == asked, "what is shown again is not asked for"
+        assert rig.port.keyframe_requests == requested, "what is shown again is not asked for"
     content = summary(rig.receiver.done[0], unusable=rig.receiver.unusable)
-    assert (content["gaps"], content["lost"], content["keyframe_requests"]) == (1, 2, asked)
+    assert (content["gaps"], content["lost"], content["keyframe_requests"]) == (1, 2, requested)
     assert (content["frames"], content["frames_decoded"]) == (28, 13)
 
 
@@ -353,11 +352,11 @@ def test_a_session_ends_when_all_of_it_has_arrived(flight, monkeypatch):
         wait_for(lambda: rig.receiver.done)
         (session,) = rig.receiver.done
         assert (session.frames_received, session.stills_received) == (6, 1)
-        asked = rig.port.asked
+        requested = rig.port.requested
         rig.put(flight.base(20), flight.still(3, 1))  # a keyframe after the end does not begin it again
         rig.settle()
         assert rig.receiver.idle
-        assert rig.port.asked == asked
+        assert rig.port.requested == requested
 
 
 def test_a_session_whose_rest_is_lost_ends_after_two_seconds(flight):
@@ -390,7 +389,7 @@ def test_a_lost_answer_does_not_lose_the_flight(flight):
     """Where the link loses the one answer to ``info``, nothing of the whole flight would be shown."""
     with Rig() as rig:
         rig.put(*bases(flight, 0, 1, 2))  # nobody answers yet
-        wait_for(lambda: rig.port.asked >= 3)
+        wait_for(lambda: rig.port.requested >= 3)
         rig.settle()
         assert rig.receiver.session is None
         rig.port.flight = flight
@@ -513,24 +512,22 @@ def test_a_crash_of_the_eyes_ends_the_process_and_not_in_silence(flight):
     rig = Rig(detector=Broken())
     rig.port.flight = flight
     rig.put(*bases(flight, *range(10)))
-    wait_for(lambda: rig.receiver.error is not None)
-    assert str(rig.receiver.error) == "model is gone"
-    rig.receiver.close()
+    wait_for(lambda: rig.thread.error is not None)
+    assert str(rig.thread.error) == "model is gone"
+    rig.thread.close()
 
 
 def test_closing_keeps_what_has_arrived_and_ends(flight, monkeypatch):
     """Ctrl-C would throw away the last second, or hang."""
     # What a second or two are enough for is the machine's affair.
-    monkeypatch.setattr("hvt_ground.session.receiver._DRAIN_NS", 20_000_000_000)
+    monkeypatch.setattr("hvt_ground.session.edge_sessions._DRAIN_NS", 20_000_000_000)
     monkeypatch.setattr("hvt_ground.perception.worker._FINISH_S", 20.0)
     rig = Rig(detector=RedSquares(takes_s=0.05))
     rig.port.flight = flight
     rig.put(flight.base(0))
     wait_for(lambda: bool(rig.opened))
     rig.put(*bases(flight, *range(1, 30)))
-    rig.receiver.close()
-    rig.receiver._thread.join(60)
-    assert not rig.receiver._thread.is_alive()
+    assert rig.thread.close(timeout_s=60)
     (session,) = rig.receiver.done
     assert session.frames_decoded == 30
     assert session.last_frame_index == 29

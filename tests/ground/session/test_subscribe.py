@@ -57,7 +57,7 @@ def test_invented_names_do_not_lock_out_a_real_edge(link, caplog):
         assert len(served(ground)) == MAX_EDGES
         assert first.edge not in served(ground)
         assert first.inbox.get(timeout_s=0.1) is not None, "what had come is still there"
-        assert ground.sees("uav-1")
+        assert ground.is_known("uav-1")
 
 
 def test_edges_that_are_there_or_have_flown_keep_their_place(link):
@@ -70,7 +70,7 @@ def test_edges_that_are_there_or_have_flown_keep_their_place(link):
     invent(outsider, 1)
     eventually(lambda: "ghost-0" in served(ground), within_s=20, what="one more")
     (ghost,) = [port for port in ground.ports() if port.edge == "ghost-0"]
-    ghost.in_use = lambda: True
+    ghost.used.set()
     with outsider.liveliness().declare_token("hvt/late/alive"):
         eventually(lambda: ground.foreign == 1, within_s=20, what="it is refused")
     assert "late" not in served(ground)

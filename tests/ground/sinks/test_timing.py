@@ -13,21 +13,18 @@ from pathlib import Path
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.protocol.ledger import overhead_bytes
-from hvt_common.transport.inbox import Received
+from hvt_ground.events import MessageTiming, StillsRead
 from hvt_ground.sinks.timing import COLUMNS, SessionTiming, TimingTable
 
-KEY = "hvt/uav-1/base"
+
+def message(kind: str = "base", *, sequence: int, handled_ns: int | None = 3_000) -> MessageTiming:
+    """A message of frame 5."""
+    return MessageTiming(kind, sequence, 5, 1_000, 1_500, 2_000, handled_ns, 5_100, -7)
 
 
-def received(size: int = 5000, *, at_ns: int = 2_000) -> Received:
-    """A message."""
-    return Received(KEY, bytes(size), bytes(60), "video/h265", at_ns)
-
-
-def session(table: TimingTable, *, now_ns: int = 3_000) -> SessionTiming:
-    """The lines of one session, seen at this moment."""
-    return SessionTiming(table, edge="uav-1", session_id=0xA1, clock=lambda: now_ns, offset_ns=lambda: -7)
+def session(table: TimingTable) -> SessionTiming:
+    """The lines of one session."""
+    return SessionTiming(table, edge="uav-1", session_id=0xA1)
 
 
 def lines(path: Path) -> list[dict[str, str]]:
@@ -40,8 +37,8 @@ def test_a_line_says_all_of_a_message(tmp_path):
     """A latency would be computed from the wrong times, or from two clocks as if they were one."""
     table = TimingTable(tmp_path / "t.csv")
     one = session(table)
-    one.message("base", received(), sequence=4, frame_index=5, capture_ns=1_000, send_ns=1_500)
-    one.message("base", received(), sequence=5, send_ns=1_500, shown=False)
+    one.log(message(sequence=4))
+    one.log(message(sequence=5, handled_ns=0))
     first, second = lines(tmp_path / "t.csv")
     assert first == {
         "kind": "base",
@@ -51,13 +48,13 @@ def test_a_line_says_all_of_a_message(tmp_path):
         "send_ns": "1500",
         "received_ns": "2000",
         "shown_ns": "3000",
-        "line_bytes": str(5060 + overhead_bytes(5000, 60, key=KEY, encoding="video/h265")),
+        "line_bytes": "5100",
         "clock_offset_ns": "-7",
         "edge": "uav-1",
         "session": "00000000000000a1",
     }
     assert tuple(first) == COLUMNS
-    assert (second["shown_ns"], second["frame_index"], second["capture_ns"]) == ("0", "-1", "0")
+    assert second["shown_ns"] == "0"
 
 
 def test_a_still_has_its_line_when_it_was_read_or_never_will_be(tmp_path):
@@ -65,12 +62,12 @@ def test_a_still_has_its_line_when_it_was_read_or_never_will_be(tmp_path):
     table = TimingTable(tmp_path / "t.csv")
     one = session(table)
     for sequence in range(3):
-        one.still(received(), sequence=sequence, frame_index=9, capture_ns=1, send_ns=2)
+        one.log(message("roi", sequence=sequence, handled_ns=None))
     assert lines(tmp_path / "t.csv") == []
-    one.read([1])
+    one.log(StillsRead((1,), 3_000))
     assert [(row["sequence"], row["shown_ns"]) for row in lines(tmp_path / "t.csv")] == [("1", "3000")]
     one.close()
-    one.read([2])  # eyes that did not come back in time
+    one.log(StillsRead((2,), 3_000))  # perception that did not come back in time
     assert [(row["sequence"], row["shown_ns"]) for row in lines(tmp_path / "t.csv")][1:] == [
         ("0", "0"),
         ("2", "0"),
@@ -82,9 +79,10 @@ def test_stills_that_are_never_read_do_not_gather(tmp_path):
     table = TimingTable(tmp_path / "t.csv")
     one = session(table)
     for sequence in range(2000):
-        one.still(received(), sequence=sequence, frame_index=9, capture_ns=1, send_ns=2)
-    assert len(one._unread) < 1000
-    assert len(lines(tmp_path / "t.csv")) == 2000 - len(one._unread)
+        one.log(message("roi", sequence=sequence, handled_ns=None))
+    assert len(lines(tmp_path / "t.csv")) > 1000
+    one.close()
+    assert len(lines(tmp_path / "t.csv")) == 2000
 
 
 def test_nothing_is_written_after_the_end(tmp_path):
@@ -92,7 +90,7 @@ def test_nothing_is_written_after_the_end(tmp_path):
     table = TimingTable(tmp_path / "t.csv")
     table.close()
     other = os.open(tmp_path / "other", os.O_WRONLY | os.O_CREAT)
-    session(table).message("base", received(), sequence=4, send_ns=1)
+    session(table).log(message(sequence=4))
     table.close()
     os.close(other)
     assert (tmp_path / "other").read_bytes() == b""

@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from hvt_ground.events.events import Overlay
+from hvt_ground.events import Overlay
 from hvt_ground.sinks.tracks_table import TrackTable
 
 

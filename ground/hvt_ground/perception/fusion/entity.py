@@ -1,4 +1,4 @@
-"""One object as the ground believes in it, and the witnesses that it has; see `fuse`."""
+"""One object of the world, and who reports it; see `fuse`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Origin
+from hvt_ground.events import Origin
+from hvt_ground.perception.fusion.camera_path import CameraPath
 
 __all__ = ["Entity", "Vote", "Witness"]
 
@@ -24,22 +24,22 @@ MISSED_STEPS = 2
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """A box that somebody else saw at one tick, and how the object moves beyond what the camera does."""
+    """A box that somebody else saw at one frame, and how the object moves beyond what the camera does."""
 
     box: _Floats
     """(4,) float64 x1 y1 x2 y2, base pixels."""
     frame_index: int
     confidence: float
     velocity: _Floats = field(default_factory=lambda: np.zeros(2))
-    """(2,) float64, base pixels a tick."""
+    """(2,) float64, base pixels a frame."""
     steps: int = 1
     """How often it has been seen."""
 
     def seen_again(self, box: _Floats, frame_index: int, confidence: float, *, path: CameraPath) -> Witness:
-        """The same object at a later tick."""
-        ticks = frame_index - self.frame_index
+        """The same object at a later frame."""
+        frames = frame_index - self.frame_index
         stood = path.carry(self.box[None], start=self.frame_index, end=frame_index)[0]
-        newest = (_centre(box) - _centre(stood)) / max(1, ticks)
+        newest = (_centre(box) - _centre(stood)) / max(1, frames)
         share = 1.0 if self.steps == 1 else _NEW_VELOCITY
         velocity = share * newest + (1 - share) * self.velocity
         return Witness(box, frame_index, confidence, velocity, self.steps + 1)
@@ -53,7 +53,7 @@ class Vote:
     confidence: float = 0.0
     """Smoothed over its detections."""
 
-    def hear(self, class_id: int, confidence: float) -> None:
+    def update(self, class_id: int, confidence: float) -> None:
         """Take the side's present class."""
         share = 1.0 if self.class_id < 0 else _NEW_CONFIDENCE
         self.confidence += share * (confidence - self.confidence)
@@ -80,21 +80,21 @@ class Entity:
     apart: int = 0
     """Steps in a row at which its two witnesses lay apart."""
     own_then: tuple[_Floats, int] | None = None
-    """(2,) the centre of our own box at the tick of a step, and that tick."""
+    """(2,) the centre of our own box at the frame of a step, and that frame."""
     correction: tuple[_Floats, int] | None = None
     """(4,) what to add to our own box, and the frame of the still that showed it."""
     last_frame: int = -1
     """The newest at which anybody saw it."""
 
-    def is_live_afar(self, tick: int, *, patience: int) -> bool:
-        """Whether the edge's knowledge of it, or a still's, holds at this tick."""
-        if self.afar is None or tick - self.afar.frame_index > patience:
+    def is_live_afar(self, frame_index: int, *, patience: int) -> bool:
+        """Whether the edge's knowledge of it, or a still's, holds at this frame."""
+        if self.afar is None or frame_index - self.afar.frame_index > patience:
             return False
         return self.edge_id is None or self.missed < MISSED_STEPS
 
-    def origin(self, own_ids: Container[int | None], tick: int, *, patience: int) -> Origin | None:
-        """Who knows of it; ``own_ids`` are our tracks at this tick. None where nobody does (any more)."""
-        far = self.is_live_afar(tick, patience=patience)
+    def origin(self, own_ids: Container[int | None], frame_index: int, *, patience: int) -> Origin | None:
+        """Who knows of it; ``own_ids`` are our tracks at this frame. None where nobody does (any more)."""
+        far = self.is_live_afar(frame_index, patience=patience)
         if self.own_id is not None and self.own_id in own_ids:
             return "edge+base" if far and self.edge_id is not None else "base"
         if not far:

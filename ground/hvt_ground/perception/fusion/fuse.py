@@ -1,6 +1,6 @@
 """One list of tracks from three sources: the ground's own tracker on the base, the edge's report, and stills.
 
-An *entity* is one object as the ground believes in it. It has an id that never changes and up to three witnesses: a
+An *entity* is one object of the world. It has an id that never changes and up to three witnesses: a
 track of the ground's own, a track of the edge, and stills in which it was found.
 
 **Who is who.** Witnesses stay with their entity. Where one entity has only a track of our own and another is known
@@ -9,7 +9,7 @@ first (assignment), and the older id stays. A track of the edge that is new wher
 under a new number. Two witnesses that lie apart (`APART_IOU`) at two steps in a row part again. Ids are given in one
 sequence for all, so without an edge's report they are the order in which tracks were listed first.
 
-**Where it is.** A box from afar is moved from its tick by the camera's motion (`CameraPath`) and by the object's own
+**Where it is.** A box from afar is moved from its frame by the camera's motion (`CameraPath`) and by the object's own
 velocity, from its last steps, and where we track it too by the way that our box has gone since. With both at hand
 the box is their mean, weighted by confidence and by age: the weight halves every `HALF_LIFE_S` since the box was
 seen, and the edge's counts `EDGE_BOX_WEIGHT` times.
@@ -18,7 +18,7 @@ seen, and the edge's counts `EDGE_BOX_WEIGHT` times.
 over some detections, is its weight; the edge's counts `EDGE_CLASS_WEIGHT` times. A still's opinion comes after, in
 `refine`, and stands above both.
 
-**How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been heard of
+**How long.** The edge's knowledge ends when two steps in a row do not list the track, or nothing has been reported of
 it for `PATIENCE_S`; what only a still has shown ends so long after the still.
 
 **Once each.** What only one side sees on top of what the other sees is listed once (`SAME_IOU`); so are two boxes of
@@ -40,31 +40,23 @@ import numpy.typing as npt
 
 from hvt_common.tracking.association import assign
 from hvt_common.values import Detections, Tracks, iou
-from hvt_ground.events.camera_path import CameraPath
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.entity import MISSED_STEPS, Entity, Witness
-from hvt_ground.perception.fusion.object_list import Fused, Rules, far_boxes, list_entities
+from hvt_ground.perception.fusion.object_list import FusedTracks, FusionRules, far_boxes, list_entities
 
-__all__ = ["Fused", "Fusion", "unified_names"]
+__all__ = ["FusedTracks", "Fusion", "unified_names"]
 
 PAIR_IOU = 0.3
-"""Lower than the usual half: boxes of 15 pixels from two detectors, some ticks apart, seldom reach that."""
+"""Lower than the usual half: boxes of 15 pixels from two detectors, some frames apart, seldom reach that."""
 APART_IOU = 0.1
-SAME_IOU = 0.5
-TWIN_IOU = 0.85
 CLASS_BONUS = 0.05
 """Of two partners that fit equally well, the one of the same class."""
 PATIENCE_S = 2.0
 REACH_S = 1.0
-"""For how long an object is believed to move on as it did."""
+"""For how long the motion of an object is extrapolated."""
 HALF_LIFE_S = 0.3
-EDGE_BOX_WEIGHT = 4.0
-"""A box from the source overlaps the truth better than ours on a base of 200 kbit/s even when it is 0.5 s old."""
 EDGE_CLASS_WEIGHT = 0.85
 """Nearly as much as ours: it saw the source, but the drone's network is often the smaller one. The surer says."""
-ALONE_CONFIDENCE = 0.3
-"""Of what the edge alone reports at less, one in two is nothing."""
-CORRECTION_WEIGHT = 0.5
-"""A still's box stands against one box of ours at that frame, and each is off by a little."""
 FORGET_S = 10.0
 """How long an entity without any witness keeps its id for a track that is found again."""
 MAX_ENTITIES = 2048
@@ -86,10 +78,10 @@ def unified_names(own: Sequence[str], edge: Sequence[str]) -> tuple[tuple[str, .
 
 
 class Fusion:
-    """The entities of one session. The ``take_…`` methods teach it; `listed` only looks.
+    """The entities of one session. The ``take_…`` methods update it; `listed` changes nothing.
 
     Args:
-        fps: ticks a second.
+        fps: frames a second.
         edge_classes: for each class id of the edge its place in the unified names.
         path: the camera's motion, which the caller feeds.
         edge_class_weight: what the edge's class is worth against ours; 1 where both see the same pixels.
@@ -105,16 +97,11 @@ class Fusion:
     ) -> None:
         self._edge_classes = edge_classes
         self._path = path
-        self._rules = Rules(
+        self._rules = FusionRules(
             patience=max(1, round(PATIENCE_S * fps)),
             reach=max(1, round(REACH_S * fps)),
             half_life=HALF_LIFE_S * fps,
-            edge_box_weight=EDGE_BOX_WEIGHT,
             edge_class_weight=edge_class_weight,
-            correction_weight=CORRECTION_WEIGHT,
-            alone_confidence=ALONE_CONFIDENCE,
-            same_iou=SAME_IOU,
-            twin_iou=TWIN_IOU,
         )
         self._forget = max(1, round(FORGET_S * fps))
         self._entities: list[Entity] = []
@@ -160,32 +147,32 @@ class Fusion:
             entity.born = min(entity.born, int(own.born_frames[row]))
             entity.last_frame = max(entity.last_frame, own.frame_index)
             if own.seen_frames[row] == own.frame_index:
-                entity.own_vote.hear(int(own.class_ids[row]), float(own.confidences[row]))
-        self._settle(own, own.frame_index)
+                entity.own_vote.update(int(own.class_ids[row]), float(own.confidences[row]))
+        self._update(own, own.frame_index)
 
     def take_step(self, step: Tracks, *, own: Tracks | None) -> bool:
-        """Take what the edge's tracker listed at one tick, which may be before or after our newest frame.
+        """Take what the edge's tracker listed at one frame, which may be before or after our newest frame.
 
-        ``own`` are our tracks at that tick, as far as they are known. False for a step that is not newer than the
+        ``own`` are our tracks at that frame, as far as they are known. False for a step that is not newer than the
         last one: it is ignored.
         """
-        tick = step.frame_index
-        if tick <= self._stepped:
+        frame_index = step.frame_index
+        if frame_index <= self._stepped:
             return False
-        self._stepped = tick
+        self._stepped = frame_index
         listed = {int(step.ids[row]): row for row in _usable(step, classes=len(self._edge_classes))}
         fresh = [row for edge_id, row in listed.items() if edge_id not in self._by_edge]
         for edge_id, entity in self._by_edge.items():
             entity.missed = 0 if edge_id in listed else entity.missed + 1
         for edge_id, row in listed.items():
             if edge_id in self._by_edge:
-                self._hear_edge(self._by_edge[edge_id], step, row)
+                self._update_edge(self._by_edge[edge_id], step, row)
         self._welcome(step, fresh)
         if own is not None:
-            self._part(own, tick)
-        self._settle(own, tick)
+            self._part(own, frame_index)
+        self._update(own, frame_index)
         if own is not None:
-            self._note_own(own, tick)
+            self._note_own(own, frame_index)
         return True
 
     def take_found(self, found: Detections, *, known: Tracks) -> None:
@@ -193,17 +180,17 @@ class Fusion:
 
         ``known`` is the list at that frame: what overlaps one of it is no new object.
         """
-        tick = known.frame_index
+        frame_index = known.frame_index
         boxes = np.concatenate((known.boxes_xyxy_px, found.boxes_xyxy_px))
         for row in range(len(found)):
             place = len(known) + row
             if (iou(boxes[place : place + 1], boxes[:place]) >= PAIR_IOU).any():
                 continue
             confidence = float(found.confidences[row])
-            entity = self._add(Entity(born=tick, still_frame=tick, last_frame=tick))
-            entity.afar = Witness(found.boxes_xyxy_px[row].astype(np.float64), tick, confidence)
-            entity.far_vote.hear(int(found.class_ids[row]), confidence)
-        self._settle(self._own.get(tick), tick)
+            entity = self._add(Entity(born=frame_index, still_frame=frame_index, last_frame=frame_index))
+            entity.afar = Witness(found.boxes_xyxy_px[row].astype(np.float64), frame_index, confidence)
+            entity.far_vote.update(int(found.class_ids[row]), confidence)
+        self._update(self._own.get(frame_index), frame_index)
 
     def take_box(self, track_id: int, box_base_px: Sequence[float], *, frame_index: int) -> None:
         """Take where a still shows a listed entity, at the still's frame.
@@ -224,8 +211,8 @@ class Fusion:
             row = int(np.flatnonzero(own.ids == entity.own_id)[0])
             entity.correction = (box - own.boxes_xyxy_px[row], frame_index)
 
-    def listed(self, own: Tracks) -> Fused:
-        """The list at the tick of ``own``: our tracker's list of a frame, or moved on from the newest."""
+    def listed(self, own: Tracks) -> FusedTracks:
+        """The list at the frame of ``own``: our tracker's list of a frame, or moved on from the newest."""
         return list_entities(self._entities, own, path=self._path, rules=self._rules)
 
     # Learning
@@ -238,36 +225,36 @@ class Fusion:
             self._by_edge[entity.edge_id] = entity
         return entity
 
-    def _hear_edge(self, entity: Entity, step: Tracks, row: int) -> None:
-        tick, confidence = step.frame_index, float(step.confidences[row])
+    def _update_edge(self, entity: Entity, step: Tracks, row: int) -> None:
+        frame_index, confidence = step.frame_index, float(step.confidences[row])
         box, far = step.boxes_xyxy_px[row].astype(np.float64), entity.afar
-        if far is None or tick - far.frame_index > self._rules.patience:
-            entity.afar = Witness(box, tick, confidence)
+        if far is None or frame_index - far.frame_index > self._rules.patience:
+            entity.afar = Witness(box, frame_index, confidence)
         else:
-            entity.afar = far.seen_again(box, tick, confidence, path=self._path)
-        entity.last_frame = max(entity.last_frame, tick)
-        entity.far_vote.hear(int(self._edge_classes[step.class_ids[row]]), confidence)
+            entity.afar = far.seen_again(box, frame_index, confidence, path=self._path)
+        entity.last_frame = max(entity.last_frame, frame_index)
+        entity.far_vote.update(int(self._edge_classes[step.class_ids[row]]), confidence)
 
     def _welcome(self, step: Tracks, fresh: Sequence[int]) -> None:
         """Find which of the edge's new tracks continue one that it no longer lists; the others are new entities."""
-        tick = step.frame_index
-        gone = [
+        frame_index = step.frame_index
+        merged = [
             entity
             for entity in self._entities
-            if (entity.edge_id is None or entity.missed) and self._is_far(entity, tick)
+            if (entity.edge_id is None or entity.missed) and self._is_far(entity, frame_index)
         ]
         heirs: dict[int, Entity] = {}
-        if gone and fresh:
-            overlaps = iou(self._far_boxes(gone, tick), step.boxes_xyxy_px[fresh])
-            heirs = {fresh[column]: gone[line] for line, column in _pairs(overlaps)}
+        if merged and fresh:
+            overlaps = iou(self._far_boxes(merged, frame_index), step.boxes_xyxy_px[fresh])
+            heirs = {fresh[column]: merged[line] for line, column in _pairs(overlaps)}
         for row in fresh:
             edge_id = int(step.ids[row])
             entity = heirs.get(row)
             if entity is None:
-                entity = self._add(Entity(edge_id=edge_id, born=min(tick, int(step.born_frames[row]))))
+                entity = self._add(Entity(edge_id=edge_id, born=min(frame_index, int(step.born_frames[row]))))
             else:
                 self._rename(entity, edge_id)
-            self._hear_edge(entity, step, row)
+            self._update_edge(entity, step, row)
 
     def _rename(self, entity: Entity, edge_id: int) -> None:
         if entity.edge_id is not None:
@@ -275,52 +262,52 @@ class Fusion:
         entity.edge_id, entity.missed = edge_id, 0
         self._by_edge[edge_id] = entity
 
-    def _part(self, own: Tracks, tick: int) -> None:
+    def _part(self, own: Tracks, frame_index: int) -> None:
         """Give an own track that has left the edge's box an entity of its own again."""
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
         for entity in list(self._entities):
             row = rows.get(entity.own_id) if entity.own_id is not None else None
-            if row is None or entity.afar is None or entity.afar.frame_index != tick:
+            if row is None or entity.afar is None or entity.afar.frame_index != frame_index:
                 continue
-            if tick - int(own.seen_frames[row]) > self._rules.half_life:
+            if frame_index - int(own.seen_frames[row]) > self._rules.half_life:
                 continue  # ours is a guess by now and says nothing against the edge's
             overlap = iou(entity.afar.box[None], own.boxes_xyxy_px[row : row + 1])[0, 0]
             entity.apart = entity.apart + 1 if overlap < APART_IOU else 0
             if entity.apart >= MISSED_STEPS:
-                other = Entity(own_id=entity.own_id, born=int(own.born_frames[row]), last_frame=tick)
+                other = Entity(own_id=entity.own_id, born=int(own.born_frames[row]), last_frame=frame_index)
                 other.own_vote = entity.own_vote
                 self._add(other)
                 entity.part_from_own()
 
-    def _note_own(self, own: Tracks, tick: int) -> None:
-        """Remember where our own boxes are at this tick: how they move from here moves the edge's box too."""
+    def _note_own(self, own: Tracks, frame_index: int) -> None:
+        """Remember where our own boxes are at this frame: how they move from here moves the edge's box too."""
         centres = (own.boxes_xyxy_px[:, :2] + own.boxes_xyxy_px[:, 2:]).astype(np.float64) / 2
         for row, own_id in enumerate(own.ids.tolist()):
             entity = self._by_own.get(own_id)  # a step that comes late finds tracks merged away since
             if entity is not None:
-                entity.own_then = (centres[row], tick)
+                entity.own_then = (centres[row], frame_index)
 
     # After news
 
-    def _settle(self, own: Tracks | None, tick: int) -> None:
+    def _update(self, own: Tracks | None, frame_index: int) -> None:
         """Find who is who, forget what is over, give ids."""
         if own is not None:
-            self._pair(own, tick)
-        self._forget_old(tick)
+            self._pair(own, frame_index)
+        self._forget_old(frame_index)
         for entity in self._entities:
             if not entity.id:
                 entity.id = self._next_id
                 self._next_id += 1
 
-    def _pair(self, own: Tracks, tick: int) -> None:
+    def _pair(self, own: Tracks, frame_index: int) -> None:
         """Join what only we see with what only others see, where both are at the same place."""
         rows = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
-        theirs = [one for one in self._entities if one.own_id not in rows and self._is_far(one, tick)]
+        theirs = [one for one in self._entities if one.own_id not in rows and self._is_far(one, frame_index)]
         if not theirs:
             return
-        ours = [one for one in self._entities if one.own_id in rows and not self._is_far(one, tick)]
+        ours = [one for one in self._entities if one.own_id in rows and not self._is_far(one, frame_index)]
         places = [rows[one.own_id] for one in ours if one.own_id is not None]
-        overlaps = iou(own.boxes_xyxy_px[places], self._far_boxes(theirs, tick))
+        overlaps = iou(own.boxes_xyxy_px[places], self._far_boxes(theirs, frame_index))
         classes = np.array([one.far_vote.class_id for one in theirs])
         same = own.class_ids[places][:, None] == classes[None]
         for line, column in _pairs(overlaps, bonus=CLASS_BONUS * same):
@@ -334,35 +321,40 @@ class Fusion:
             self._by_own.pop(theirs.own_id, None)
         if ours.edge_id is not None:  # one of the edge's that is over
             self._by_edge.pop(ours.edge_id, None)
-        kept, gone = (theirs, ours) if theirs.id and (not ours.id or theirs.id < ours.id) else (ours, theirs)
-        kept.born, kept.last_frame = min(kept.born, gone.born), max(kept.last_frame, gone.last_frame)
-        kept.still_frame = max(kept.still_frame, gone.still_frame)
-        kept.own_id, kept.own_vote, kept.correction = ours.own_id, ours.own_vote, ours.correction
-        kept.own_then = ours.own_then
-        kept.edge_id, kept.far_vote, kept.afar = theirs.edge_id, theirs.far_vote, theirs.afar
-        kept.missed, kept.apart = theirs.missed, 0
-        if kept.own_id is not None:
-            self._by_own[kept.own_id] = kept
-        if kept.edge_id is not None:
-            self._by_edge[kept.edge_id] = kept
-        self._entities.remove(gone)
+        survivor, merged = (
+            (theirs, ours) if theirs.id and (not ours.id or theirs.id < ours.id) else (ours, theirs)
+        )
+        survivor.born, survivor.last_frame = (
+            min(survivor.born, merged.born),
+            max(survivor.last_frame, merged.last_frame),
+        )
+        survivor.still_frame = max(survivor.still_frame, merged.still_frame)
+        survivor.own_id, survivor.own_vote, survivor.correction = ours.own_id, ours.own_vote, ours.correction
+        survivor.own_then = ours.own_then
+        survivor.edge_id, survivor.far_vote, survivor.afar = theirs.edge_id, theirs.far_vote, theirs.afar
+        survivor.missed, survivor.apart = theirs.missed, 0
+        if survivor.own_id is not None:
+            self._by_own[survivor.own_id] = survivor
+        if survivor.edge_id is not None:
+            self._by_edge[survivor.edge_id] = survivor
+        self._entities.remove(merged)
 
-    def _forget_old(self, tick: int) -> None:
-        old = [one for one in self._entities if tick - one.last_frame > self._forget]
+    def _forget_old(self, frame_index: int) -> None:
+        old = [one for one in self._entities if frame_index - one.last_frame > self._forget]
         if len(self._entities) - len(old) > MAX_ENTITIES:
             old = sorted(self._entities, key=lambda one: one.last_frame)[:-MAX_ENTITIES]
         if not old:
             return
-        gone = set(map(id, old))
-        self._entities = [one for one in self._entities if id(one) not in gone]
-        self._by_own = {key: one for key, one in self._by_own.items() if id(one) not in gone}
-        self._by_edge = {key: one for key, one in self._by_edge.items() if id(one) not in gone}
+        merged = set(map(id, old))
+        self._entities = [one for one in self._entities if id(one) not in merged]
+        self._by_own = {key: one for key, one in self._by_own.items() if id(one) not in merged}
+        self._by_edge = {key: one for key, one in self._by_edge.items() if id(one) not in merged}
 
-    def _is_far(self, entity: Entity, tick: int) -> bool:
-        return entity.is_live_afar(tick, patience=self._rules.patience)
+    def _is_far(self, entity: Entity, frame_index: int) -> bool:
+        return entity.is_live_afar(frame_index, patience=self._rules.patience)
 
-    def _far_boxes(self, entities: Sequence[Entity], tick: int) -> npt.NDArray[np.float64]:
-        return far_boxes(entities, tick, path=self._path, reach=self._rules.reach)
+    def _far_boxes(self, entities: Sequence[Entity], frame_index: int) -> npt.NDArray[np.float64]:
+        return far_boxes(entities, frame_index, path=self._path, reach=self._rules.reach)
 
 
 def _usable(step: Tracks, *, classes: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""What the ground shows at one tick of all that it believes in: boxes, classes and who knows of each."""
+"""The list of one frame out of all entities: boxes, classes and who reports each."""
 
 from __future__ import annotations
 
@@ -9,39 +9,41 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Tracks, iou
-from hvt_ground.events.camera_path import CameraPath
-from hvt_ground.events.events import Origin
+from hvt_ground.events import Origin
+from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.entity import Entity, Witness
 
-__all__ = ["Fused", "Rules", "far_boxes", "list_entities"]
+__all__ = ["FusedTracks", "FusionRules", "far_boxes", "list_entities"]
 
 _Floats = npt.NDArray[np.float64]
 
 
+SAME_IOU = 0.5
+TWIN_IOU = 0.85
+EDGE_BOX_WEIGHT = 4.0
+"""A box from the source overlaps the truth better than ours on a base of 200 kbit/s even when it is 0.5 s old."""
+ALONE_CONFIDENCE = 0.3
+"""Of what the edge alone reports at less, one in two is nothing."""
+CORRECTION_WEIGHT = 0.5
+"""A still's box stands against one box of ours at that frame, and each is off by a little."""
+
+
 @dataclass(frozen=True, slots=True)
-class Rules:
-    """How two opinions on one object become one; the reasons stand in `fuse`."""
+class FusionRules:
+    """How two opinions on one object become one, where it depends on the session; the reasons stand in `fuse`."""
 
     patience: int
-    """For how many ticks what was seen from afar holds."""
+    """For how many frames what was seen from afar holds."""
     reach: int
-    """For how many ticks its own motion is believed to go on."""
+    """For how many frames its own motion is extrapolated."""
     half_life: float
-    """After how many ticks a box counts half."""
-    edge_box_weight: float
+    """After how many frames a box counts half."""
     edge_class_weight: float
-    correction_weight: float
-    alone_confidence: float
-    """Below it what only the edge sees is not listed."""
-    same_iou: float
-    """Of one class, seen by the edge and only by us."""
-    twin_iou: float
-    """Of two classes."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fused:
-    """The tracks of one tick and who knows of each."""
+class FusedTracks:
+    """The tracks of one frame and who knows of each."""
 
     tracks: Tracks
     """Ids are those of the entities; class ids index the unified names."""
@@ -50,7 +52,7 @@ class Fused:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """One entity and our own track of it, if it has one at this tick."""
+    """One entity and our own track of it, if it has one at this frame."""
 
     entity: Entity
     origin: Origin
@@ -63,29 +65,31 @@ class _Line:
         return None if self.origin == "base" else self.entity.afar
 
 
-def list_entities(entities: Sequence[Entity], own: Tracks, *, path: CameraPath, rules: Rules) -> Fused:
-    """The list at the tick of ``own``, our tracker's list there; changes nothing."""
+def list_entities(
+    entities: Sequence[Entity], own: Tracks, *, path: CameraPath, rules: FusionRules
+) -> FusedTracks:
+    """The list at the frame of ``own``, our tracker's list there; changes nothing."""
     lines = _lines(entities, own, rules)
     boxes = _boxes(lines, own, path, rules)
     classes, confidences = _classes(lines, own, rules)
-    kept = _once_each(lines, boxes, classes, confidences, rules)
-    lines = [line for line, keep in zip(lines, kept, strict=True) if keep]
+    listed = _once_each(lines, boxes, classes, confidences)
+    lines = [line for line, is_listed in zip(lines, listed, strict=True) if is_listed]
     born = [line.entity.born for line in lines]
     tracks = Tracks(
         frame_index=own.frame_index,
         ids=np.array([line.entity.id for line in lines], np.int64),
-        boxes_xyxy_px=boxes[kept],
-        confidences=confidences[kept],
-        class_ids=classes[kept],
+        boxes_xyxy_px=boxes[listed],
+        confidences=confidences[listed],
+        class_ids=classes[listed],
         born_frames=np.array(born, np.int64),
         seen_frames=np.array([_seen_frame(line, own) for line in lines], np.int64),
         started=np.array([_started(line, own) for line in lines], np.bool_),
     )
-    return Fused(tracks, tuple(line.origin for line in lines))
+    return FusedTracks(tracks, tuple(line.origin for line in lines))
 
 
-def far_boxes(entities: Sequence[Entity], tick: int, *, path: CameraPath, reach: int) -> _Floats:
-    """(N, 4) float64: where entities that were seen from afar are at a tick, base pixels."""
+def far_boxes(entities: Sequence[Entity], frame_index: int, *, path: CameraPath, reach: int) -> _Floats:
+    """(N, 4) float64: where entities that were seen from afar are at a frame, base pixels."""
     boxes = np.empty((len(entities), 4))
     by_start: dict[int, list[int]] = {}
     for place, entity in enumerate(entities):
@@ -94,40 +98,42 @@ def far_boxes(entities: Sequence[Entity], tick: int, *, path: CameraPath, reach:
         by_start.setdefault(entity.afar.frame_index, []).append(place)
     for start, places in by_start.items():
         velocities = np.array([far.velocity for place in places if (far := entities[place].afar) is not None])
-        moved = velocities * np.clip(tick - start, -reach, reach)
-        boxes[places] = path.carry(boxes[places], start=start, end=tick) + np.tile(moved, 2)
+        moved = velocities * np.clip(frame_index - start, -reach, reach)
+        boxes[places] = path.carry(boxes[places], start=start, end=frame_index) + np.tile(moved, 2)
     return boxes
 
 
-def _lines(entities: Sequence[Entity], own: Tracks, rules: Rules) -> list[_Line]:
+def _lines(entities: Sequence[Entity], own: Tracks, rules: FusionRules) -> list[_Line]:
     rows: Mapping[int | None, int] = {own_id: row for row, own_id in enumerate(own.ids.tolist())}
     lines = []
     for entity in entities:
         origin = entity.origin(rows, own.frame_index, patience=rules.patience)
-        unsure = origin == "edge" and entity.far_vote.confidence < rules.alone_confidence
+        unsure = origin == "edge" and entity.far_vote.confidence < ALONE_CONFIDENCE
         if origin is not None and entity.id and not unsure:
             lines.append(_Line(entity, origin, rows.get(entity.own_id)))
     return sorted(lines, key=lambda line: line.entity.id)
 
 
-def _boxes(lines: Sequence[_Line], own: Tracks, path: CameraPath, rules: Rules) -> npt.NDArray[np.float32]:
+def _boxes(
+    lines: Sequence[_Line], own: Tracks, path: CameraPath, rules: FusionRules
+) -> npt.NDArray[np.float32]:
     """(N, 4): ours, theirs, or the mean of both, weighted by confidence and age."""
-    tick = own.frame_index
+    frame_index = own.frame_index
     boxes = np.empty((len(lines), 4))
     far = [place for place, line in enumerate(lines) if line.far is not None]
     near = [place for place, line in enumerate(lines) if line.row is not None]
     rows = [line.row for line in lines if line.row is not None]
-    boxes[far] = far_boxes([lines[place].entity for place in far], tick, path=path, reach=rules.reach)
+    boxes[far] = far_boxes([lines[place].entity for place in far], frame_index, path=path, reach=rules.reach)
     ours = own.boxes_xyxy_px[rows].astype(np.float64)
-    weights = own.confidences[rows] * 0.5 ** ((tick - own.seen_frames[rows]) / rules.half_life)
+    weights = own.confidences[rows] * 0.5 ** ((frame_index - own.seen_frames[rows]) / rules.half_life)
     for place, box, weight in zip(near, ours, weights.tolist(), strict=True):
         entity, witness = lines[place].entity, lines[place].far
         if witness is None:
-            boxes[place] = box if entity.correction is None else box + _correction(entity, tick, rules)
+            boxes[place] = box if entity.correction is None else box + _correction(entity, frame_index, rules)
             continue
         theirs = _moved_with_ours(entity, witness, box, boxes[place])
-        age = abs(tick - witness.frame_index)
-        against = rules.edge_box_weight * witness.confidence * 0.5 ** (age / rules.half_life)
+        age = abs(frame_index - witness.frame_index)
+        against = EDGE_BOX_WEIGHT * witness.confidence * 0.5 ** (age / rules.half_life)
         share = weight / max(weight + against, 1e-9)
         boxes[place] = share * box + (1 - share) * theirs
     return boxes.astype(np.float32)
@@ -138,20 +144,21 @@ def _moved_with_ours(entity: Entity, far: Witness, ours: _Floats, predicted: _Fl
     then = entity.own_then
     if then is None or then[1] != far.frame_index:
         return predicted
-    followed = far.box + np.tile((ours[:2] + ours[2:]) / 2 - then[0], 2)
-    return followed if far.steps == 1 else (followed + predicted) / 2
+    moved = far.box + np.tile((ours[:2] + ours[2:]) / 2 - then[0], 2)
+    return moved if far.steps == 1 else (moved + predicted) / 2
 
 
-def _correction(entity: Entity, tick: int, rules: Rules) -> _Floats:
+def _correction(entity: Entity, frame_index: int, rules: FusionRules) -> _Floats:
     assert entity.correction is not None
     offset, since = entity.correction
     return np.asarray(
-        offset * (rules.correction_weight * 0.5 ** (max(0, tick - since) / rules.half_life)), np.float64
+        offset * (CORRECTION_WEIGHT * 0.5 ** (max(0, frame_index - since) / rules.half_life)),
+        np.float64,
     )
 
 
 def _classes(
-    lines: Sequence[_Line], own: Tracks, rules: Rules
+    lines: Sequence[_Line], own: Tracks, rules: FusionRules
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """(N,) class ids and their confidences: the side that is surer says."""
     classes, confidences = np.zeros(len(lines), np.int32), np.zeros(len(lines), np.float32)
@@ -174,12 +181,11 @@ def _once_each(
     boxes: npt.NDArray[np.float32],
     classes: npt.NDArray[np.int32],
     confidences: npt.NDArray[np.float32],
-    rules: Rules,
 ) -> npt.NDArray[np.bool_]:
     """(N,) which to list: of two that are one object the better known, then the surer, then the older."""
-    kept = np.ones(len(lines), np.bool_)
+    listed = np.ones(len(lines), np.bool_)
     if all(line.far is None for line in lines):
-        return kept
+        return listed
     overlaps = iou(boxes, boxes)
     both = np.array([line.origin == "edge+base" for line in lines])
     edge = np.array([line.entity.edge_id is not None and line.far is not None for line in lines])
@@ -188,12 +194,12 @@ def _once_each(
     order = np.lexsort((np.arange(len(lines)), -confidences, ~both))
     rank = np.empty(len(lines), int)
     rank[order] = np.arange(len(lines))
-    clash = np.where(alike, mixed & (overlaps >= rules.same_iou), overlaps >= rules.twin_iou)
+    clash = np.where(alike, mixed & (overlaps >= SAME_IOU), overlaps >= TWIN_IOU)
     weaker = clash & (rank[None] > rank[:, None])
     for place in order[np.asarray(weaker.any(axis=1))[order]]:
-        if kept[place]:
-            kept &= ~weaker[place]
-    return kept
+        if listed[place]:
+            listed &= ~weaker[place]
+    return listed
 
 
 def _seen_frame(line: _Line, own: Tracks) -> int:

@@ -13,21 +13,19 @@ from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, OnnxDetector
 from hvt_common.values import Boxes, Detections, Image, Posterior, View, iou
 from hvt_ground.perception.stills.composite import composite
+from hvt_ground.perception.stills.decode import Box, DecodedStill
 
 __all__ = [
     "Box",
     "CropReader",
-    "Decoded",
+    "DecodedStill",
+    "FrameReadings",
     "NoReader",
-    "Reading",
-    "Readings",
+    "ObjectReading",
     "Redetection",
     "StillReader",
     "object_crops",
 ]
-
-Box = tuple[float, float, float, float]
-"""x1 y1 x2 y2."""
 
 _SAME_OBJECT_IOU = 0.4
 """A detection on the composite that overlaps an object's box less is of something else."""
@@ -41,37 +39,20 @@ _PADDING = 0.15
 
 
 @dataclass(frozen=True, slots=True)
-class Decoded:
-    """A decoded still and where it belongs."""
-
-    image_bgr: Image
-    crop_source_px: tuple[int, int, int, int]
-    box_base_px: Box
-    frame_index: int
-    also_boxes_base_px: tuple[Box, ...] = ()
-    """Of the further objects that it shows, in the order of the header's ``also``."""
-
-    @property
-    def boxes_base_px(self) -> tuple[Box, ...]:
-        """The lead object's box, then those of the others."""
-        return (self.box_base_px, *self.also_boxes_base_px)
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
+class ObjectReading:
     """What is said of one object in a still."""
 
     posterior: Posterior | None = None
     """None is no opinion."""
     box_base_px: Box | None = None
-    """Where the object was found at the still's frame; None where the reader does not look for boxes."""
+    """Where the object was found at the still's frame; None where the reader finds no boxes."""
 
 
 @dataclass(frozen=True, slots=True)
-class Readings:
+class FrameReadings:
     """What is said of all stills of one frame."""
 
-    objects: tuple[tuple[Reading, ...], ...]
+    objects: tuple[tuple[ObjectReading, ...], ...]
     """For each still, in order: the lead object's reading, then one for each ``also`` box."""
     found: Detections = field(default_factory=Detections.none)
     """Objects that were seen inside a still and are none of the named ones; base pixels, class ids of the reader's
@@ -86,7 +67,7 @@ class StillReader(Protocol):
         """Of the posteriors, and of ``found``."""
         ...
 
-    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:
+    def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:
         """One reading for every object of every still.
 
         All stills are of one frame, ``base_bgr`` is that frame decoded, where it is still at hand.
@@ -94,8 +75,8 @@ class StillReader(Protocol):
         ...
 
 
-def _silent(stills: Sequence[Decoded]) -> Readings:
-    return Readings(tuple((Reading(),) * len(still.boxes_base_px) for still in stills))
+def _silent(stills: Sequence[DecodedStill]) -> FrameReadings:
+    return FrameReadings(tuple((ObjectReading(),) * len(still.boxes_base_px) for still in stills))
 
 
 class NoReader:
@@ -103,7 +84,7 @@ class NoReader:
 
     class_names: tuple[str, ...] = ("object",)
 
-    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:  # noqa: ARG002
+    def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:  # noqa: ARG002
         """Nothing."""
         return _silent(stills)
 
@@ -120,11 +101,13 @@ class CropReader:
         """The classifier's."""
         return self._classifier.class_names
 
-    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:  # noqa: ARG002
+    def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:  # noqa: ARG002
         """The classifier's posteriors; it finds neither boxes nor new objects."""
         crops = [crop for still in stills for crop in object_crops(still, view=self._view)]
         answers = iter(self._classifier.classify(crops))
-        return Readings(tuple(tuple(Reading(next(answers)) for _ in still.boxes_base_px) for still in stills))
+        return FrameReadings(
+            tuple(tuple(ObjectReading(next(answers)) for _ in still.boxes_base_px) for still in stills)
+        )
 
 
 class Redetection:
@@ -134,7 +117,7 @@ class Redetection:
     larger than the base, so is the composite, and the stills keep their detail.
 
     Args:
-        detector: What is run; its confidence is the least at which a class or a box is believed.
+        detector: What is run; its confidence is the least at which a class or a box counts.
         view: Between source and base pixels.
         new_confidence: Least confidence of an object that nobody has named.
     """
@@ -149,7 +132,7 @@ class Redetection:
         """The detector's."""
         return self._detector.class_names
 
-    def read(self, stills: Sequence[Decoded], base_bgr: Image | None) -> Readings:
+    def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:
         """Class and box of what is detected at each object's place; no opinion where nothing is."""
         if base_bgr is None or not stills:
             return _silent(stills)
@@ -157,12 +140,12 @@ class Redetection:
         named = np.array([box for still in stills for box in still.boxes_base_px], np.float32)
         overlaps = iou(named, found.boxes_xyxy_px)
         answers = iter(self._readings(found, overlaps))
-        return Readings(
+        return FrameReadings(
             tuple(tuple(next(answers) for _ in still.boxes_base_px) for still in stills),
             self._new(found, overlaps, stills),
         )
 
-    def _detect(self, stills: Sequence[Decoded], base_bgr: Image) -> Detections:
+    def _detect(self, stills: Sequence[DecodedStill], base_bgr: Image) -> Detections:
         """On the composite; base pixels."""
         zoom = self._zoom((base_bgr.shape[1], base_bgr.shape[0]))
         found = self._detector.detect(composite(base_bgr, stills, view=self._view, zoom=zoom))
@@ -180,21 +163,23 @@ class Redetection:
         width, height = self._detector.input_size(base_size)
         return max(1.0, min(width / base_size[0], height / base_size[1], 1 / self._view.scale))
 
-    def _readings(self, found: Detections, overlaps: npt.NDArray[np.float64]) -> list[Reading]:
+    def _readings(self, found: Detections, overlaps: npt.NDArray[np.float64]) -> list[ObjectReading]:
         """For each row of ``overlaps`` (an object), what the detections (columns) at its place say."""
         if not len(found):
-            return [Reading()] * len(overlaps)
+            return [ObjectReading()] * len(overlaps)
         owners = overlaps.argmax(axis=0)
         readings = []
         for row, overlap in enumerate(overlaps):
             at_place = np.flatnonzero((overlap >= _SAME_OBJECT_IOU) & (owners == row))
             if not len(at_place):
-                readings.append(Reading())
+                readings.append(ObjectReading())
                 continue
             # The best box, not the most confident: that is right more often, since a
             # neighbour's detection may be more confident than the object's own.
             best = int(at_place[np.argmax(overlap[at_place])])
-            readings.append(Reading(self._posterior(found, best, at_place), _box(found.boxes_xyxy_px[best])))
+            readings.append(
+                ObjectReading(self._posterior(found, best, at_place), _box(found.boxes_xyxy_px[best]))
+            )
         return readings
 
     def _posterior(self, found: Detections, best: int, others: npt.NDArray[np.intp]) -> Posterior:
@@ -216,7 +201,7 @@ class Redetection:
         return Posterior(names[named], float(probabilities[named]), entropy, probabilities)
 
     def _new(
-        self, found: Detections, overlaps: npt.NDArray[np.float64], stills: Sequence[Decoded]
+        self, found: Detections, overlaps: npt.NDArray[np.float64], stills: Sequence[DecodedStill]
     ) -> Detections:
         """Confident detections that lie inside a still and on no named object."""
         crops = self._view.to_base(np.array([still.crop_source_px for still in stills], np.float32))
@@ -226,7 +211,7 @@ class Redetection:
         return Detections(found.boxes_xyxy_px[new], found.confidences[new], found.class_ids[new])
 
 
-def object_crops(still: Decoded, *, view: View) -> list[Image]:
+def object_crops(still: DecodedStill, *, view: View) -> list[Image]:
     """The picture of each object in a still, the lead's first: its box with the still's padding.
 
     A still of one object is that picture already.

@@ -10,30 +10,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Image, View
+from hvt_ground.perception.stills.decode import DecodedStill
 
-__all__ = ["Patch", "Placed", "composite", "patch_of"]
+__all__ = ["Patch", "composite", "patch_of"]
 
 _FEATHER_PX = 1.5
-"""Width of the seam in pixels of the result. A hard edge is a contour that a detector looks at."""
-
-
-class Placed(Protocol):
-    """What can be pasted."""
-
-    @property
-    def image_bgr(self) -> Image:
-        """The still, at the size at which it was coded."""
-
-    @property
-    def crop_source_px(self) -> tuple[int, int, int, int]:
-        """What it shows, whole source pixels."""
+"""Width of the seam in pixels of the result. A detector takes a hard edge for a contour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +36,7 @@ class Patch:
     """(height, width) 0…1: what of each pixel the still covers, soft at the seam."""
 
 
-def composite(base_bgr: Image, stills: Sequence[Placed], *, view: View, zoom: float = 1.0) -> Image:
+def composite(base_bgr: Image, stills: Sequence[DecodedStill], *, view: View, zoom: float = 1.0) -> Image:
     """The base picture with each still in its place, ``zoom`` times as large as the base; a copy.
 
     Later stills lie over earlier ones.
@@ -60,7 +49,7 @@ def composite(base_bgr: Image, stills: Sequence[Placed], *, view: View, zoom: fl
     return picture
 
 
-def patch_of(still: Placed, *, view: View, zoom: float, size: tuple[int, int]) -> Patch | None:
+def patch_of(still: DecodedStill, *, view: View, zoom: float, size: tuple[int, int]) -> Patch | None:
     """The still resampled to the pixels of a result of ``size`` that it touches; None where it touches none.
 
     Cubic where it is enlarged, area means where it is shrunk.

@@ -10,7 +10,10 @@ from hvt_common.values import Image, View
 from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop
 from hvt_common.video.still_codecs import BaseMissingError, StillError, still_codec
 
-__all__ = ["ReceivedStill", "decode_still", "needs_base"]
+__all__ = ["Box", "DecodedStill", "ReceivedStill", "decode_still", "needs_base"]
+
+Box = tuple[float, float, float, float]
+"""x1 y1 x2 y2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +23,23 @@ class ReceivedStill:
     header: RoiHeader
     data: bytes
     media_type: str
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedStill:
+    """A decoded still and where it belongs."""
+
+    image_bgr: Image
+    crop_source_px: tuple[int, int, int, int]
+    box_base_px: Box
+    frame_index: int
+    also_boxes_base_px: tuple[Box, ...] = ()
+    """Of the further objects that it shows, in the order of the header's ``also``."""
+
+    @property
+    def boxes_base_px(self) -> tuple[Box, ...]:
+        """The lead object's box, then those of the others."""
+        return (self.box_base_px, *self.also_boxes_base_px)
 
 
 def needs_base(header: RoiHeader) -> bool:
@@ -34,7 +54,7 @@ def decode_still(still: ReceivedStill, *, base_bgr: Image | None, view: View) ->
     """The crop at the size at which it was coded, BGR.
 
     ``base_bgr`` is the decoded base frame of the still's own index, None where it is not at hand; only codecs that
-    need it look at it.
+    need it use it.
 
     Raises:
         BaseMissingError: the still builds on a base frame that is not at hand, or not the one that the edge had.

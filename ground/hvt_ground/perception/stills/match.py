@@ -3,7 +3,7 @@
 Evidence is the IoU of the still's box with the track's box at that frame, and what earlier stills have shown:
 a track that this edge track was matched to before gains 0.10, one that belongs to another edge track loses
 0.25. Evidence of at least the threshold is needed. So two objects that stand close do not exchange their
-stills when the ground misses one of them for a moment, and yet a clear overlap corrects an old belief.
+stills when the ground misses one of them for a moment, and yet a clear overlap corrects an old posterior.
 
 Several stills of one frame are assigned together, one to one, for the greatest sum. If a free track fits
 nearly as well as the chosen one and is not merely a second box on the same object, the still is ambiguous and
@@ -23,9 +23,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from hvt_common.values import Boxes, Tracks
+from hvt_common.values import Boxes, Tracks, iou
 
-__all__ = ["Candidate", "Matcher", "Wanted", "iou_matrix"]
+__all__ = ["Matcher", "StillToMatch", "TrackMatch"]
 
 KNOWN_BONUS = 0.10
 OTHERS_PENALTY = 0.25
@@ -39,7 +39,7 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class StillToMatch:
     """A still for which a track is wanted."""
 
     key: Hashable
@@ -50,7 +50,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class TrackMatch:
     """What was found for a still: row ``row`` of ``tracks``, or nothing (``tracks`` is None)."""
 
     tracks: Tracks | None = None
@@ -62,14 +62,14 @@ class Matcher:
     """Remembers which edge track is which ground track, for one session and in bounded memory.
 
     Args:
-        iou: the threshold that the evidence must reach.
+        least_iou: the threshold that the evidence must reach.
         owned_frames: for how many frames after a still a ground track counts as the edge track's own.
     """
 
-    def __init__(self, *, iou: float, owned_frames: int) -> None:
-        if not 0 < iou <= 1:
-            raise ValueError(f"the IoU threshold lies within 0…1, not {iou!r}")
-        self._iou = iou
+    def __init__(self, *, least_iou: float, owned_frames: int) -> None:
+        if not 0 < least_iou <= 1:
+            raise ValueError(f"the IoU threshold lies within 0…1, not {least_iou!r}")
+        self._iou = least_iou
         self._owned_frames = owned_frames
         self._ground_of: OrderedDict[int, tuple[int, int]] = (
             OrderedDict()
@@ -78,8 +78,13 @@ class Matcher:
         self._claims: OrderedDict[int, dict[int, int]] = OrderedDict()  # frame → ground track → edge track
 
     def match(
-        self, wanted: Sequence[Wanted], tracks: Tracks, *, later: Iterable[Tracks], class_names: Sequence[str]
-    ) -> dict[Hashable, Candidate]:
+        self,
+        wanted: Sequence[StillToMatch],
+        tracks: Tracks,
+        *,
+        later: Iterable[Tracks],
+        class_names: Sequence[str],
+    ) -> dict[Hashable, TrackMatch]:
         """A `Candidate` for each key of ``wanted``, all of which are stills of the frame of ``tracks``.
 
         ``later`` are the tracks of the following frames, in order, as far as a late confirmation counts.
@@ -104,26 +109,26 @@ class Matcher:
         known = self._ground_of.get(edge_track_id)
         return None if known is None else known[0]
 
-    def merge(self, kept_id: int, gone_id: int) -> None:
+    def merge(self, survivor_id: int, merged_id: int) -> None:
         """Two ground tracks have turned out to be one, which goes on under the first id."""
         for edge_id, (ground_id, frame_index) in self._ground_of.items():
-            if ground_id == gone_id:
-                self._ground_of[edge_id] = (kept_id, frame_index)
-        owner = self._edge_of.pop(gone_id, None)
+            if ground_id == merged_id:
+                self._ground_of[edge_id] = (survivor_id, frame_index)
+        owner = self._edge_of.pop(merged_id, None)
         if owner is not None:
-            self._edge_of.setdefault(kept_id, owner)
+            self._edge_of.setdefault(survivor_id, owner)
 
     def _assign(
         self,
-        groups: Sequence[Sequence[Wanted]],
+        groups: Sequence[Sequence[StillToMatch]],
         tracks: Tracks,
         rows: npt.NDArray[np.intp],
         frame_index: int,
         class_names: Sequence[str],
-    ) -> dict[Hashable, Candidate]:
+    ) -> dict[Hashable, TrackMatch]:
         """One to one among the tracks in ``rows``, by the key of each group's first; finds are remembered."""
         heads = [group[0] for group in groups]
-        found = {head.key: Candidate() for head in heads}
+        found = {head.key: TrackMatch() for head in heads}
         if not heads or not len(rows):
             return found
         boxes = tracks.boxes_xyxy_px[rows]
@@ -133,15 +138,15 @@ class Matcher:
         for r, c in chosen.items():
             taken = [column for row, column in chosen.items() if row != r]
             if _ambiguous(preference[r], c, taken, boxes):
-                found[heads[r].key] = Candidate(ambiguous=True)
+                found[heads[r].key] = TrackMatch(ambiguous=True)
                 continue
-            found[heads[r].key] = Candidate(tracks, int(rows[c]))
+            found[heads[r].key] = TrackMatch(tracks, int(rows[c]))
             self._remember(heads[r].edge_track_id, int(tracks.ids[rows[c]]), frame_index)
         return found
 
     def _preference(
         self,
-        heads: Sequence[Wanted],
+        heads: Sequence[StillToMatch],
         tracks: Tracks,
         rows: npt.NDArray[np.intp],
         frame_index: int,
@@ -149,7 +154,7 @@ class Matcher:
     ) -> Floats:
         """(heads, rows) how much each pair is preferred; 0 where the evidence does not reach the threshold."""
         wanted_px = np.array([head.box_base_px for head in heads], np.float32)
-        evidence = iou_matrix(wanted_px, tracks.boxes_xyxy_px[rows])
+        evidence = iou(wanted_px, tracks.boxes_xyxy_px[rows])
         same_class = np.zeros(evidence.shape, np.bool_)
         claims = self._claims.get(frame_index, {})
         for column, row in enumerate(rows):
@@ -187,18 +192,8 @@ class Matcher:
                 known.popitem(last=False)
 
 
-def iou_matrix(boxes_a_px: Boxes, boxes_b_px: Boxes) -> Floats:
-    """(A, B) intersection over union of two sets of boxes (x1 y1 x2 y2); 0 for boxes without area."""
-    a, b = boxes_a_px.astype(np.float64)[:, None], boxes_b_px.astype(np.float64)[None]
-    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
-    overlap = sides.clip(0).prod(-1)
-    union = (a[..., 2:] - a[..., :2]).clip(0).prod(-1) + (b[..., 2:] - b[..., :2]).clip(0).prod(-1) - overlap
-    iou: Floats = np.divide(overlap, union, out=np.zeros_like(overlap), where=union > 0)
-    return iou
-
-
-def _by_edge_track(wanted: Sequence[Wanted]) -> list[list[Wanted]]:
-    groups: dict[tuple[str, Hashable], list[Wanted]] = {}
+def _by_edge_track(wanted: Sequence[StillToMatch]) -> list[list[StillToMatch]]:
+    groups: dict[tuple[str, Hashable], list[StillToMatch]] = {}
     for want in wanted:
         of_track = want.edge_track_id >= 0
         groups.setdefault(("track", want.edge_track_id) if of_track else ("still", want.key), []).append(want)
@@ -209,5 +204,5 @@ def _ambiguous(preference: Floats, chosen: int, taken: Sequence[int], boxes: Box
     """Whether a free track fits nearly as well and is another object."""
     near = (preference > 0) & (preference >= preference[chosen] - AMBIGUITY_MARGIN)
     near[[chosen, *taken]] = False
-    apart = iou_matrix(boxes[chosen : chosen + 1], boxes)[0] < SAME_OBJECT_IOU
+    apart = iou(boxes[chosen : chosen + 1], boxes)[0] < SAME_OBJECT_IOU
     return bool((near & apart).any())

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from hvt_common.values import Posterior
 
-__all__ = ["BASE_WEIGHT", "PROBABILITY_FLOOR", "Labels", "Reading", "TrackPosterior"]
+__all__ = ["BASE_WEIGHT", "PROBABILITY_FLOOR", "ClassEstimate", "ClassNames", "TrackPosterior"]
 
 PROBABILITY_FLOOR = 1e-4
 BASE_WEIGHT = 1.0
@@ -33,7 +33,7 @@ _UNITS_PER_NAT = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ClassEstimate:
     """A class with its probability and the entropy of the distribution it comes from."""
 
     class_name: str
@@ -41,7 +41,7 @@ class Reading:
     entropy_nats: float
 
 
-class Labels:
+class ClassNames:
     """The detector's and the classifier's class names, and which of the former have a namesake in the latter."""
 
     def __init__(self, detector: tuple[str, ...], classifier: tuple[str, ...]) -> None:
@@ -69,12 +69,12 @@ class TrackPosterior:
     def __init__(self, frame_index: int) -> None:
         self.last_frame = frame_index
         """The newest frame in which the track was there."""
-        self._newest: Reading | None = None
+        self._newest: ClassEstimate | None = None
         self._order = (-1, -1)
         self._log_sum: npt.NDArray[np.int64] | None = None
 
-    def hear(
-        self, posterior: Posterior, labels: Labels, *, order: tuple[int, int], news: float = 1.0
+    def update(
+        self, posterior: Posterior, names: ClassNames, *, order: tuple[int, int], news: float = 1.0
     ) -> bool:
         """Take a still's posterior; True if it is the newest so far by ``order`` (frame index, sequence).
 
@@ -83,8 +83,8 @@ class TrackPosterior:
         ``ValueError`` if it does not have one probability for each of the classifier's classes.
         """
         said = posterior.probabilities.astype(np.float64)
-        if said.shape != (len(labels.classifier),):
-            raise ValueError(f"a posterior over {len(labels.classifier)} classes is wanted, not {said.shape}")
+        if said.shape != (len(names.classifier),):
+            raise ValueError(f"a posterior over {len(names.classifier)} classes is wanted, not {said.shape}")
         said = np.where(
             np.isfinite(said), said, 0.0
         )  # a model that overflows says nothing, and vetoes nothing
@@ -93,21 +93,21 @@ class TrackPosterior:
         if order < self._order:
             return False
         self._order = order
-        self._newest = Reading(posterior.class_name, posterior.confidence, posterior.entropy_nats)
+        self._newest = ClassEstimate(posterior.class_name, posterior.confidence, posterior.entropy_nats)
         return True
 
-    def newest(self) -> Reading:
+    def newest(self) -> ClassEstimate:
         """What the still of the newest frame said."""
         if self._newest is None:
-            raise ValueError("no still has spoken on this track yet")
+            raise ValueError("no still has refined this track yet")
         return self._newest
 
-    def fused(self, labels: Labels, *, class_id: int, confidence: float) -> Reading:
+    def fused(self, names: ClassNames, *, class_id: int, confidence: float) -> ClassEstimate:
         """All stills together with the detector's present vote (its class and confidence on the base)."""
         if self._log_sum is None:
-            raise ValueError("no still has spoken on this track yet")
+            raise ValueError("no still has refined this track yet")
         logs = self._log_sum / _UNITS_PER_NAT
-        vote = labels.base_log_vote(class_id=class_id, confidence=confidence)
+        vote = names.base_log_vote(class_id=class_id, confidence=confidence)
         if vote is not None:
             logs += BASE_WEIGHT * vote
         logs -= logs.max()
@@ -115,4 +115,4 @@ class TrackPosterior:
         probabilities = np.exp(logs)
         best = int(probabilities.argmax())
         entropy_nats = max(0.0, -float(probabilities @ logs))
-        return Reading(labels.classifier[best], float(probabilities[best]), entropy_nats)
+        return ClassEstimate(names.classifier[best], float(probabilities[best]), entropy_nats)

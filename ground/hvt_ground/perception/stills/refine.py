@@ -6,7 +6,7 @@ base packet must not refine the wrong object. What cannot be decided yet is held
 when it never will be.
 
 ``replace`` is the paper's rule: the newest still's prediction is the class. ``fuse`` multiplies what all
-stills of the track say (see `TrackPosterior`). Frames are the only clock here; `History` satisfies `TrackLog`.
+stills of the track say (see `TrackPosterior`). Frames are the only clock here.
 """
 
 from __future__ import annotations
@@ -14,16 +14,32 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
-from typing import Generic, Literal, Protocol, TypeVar
+from typing import Literal
 
 import numpy as np
 
 from hvt_common.values import Tracks
-from hvt_ground.perception.stills.match import Candidate, Matcher, Wanted
-from hvt_ground.perception.stills.posterior import Labels, Reading, TrackPosterior
-from hvt_ground.perception.stills.resolved import Outcome, ResolvedStill, Shown, StillSeen
+from hvt_ground.perception.history import History
+from hvt_ground.perception.stills.match import Matcher, StillToMatch, TrackMatch
+from hvt_ground.perception.stills.posterior import ClassEstimate, ClassNames, TrackPosterior
+from hvt_ground.perception.stills.resolved import (
+    Outcome,
+    ResolvedStill,
+    ShownClasses,
+    StillContext,
+    StillSeen,
+)
 
-__all__ = ["Counters", "Mode", "Outcome", "Refiner", "ResolvedStill", "Shown", "StillSeen", "TrackLog"]
+__all__ = [
+    "Mode",
+    "Outcome",
+    "RefinementCounters",
+    "Refiner",
+    "ResolvedStill",
+    "ShownClasses",
+    "StillContext",
+    "StillSeen",
+]
 
 Mode = Literal["replace", "fuse"]
 
@@ -31,26 +47,9 @@ MAX_HELD = 256
 MAX_TRACK_POSTERIORS = 1024
 _REMEMBERED_STILLS = 4096
 
-P = TypeVar("P")
-
-
-class TrackLog(Protocol):
-    """The ground's tracks by frame; every decoded frame has an entry, with or without tracks in it."""
-
-    @property
-    def oldest_tracked(self) -> int | None:
-        """Frame index of the oldest entry."""
-
-    @property
-    def newest_tracked(self) -> int | None:
-        """Frame index of the newest entry."""
-
-    def tracks(self, frame_index: int) -> Tracks | None:
-        """The tracks of that frame; None if it is lost, gone, or not tracked yet."""
-
 
 @dataclass(slots=True)
-class Counters:
+class RefinementCounters:
     """Totals of one session."""
 
     offered: int = 0
@@ -62,7 +61,7 @@ class Counters:
     late: int = 0
     """Among the unmatched: those whose outcome is late."""
     tracks_refined: int = 0
-    """Distinct tracks of the ground on whose class a still has spoken."""
+    """Distinct tracks of the ground that a still has refined."""
     class_changes: int = 0
     """Stills after which the class shown was another than before."""
 
@@ -72,13 +71,13 @@ def _unknown(_edge_track_id: int) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Held(Generic[P]):
-    still: StillSeen[P]
+class _Held:
+    still: StillSeen
     last_frame: int
     """It waits no longer once the stream is past this frame."""
 
 
-class Refiner(Generic[P]):
+class Refiner:
     """Holds stills until their track is known, and the classes that came of them. One for each session.
 
     Args:
@@ -106,20 +105,20 @@ class Refiner(Generic[P]):
         forget_s: float = 10.0,
         iou: float = 0.5,
     ) -> None:
-        self.counters = Counters()
+        self.counters = RefinementCounters()
         self._mode = mode
-        self._labels = Labels(detector_classes, classifier_classes)
+        self._class_names = ClassNames(detector_classes, classifier_classes)
         self._hold_frames = round(hold_s * fps)
         self._confirm_frames = round(confirm_s * fps)
         self._forget_frames = round(forget_s * fps)
-        self._matcher = Matcher(iou=iou, owned_frames=self._forget_frames)
-        self._held: dict[tuple[int, int], _Held[P]] = {}  # by still sequence and part, oldest offer first
+        self._matcher = Matcher(least_iou=iou, owned_frames=self._forget_frames)
+        self._held: dict[tuple[int, int], _Held] = {}  # by still sequence and part, oldest offer first
         self._seen: OrderedDict[tuple[int, int], None] = OrderedDict()
         self._track_posteriors: OrderedDict[int, TrackPosterior] = (
             OrderedDict()
         )  # by ground track id, longest unseen first
 
-    def offer(self, still: StillSeen[P], *, now_frame: int) -> list[ResolvedStill[P]]:
+    def offer(self, still: StillSeen, *, now_frame: int) -> list[ResolvedStill]:
         """Take a still; returns what had to make room for it (almost always nothing).
 
         ``now_frame`` is the newest frame that was decoded. A part of a still that was here before is ignored.
@@ -138,40 +137,40 @@ class Refiner(Generic[P]):
         return [self._unmatched(self._held.pop(oldest).still, "overflow")]
 
     def settle(
-        self, log: TrackLog, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
-    ) -> list[ResolvedStill[P]]:
+        self, history: History, *, now_frame: int, known_as: Callable[[int], int | None] = _unknown
+    ) -> list[ResolvedStill]:
         """Match what can be matched and give up what never will be, oldest frame first.
 
         Call it after each frame was tracked, with the newest frame that was decoded. ``known_as`` gives the ground's
-        track for one of the edge, where the edge itself has told.
+        track for one of the edge, where the edge has reported it.
         """
-        by_frame: dict[int, list[_Held[P]]] = {}
+        by_frame: dict[int, list[_Held]] = {}
         for held in self._held.values():
             by_frame.setdefault(held.still.frame_index, []).append(held)
-        resolved: list[ResolvedStill[P]] = []
+        resolved: list[ResolvedStill] = []
         for frame_index in sorted(by_frame):
-            resolved += self._settle_frame(by_frame[frame_index], log, now_frame, known_as)
+            resolved += self._resolve_frame(by_frame[frame_index], history, now_frame, known_as)
         for done in resolved:
             del self._held[done.still.key]
         return resolved
 
-    def end(self) -> list[ResolvedStill[P]]:
+    def end(self) -> list[ResolvedStill]:
         """Give out all that still waits, as unmatched: the stream or its session is over."""
         ended = [self._unmatched(held.still, "ended") for held in self._held.values()]
         self._held.clear()
         return ended
 
-    def merge(self, kept_id: int, gone_id: int) -> None:
-        """Two tracks have turned out to be one: what is believed of the one that is gone holds for the other.
+    def merge(self, survivor_id: int, merged_id: int) -> None:
+        """Two tracks have turned out to be one: the posterior of the one that is gone holds for the other.
 
-        Where both were refined, the track that stays keeps its own belief.
+        Where both were refined, the track that stays keeps its own posterior.
         """
-        class_posterior = self._track_posteriors.pop(gone_id, None)
+        class_posterior = self._track_posteriors.pop(merged_id, None)
         if class_posterior is not None:
-            self._track_posteriors.setdefault(kept_id, class_posterior)
-        self._matcher.merge(kept_id, gone_id)
+            self._track_posteriors.setdefault(survivor_id, class_posterior)
+        self._matcher.merge(survivor_id, merged_id)
 
-    def shown(self, tracks: Tracks) -> Shown:
+    def shown(self, tracks: Tracks) -> ShownClasses:
         """The classes to show for the tracks of one frame; frames must not go back."""
         for track_id in tracks.ids.tolist():
             class_posterior = self._track_posteriors.get(track_id)
@@ -180,9 +179,9 @@ class Refiner(Generic[P]):
         self._forget(tracks.frame_index)
         return self.preview(tracks)
 
-    def preview(self, tracks: Tracks) -> Shown:
+    def preview(self, tracks: Tracks) -> ShownClasses:
         """The classes that would be shown for these tracks; changes nothing, so any frame may be asked for."""
-        base_classes = tuple(self._labels.detector[class_id] for class_id in tracks.class_ids)
+        base_classes = tuple(self._class_names.detector[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)
         confidences = tracks.confidences.astype(np.float32)  # a copy
         refined = np.zeros(len(tracks), np.bool_)
@@ -192,99 +191,103 @@ class Refiner(Generic[P]):
                 continue
             reading = self._read(class_posterior, tracks, row)
             classes[row], confidences[row], refined[row] = reading.class_name, reading.confidence, True
-        return Shown(base_classes, tuple(classes), confidences, refined)
+        return ShownClasses(base_classes, tuple(classes), confidences, refined)
 
     # One frame's stills.
 
-    def _settle_frame(
-        self, held: list[_Held[P]], log: TrackLog, now_frame: int, known_as: Callable[[int], int | None]
-    ) -> list[ResolvedStill[P]]:
+    def _resolve_frame(
+        self, held: list[_Held], history: History, now_frame: int, known_as: Callable[[int], int | None]
+    ) -> list[ResolvedStill]:
         frame_index = held[0].still.frame_index
-        tracks = log.tracks(frame_index)
+        tracks = history.tracks(frame_index)
         if tracks is None:
-            return self._settle_untracked(held, log, now_frame, known_as)
-        found = self._match(held, tracks, log)
-        newest = log.newest_tracked
-        resolved: list[ResolvedStill[P]] = []
-        for waiting in sorted(held, key=lambda waiting: waiting.still.key):
-            candidate = found[waiting.still.key]
+            return self._resolve_untracked(held, history, now_frame, known_as)
+        found = self._match(held, tracks, history)
+        newest = history.newest_tracked
+        resolved: list[ResolvedStill] = []
+        for pending in sorted(held, key=lambda pending: pending.still.key):
+            candidate = found[pending.still.key]
             if candidate.tracks is not None:
-                resolved.append(self._speak(waiting.still, candidate.tracks, candidate.row))
-            elif now_frame > waiting.last_frame or (
+                resolved.append(self._apply(pending.still, candidate.tracks, candidate.row))
+            elif now_frame > pending.last_frame or (
                 newest is not None and newest >= frame_index + self._confirm_frames
             ):
                 outcome: Outcome = "ambiguous" if candidate.ambiguous else "no track"
-                resolved.append(self._unmatched(waiting.still, outcome))
+                resolved.append(self._unmatched(pending.still, outcome))
         return resolved
 
-    def _settle_untracked(
+    def _resolve_untracked(
         self,
-        held: Iterable[_Held[P]],
-        log: TrackLog,
+        held: Iterable[_Held],
+        history: History,
         now_frame: int,
         known_as: Callable[[int], int | None],
-    ) -> list[ResolvedStill[P]]:
+    ) -> list[ResolvedStill]:
         """Tracks come in the order of frames: once a later frame is there, an absent one never will be."""
-        resolved: list[ResolvedStill[P]] = []
-        for waiting in held:
-            oldest, newest, frame_index = log.oldest_tracked, log.newest_tracked, waiting.still.frame_index
+        resolved: list[ResolvedStill] = []
+        for pending in held:
+            oldest, newest, frame_index = (
+                history.oldest_tracked,
+                history.newest_tracked,
+                pending.still.frame_index,
+            )
             outcome: Outcome | None = None
             if oldest is not None and frame_index < oldest:
                 outcome = "late"
             elif newest is not None and frame_index < newest:
                 outcome = "frame lost"
-            elif now_frame > waiting.last_frame:
+            elif now_frame > pending.last_frame:
                 outcome = "late"
             if outcome is not None:
-                named = self._by_name(waiting.still, log, known_as) if waiting.still.stored else None
-                resolved.append(named or self._unmatched(waiting.still, outcome))
+                named = self._by_name(pending.still, history, known_as) if pending.still.stored else None
+                resolved.append(named or self._unmatched(pending.still, outcome))
         return resolved
 
     def _by_name(
-        self, still: StillSeen[P], log: TrackLog, known_as: Callable[[int], int | None]
-    ) -> ResolvedStill[P] | None:
-        """Let a still of long ago speak on the track that its edge track is known as now; None where it is not."""
+        self, still: StillSeen, history: History, known_as: Callable[[int], int | None]
+    ) -> ResolvedStill | None:
+        """Apply a still of long ago to the track that its edge track is known as now; None where it is not known."""
         edge_id = still.edge_track_id
-        if edge_id < 0 or log.newest_tracked is None:
+        if edge_id < 0 or history.newest_tracked is None:
             return None
-        track_id, tracks = known_as(edge_id), log.tracks(log.newest_tracked)
+        track_id, tracks = known_as(edge_id), history.tracks(history.newest_tracked)
         if track_id is None:
             track_id = self._matcher.known_as(edge_id)
         if track_id is None or tracks is None or track_id not in tracks.ids:
             return None
-        return self._speak(still, tracks, int(np.flatnonzero(tracks.ids == track_id)[0]))
+        return self._apply(still, tracks, int(np.flatnonzero(tracks.ids == track_id)[0]))
 
-    def _match(self, held: list[_Held[P]], tracks: Tracks, log: TrackLog) -> dict[Hashable, Candidate]:
+    def _match(self, held: list[_Held], tracks: Tracks, history: History) -> dict[Hashable, TrackMatch]:
         wanted = [
-            Wanted(
-                key=waiting.still.key,
-                edge_track_id=waiting.still.edge_track_id,
-                box_base_px=waiting.still.box_base_px,
-                class_name=waiting.still.class_name,
+            StillToMatch(
+                key=pending.still.key,
+                edge_track_id=pending.still.edge_track_id,
+                box_base_px=pending.still.box_base_px,
+                class_name=pending.still.class_name,
             )
-            for waiting in held
+            for pending in held
         ]
-        newest = log.newest_tracked or 0
+        newest = history.newest_tracked or 0
         last = min(tracks.frame_index + self._confirm_frames, newest)
-        later = (log.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
+        later = (history.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
         return self._matcher.match(
-            wanted, tracks, later=(t for t in later if t is not None), class_names=self._labels.detector
+            wanted, tracks, later=(t for t in later if t is not None), class_names=self._class_names.detector
         )
 
-    def _speak(self, still: StillSeen[P], tracks: Tracks, row: int) -> ResolvedStill[P]:
-        """Let a still speak on the class of a track."""
+    def _apply(self, still: StillSeen, tracks: Tracks, row: int) -> ResolvedStill:
+        """Update the class of a track by a still."""
         track_id = int(tracks.ids[row])
         class_posterior = self._track_posteriors.get(track_id)
         if class_posterior is None:
-            before = self._labels.detector[tracks.class_ids[row]]
+            before = self._class_names.detector[tracks.class_ids[row]]
             class_posterior = self._track_posteriors[track_id] = TrackPosterior(tracks.frame_index)
             self.counters.tracks_refined += 1
             if len(self._track_posteriors) > MAX_TRACK_POSTERIORS:
                 self._track_posteriors.popitem(last=False)
         else:
             before = self._read(class_posterior, tracks, row).class_name
-        newest = class_posterior.hear(
-            still.posterior, self._labels, order=(still.frame_index, still.sequence), news=still.news
+        newest = class_posterior.update(
+            still.posterior, self._class_names, order=(still.frame_index, still.sequence), news=still.news
         )
         self._touch(track_id, class_posterior, still.frame_index)
         after = self._read(class_posterior, tracks, row)
@@ -300,7 +303,7 @@ class Refiner(Generic[P]):
             entropy_nats=after.entropy_nats,
         )
 
-    def _unmatched(self, still: StillSeen[P], outcome: Outcome) -> ResolvedStill[P]:
+    def _unmatched(self, still: StillSeen, outcome: Outcome) -> ResolvedStill:
         self.counters.unmatched += 1
         self.counters.late += outcome == "late"
         said = still.posterior
@@ -314,13 +317,13 @@ class Refiner(Generic[P]):
             entropy_nats=said.entropy_nats,
         )
 
-    # What is believed of each track.
+    # The posterior of each track.
 
-    def _read(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> Reading:
+    def _read(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> ClassEstimate:
         if self._mode == "replace":
             return class_posterior.newest()
         return class_posterior.fused(
-            self._labels, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
+            self._class_names, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
         )
 
     def _touch(self, track_id: int, class_posterior: TrackPosterior, frame_index: int) -> None:
@@ -328,7 +331,7 @@ class Refiner(Generic[P]):
         self._track_posteriors.move_to_end(track_id)
 
     def _forget(self, now_frame: int) -> None:
-        """Drop what is believed of tracks that ended; the longest unseen stand first."""
+        """Drop the posteriors of tracks that ended; the longest unseen stand first."""
         while self._track_posteriors:
             track_id, class_posterior = next(iter(self._track_posteriors.items()))
             if now_frame - class_posterior.last_frame <= self._forget_frames:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.values import Posterior
+from hvt_common.values import Image, Posterior
+from hvt_ground.perception.stills.decode import Box, DecodedStill, ReceivedStill
 
-__all__ = ["Outcome", "ResolvedStill", "Shown", "StillSeen"]
+__all__ = ["Outcome", "ResolvedStill", "ShownClasses", "StillContext", "StillSeen"]
 
 Outcome = Literal["matched", "superseded", "no track", "ambiguous", "frame lost", "late", "overflow", "ended"]
 """What became of a still:
@@ -33,11 +34,23 @@ ended
     it still waited when the stream or its session ended.
 """
 
-P = TypeVar("P")
+
+@dataclass(frozen=True, slots=True)
+class StillContext:
+    """What a still brings along while it waits for its track, for one of the objects that it shows."""
+
+    received: ReceivedStill
+    decoded: DecodedStill
+    track_id: int
+    """The edge's."""
+    box_base_px: Box
+    found_base_px: Box | None
+    """Where the reader found the object."""
+    base_crop_bgr: Image | None
 
 
 @dataclass(frozen=True, slots=True)
-class StillSeen(Generic[P]):
+class StillSeen:
     """A still that was decoded and classified."""
 
     sequence: int
@@ -51,14 +64,13 @@ class StillSeen(Generic[P]):
     """What the edge's detector called it."""
     posterior: Posterior
     """Of the classifier, over the `Refiner`'s ``classifier_classes``."""
-    wire_field: P
-    """Whatever the caller wants back with it (the coded still, its header)."""
+    context: StillContext
     news: float = 1.0
     """How much the still shows that the base did not, 0…1; see `news`."""
     part: int = 0
     """Which of the objects that the still shows: each is offered by itself, under the still's sequence number."""
     stored: bool = False
-    """It was kept while the link was away. Where nothing is known of its frame it may speak on the track that its
+    """It was stored while the link was down. Where nothing is known of its frame it may refine the track that its
     edge track is known as now: the object is the same, and so is its class."""
 
     @property
@@ -68,10 +80,10 @@ class StillSeen(Generic[P]):
 
 
 @dataclass(frozen=True, slots=True)
-class ResolvedStill(Generic[P]):
+class ResolvedStill:
     """A still and what it did."""
 
-    still: StillSeen[P]
+    still: StillSeen
     outcome: Outcome
     track_id: int | None
     """The ground's track; None unless the outcome is matched or superseded."""
@@ -86,7 +98,7 @@ class ResolvedStill(Generic[P]):
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class ShownClasses:
     """Classes of N tracks, parallel to the `Tracks` they were asked for; fields of `events.Overlay`."""
 
     base_classes: tuple[str, ...]
@@ -94,4 +106,4 @@ class Shown:
     confidences: npt.NDArray[np.float32]
     """(N,) of ``classes``, 0…1."""
     refined: npt.NDArray[np.bool_]
-    """(N,) True once a still has spoken."""
+    """(N,) True once a still has refined it."""

@@ -12,46 +12,32 @@ from hvt_common.protocol.messages import Flags, RoiHeader, StillResult, fitted_t
 from hvt_common.values import Image, Posterior, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.still_codecs import BaseMissingError, StillError, psnr_y_db, still_codec
-from hvt_ground.events.events import Event, Notice, Refinement
-from hvt_ground.events.history import FilledLog, History
+from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.fusion.fuse import Fusion
-from hvt_ground.perception.stills.classify import Box, Decoded, Reading, StillReader
+from hvt_ground.perception.history import History
+from hvt_ground.perception.stills.classify import Box, DecodedStill, ObjectReading, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
-from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillSeen
+from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillContext, StillSeen
 
-__all__ = ["Carried", "Moment", "StillStage"]
+__all__ = ["Progress", "StillStage"]
 
 SAME_DB, OTHER_DB = 38.0, 26.0
 """Luma PSNR between a still and the base of the same place: at the first it says nothing new, at the second all."""
-_MOST_SPOILT, _SPOILT_TICKS = 32, 150
-"""After so many undecodable stills in so many ticks the next are dropped unseen until the time is over."""
+_MOST_SPOILT, _SPOILT_FRAMES = 32, 150
+"""After so many undecodable stills in so many frames the next are dropped unseen until the time is over."""
 MAX_PENDING = 64
 """Stills that wait for their base frame; beyond, the oldest is read without it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class Progress:
     """How far the ground is."""
 
     frame_index: int = 0
-    """The newest tick of which anything is known; what happens now is shown there."""
+    """The newest frame of which anything is known; what happens now is shown there."""
     capture_ns: int = 0
     picture_index: int = -1
     """The newest decoded frame; -1 before the first."""
-
-
-@dataclass(frozen=True, slots=True)
-class Carried:
-    """What a still brings along while it waits for its track, for one of the objects that it shows."""
-
-    received: ReceivedStill
-    decoded: Decoded
-    track_id: int
-    """The edge's."""
-    box_base_px: Box
-    found_base_px: Box | None
-    """Where the reader found the object."""
-    base_crop_bgr: Image | None
 
 
 class StillStage:
@@ -63,82 +49,81 @@ class StillStage:
         history: the pictures and tracks by frame.
         fusion: learns where stills show objects.
         view: between source and base pixels.
-        wants_base: whether ``reader`` looks at the base frame; then all stills wait for theirs, not only residuals.
-        gap_ticks: how many ticks the base stream may leave out and still say where tracks were between.
+        wants_base: whether ``reader`` uses the base frame; then all stills wait for theirs, not only residuals.
+        gap_ticks: how many frames the base stream may leave out and still say where tracks were between.
         emit: takes the events.
     """
 
     def __init__(
         self,
         reader: StillReader,
-        refiner: Refiner[Carried],
+        refiner: Refiner,
         *,
         history: History,
         fusion: Fusion,
         view: View,
         wants_base: bool,
-        gap_ticks: int,
+        gap_frames: int,
         emit: Callable[[Event], None],
     ) -> None:
         self._reader = reader
         self._refiner = refiner
         self._history = history
-        self._log = FilledLog(history, within=gap_ticks)
-        self._gap_ticks = gap_ticks
+        self._gap_frames = gap_frames
         self._fusion = fusion
         self._view = view
         self._wants_base = wants_base
         self._emit = emit
-        self._waiting: list[ReceivedStill] = []
+        self._pending: list[ReceivedStill] = []
         self._results: list[StillResult] = []
         self._spoilt: deque[int] = deque(maxlen=_MOST_SPOILT)
-        """When the last ones came that could not be decoded, in ticks."""
+        """When the last ones came that could not be decoded, in frames."""
         self.dropped: Counter[str] = Counter()
         """Stills of which nothing could be made, by reason."""
         self.outcomes: Counter[str] = Counter()
         """What became of each object in the others."""
 
-    def take(self, stills: Sequence[ReceivedStill], now: Moment) -> None:
+    def take(self, stills: Sequence[ReceivedStill], now: Progress) -> None:
         """Take stills in the order in which they came; those whose base frame may still come wait for it."""
-        self._waiting += stills
-        self.look_again(now)
+        self._pending += stills
+        self.update(now)
 
-    def look_again(self, now: Moment) -> None:
+    def update(self, now: Progress) -> None:
         """Read what need not wait any longer, and settle what can be: call it after each picture and each step."""
-        ready = [still for still in self._waiting if not self._may_wait(still.header, now)]
+        ready = [still for still in self._pending if not self._may_wait(still.header, now)]
         if ready:
-            self._waiting = [still for still in self._waiting if self._may_wait(still.header, now)]
-        surplus = len(self._waiting) - MAX_PENDING
+            self._pending = [still for still in self._pending if self._may_wait(still.header, now)]
+        surplus = len(self._pending) - MAX_PENDING
         if surplus > 0:
-            ready, self._waiting = ready + self._waiting[:surplus], self._waiting[surplus:]
+            ready, self._pending = ready + self._pending[:surplus], self._pending[surplus:]
         self._read(ready, now)
         for resolved in self._refiner.settle(
-            self._log, now_frame=now.frame_index, known_as=self._fusion.known_as
+            self._history, now_frame=now.frame_index, known_as=self._fusion.known_as
         ):
             self._resolved(resolved, now)
 
-    def end(self, now: Moment) -> None:
+    def end(self, now: Progress) -> None:
         """The session is over: what still waits is given out as it is."""
-        ready, self._waiting = self._waiting, []
+        ready, self._pending = self._pending, []
         self._read(ready, now)
         for resolved in self._refiner.end():
             self._resolved(resolved, now)
 
     def take_results(self) -> list[StillResult]:
-        """Return and forget what the edge wants to hear of its stills."""
+        """Return and forget the results of stills that the edge has not been sent yet."""
         results, self._results = self._results, []
         return results
 
     # From bytes to readings
 
-    def _may_wait(self, header: RoiHeader, now: Moment) -> bool:
-        """Whether its picture may yet come. A residual is nothing without it; others wait for the next tick only."""
+    def _may_wait(self, header: RoiHeader, now: Progress) -> bool:
+        """Whether its picture may yet come. A residual is nothing without it; others wait for the next frame only."""
         if header.frame_index <= now.picture_index:
             return False
         return needs_base(header) or (self._wants_base and header.frame_index >= now.frame_index)
 
-    def _read(self, stills: Sequence[ReceivedStill], now: Moment) -> None:
-        by_frame: dict[int, list[tuple[ReceivedStill, Decoded]]] = {}
+    def _read(self, stills: Sequence[ReceivedStill], now: Progress) -> None:
+        by_frame: dict[int, list[tuple[ReceivedStill, DecodedStill]]] = {}
         for still in stills:
             decoded = self._decode(still, now)
             if decoded is not None:
@@ -146,24 +131,24 @@ class StillStage:
         for frame_index, pairs in by_frame.items():
             # Of an outage there may be no picture, and the last one before it is not the same place any more.
             stored = any(still.header.flags & Flags.STORED for still, _ in pairs)
-            base_bgr = self._history.frame_before(frame_index, within=0 if stored else self._gap_ticks)
+            base_bgr = self._history.frame_before(frame_index, within=0 if stored else self._gap_frames)
             readings = self._reader.read([decoded for _, decoded in pairs], base_bgr)
             for (still, decoded), objects in zip(pairs, readings.objects, strict=True):
                 self._offer(still, decoded, objects, base_bgr, now)
             if len(readings.found):
-                known = self._log.tracks(frame_index)
+                known = self._history.tracks(frame_index)
                 if known is not None:
                     self._fusion.take_found(readings.found, known=known)
 
-    def _out_of_patience(self, now: Moment) -> bool:
+    def _out_of_patience(self, now: Progress) -> bool:
         """Whether so many stills could not be decoded lately that somebody sends them on purpose.
 
         Each costs a line in the recording and, from libjpeg, one on stderr.
         """
         spoilt = self._spoilt
-        return len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_TICKS
+        return len(spoilt) == _MOST_SPOILT and abs(now.frame_index - spoilt[0]) < _SPOILT_FRAMES
 
-    def _decode(self, still: ReceivedStill, now: Moment) -> Decoded | None:
+    def _decode(self, still: ReceivedStill, now: Progress) -> DecodedStill | None:
         header = still.header
         if self._out_of_patience(now):
             self.dropped["undecodable"] += 1
@@ -185,29 +170,29 @@ class StillStage:
                 self._answer(header, track_id, None)
             return None
         boxes = [self._to_base(box) for _, box in _shown(header)]
-        return Decoded(image, header.crop_source_px, boxes[0], header.frame_index, tuple(boxes[1:]))
+        return DecodedStill(image, header.crop_source_px, boxes[0], header.frame_index, tuple(boxes[1:]))
 
     # From readings to tracks
 
     def _offer(
         self,
         still: ReceivedStill,
-        decoded: Decoded,
-        objects: Sequence[Reading],
+        decoded: DecodedStill,
+        objects: Sequence[ObjectReading],
         base_bgr: Image | None,
-        now: Moment,
+        now: Progress,
     ) -> None:
         header = still.header
-        crop = None if base_bgr is None else _cut(base_bgr, header.crop_source_px, view=self._view)
+        crop = None if base_bgr is None else _base_crop_at(base_bgr, header.crop_source_px, view=self._view)
         news = self._news(decoded)
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
-            wire_field = Carried(still, decoded, track_id, box, reading.box_base_px, crop)
+            context = StillContext(still, decoded, track_id, box, reading.box_base_px, crop)
             self._answer(header, track_id, reading.posterior)
             if reading.posterior is None:
                 self.outcomes["unread"] += 1
                 name = header.class_name
-                self._emit(self._refinement(wire_field, now, None, name, name, header.confidence))
+                self._emit(self._refinement(context, now, None, name, name, header.confidence))
                 continue
             seen = StillSeen(
                 sequence=header.sequence,
@@ -217,7 +202,7 @@ class StillStage:
                 box_base_px=box,
                 class_name=header.class_name,
                 posterior=reading.posterior,
-                wire_field=wire_field,
+                context=context,
                 news=news,
                 part=part,
                 stored=bool(header.flags & Flags.STORED),
@@ -225,7 +210,7 @@ class StillStage:
             for resolved in self._refiner.offer(seen, now_frame=now.frame_index):
                 self._resolved(resolved, now)
 
-    def _news(self, decoded: Decoded) -> float:
+    def _news(self, decoded: DecodedStill) -> float:
         """How much a still shows that the base did not, 0…1.
 
         A detector that names the same pixels twice has not seen them twice. On a base near the source the many
@@ -241,51 +226,51 @@ class StillStage:
         nearness_db = psnr_y_db(seen, decoded.image_bgr)
         return float(np.clip((SAME_DB - nearness_db) / (SAME_DB - OTHER_DB), 0.0, 1.0))
 
-    def _resolved(self, resolved: ResolvedStill[Carried], now: Moment) -> None:
+    def _resolved(self, resolved: ResolvedStill, now: Progress) -> None:
         self.outcomes[resolved.outcome] += 1
-        wire_field, track_id = resolved.still.wire_field, resolved.track_id
+        context, track_id = resolved.still.context, resolved.track_id
         if track_id is not None:
             self._name_track(resolved.still, track_id)
-            if wire_field.found_base_px is not None and not resolved.still.stored:
+            if context.found_base_px is not None and not resolved.still.stored:
                 frame_index = resolved.still.frame_index
-                self._fusion.take_box(track_id, wire_field.found_base_px, frame_index=frame_index)
+                self._fusion.take_box(track_id, context.found_base_px, frame_index=frame_index)
         before, after = resolved.class_before, resolved.class_after
-        self._emit(self._refinement(wire_field, now, track_id, before, after, resolved.confidence))
+        self._emit(self._refinement(context, now, track_id, before, after, resolved.confidence))
 
     def _refinement(
         self,
-        wire_field: Carried,
-        now: Moment,
+        context: StillContext,
+        now: Progress,
         track_id: int | None,
         before: str,
         after: str,
         confidence: float,
     ) -> Refinement:
-        header = wire_field.received.header
+        header = context.received.header
         stored = bool(header.flags & Flags.STORED)
         # It is shown when it is known, not at the frame that it was cut from: that one has been drawn already. What
-        # was kept while the link was away tells of then, and nobody looked on.
+        # was stored while the link was down belongs to that time.
         return Refinement(
             frame_index=header.frame_index if stored else now.frame_index,
             capture_ns=header.capture_ns if stored else now.capture_ns,
             still_sequence=header.sequence,
             track_id=track_id,
-            edge_track_id=wire_field.track_id,
-            box_base_px=wire_field.box_base_px,
-            still=wire_field.received.data,
+            edge_track_id=context.track_id,
+            box_base_px=context.box_base_px,
+            still=context.received.data,
             media_type=still_codec(header.codec).media_type,  # not what Zenoh said: that is nobody's word
-            base_crop_bgr=wire_field.base_crop_bgr,
+            base_crop_bgr=context.base_crop_bgr,
             class_before=before,
             class_after=after,
             confidence=confidence,
             reason=header.reason,
             quality_pct=header.quality_pct,
-            still_bgr=wire_field.decoded.image_bgr,
+            still_bgr=context.decoded.image_bgr,
             crop_base_px=self._to_base(header.crop_source_px),
             stored=stored,
         )
 
-    # What goes back and what is told
+    # Results and notices
 
     def _answer(
         self, header: RoiHeader, track_id: int, posterior: Posterior | None, *, again: bool = False
@@ -306,7 +291,7 @@ class StillStage:
             )
         )
 
-    def _name_track(self, still: StillSeen[Carried], ground_track_id: int) -> None:
+    def _name_track(self, still: StillSeen, ground_track_id: int) -> None:
         """Add the track that a still refined to its answer, if that has not been reported yet."""
         for place, result in enumerate(self._results):
             if (result.still_sequence, result.track_id) == (still.sequence, still.edge_track_id):
@@ -316,7 +301,7 @@ class StillStage:
         x1, y1, x2, y2 = self._view.to_base(np.array([box_source_px], np.float32))[0].tolist()
         return x1, y1, x2, y2
 
-    def _notice(self, now: Moment, text: str) -> None:
+    def _notice(self, now: Progress, text: str) -> None:
         self._emit(Notice(now.frame_index, now.capture_ns, "warning", text))
 
 
@@ -328,7 +313,7 @@ def _shown(header: RoiHeader) -> list[tuple[int, Box]]:
     ]
 
 
-def _cut(base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View) -> Image | None:
+def _base_crop_at(base_bgr: Image, crop_source_px: tuple[int, int, int, int], *, view: View) -> Image | None:
     """The same padded box of the base frame, whole pixels, clipped; None where nothing of it is inside."""
     x1, y1, x2, y2 = view.to_base(np.array([crop_source_px], np.float32))[0]
     height, width = base_bgr.shape[:2]

@@ -1,1 +1,1 @@
-"""The Rerun recording and live view: what is written, and how the screen is laid out."""
+"""The Rerun recording and live view: `Recorder` writes one session, `LiveView` is the viewer that may watch."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -17,20 +15,19 @@ __all__ = [
     "OVERFLOW",
     "PATCHES",
     "REFINED",
+    "REPORTED",
     "SESSION",
     "STILLS",
-    "TOLD",
     "TRACKS",
     "TRACK_COUNT",
     "VIDEO",
-    "Front",
     "screen",
 ]
 
 VIDEO = "/base/video"
 TRACKS = "/base/tracks"
 REFINED = "/base/refined"
-TOLD = "/base/told"
+REPORTED = "/base/reported"
 PATCHES = "/base/patches"
 STILLS = "/stills"
 CAPTIONS = "/stills/captions"
@@ -44,12 +41,9 @@ SESSION = "/session"
 _PAPER = (14, 17, 22)
 """Background behind pictures."""
 
-Front = Literal["tracks", "enhanced"]
-"""The tab that lies in front."""
-
 
 def screen(
-    *, base_size: tuple[int, int], fps: float, budget_bps: float, clocked: bool, live: bool, front: Front
+    *, base_size: tuple[int, int], fps: float, budget_bps: float, clocked: bool, live: bool
 ) -> rrb.Blueprint:
     """Video with boxes, plots below; gallery of stills, session facts and events to the right.
 
@@ -61,9 +55,8 @@ def screen(
         budget_bps: The budget in all; sets the height of the bitrate plot.
         clocked: Whether latencies are known; without them their plot is left out.
         live: Follow the newest data, rather than play from the beginning.
-        front: Which of the two tabs of the video is seen first.
     """
-    left = rrb.Vertical(_videos(base_size, front), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
+    left = rrb.Vertical(_videos(base_size), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
     right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.35, 0.62, 0.93])
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1.72, 1.0]),
@@ -81,12 +74,11 @@ def screen(
     )
 
 
-def _videos(base_size: tuple[int, int], front: Front) -> rrb.Tabs:
+def _videos(base_size: tuple[int, int]) -> rrb.Tabs:
     return rrb.Tabs(
         _video(base_size, "Base stream and tracks", without=(f"{PATCHES}/**",)),
         # Boxes say which objects a still has spoken on; thin and without words, for the picture is the matter.
-        _video(base_size, "Enhanced: stills in their places", without=(TRACKS, TOLD), bare=REFINED),
-        active_tab=0 if front == "tracks" else 1,
+        _video(base_size, "Enhanced: stills in their places", without=(TRACKS, REPORTED), bare=REFINED),
     )
 
 

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
@@ -21,9 +20,9 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.rerun.rrd.release import send_blueprint
+from hvt_ground.sinks.rerun.sdk import new_recording, send_blueprint, viewer_environment, viewer_program
 
-__all__ = ["LiveSink", "LiveView", "free_port", "listening", "viewer_environment", "viewer_program"]
+__all__ = ["LiveRecording", "LiveView", "free_port", "listening"]
 
 log = logging.getLogger(__name__)
 
@@ -108,36 +107,36 @@ class LiveView:
             time.sleep(0.05)
 
 
-class LiveSink:
-    """Sends one recording to a viewer. Trouble there costs one warning, then nothing is sent any more."""
+class LiveRecording:
+    """One recording in a viewer. Trouble there costs one warning, then nothing is sent any more."""
 
-    def __init__(self, url: str, *, application_id: str, recording_id: str, name: str) -> None:
+    live = True
+    size_bytes = 0
+
+    def __init__(self, url: str, *, recording_id: str, name: str) -> None:
         self._url = url
         self._port = int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
-        self._next_look = 0.0
-        self._application_id = application_id
-        self._recording: rr.RecordingStream | None = rr.RecordingStream(
-            application_id, recording_id=recording_id, send_properties=False
-        )
-        self._recording.set_log_time_enabled(False)
-        self._recording.set_log_tick_enabled(False)
+        self._next_check_s = 0.0
+        self._recording: rr.RecordingStream | None = new_recording(recording_id)
         self._recording.connect_grpc(url)
         self._recording.send_recording_name(name)
 
-    def blueprint(self, blueprint: rrb.Blueprint) -> bytes:
+    def open(self, screen: rrb.Blueprint, chunks: Sequence[Chunk]) -> None:
         """Show the recording on this screen."""
         if self._recording is not None:
-            send_blueprint(self._recording, blueprint, application_id=self._application_id)
-        return b""
+            send_blueprint(self._recording, screen)
+        self.write(chunks)
 
-    def chunks(self, chunks: Sequence[Chunk]) -> bytes:
+    def write(self, chunks: Sequence[Chunk]) -> None:
         """Send, while the viewer is there."""
         if self._recording is not None and self._viewer_there():
             self._recording.send_chunks(chunks)
-        return b""
 
-    def close(self) -> None:
-        """Send what is under way and disconnect; a viewer that is gone is not waited for."""
+    def compact(self, chunks: Sequence[Chunk]) -> None:
+        """A viewer has them already."""
+
+    def close(self, *, quickly: bool) -> None:  # noqa: ARG002 - a viewer that is gone is not waited for
+        """Send what is under way and disconnect."""
         recording, self._recording = self._recording, None
         if recording is None:
             return
@@ -148,11 +147,11 @@ class LiveSink:
         recording.disconnect()
 
     def _viewer_there(self) -> bool:
-        """Look once a second: the SDK would keep what it cannot send, and slow every call."""
-        now = time.monotonic()
-        if now < self._next_look:
+        """Check once a second: the SDK would keep what it cannot send, and slow every call."""
+        now_s = time.monotonic()
+        if now_s < self._next_check_s:
             return True
-        self._next_look = now + 1.0
+        self._next_check_s = now_s + 1.0
         if listening(self._port):
             return True
         log.warning("live view at %s is gone; the recording goes on", self._url)
@@ -160,19 +159,6 @@ class LiveSink:
         if recording is not None:
             recording.disconnect()
         return False
-
-
-def viewer_program() -> Path:
-    """The viewer that came with the SDK; `UserError` where the installation lacks it."""
-    program = Path(rr.__file__).parent.parent / "rerun_cli" / ("rerun.exe" if os.name == "nt" else "rerun")
-    if not program.is_file():
-        raise UserError(f"the Rerun viewer is missing at {program}: install rerun-sdk from its wheel")
-    return program
-
-
-def viewer_environment() -> dict[str, str]:
-    """The environment for the viewer. ``CI`` keeps its analytics off without touching the user's own settings."""
-    return {**os.environ, "CI": "1", "RUST_LOG": os.environ.get("RUST_LOG", "error")}
 
 
 def listening(port: int) -> bool:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_ground.events.events import Overlay, Refinement
+from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.rerun.gallery import Placement
 
 __all__ = ["FRESH_NS", "PATCHES", "Moved", "Patches"]
 
 PATCHES = 20
-"""How many lie on the picture at most. Each is an entity of its own: 2.5 kB of a recording and fold."""
+"""How many lie on the picture at most. Each is an entity of its own: 2.5 kB of a recording and compaction."""
 
 FRESH_NS = 2_000_000_000
 """For how long the still of a moving object is shown."""
@@ -80,7 +80,7 @@ class Patches:
         self._patches[slot] = patch
         return Moved(slot, patch.place())
 
-    def follow(self, overlay: Overlay) -> list[Moved]:
+    def move(self, overlay: Overlay) -> list[Moved]:
         """What changes with this overlay: patches that move with their tracks, and those that go."""
         boxes = overlay.boxes_base_px.astype(np.float64)
         centres = (boxes[:, :2] + boxes[:, 2:]) / 2

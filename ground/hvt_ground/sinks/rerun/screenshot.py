@@ -20,7 +20,8 @@ from rerun.experimental import ViewerClient
 
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.units import parse_size
-from hvt_ground.sinks.rerun.live_view import free_port, listening, viewer_environment, viewer_program
+from hvt_ground.sinks.rerun.live_view import free_port, listening
+from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
 
 __all__ = ["main", "screenshot"]
 
@@ -82,8 +83,8 @@ def _without_menu(png: bytes) -> bytes:
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise UserError("the headless viewer returned no picture")
-    _, cut = cv2.imencode(".png", picture[_MENU_PX:])
-    return cut.tobytes()
+    _, cropped = cv2.imencode(".png", picture[_MENU_PX:])
+    return cropped.tobytes()
 
 
 def _wait_until_listening(process: subprocess.Popen[bytes], port: int) -> None:

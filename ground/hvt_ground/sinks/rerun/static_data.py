@@ -10,7 +10,7 @@ from rerun.chunk import Chunk
 
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.gallery import SLOTS, frame_of
-from hvt_ground.sinks.rerun.overlay_encoding import TOLD_MARK
+from hvt_ground.sinks.rerun.overlays import REPORTED_MARK
 from hvt_ground.sinks.rerun.palette import (
     BASE_LINE,
     BUDGET_LINE,
@@ -20,7 +20,7 @@ from hvt_ground.sinks.rerun.palette import (
     class_colour,
     dimmed,
 )
-from hvt_ground.sinks.rerun.rrd.tables import static_chunk
+from hvt_ground.sinks.rerun.tables import static_chunk
 
 __all__ = ["class_chunk", "static_chunks"]
 
@@ -33,7 +33,10 @@ _BITRATE = (
 _LATENCY = (("to receive", BASE_LINE, 2.0), ("to overlay", STILL_LINE, 2.0))
 _TRACKS = (("tracks", GREY, 2.0), ("refined", STILL_LINE, 2.5))
 
-_LEGEND = f"□ seen on the base  ·  {TOLD_MARK} told by edge or still only  ·  **thick** a still spoke  ·  ✓ it agreed"
+_LEGEND = (
+    f"□ seen on the base  ·  {REPORTED_MARK} reported by edge or still only  ·  "
+    "**thick** a still spoke  ·  ✓ it agreed"
+)
 
 
 def static_chunks(*, title: str, facts: Mapping[str, str]) -> list[Chunk]:
@@ -41,7 +44,7 @@ def static_chunks(*, title: str, facts: Mapping[str, str]) -> list[Chunk]:
     return [
         static_chunk(names.VIDEO, rr.VideoStream.from_fields(codec=rr.VideoCodec.H265)),
         static_chunk(names.TRACKS, _box_style(width=1.0, draw_order=10.0, labels=False)),
-        static_chunk(names.TOLD, _ellipse_style(width=1.0, draw_order=15.0)),
+        static_chunk(names.REPORTED, _ellipse_style(width=1.0, draw_order=15.0)),
         static_chunk(names.REFINED, _box_style(width=2.5, draw_order=20.0, labels=True)),
         static_chunk(names.CAPTIONS, _gallery_frames()),
         static_chunk(names.BITRATE, _lines(_BITRATE)),
@@ -98,5 +101,5 @@ def _lines(lines: tuple[tuple[str, tuple[int, int, int], float], ...]) -> rr.Ser
 
 
 def _facts(title: str, facts: Mapping[str, str]) -> str:
-    told = "  ·  ".join([f"**{title}**", *(f"{name} **{value}**" for name, value in facts.items())])
-    return f"{told}\n\n{_LEGEND}"
+    reported = "  ·  ".join([f"**{title}**", *(f"{name} **{value}**" for name, value in facts.items())])
+    return f"{reported}\n\n{_LEGEND}"

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from hvt_common.values import Image
-from hvt_ground.events.events import Refinement
-from hvt_ground.sinks.rerun.overlay_encoding import confidence_text
+from hvt_ground.events import Refinement
+from hvt_ground.sinks.rerun.overlays import confidence_text
 
 __all__ = ["BLANK", "Coded", "base_picture", "caption", "event_text", "still_picture"]
 

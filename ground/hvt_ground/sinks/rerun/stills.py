@@ -3,33 +3,16 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Any
 
-import rerun as rr
-
-from hvt_ground.events.events import Overlay, Refinement
+from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.backlog_stills import BacklogGallery, Put, Shown
-from hvt_ground.sinks.rerun.gallery import HOLD_S, SLOTS, Gallery, placed
-from hvt_ground.sinks.rerun.palette import GREY, Rgb, class_colour
+from hvt_ground.sinks.rerun.gallery import SLOTS, Gallery, placed
+from hvt_ground.sinks.rerun.palette import GREY, class_colour
 from hvt_ground.sinks.rerun.patches import Patches
-from hvt_ground.sinks.rerun.rrd.size_limit import SizeLimit
-from hvt_ground.sinks.rerun.rrd.tables import (
-    Captions,
-    Picture,
-    Text,
-    caption_columns,
-    hidden_picture_columns,
-    patch_columns,
-    picture_columns,
-    place_columns,
-    text_columns,
-)
 from hvt_ground.sinks.rerun.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
+from hvt_ground.sinks.rerun.tables import Captions, LogText, PlacedJpeg, SizeLimit, TableRow
 
-__all__ = ["At", "EventRow", "StillRows"]
+__all__ = ["StillRows"]
 
 HIDDEN_CROP_RATIO = 1.15
 """A still that is not shown keeps its base crop while the recording is smaller than this times the bytes received."""
@@ -45,48 +28,26 @@ _MOVE_BYTES = 30
 _PATCH_BYTES = 100
 
 
-@dataclass(frozen=True, slots=True)
-class At:
-    """A moment of a recording."""
-
-    frame_index: int
-    capture_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class EventRow:
-    """A row for the table of an entity with these columns."""
-
-    path: str
-    columns: Callable[..., Iterable[rr.ComponentColumn]]
-    value: Any
-    size_bytes: int = 64
-    """What it costs once folded, about."""
-    at: At | None = None
-    """Where that is not the event's."""
-
-
 class StillRows:
     """Decides what of each still is worth writing. Not safe for threads."""
 
-    def __init__(self, room: SizeLimit) -> None:
-        self._room = room
-        self._gallery = Gallery()
-        self._captions: Captions = (("", GREY),) * SLOTS
-        self._backlog = BacklogGallery(self._captions, hold_ns=round(HOLD_S * 1e9))
+    def __init__(self, size_limit: SizeLimit) -> None:
+        self._size_limit = size_limit
+        empty: Captions = (("", GREY),) * SLOTS
+        self._gallery = Gallery(empty)
         self._patches = Patches()
         self._pictured: OrderedDict[int, None] = OrderedDict()
 
-    def refinement(self, refinement: Refinement) -> list[EventRow]:
+    def refinement(self, refinement: Refinement) -> list[TableRow]:
         """The rows of a still; its pictures are written once, however many objects it shows."""
         changed = refinement.class_before != refinement.class_after
         text = event_text(refinement)
         colour = class_colour(refinement.class_after) if changed else GREY
-        rows = [EventRow(names.EVENTS, text_columns, Text(text, "INFO", colour), len(text))]
+        rows = [TableRow(names.EVENTS, "text", LogText(text, "INFO", colour), len(text))]
         still = still_picture(refinement) if self._is_new(refinement.still_sequence) else None
         if still is None:
             return rows
-        self._room.received_bytes += len(refinement.still)
+        self._size_limit.received_bytes += len(refinement.still)
         base = base_picture(refinement, still_size=still[1], limit_bytes=round(0.8 * len(still[0])))
         shown = self._pair(refinement, base, still, changed=changed)
         spent = sum(row.size_bytes for row in shown)
@@ -94,21 +55,21 @@ class StillRows:
         # tracks of now: one of long ago has no place there.
         if refinement.stored:
             return rows + (shown or self._hidden(refinement, base, still))
-        if self._room.has(spent + len(still[0]) + _PATCH_BYTES, ratio=PATCH_RATIO) or not (
+        if self._size_limit.has(spent + len(still[0]) + _PATCH_BYTES, ratio=PATCH_RATIO) or not (
             shown or still[0] is not refinement.still
         ):
             shown += self._patch(refinement, still)
         return rows + (shown or self._hidden(refinement, base, still))
 
-    def overlay(self, overlay: Overlay) -> list[EventRow]:
+    def overlay(self, overlay: Overlay) -> list[TableRow]:
         """The patches that move with their tracks, or go."""
         rows = []
-        for moved in self._patches.follow(overlay):
+        for moved in self._patches.move(overlay):
             path = f"{names.PATCHES}/{moved.slot}"
             if moved.place is None:
-                rows.append(EventRow(path, patch_columns, None, _MOVE_BYTES))
-            elif self._room.has(_MOVE_BYTES, ratio=PATCH_RATIO):
-                rows.append(EventRow(path, place_columns, moved.place, _MOVE_BYTES))
+                rows.append(TableRow(path, "patch", None, _MOVE_BYTES))
+            elif self._size_limit.has(_MOVE_BYTES, ratio=PATCH_RATIO):
+                rows.append(TableRow(path, "place", moved.place, _MOVE_BYTES))
         return rows
 
     def _is_new(self, still_sequence: int) -> bool:
@@ -121,62 +82,46 @@ class StillRows:
 
     def _pair(
         self, refinement: Refinement, base: Coded | None, still: Coded, *, changed: bool
-    ) -> list[EventRow]:
+    ) -> list[TableRow]:
         """Base crop and still in the gallery; nothing where all slots are held, or for lack of room."""
         # A slot's old base crop must not stand beside a new still: the frame's absence is shown as a blank.
         pictures = (("base", base or BLANK), ("still", still))
         cost = sum(len(data) for _, (data, _) in pictures)
-        if still[0] is not refinement.still and not self._room.has(cost, ratio=PAIR_RATIO):
+        if still[0] is not refinement.still and not self._size_limit.has(cost, ratio=PAIR_RATIO):
             return []
-        put = self._slot(refinement, changed=changed)
+        words = (caption(refinement), class_colour(refinement.class_after))
+        at = refinement.frame_index, refinement.capture_ns
+        if refinement.stored:
+            put = self._gallery.put_stored(*at, words)
+        else:
+            put = self._gallery.put(*at, words, changed=changed)
         if put is None:
             return []
         rows = []
         for name, (data, size) in pictures:
-            picture = Picture(data, placed(put.slot, size, right=name == "still"))
-            rows.append(EventRow(f"{names.STILLS}/{put.slot}/{name}", picture_columns, picture, len(data)))
-        for shown in put.rows:
-            at = At(shown.frame_index, shown.capture_ns)
-            rows.append(EventRow(names.CAPTIONS, caption_columns, shown.captions, 160, at))
+            picture = PlacedJpeg(data, placed(put.slot, size, right=name == "still"))
+            rows.append(TableRow(f"{names.STILLS}/{put.slot}/{name}", "placed jpeg", picture, len(data)))
+        for row in put.rows:
+            time = row.frame_index, row.capture_ns
+            rows.append(TableRow(names.CAPTIONS, "captions", row.captions, 160, time))
         return rows
 
-    def _slot(self, refinement: Refinement, *, changed: bool) -> Put[tuple[str, Rgb]] | None:
-        """A slot of the gallery and the captions to write; None where all are held."""
-        words = (caption(refinement), class_colour(refinement.class_after))
-        at = refinement.frame_index, refinement.capture_ns
-        if refinement.stored:
-            put = self._backlog.put(*at, words)
-            if put is not None and put.stays:
-                self._captions = _with(self._captions, put.slot, words)
-            return put
-        slot = self._gallery.take(refinement.capture_ns, changed=changed)
-        if slot is None:
-            return None
-        self._captions = _with(self._captions, slot, words)
-        row = Shown(*at, self._captions)
-        self._backlog.note(slot, row)
-        return Put(slot, (row,), stays=True)
-
-    def _patch(self, refinement: Refinement, still: Coded) -> list[EventRow]:
+    def _patch(self, refinement: Refinement, still: Coded) -> list[TableRow]:
         """The still on the enhanced picture; nothing where its object is not on the screen."""
         data, size = still
         put = self._patches.put(refinement, size=size)
         if put is None or put.place is None:
             return []
         path = f"{names.PATCHES}/{put.slot}"
-        return [EventRow(path, patch_columns, Picture(data, put.place), len(data) + _MOVE_BYTES)]
+        return [TableRow(path, "patch", PlacedJpeg(data, put.place), len(data) + _MOVE_BYTES)]
 
-    def _hidden(self, refinement: Refinement, base: Coded | None, still: Coded) -> list[EventRow]:
+    def _hidden(self, refinement: Refinement, base: Coded | None, still: Coded) -> list[TableRow]:
         """Kept where it can be found but not seen, as far as bytes allow; a still as received always is."""
         path, rows = names.OVERFLOW, []
         for name, picture in (("still", still), ("base", base)):
             if picture is None:
                 continue
             data = picture[0]
-            if data is refinement.still or self._room.has(len(data), ratio=HIDDEN_CROP_RATIO):
-                rows.append(EventRow(f"{path}/{name}", hidden_picture_columns, data, len(data)))
+            if data is refinement.still or self._size_limit.has(len(data), ratio=HIDDEN_CROP_RATIO):
+                rows.append(TableRow(f"{path}/{name}", "jpeg", data, len(data)))
         return rows
-
-
-def _with(captions: Captions, slot: int, words: tuple[str, Rgb]) -> Captions:
-    return (*captions[:slot], words, *captions[slot + 1 :])

@@ -54,20 +54,22 @@ sys.path[:0] = sys.argv[1:]
 from dataclasses import replace
 from flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader
+from hvt_ground.link.packets import BasePacket
+from hvt_ground.link.reassemble import Arrival
 from hvt_ground.session.session import GroundSession
 (bomb,) = pickle.load(sys.stdin.buffer)
 flight = Flight(2)
-session = GroundSession(
-    flight.info(), recorder=None, recording=None, pipeline_of=pipeline_of, to_local_ns=int, clock=time.time_ns,
-    report=lambda: None,
-)
+session = GroundSession(flight.info(), pipeline_of=pipeline_of, clock=time.time_ns)
+def take(header, item):
+    unit = Arrival("decode", header, item.payload, item.received_ns, starts_run=True)
+    return session.base(BasePacket(unit, item, on_time=True))
 first = flight.base(0)
 header = BaseHeader.parse(first.attachment, first.payload)
-assert session.base(header, first, decode=True, starts_run=True)
+assert take(header, first)
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 before = peak()
 item = replace(first, payload=bomb)
-shown = sum(session.base(replace(header, frame_index=n), item, decode=True, starts_run=True) for n in range(1, 5))
+shown = sum(take(replace(header, frame_index=n), item) for n in range(1, 5))
 session.close()
 print((peak() - before) // 1024, shown)
 """

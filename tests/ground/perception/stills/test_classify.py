@@ -16,9 +16,9 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.values import Detections, Image, View, iou
 from hvt_ground.perception.stills.classify import (
     CropReader,
-    Decoded,
+    DecodedStill,
     NoReader,
-    Reading,
+    ObjectReading,
     Redetection,
     object_crops,
 )
@@ -32,12 +32,12 @@ GREY = np.full((180, 320, 3), 100, np.uint8)
 
 def decoded(
     crop: tuple[int, int, int, int], *, colour=(0, 0, 255), size: tuple[int, int] | None = None
-) -> Decoded:
+) -> DecodedStill:
     """A still of one colour; ``size`` as coded."""
     width, height = size or (crop[2] - crop[0], crop[3] - crop[1])
     image = np.full((height, width, 3), colour, np.uint8)
     x1, y1, x2, y2 = VIEW.to_base(np.array([crop], np.float32))[0].tolist()
-    return Decoded(image, crop, (x1, y1, x2, y2), 0)
+    return DecodedStill(image, crop, (x1, y1, x2, y2), 0)
 
 
 class Bright:
@@ -77,7 +77,7 @@ def test_redetection_names_each_still_by_what_is_found_at_its_place():
     assert (first.posterior.class_name, first.posterior.confidence) == ("car", pytest.approx(0.8))
     assert first.box_base_px == pytest.approx((100, 50, 120, 70), abs=1)
     assert second.posterior.class_name == "bus"
-    assert third == Reading(None, None)
+    assert third == ObjectReading(None, None)
     np.testing.assert_allclose(first.posterior.probabilities, [0.8, 0.1, 0.1], atol=1e-6)
     entropy = -(0.8 * np.log(0.8) + 0.2 * np.log(0.1))
     assert first.posterior.entropy_nats == pytest.approx(entropy, abs=1e-5)
@@ -134,7 +134,7 @@ def test_a_detection_speaks_for_one_object_only():
     still = dataclasses.replace(decoded((400, 200, 520, 280)), box_base_px=near, also_boxes_base_px=(behind,))
     ((lead, also),) = Redetection(Says((near, 0.6, 0)), view=VIEW).read([still], GREY).objects
     assert lead.posterior.class_name == "car"
-    assert also == Reading()
+    assert also == ObjectReading()
 
 
 def test_what_nobody_named_inside_a_still_is_found():
@@ -168,7 +168,7 @@ def test_a_network_larger_than_the_base_gets_the_stills_detail(data, monkeypatch
     truth = detector.detect(source)
     base = composite(
         np.zeros((384, 640, 3), np.uint8),
-        [Decoded(source, (0, 0, *size), (0, 0, 1, 1), 0)],
+        [DecodedStill(source, (0, 0, *size), (0, 0, 1, 1), 0)],
         view=view,
     )
     base = cv2.resize(cv2.resize(base, (160, 96), interpolation=cv2.INTER_AREA), (640, 384))
@@ -176,7 +176,7 @@ def test_a_network_larger_than_the_base_gets_the_stills_detail(data, monkeypatch
     for box in truth.boxes_xyxy_px[:12]:
         x1, y1, x2, y2 = np.clip(box + np.array([-8, -8, 8, 8]), 0, [*size, *size]).astype(int).tolist()
         place = tuple(view.to_base(box[None])[0].tolist())
-        stills.append(Decoded(source[y1:y2, x1:x2], (x1, y1, x2, y2), place, 0))
+        stills.append(DecodedStill(source[y1:y2, x1:x2], (x1, y1, x2, y2), place, 0))
     seen, detect = [], detector.detect
     monkeypatch.setattr(detector, "detect", lambda image_bgr: seen.append(image_bgr) or detect(image_bgr))
     readings = [reading for (reading,) in Redetection(detector, view=view).read(stills, base).objects]
@@ -196,7 +196,7 @@ def test_redetection_without_the_picture_says_nothing():
     """A still whose frame was lost would be named by a picture of another moment."""
     reader = Redetection(Bright(), view=VIEW)
     read = reader.read([decoded((400, 200, 480, 280))], None)
-    assert read.objects == ((Reading(),),)
+    assert read.objects == ((ObjectReading(),),)
     assert len(read.found) == 0
     assert reader.class_names == ("car", "bus", "van")
 
@@ -240,7 +240,9 @@ def test_the_crop_reader_shows_each_object_of_a_shared_still_by_itself(tmp_path)
     )
     image = np.zeros((50, 100, 3), np.uint8)  # coded at half the size of its crop
     image[:, :50], image[:, 50:] = (0, 0, 255), (255, 0, 0)
-    still = Decoded(image, (400, 200, 600, 300), (102.0, 52.0, 123.0, 73.0), 0, ((127.0, 52.0, 148.0, 73.0),))
+    still = DecodedStill(
+        image, (400, 200, 600, 300), (102.0, 52.0, 123.0, 73.0), 0, ((127.0, 52.0, 148.0, 73.0),)
+    )
     ((lead, also),) = reader.read([still], None).objects
     assert (lead.posterior.class_name, also.posterior.class_name) == ("red", "blue")
     first, second = object_crops(still, view=VIEW)
@@ -252,7 +254,7 @@ def test_the_crop_reader_shows_each_object_of_a_shared_still_by_itself(tmp_path)
 def test_no_box_of_a_still_is_too_odd_to_cut(corners):
     """A header with a box outside its crop would end the ground."""
     boxes = [(min(a, c), min(b, d), max(a, c), max(b, d)) for a, b, c, d in corners]
-    still = Decoded(np.zeros((40, 60, 3), np.uint8), (400, 200, 460, 240), boxes[0], 0, tuple(boxes[1:]))
+    still = DecodedStill(np.zeros((40, 60, 3), np.uint8), (400, 200, 460, 240), boxes[0], 0, tuple(boxes[1:]))
     for crop in object_crops(still, view=VIEW):
         assert crop.shape[0] >= 1
         assert crop.shape[1] >= 1
@@ -262,6 +264,6 @@ def test_without_any_model_stills_have_no_name():
     """A ground without models would not start."""
     both = dataclasses.replace(decoded((0, 0, 9, 9)), also_boxes_base_px=((0.0, 0.0, 1.0, 1.0),))
     assert NoReader().read([decoded((0, 0, 9, 9)), both], GREY).objects == (
-        (Reading(),),
-        (Reading(), Reading()),
+        (ObjectReading(),),
+        (ObjectReading(), ObjectReading()),
     )

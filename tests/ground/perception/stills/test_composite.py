@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_common.values import Image, View
-from hvt_ground.perception.stills.classify import Decoded
+from hvt_ground.perception.stills.classify import DecodedStill
 from hvt_ground.perception.stills.composite import composite
 
 SOURCE, BASE = (1280, 720), (320, 180)
@@ -17,14 +17,14 @@ VIEW = View.fitted(SOURCE, BASE, fit="letterbox")
 GREY = np.full((180, 320, 3), 100, np.uint8)
 
 
-def still(crop: tuple[int, int, int, int], image_bgr: Image) -> Decoded:
+def still(crop: tuple[int, int, int, int], image_bgr: Image) -> DecodedStill:
     """A still of this crop."""
-    return Decoded(image_bgr, crop, (0.0, 0.0, 1.0, 1.0), 0)
+    return DecodedStill(image_bgr, crop, (0.0, 0.0, 1.0, 1.0), 0)
 
 
 def one_colour(
     crop: tuple[int, int, int, int], *, colour=(0, 0, 255), size: tuple[int, int] | None = None
-) -> Decoded:
+) -> DecodedStill:
     """A still of one colour; ``size`` as coded."""
     width, height = size or (crop[2] - crop[0], crop[3] - crop[1])
     return still(crop, np.full((height, width, 3), colour, np.uint8))

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hvt_common.values import Posterior, Tracks
-from hvt_ground.events.history import History
-from hvt_ground.perception.stills.match import Matcher, Wanted, iou_matrix
-from hvt_ground.perception.stills.refine import MAX_HELD, MAX_TRACK_POSTERIORS, Refiner, StillSeen
+from footprint import footprint_bytes
+from hvt_common.values import Posterior, Tracks, iou
+from hvt_ground.perception.history import History
+from hvt_ground.perception.stills.match import Matcher, StillToMatch
+from hvt_ground.perception.stills.refine import MAX_HELD, Refiner, StillSeen
 
 DETECTOR = ("car", "van", "person")
 CLASSIFIER = ("Person", "car", "truck")
@@ -62,7 +63,7 @@ def still(sequence, frame_index, box=A, *, edge=70, posterior=TRUCK, class_name=
         box_base_px=box,
         class_name=class_name,
         posterior=posterior,
-        wire_field=f"still {sequence}",
+        context=f"still {sequence}",
     )
 
 
@@ -115,7 +116,7 @@ def test_a_still_replaces_the_class_of_its_track(ground):
     assert (done.track_id, done.class_before, done.class_after) == (1, "car", "truck")
     assert done.confidence == pytest.approx(0.7)
     assert done.entropy_nats == pytest.approx(0.8018, abs=1e-4)
-    assert done.still.wire_field == "still 0"
+    assert done.still.context == "still 0"
     shown = ground.refiner.shown(tracks(6, {1: A, 2: B}, classes={2: 1}, confidences={2: 0.25}))
     assert shown.base_classes == ("car", "van")
     assert shown.classes == ("truck", "van")
@@ -142,7 +143,7 @@ def test_a_missing_track_leaves_the_neighbour_alone(ground):
 
 
 def test_a_close_neighbour_that_has_its_own_edge_track_is_left_alone(ground):
-    """Two cars that overlap in the picture would swap classes when the ground loses sight of one."""
+    """Two cars that overlap in the picture would swap classes when the ground loses one."""
     ground.track(5, {1: A, 2: A_NEAR})
     assert brief(ground.offer(still(0, 5, A, edge=70), still(1, 5, A_NEAR, edge=71))) == [
         (0, "matched", 1),
@@ -155,8 +156,8 @@ def test_a_close_neighbour_that_has_its_own_edge_track_is_left_alone(ground):
     assert brief(ground.offer(still(3, 30, A, edge=70))) == [(3, "matched", 2)], "a clear overlap corrects"
 
 
-FIRST = Wanted(key=0, edge_track_id=70, box_base_px=A, class_name="car")
-OTHER = Wanted(key=1, edge_track_id=71, box_base_px=A_NEAR, class_name="car")
+FIRST = StillToMatch(key=0, edge_track_id=70, box_base_px=A, class_name="car")
+OTHER = StillToMatch(key=1, edge_track_id=71, box_base_px=A_NEAR, class_name="car")
 
 
 def rows(matcher, frame_index, boxes, *wanted):
@@ -167,7 +168,7 @@ def rows(matcher, frame_index, boxes, *wanted):
 
 def test_a_track_is_another_edge_tracks_own_only_for_a_while():
     """When the edge gives an object a new id, its stills would be refused for the rest of the flight."""
-    matcher = Matcher(iou=0.5, owned_frames=20)
+    matcher = Matcher(least_iou=0.5, owned_frames=20)
     assert rows(matcher, 5, {1: A}, FIRST) == [0]
     assert rows(matcher, 25, {1: A}, OTHER) == [-1]
     assert rows(matcher, 26, {1: A}, OTHER) == [0]
@@ -175,15 +176,15 @@ def test_a_track_is_another_edge_tracks_own_only_for_a_while():
 
 def test_a_track_that_its_owner_has_left_is_free():
     """After an exchange of ids on the ground, the second object would be refused as the first one's."""
-    matcher = Matcher(iou=0.5, owned_frames=1000)
+    matcher = Matcher(least_iou=0.5, owned_frames=1000)
     assert rows(matcher, 5, {1: A}, FIRST) == [0]
     assert rows(matcher, 6, {1: (300, 100, 340, 120), 2: A}, FIRST) == [1]
     assert rows(matcher, 7, {1: A}, OTHER) == [0]
 
 
 def test_an_older_still_does_not_overrule_what_a_newer_one_showed():
-    """A late still from before an exchange of ids would bring the old belief back."""
-    matcher = Matcher(iou=0.5, owned_frames=1000)
+    """A late still from before an exchange of ids would bring the old posterior back."""
+    matcher = Matcher(least_iou=0.5, owned_frames=1000)
     assert rows(matcher, 9, {2: A}, FIRST) == [0]
     assert rows(matcher, 5, {1: A}, FIRST) == [0]
     assert rows(matcher, 10, {2: A}, OTHER) == [-1], "2 is still the first one's own"
@@ -261,9 +262,7 @@ def test_two_stills_of_one_frame_go_to_two_tracks(ground):
     middle = (112.0, 100.0, 152.0, 120.0)  # nearer to track 2, but track 2 is what the other still wants
     ground.track(5, {1: A, 2: (112.0, 100.0, 152.0, 120.0)})
     first = still(0, 5, A_NEAR, edge=70)
-    assert iou_matrix(np.float32([A_NEAR]), np.float32([A, middle]))[0] == pytest.approx(
-        [0.739, 0.739], abs=1e-3
-    )
+    assert iou(np.float32([A_NEAR]), np.float32([A, middle]))[0] == pytest.approx([0.739, 0.739], abs=1e-3)
     done = ground.offer(first)
     assert done == []
     assert brief(ground.offer(still(1, 5, middle, edge=71))) == [(0, "matched", 1), (1, "matched", 2)]
@@ -345,10 +344,9 @@ def test_a_flood_of_stills_is_bounded_and_given_out():
     """Anyone who can send a packet could fill the ground's memory."""
     ground = Ground()
     ground.track(5, {1: A})
-    out = []
+    out, sizes = [], []
     for sequence in range(3 * MAX_HELD):
         out += ground.refiner.offer(still(sequence, 1 << 30, edge=sequence), now_frame=5)
-        assert len(ground.refiner._held) <= MAX_HELD
     assert brief(out) == [(sequence, "overflow", None) for sequence in range(2 * MAX_HELD)]
     for sequence in range(10_000, 12_000):
         boxes = {sequence: A}
@@ -356,11 +354,8 @@ def test_a_flood_of_stills_is_bounded_and_given_out():
         ground.offer(still(sequence, sequence, edge=sequence))
         ground.refiner.shown(tracks(sequence, dict.fromkeys(range(10000, sequence + 1), A)))
         if sequence % 500 == 499:
-            assert len(ground.refiner._track_posteriors) <= MAX_TRACK_POSTERIORS
-    matcher = ground.refiner._matcher
-    sizes = [len(known) for known in (matcher._ground_of, matcher._edge_of, matcher._claims)]
-    assert sizes == [1024, 1024, 256]
-    assert len(ground.refiner._seen) <= 4096
+            sizes.append(footprint_bytes(ground.refiner))
+    assert sizes[-1] < 1.2 * sizes[2], "twelve hundred tracks fill all that it remembers"
 
 
 def test_fusing_multiplies_what_the_stills_say():

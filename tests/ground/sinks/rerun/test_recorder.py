@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_ground.events.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun.gallery import CANVAS, SLOTS, Gallery, frame_of, placed
 from hvt_ground.sinks.rerun.live_view import LiveView, free_port, listening
-from hvt_ground.sinks.rerun.overlay_encoding import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
+from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
 from hvt_ground.sinks.rerun.palette import class_colour
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session
@@ -216,7 +216,7 @@ def test_a_keyframe_without_parameter_sets_does_not_begin_a_recording(
 def test_folding_changes_nothing_but_the_size(
     events: list[Event], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The journal is rewritten while recording; a row lost or doubled there would be lost for good."""
+    """The append log is rewritten while recording; a row lost or doubled there would be lost for good."""
     plain, compacted = tmp_path / "plain.rrd", tmp_path / "folded.rrd"
     sizes: list[int] = []
     for path, limit in ((plain, 1 << 40), (compacted, 20_000)):
@@ -329,14 +329,14 @@ def test_a_footer_makes_a_recording_that_verifies(
 ) -> None:
     """Tools that index recordings refuse a file without a footer; a short flight must not grow by one."""
     from hvt_ground.sinks.rerun.live_view import viewer_program
-    from hvt_ground.sinks.rerun.rrd.footer import add_footer
+    from hvt_ground.sinks.rerun.rrd_file import add_footer
 
     path = tmp_path / "copy.rrd"
     path.write_bytes(Path(recording.reader.path).read_bytes())
     plain_bytes = path.stat().st_size
     assert not add_footer(path)
     assert path.stat().st_size == plain_bytes
-    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd.footer._MOST_GROWTH", 10)
+    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd_file._MOST_GROWTH", 10)
     assert add_footer(path)
     subprocess.run([viewer_program(), "rrd", "verify", path], check=True, capture_output=True)
     assert Recording(path).video() == recording.video()
@@ -380,13 +380,16 @@ def test_a_dead_viewer_does_not_stop_the_recording(
     """Closing the window must not cost the flight."""
     path = tmp_path / "a.rrd"
     with LiveView("serve", port=free_port, web_port=_another(free_port)) as view:
-        recorder = Recorder(settings(path, live_url=view.url))
+        recorder, live = Recorder(settings(path)), Recorder(settings(None, live_url=view.url))
         for event in events[:30]:
             recorder.log(event)
+            live.log(event)
     time.sleep(1.1)  # the recorder looks once a second
     assert not listening(free_port)
     for event in events[30:]:
         recorder.log(event)
+        live.log(event)
+    live.close()
     recorder.close()
     assert len(Recording(path).video()) == FRAMES
 
@@ -433,8 +436,7 @@ def test_an_overlay_that_shows_the_same_writes_nothing() -> None:
     assert encoder.encode(overlay(1, boxes + 0.3, confidence=0.82)) == []
     moved = encoder.encode(overlay(2, boxes + 2.0))
     assert [u.layer for u in moved] == ["tracks"]
-    assert moved[0].identity is None
-    assert moved[0].geometry is not None
+    assert moved[0].components.keys() == {"boxes"}
 
 
 def test_slow_drift_is_followed() -> None:
@@ -444,7 +446,7 @@ def test_slow_drift_is_followed() -> None:
     centres = None
     for i in range(50):
         for update in encoder.encode(overlay(i, boxes + 0.1 * i)):
-            centres = update.geometry.centres_px
+            centres = update.components["boxes"][:, :2]
         wanted = (boxes[:, :2] + boxes[:, 2:]) / 2 + 0.1 * i
         assert np.abs(centres - wanted).max() <= CENTRE_STEP_PX + 1e-3
 
@@ -454,8 +456,8 @@ def test_tracks_that_end_leave_the_screen() -> None:
     encoder = OverlayEncoder()
     encoder.encode(overlay(0, moving_boxes(0, 5, (640, 360))))
     (update,) = encoder.encode(overlay(1, np.empty((0, 4))))
-    assert len(update.geometry.centres_px) == 0
-    assert update.identity.track_ids == ()
+    assert len(update.components["boxes"]) == 0
+    assert update.components["identity"].track_ids == ()
 
 
 def test_movement_yields_to_the_allowance_but_news_does_not() -> None:
@@ -471,12 +473,12 @@ def test_movement_yields_to_the_allowance_but_news_does_not() -> None:
 
 def test_the_gallery_holds_what_one_is_looking_at() -> None:
     """Pairs that flicker by cannot be compared; a changed class is worth the place of one that was confirmed."""
-    gallery = Gallery(hold_s=1.0)
-    slots = [gallery.take(i, changed=i == 0) for i in range(SLOTS)]
+    gallery = Gallery(("",) * SLOTS, hold_ns=1_000_000_000)
+    slots = [gallery.put(i, i, "a", changed=i == 0).slot for i in range(SLOTS)]
     assert sorted(slots) == list(range(SLOTS))
-    assert gallery.take(500_000_000, changed=False) is None
-    assert gallery.take(500_000_000, changed=True) == slots[1]  # the oldest that only confirmed
-    assert gallery.take(1_200_000_000, changed=False) == slots[0]
+    assert gallery.put(20, 500_000_000, "b", changed=False) is None
+    assert gallery.put(20, 500_000_000, "c", changed=True).slot == slots[1]  # the oldest that only confirmed
+    assert gallery.put(30, 1_200_000_000, "d", changed=False).slot == slots[0]
 
 
 def test_a_picture_fits_its_half_of_the_slot() -> None:

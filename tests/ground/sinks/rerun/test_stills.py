@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hvt_ground.events.events import Overlay, Refinement, VideoSample
+from hvt_ground.events import Overlay, Refinement, VideoSample
 from hvt_ground.sinks.rerun.gallery import Placement
-from hvt_ground.sinks.rerun.overlay_encoding import ORIGINS, TOLD_MARK
+from hvt_ground.sinks.rerun.overlays import ORIGINS, REPORTED_MARK
 from hvt_ground.sinks.rerun.patches import FRESH_NS, PATCHES, Moved, Patches
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from recorded_feed import START_NS, STEP_NS, coded, drawn_frames
@@ -96,11 +96,9 @@ def test_the_still_of_a_moving_object_goes_stale() -> None:
     """After seconds of driving the picture of a car shows another turn, another light, another street."""
     board = Patches()
     start = (0.0, 0.0, 30.0, 30.0)
-    board.follow(_overlay(0, [np.array(start)], [1]))
+    board.move(_overlay(0, [np.array(start)], [1]))
     assert board.put(_one_still(0, 0, start), size=(100, 100)) == Moved(0, Placement(-10, -10, 0.5))
-    gone = [
-        f for f in range(1, 90) if Moved(0, None) in board.follow(_overlay(f, [np.array(start) + f], [1]))
-    ]
+    gone = [f for f in range(1, 90) if Moved(0, None) in board.move(_overlay(f, [np.array(start) + f], [1]))]
     assert gone == [math.ceil(FRESH_NS / STEP_NS)]
     assert board.put(_one_still(0, 0, start, track_id=2), size=(100, 100)) is None
     assert board.put(_one_still(0, 0, start, crop_base_px=None), size=(100, 100)) is None
@@ -111,7 +109,7 @@ def test_the_enhanced_picture_holds_the_newest_stills() -> None:
     board = Patches()
     many = PATCHES + 5
     boxes = [np.array([40.0 * i, 0, 40.0 * i + 30, 30]) for i in range(many)]
-    board.follow(_overlay(0, boxes, list(range(many))))
+    board.move(_overlay(0, boxes, list(range(many))))
     slots = []
     for i, box in enumerate(boxes):
         put = board.put(_one_still(i, i, tuple(box.tolist()), track_id=i), size=(100, 100))
@@ -164,8 +162,8 @@ def test_what_the_base_does_not_show_is_drawn_otherwise(tmp_path: Path) -> None:
         )
         recorder.log(_overlay(2, boxes, [1, 2, 3, 4, 5]))
     read = Recording(path)
-    assert all(not box.told and box.origin is None for box in read.boxes(0).values())
-    assert [(box.told, box.refined) for box in read.boxes(1).values()] == [
+    assert all(not box.reported and box.origin is None for box in read.boxes(0).values())
+    assert [(box.reported, box.refined) for box in read.boxes(1).values()] == [
         (False, False),
         (True, False),
         (True, False),
@@ -175,9 +173,9 @@ def test_what_the_base_does_not_show_is_drawn_otherwise(tmp_path: Path) -> None:
     now = read.boxes(1)
     assert {track: ORIGINS[box.origin] for track, box in now.items()} == dict(enumerate(origins, 1))
     assert now[2].box_px == (40, 20, 70, 50)
-    assert (now[1].label, now[5].label) == ("1 ✓", f"5 ✓ {TOLD_MARK}")
-    assert [box.told for box in read.boxes(2).values()] == [False] * 5
-    assert TOLD_MARK in read.rows("/session", "TextDocument:text")[0][2][0]
+    assert (now[1].label, now[5].label) == ("1 ✓", f"5 ✓ {REPORTED_MARK}")
+    assert [box.reported for box in read.boxes(2).values()] == [False] * 5
+    assert REPORTED_MARK in read.rows("/session", "TextDocument:text")[0][2][0]
 
 
 def test_a_step_between_coded_frames_shows_its_boxes(tmp_path: Path) -> None:
@@ -187,9 +185,15 @@ def test_a_step_between_coded_frames_shows_its_boxes(tmp_path: Path) -> None:
     with Recorder(settings(path)) as recorder:
         for frame in range(0, 15, 5):
             recorder.log(VideoSample(frame, START_NS + frame * STEP_NS, *units[frame]))
-            for tick in range(frame, frame + 5):
-                recorder.log(_overlay(tick, [np.array([10.0 * tick, 0, 10.0 * tick + 30, 30])], [1]))
+            for frame_index in range(frame, frame + 5):
+                recorder.log(
+                    _overlay(
+                        frame_index, [np.array([10.0 * frame_index, 0, 10.0 * frame_index + 30, 30])], [1]
+                    )
+                )
         recorder.log(_overlay(3, [np.array([0.0, 0, 30, 30])], [1]))  # late: what it says has been drawn over
     read = Recording(path)
     assert [frame for frame, _, _ in read.video()] == [0, 5, 10]
-    assert [read.boxes(tick)[1].box_px[0] for tick in range(15)] == [10.0 * tick for tick in range(15)]
+    assert [read.boxes(frame_index)[1].box_px[0] for frame_index in range(15)] == [
+        10.0 * frame_index for frame_index in range(15)
+    ]

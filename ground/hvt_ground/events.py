@@ -14,7 +14,17 @@ import numpy.typing as npt
 
 from hvt_common.values import Boxes, Image
 
-__all__ = ["Event", "Notice", "Origin", "Overlay", "Refinement", "Traffic", "VideoSample"]
+__all__ = [
+    "Event",
+    "MessageTiming",
+    "Notice",
+    "Origin",
+    "Overlay",
+    "Refinement",
+    "StillsRead",
+    "Traffic",
+    "VideoSample",
+]
 
 Origin = Literal["base", "edge", "edge+base", "still"]
 """Who knows of a track: the ground's own tracker on the base stream, the edge's report, both, or (``still``) nobody
@@ -30,14 +40,14 @@ class VideoSample:
     data: bytes
     keyframe: bool
     stored: bool = False
-    """It was kept at the edge while the link was away: it lies before others that are logged already."""
+    """It was stored at the edge while the link was down: it lies before others that are logged already."""
 
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
     """The ground's tracks at one frame, as parallel arrays ordered by track id.
 
-    A tick that the base stream left out may have one too: what the edge reported, and the others predicted.
+    A frame that the base stream left out may have one too: what the edge reported, and the others predicted.
     """
 
     frame_index: int
@@ -49,11 +59,11 @@ class Overlay:
     base_classes: tuple[str, ...]
     """N names: what the detector says of the base stream."""
     classes: tuple[str, ...]
-    """N names: the same after refinement; equal to the base class where no still has spoken."""
+    """N names: the same after refinement; equal to the base class where no still has refined it."""
     confidences: npt.NDArray[np.float32]
     """(N,) of the class that is shown, 0…1."""
     refined: npt.NDArray[np.bool_]
-    """(N,) True once a still has spoken on the track's class."""
+    """(N,) True once a still has refined the track's class."""
     origins: tuple[Origin, ...] = ()
     """N words; empty says ``base`` for all."""
     stored: bool = False
@@ -92,7 +102,7 @@ class Refinement:
     """x1 y1 x2 y2, where the whole still lies in the base picture of its own frame (that of ``box_base_px``), not
     clipped; None leaves it out of the enhanced picture."""
     stored: bool = False
-    """It was kept at the edge while the link was away: its frame is the one that it shows, long ago."""
+    """It was stored at the edge while the link was down: its frame is the one that it shows, long ago."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,4 +134,33 @@ class Notice:
     text: str
 
 
-Event = VideoSample | Overlay | Refinement | Traffic | Notice
+@dataclass(frozen=True, slots=True)
+class MessageTiming:
+    """When a message was captured, sent, received and handled; Unix nanoseconds, 0 where there is none."""
+
+    kind: str
+    """The channel; of a backlog chunk with what it is of, as ``backlog-still``."""
+    sequence: int
+    frame_index: int
+    """-1 where it is about no frame."""
+    capture_ns: int
+    send_ns: int
+    received_ns: int
+    handled_ns: int | None
+    """0: nothing was made of it; None: a `StillsRead` will tell."""
+    line_bytes: int
+    clock_offset_ns: int
+    """The edge's clock less this one."""
+
+
+@dataclass(frozen=True, slots=True)
+class StillsRead:
+    """The stills of these numbers were read by the classifier."""
+
+    sequences: tuple[int, ...]
+    at_ns: int
+
+
+FrameEvent = VideoSample | Overlay | Refinement | Traffic | Notice
+"""What a recording shows, at the frame and capture time that it carries."""
+Event = FrameEvent | MessageTiming | StillsRead

@@ -3,7 +3,7 @@
 A still arrives after its frame: it is matched to the tracks of that very frame and shown beside (or pasted
 into) the decoded picture of it. Tracks are small and kept for `track_frames`. Pictures are large: 1280x720 BGR
 is 2.7 MB, so the default bound of 96 MiB is 36 frames, 2.4 s at 15 fps. Where the edge codes fewer frames than there
-are ticks, the same 36 reach back further. They are kept just as given, without a lossy detour, because a residual
+are frames, the same 36 reach back further. They are kept just as given, without a lossy detour, because a residual
 still must be applied to exactly the pixels that the edge had.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from hvt_common.values import Image, Tracks
 
-__all__ = ["FilledLog", "History"]
+__all__ = ["History"]
 
 DEFAULT_MAX_BYTES = 96 * 1024 * 1024
 
@@ -28,16 +28,23 @@ class History:
         max_frames: how many pictures are kept at most.
         max_bytes: how many bytes of pictures are kept at most; the newest picture is always kept.
         track_frames: for how many frames the tracks are kept; at least the seconds that a still may be late.
+        gap_frames: how many frames the base stream may leave out and still tell where tracks were between.
     """
 
     def __init__(
-        self, *, max_frames: int = 45, max_bytes: int = DEFAULT_MAX_BYTES, track_frames: int = 300
+        self,
+        *,
+        max_frames: int = 45,
+        max_bytes: int = DEFAULT_MAX_BYTES,
+        track_frames: int = 300,
+        gap_frames: int = 0,
     ) -> None:
         if min(max_frames, max_bytes, track_frames) < 1:
             raise ValueError(f"bounds must be positive: {max_frames=}, {max_bytes=}, {track_frames=}")
         self._max_frames = max_frames
         self._max_bytes = max_bytes
         self._track_frames = track_frames
+        self._gap_frames = gap_frames
         self._frames: OrderedDict[int, Image] = OrderedDict()
         self._frame_bytes = 0
         self._tracks: OrderedDict[int, Tracks] = OrderedDict()
@@ -67,7 +74,7 @@ class History:
             self._frame_bytes -= dropped.nbytes
 
     def add_tracks(self, tracks: Tracks) -> None:
-        """Keep the tracks of a frame; an empty `Tracks` says that the frame was seen and held nothing."""
+        """Keep the tracks of a frame; an empty `Tracks` says that the frame was analyzed and held nothing."""
         _require_rising(self.newest_tracked, tracks.frame_index)
         self._tracks[tracks.frame_index] = tracks
         if len(self._tracks) > self._track_frames:
@@ -98,28 +105,25 @@ class History:
         return self._frames[before[-1]] if before else None
 
     def tracks(self, frame_index: int) -> Tracks | None:
-        """The tracks at that frame; None if it was lost, is not tracked yet, or is gone."""
-        return self._tracks.get(frame_index)
+        """The tracks at that frame; None if it was lost, is not tracked yet, or is gone.
 
-    def tracks_between(self, frame_index: int, *, within: int) -> Tracks | None:
-        """The tracks at a frame that was left out, between those of the frames around it; None for any other.
-
-        Only tracks that are there before and after, no more than ``within`` frames apart, and on a straight line.
+        Of a frame that the base stream left out: those that are there before and after, on a straight line.
         """
-        if frame_index in self._tracks:
-            return None
+        exact = self._tracks.get(frame_index)
+        if exact is not None:
+            return exact
         before = next((one for one in reversed(self._tracks) if one < frame_index), None)
         after = next((one for one in self._tracks if one > frame_index), None)
-        if before is None or after is None or after - before > within:
+        if before is None or after is None or after - before > self._gap_frames:
             return None
         share = (frame_index - before) / (after - before)
         return _between(self._tracks[before], self._tracks[after], frame_index, share=share)
 
-    def rename_track(self, kept_id: int, gone_id: int) -> None:
+    def rename_track(self, survivor_id: int, merged_id: int) -> None:
         """Two tracks have turned out to be one: where only the second is listed it gets the id of the first."""
         for index, tracks in self._tracks.items():
-            if gone_id in tracks.ids and kept_id not in tracks.ids:
-                ids = np.where(tracks.ids == gone_id, kept_id, tracks.ids)
+            if merged_id in tracks.ids and survivor_id not in tracks.ids:
+                ids = np.where(tracks.ids == merged_id, survivor_id, tracks.ids)
                 self._tracks[index] = replace(tracks, ids=ids)
 
     def clear(self) -> None:
@@ -150,26 +154,3 @@ def _between(before: Tracks, after: Tracks, frame_index: int, *, share: float) -
         seen_frames=before.seen_frames[old],
         started=np.zeros(len(old), np.bool_),
     )
-
-
-class FilledLog:
-    """The tracks of a `History`, those between two frames filled in: a still may be of a tick without a picture."""
-
-    def __init__(self, history: History, *, within: int) -> None:
-        self._history = history
-        self._within = within
-
-    @property
-    def oldest_tracked(self) -> int | None:
-        """Frame index of the oldest tracks held."""
-        return self._history.oldest_tracked
-
-    @property
-    def newest_tracked(self) -> int | None:
-        """Frame index of the newest tracks held."""
-        return self._history.newest_tracked
-
-    def tracks(self, frame_index: int) -> Tracks | None:
-        """The tracks at that frame, or between those around it."""
-        exact = self._history.tracks(frame_index)
-        return self._history.tracks_between(frame_index, within=self._within) if exact is None else exact

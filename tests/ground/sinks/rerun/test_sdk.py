@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from hvt_ground.sinks.rerun import sdk
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.rerun.rrd import release as rrd_release
 from processes import eventually
 from rrd import Recording
 
@@ -46,9 +46,9 @@ def test_many_recordings_leave_no_threads(tmp_path):
 @pytest.mark.parametrize("bindings", [None, object()], ids=["no such module", "no such names"])
 def test_a_sdk_with_other_names_inside_still_records(tmp_path, monkeypatch, bindings):
     """With the next version of the SDK the ground would not even start, for the sake of its tidiness."""
-    monkeypatch.setattr(rrd_release, "bindings", bindings)
+    monkeypatch.setattr(sdk, "bindings", bindings)
     with Recorder(settings_of(tmp_path)) as recorder:
         assert recorder is not None
-    rrd_release.release_recordings()
+    sdk.release_recordings()
     assert (tmp_path / "flight.rrd").stat().st_size > 0
     assert Recording(tmp_path / "flight.rrd").events() is not None

@@ -1,4 +1,4 @@
-"""How the camera moved over the last seconds: boxes are carried from the tick that they were seen at to another."""
+"""How the camera moved over the last seconds: boxes are moved from one frame to another."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from hvt_common.camera_motion import Affine
 
 __all__ = ["CameraPath"]
 
-_MOST_ASKED = 256
+_MOST_CACHED = 256
 
 _Floats = npt.NDArray[np.float64]
 
 
 class CameraPath:
-    """The motion between decoded frames, and from it that between any two ticks.
+    """The motion between decoded frames, and from it that between any two frames.
 
-    Between two decoded frames the motion is spread evenly over the ticks; after the newest it goes on as it was for
+    Between two decoded frames the motion is spread evenly over the frames; after the newest it goes on as it was for
     ``ahead_ticks`` and then stands; before the oldest it stands.
 
     Args:
-        ahead_ticks: for how long the last motion is believed to go on.
+        ahead_frames: for how long the last motion is extrapolated.
         frames: how many motions are remembered.
     """
 
-    def __init__(self, *, ahead_ticks: int, frames: int = 90) -> None:
-        self._ahead_ticks = ahead_ticks
+    def __init__(self, *, ahead_frames: int, frames: int = 90) -> None:
+        self._ahead_frames = ahead_frames
         self._steps: deque[tuple[int, int, _Floats]] = deque(maxlen=frames)
-        self._asked: dict[tuple[int, int], Affine] = {}
-        """Since the last picture: a hundred boxes ask for the same two ticks."""
+        self._cached: dict[tuple[int, int], Affine] = {}
+        """Since the last picture: a hundred boxes ask for the same two frames."""
 
     def add(self, affine: Affine, *, start: int, end: int) -> None:
         """Take the (2, 3) map from the picture of frame ``start`` to that of ``end``, base pixels, end > start."""
         self._steps.append((start, end, np.vstack((affine, [0.0, 0.0, 1.0]))))
-        self._asked.clear()
+        self._cached.clear()
 
     def between(self, start: int, end: int) -> Affine:
-        """The (2, 3) map from the base pixels of one tick to those of another, either of which may be the later."""
-        affine = self._asked.get((start, end))
+        """The (2, 3) map from the base pixels of one frame to those of another, either of which may be the later."""
+        affine = self._cached.get((start, end))
         if affine is None:
-            affine = self._asked[start, end] = self._between(start, end)
-            if len(self._asked) > _MOST_ASKED:
-                self._asked.clear()
+            affine = self._cached[start, end] = self._between(start, end)
+            if len(self._cached) > _MOST_CACHED:
+                self._cached.clear()
         return affine
 
     def _between(self, start: int, end: int) -> Affine:
@@ -57,13 +57,13 @@ class CameraPath:
                 whole = _part(step, shared / (last - first)) @ whole
         if self._steps:
             first, last, step = self._steps[-1]
-            ticks = min(end - max(start, last), self._ahead_ticks)
-            if ticks > 0:
-                whole = np.linalg.matrix_power(_part(step, 1 / (last - first)), ticks) @ whole
+            frames = min(end - max(start, last), self._ahead_frames)
+            if frames > 0:
+                whole = np.linalg.matrix_power(_part(step, 1 / (last - first)), frames) @ whole
         return np.asarray(whole[:2], np.float64)
 
     def carry(self, boxes: _Floats, *, start: int, end: int) -> _Floats:
-        """(N, 4) boxes in base pixels of tick ``start`` as they lie at tick ``end`` if nothing moves but the camera.
+        """(N, 4) boxes of frame ``start``, base pixels, where they lie at frame ``end`` if only the camera moves.
 
         They stay upright: the centre is mapped, the sides grow by the mean scale.
         """

@@ -7,7 +7,7 @@ import pytest
 
 from flight import tracks_at
 from hvt_common.values import Tracks
-from hvt_ground.events.history import FilledLog, History
+from hvt_ground.perception.history import History
 
 
 def picture(value, *, height=4, width=6):
@@ -105,22 +105,20 @@ def test_what_is_learned_later_is_put_where_it_belongs():
 
 
 def test_between_two_frames_tracks_lie_on_a_line():
-    """Where the base leaves ticks out, stills of them would refine nothing; or something far away."""
-    history = History()
+    """Where the base leaves frames out, stills of them would refine nothing; or something far away."""
+    history = History(gap_frames=15)
     history.add_tracks(listed(0, {1: 0.0, 2: 90.0}))
     history.add_tracks(listed(4, {1: 8.0, 3: 50.0}))
     history.add_tracks(listed(24, {1: 8.0}))
-    log = FilledLog(history, within=15)
-    assert log.tracks(3).ids.tolist() == [1]
-    np.testing.assert_allclose(log.tracks(3).boxes_xyxy_px, [[6, 0, 16, 10]])
-    assert log.tracks(4) is history.tracks(4)
-    assert log.tracks(12) is None, "twenty frames are no gap but an outage"
-    assert log.tracks(25) is None
-    assert (log.oldest_tracked, log.newest_tracked) == (0, 24)
+    assert history.tracks(3).ids.tolist() == [1]
+    np.testing.assert_allclose(history.tracks(3).boxes_xyxy_px, [[6, 0, 16, 10]])
+    assert history.tracks(12) is None, "twenty frames are no gap but an outage"
+    assert history.tracks(25) is None
+    assert (history.oldest_tracked, history.newest_tracked) == (0, 24)
 
 
-def test_a_tick_without_a_picture_has_the_one_before_it():
-    """Re-detection would have no surroundings for a still of such a tick."""
+def test_a_frame_without_a_picture_has_the_one_before_it():
+    """Re-detection would have no surroundings for a still of such a frame."""
     history = History()
     history.add_frame(4, picture(4))
     history.add_frame(9, picture(9))

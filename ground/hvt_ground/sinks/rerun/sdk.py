@@ -1,7 +1,7 @@
 """What the Rerun SDK does not let go of by itself: each recording would leave four threads and two megabytes behind.
 
 A ground opens a recording for each session and each return after a long outage, so this has to be flat over weeks.
-Measured with rerun-sdk 0.41 (which pyproject pins); `tests/ground/sinks/rerun/test_rrd_release.py` holds it to
+Measured with rerun-sdk 0.41 (which pyproject pins); `tests/ground/sinks/rerun/test_sdk.py` holds it to
 that. The names it takes for that are the SDK's own and may go with another version: then its public way is taken, and
 a long-lived ground grows, but starts and records.
 """
@@ -9,34 +9,55 @@ a long-lived ground grows, but starts and records.
 from __future__ import annotations
 
 import logging
+import os
+from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
+
+from hvt_common.errors import UserError
 
 try:
     import rerun_bindings as bindings
 except ImportError:
     bindings = None  # type: ignore[assignment]
 
-__all__ = ["release_recordings", "send_blueprint"]
+__all__ = [
+    "APPLICATION_ID",
+    "new_recording",
+    "release_recordings",
+    "send_blueprint",
+    "viewer_environment",
+    "viewer_program",
+]
 
 _log = logging.getLogger(__name__)
 
+APPLICATION_ID = "hvt"
 
-def send_blueprint(recording: rr.RecordingStream, blueprint: rrb.Blueprint, *, application_id: str) -> None:
+
+def new_recording(recording_id: str) -> rr.RecordingStream:
+    """A recording without the SDK's own two timelines, which would cost bytes and mean nothing here."""
+    recording = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id, send_properties=False)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    return recording
+
+
+def send_blueprint(recording: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
     """Send the blueprint and make it active: the SDK's own function never frees the stream that it writes it to."""
     try:
-        _send_and_let_go(recording, blueprint, application_id=application_id)
+        _send_and_let_go(recording, blueprint)
     except (AttributeError, TypeError) as error:
         _log.debug("this Rerun SDK has other names inside (%s): a recording leaves its threads behind", error)
         rr.send_blueprint(blueprint, recording=recording)
 
 
-def _send_and_let_go(recording: rr.RecordingStream, blueprint: rrb.Blueprint, *, application_id: str) -> None:
+def _send_and_let_go(recording: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
     # As rerun.sinks.send_blueprint has it, but for the last line: stream and storage hold each other until then.
     stream = rr.RecordingStream._from_native(  # noqa: SLF001
         bindings.new_blueprint(
-            application_id=application_id, make_default=False, make_thread_default=False, default_enabled=True
+            application_id=APPLICATION_ID, make_default=False, make_thread_default=False, default_enabled=True
         )
     )
     stream.set_time("blueprint", sequence=0)
@@ -51,3 +72,16 @@ def release_recordings() -> None:
         bindings.flush_and_cleanup_orphaned_recordings()
     except AttributeError as error:
         _log.debug("this Rerun SDK has other names inside (%s): recordings are not freed", error)
+
+
+def viewer_program() -> Path:
+    """The viewer that came with the SDK; `UserError` where the installation lacks it."""
+    program = Path(rr.__file__).parent.parent / "rerun_cli" / ("rerun.exe" if os.name == "nt" else "rerun")
+    if not program.is_file():
+        raise UserError(f"the Rerun viewer is missing at {program}: install rerun-sdk from its wheel")
+    return program
+
+
+def viewer_environment() -> dict[str, str]:
+    """The environment for the viewer. ``CI`` keeps its analytics off without touching the user's own settings."""
+    return {**os.environ, "CI": "1", "RUST_LOG": os.environ.get("RUST_LOG", "error")}

@@ -1,0 +1,176 @@
+"""What an edge stored while the link was down, from the chunks that come to the session that they belong to.
+
+Objects of the open session go there, those of a session before into a recording of its own. All of it is done by the
+open session's perception worker when nothing newer is there: the picture of now goes first.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from hvt_common.protocol.channels import DELIVERIES, Channel
+from hvt_common.protocol.messages import AcknowledgedRange, BacklogHeader, BacklogKind, Info, WireError
+from hvt_ground.backlog.assembly import BacklogAssembly, BacklogKey, StoredStill, backlog_content
+from hvt_ground.backlog.jobs import Destination, StillJob, VideoJob
+from hvt_ground.backlog.recordings import BacklogRecordings
+from hvt_ground.backlog.session_backlog import SessionBacklog
+from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.worker import Job, PerceptionWorker
+
+__all__ = ["EdgeBacklog"]
+
+_log = logging.getLogger(__name__)
+
+_MOST_INFOS = 64
+
+
+class EdgeBacklog:
+    """Of one edge. `chunk` is for the receiving thread, `take_acknowledged_ranges` for any.
+
+    Args:
+        edge: its id.
+        recordings: where what is of another session goes; None refuses it.
+        assembly: puts chunks together.
+    """
+
+    def __init__(
+        self, edge: str, *, recordings: BacklogRecordings | None, assembly: BacklogAssembly | None = None
+    ) -> None:
+        self._edge = edge
+        self._recordings = recordings
+        self._assembly = assembly or BacklogAssembly()
+        self._lock = threading.Lock()
+        self._infos: OrderedDict[int, Info] = OrderedDict()
+        self._working = 0
+        self._sessions = 0
+        """That have ended: what is still at work for one of them has no say any more."""
+
+    @property
+    def paths(self) -> Sequence[Path]:
+        """Recordings of former sessions that were written."""
+        return () if self._recordings is None else tuple(self._recordings.paths)
+
+    @property
+    def refused(self) -> int:
+        """Objects that came whole and were unusable."""
+        return self._assembly.refused
+
+    @property
+    def working(self) -> int:
+        """How many objects have come and are not where they belong yet."""
+        return self._working
+
+    @property
+    def unreported(self) -> int:
+        """How many acknowledgements the edge has not been sent yet."""
+        return self._assembly.unreported
+
+    def take_acknowledged_ranges(self, most: int) -> tuple[AcknowledgedRange, ...]:
+        """Return and forget up to ``most`` acknowledgements."""
+        with self._lock:
+            return self._assembly.take_acknowledged_ranges(most)
+
+    def chunk(
+        self, header: BacklogHeader, payload: bytes, *, own: SessionBacklog, worker: PerceptionWorker
+    ) -> bool:
+        """Take a chunk; True where it completes its object, which is handed to ``worker``.
+
+        ``own`` is the backlog of the session that is open.
+
+        Raises:
+            WireError: it cannot be one, or the object that it completes is unusable.
+        """
+        is_own = header.session_id == own.info.session_id
+        if not is_own and (self._recordings is None or not self._recordings.takes(header.session_id)):
+            raise WireError(f"it was stored of the session {header.session_id:016x}, which is not shown")
+        is_info = header.kind == BacklogKind.INFO
+        with self._lock:
+            known = is_own or header.session_id in self._infos
+            if not (known or is_info):
+                self._assembly.want_info(header.session_id)
+            may_finish = is_info or (known and worker.accepts_jobs)
+            whole = self._assembly.chunk(header, payload, may_finish=may_finish)
+        if whole is None:
+            return False
+        self._deliver((header.session_id, header.kind, header.number), whole, own, worker)
+        return True
+
+    def session_ended(self, info: Info) -> None:
+        """The session that was open is closed: what was not worked off was not acknowledged, and is to come again."""
+        with self._lock:
+            self._learn(info)
+            dropped = self._assembly.drop_handed()
+            self._working = 0
+            self._sessions += 1
+        if dropped:
+            _log.info("%s: %d objects of an outage were not worked off in time", self._edge, dropped)
+
+    def close(self) -> None:
+        """Close the recordings of former sessions."""
+        if self._recordings is not None:
+            self._recordings.close()
+
+    def _deliver(self, key: BacklogKey, whole: bytes, own: SessionBacklog, worker: PerceptionWorker) -> None:
+        try:
+            content = backlog_content(key, whole, edge=self._edge)
+        except WireError:
+            self._settle(key, usable=False)
+            raise
+        is_own = key[0] == own.info.session_id
+        if isinstance(content, Info):
+            with self._lock:
+                self._learn(content)
+                self._assembly.settle(key, usable=True)
+            return
+        destination = (
+            Destination(lambda: own, _release_nothing) if is_own else self._former(self._infos[key[0]])
+        )
+        with self._lock:
+            self._working += 1
+            done = partial(self._done, key, self._sessions)
+        job: Job
+        if isinstance(content, StoredStill):
+            job = StillJob(_received(content), destination, done=done)
+        else:
+            job = VideoJob(content, destination, worker=worker, done=done)
+        worker.submit(job)
+
+    def _former(self, info: Info) -> Destination:
+        recordings = self._recordings
+        assert recordings is not None, "without, no chunk of another session is taken"
+        return Destination(partial(recordings.acquire, info), recordings.release)
+
+    def _done(self, key: BacklogKey, session: int, usable: bool | None) -> None:  # noqa: FBT001 - partial
+        """A job has ended; None: its object was not taken."""
+        with self._lock:
+            if session != self._sessions:
+                return
+            self._working -= 1
+            if usable is None:
+                self._assembly.drop(key)
+            else:
+                self._assembly.settle(key, usable=usable)
+
+    def _settle(self, key: BacklogKey, *, usable: bool) -> None:
+        with self._lock:
+            self._assembly.settle(key, usable=usable)
+
+    def _learn(self, info: Info) -> None:
+        self._infos[info.session_id] = info
+        self._infos.move_to_end(info.session_id)
+        if len(self._infos) > _MOST_INFOS:
+            self._infos.popitem(last=False)
+
+
+def _release_nothing(_backlog: SessionBacklog) -> None:
+    """The open session stays open as long as its worker."""
+
+
+def _received(still: StoredStill) -> ReceivedStill:
+    media_type = still.encoding.partition(";")[0] or DELIVERIES[Channel.ROI].encoding
+    return ReceivedStill(still.header, still.data, media_type)

@@ -1,0 +1,142 @@
+"""Stored objects on their way into a recording: jobs of the perception worker, one step a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from hvt_common.protocol.messages import BacklogUnit
+from hvt_common.values import Image
+from hvt_ground.backlog.perception import StretchTracker
+from hvt_ground.backlog.session_backlog import SessionBacklog
+from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.worker import Job, PerceptionWorker
+
+__all__ = ["Destination", "StillJob", "VideoJob"]
+
+_Pictures = Iterator[tuple[BacklogUnit, Image | None] | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Destination:
+    """Where an object goes: acquired when its job begins, released when the job is closed."""
+
+    acquire: Callable[[], SessionBacklog | None]
+    """None: nothing of that session is taken any more."""
+    release: Callable[[SessionBacklog], None]
+
+
+class StillJob(Job):
+    """Reads one still; ``done(usable)`` is called at the end, with None where it was not taken."""
+
+    def __init__(
+        self, still: ReceivedStill, destination: Destination, *, done: Callable[[bool | None], None]
+    ) -> None:
+        self._still = still
+        self._destination = destination
+        self._done = done
+
+    def step(self) -> bool:
+        """All of it."""
+        target = self._destination.acquire()
+        if target is None:
+            self._done(None)
+            return True
+        try:
+            if target.is_new_still(self._still.header.sequence):
+                target.read_still(self._still)
+        finally:
+            self._destination.release(target)
+        self._done(True)
+        return True
+
+
+class VideoJob(Job):
+    """Logs those frames of a stretch that are missing and can be decoded; then a job of its own finds their boxes.
+
+    Where the worker has too many of those, only the video is shown. ``done`` is as for `StillJob`.
+    """
+
+    def __init__(
+        self,
+        units: Sequence[BacklogUnit],
+        destination: Destination,
+        *,
+        worker: PerceptionWorker,
+        done: Callable[[bool | None], None],
+    ) -> None:
+        self._units = units
+        self._destination = destination
+        self._worker = worker
+        self._done = done
+        self._target: SessionBacklog | None = None
+        self._pictures: _Pictures = iter(())
+        self._last: BacklogUnit | None = None
+        self._logged: set[int] = set()
+
+    def step(self) -> bool:
+        """Decode and log one frame."""
+        if self._target is None:
+            self._target = self._destination.acquire()
+            if self._target is None:
+                self._done(None)
+                return True
+            self._pictures = self._target.video.pictures(self._units)
+        for shown in self._pictures:
+            if shown is not None and self._target.show(*shown, after=self._last):
+                self._last = shown[0]
+                self._logged.add(self._last.frame_index)
+            return False
+        if self._logged and self._target.perception is not None:
+            boxes = _BoxesJob(self._units, self._logged, self._destination)
+            if not self._worker.submit(boxes, last=True):
+                boxes.close()
+        self._done(True)
+        return True
+
+    def close(self) -> None:
+        """Release the destination."""
+        if self._target is not None:
+            self._destination.release(self._target)
+
+
+class _BoxesJob(Job):
+    """Finds boxes in those frames of a stretch; made while its destination is in use."""
+
+    def __init__(
+        self, units: Sequence[BacklogUnit], frames: AbstractSet[int], destination: Destination
+    ) -> None:
+        self._units = units
+        self._frames = frames
+        self._destination = destination
+        self._target = destination.acquire()
+        self._pictures: _Pictures = iter(())
+        self._checkout = ExitStack()
+        """Of the models, from the first step on."""
+        self._tracker: StretchTracker | None = None
+        self._last: BacklogUnit | None = None
+
+    def step(self) -> bool:
+        """Analyze one frame."""
+        target = self._target
+        if target is None or target.perception is None:
+            return True
+        if self._tracker is None:
+            self._tracker = self._checkout.enter_context(target.perception.track(target.log))
+            self._pictures = target.video.pictures(self._units)
+        for shown in self._pictures:
+            if shown is not None and shown[1] is not None and shown[0].frame_index in self._frames:
+                self._last = shown[0]
+                self._tracker.analyze(self._last.frame_index, self._last.capture_ns, shown[1])
+            return False
+        if self._last is not None:
+            target.end_boxes(self._last)
+        return True
+
+    def close(self) -> None:
+        """Give the models back and release the destination."""
+        self._checkout.close()
+        if self._target is not None:
+            self._destination.release(self._target)

@@ -1,0 +1,151 @@
+"""What is stored of one session becomes the same events as live messages do: video in its holes, stills, boxes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvt_common.protocol.messages import BacklogUnit, Info
+from hvt_common.values import Image
+from hvt_ground.backlog.perception import BacklogPerception
+from hvt_ground.backlog.video import BacklogVideo
+from hvt_ground.events import Event, Overlay, VideoSample
+from hvt_ground.link.sequence_window import SequenceWindow, StillSequenceWindow
+from hvt_ground.perception.stills.decode import ReceivedStill
+
+__all__ = ["BacklogTotals", "SessionBacklog"]
+
+_SECOND_NS = 1_000_000_000
+_LONGEST_S = 1.0
+"""For so long one frame counts as video, where the next was left out."""
+
+
+@dataclass(slots=True)
+class BacklogTotals:
+    """How much of a backlog has come."""
+
+    stills: int = 0
+    frames: int = 0
+    """That can be shown and were missing."""
+    left_out: int = 0
+    """That are missing still, for no decoder can use them."""
+    video_s: float = 0.0
+    first: tuple[int, int] | None = None
+    """Frame index and capture time of the oldest of it."""
+
+    def add_still(self, frame_index: int, capture_ns: int) -> None:
+        """Count a still."""
+        self.stills += 1
+        self._note(frame_index, capture_ns)
+
+    def add_frame(self, frame_index: int, capture_ns: int, *, lasts_s: float) -> None:
+        """Count a frame."""
+        self.frames += 1
+        self.video_s += lasts_s
+        self._note(frame_index, capture_ns)
+
+    def amount(self) -> str:
+        """``12 stills and 31 s of video``."""
+        parts = [f"{self.stills} still{'s' * (self.stills != 1)}"] if self.stills else []
+        if self.frames:
+            parts.append(f"{self.video_s:.{int(self.video_s < 1)}f} s of video")
+        return " and ".join(parts)
+
+    def _note(self, frame_index: int, capture_ns: int) -> None:
+        if self.first is None or frame_index < self.first[0]:
+            self.first = frame_index, capture_ns
+
+
+class SessionBacklog:
+    """Of one session, open or over. Safe for the receiving thread and the perception worker's.
+
+    Args:
+        info: of the session.
+        log: takes the events; they may lie before others that it has.
+        perception: finds boxes in the video; None leaves it without.
+        read: reads a still and gives out its events.
+        stills: which stills have come; the session's own where it is open.
+    """
+
+    def __init__(
+        self,
+        info: Info,
+        *,
+        log: Callable[[Event], None],
+        perception: BacklogPerception | None,
+        read: Callable[[ReceivedStill], None],
+        stills: StillSequenceWindow | None = None,
+    ) -> None:
+        self.info = info
+        self.perception = perception
+        self.video = BacklogVideo(base_size=info.base_size)
+        self.log = log
+        self._read = read
+        self._stills = stills or StillSequenceWindow()
+        self._frame_ns = round(_SECOND_NS / info.fps)
+        self._lock = threading.Lock()
+        self._frames = SequenceWindow()
+        self.totals = BacklogTotals()
+        """Since the start."""
+        self._news = BacklogTotals()
+
+    def live(self, frame_index: int, data: bytes, *, keyframe: bool, after_gap: bool) -> None:
+        """Note a unit that came over the link at once and was decoded."""
+        with self._lock:
+            self._frames.add([frame_index])
+        self.video.live(frame_index, data, keyframe=keyframe, after_gap=after_gap)
+
+    def is_new_still(self, sequence: int) -> bool:
+        """Note the number of a still; whether none of it has come before, on whichever way."""
+        return self._stills.is_new_stored(sequence)
+
+    def read_still(self, still: ReceivedStill) -> None:
+        """Read and count a still."""
+        self._read(still)
+        header = still.header
+        with self._lock:
+            for totals in (self.totals, self._news):
+                totals.add_still(header.frame_index, header.capture_ns)
+
+    def show(self, unit: BacklogUnit, image: Image | None, *, after: BacklogUnit | None) -> bool:
+        """Log a frame that is missing; False where it is not, or cannot be shown (``image`` is None)."""
+        with self._lock:
+            if image is None:
+                self.totals.left_out += unit.frame_index not in self._frames
+                return False
+            if not self._frames.add([unit.frame_index]):
+                return False
+            frames = 1 if after is None else unit.frame_index - after.frame_index
+            lasts_s = min(frames / self.info.fps, _LONGEST_S)
+            for totals in (self.totals, self._news):
+                totals.add_frame(unit.frame_index, unit.capture_ns, lasts_s=lasts_s)
+        self.log(VideoSample(unit.frame_index, unit.capture_ns, unit.data, unit.keyframe, stored=True))
+        return True
+
+    def end_boxes(self, last: BacklogUnit) -> None:
+        """The boxes of a stretch end with it, where nothing goes on from there."""
+        with self._lock:
+            if last.frame_index + 1 in self._frames:
+                return
+        self.log(
+            Overlay(
+                frame_index=last.frame_index + 1,
+                capture_ns=last.capture_ns + self._frame_ns,
+                track_ids=np.empty(0, np.int64),
+                boxes_base_px=np.empty((0, 4), np.float32),
+                base_classes=(),
+                classes=(),
+                confidences=np.empty(0, np.float32),
+                refined=np.empty(0, np.bool_),
+                stored=True,
+            )
+        )
+
+    def take_news(self) -> BacklogTotals:
+        """Return and forget what has come since the last call."""
+        with self._lock:
+            news, self._news = self._news, BacklogTotals()
+            return news

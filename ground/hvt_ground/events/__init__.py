@@ -1,1 +1,0 @@
-"""What happened, as values: the language that all rooms of the ground speak."""

@@ -1,0 +1,57 @@
+"""The messages of an edge once they are parsed: what the receiver gives and sessions take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hvt_common.protocol.messages import BacklogHeader, RoiHeader, Status, TrackStep
+from hvt_common.transport.inbox import Received
+from hvt_ground.link.reassemble import Arrival
+
+__all__ = ["BacklogPacket", "BasePacket", "Packet", "StatusPacket", "StillPacket", "TracksPacket"]
+
+
+@dataclass(frozen=True, slots=True)
+class BasePacket:
+    """An access unit that the reassembly has judged, with its own bytes even if it waited behind a hole."""
+
+    arrival: Arrival
+    item: Received
+    on_time: bool
+    """It did not wait: the time of ``item`` is its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class StillPacket:
+    """A still."""
+
+    header: RoiHeader
+    item: Received
+    media_type: str
+
+
+@dataclass(frozen=True, slots=True)
+class TracksPacket:
+    """The edge's tracks at one frame."""
+
+    step: TrackStep
+    item: Received
+
+
+@dataclass(frozen=True, slots=True)
+class BacklogPacket:
+    """A chunk of what was stored while the link was down."""
+
+    header: BacklogHeader
+    item: Received
+
+
+@dataclass(frozen=True, slots=True)
+class StatusPacket:
+    """The edge's report."""
+
+    status: Status
+    item: Received
+
+
+Packet = BasePacket | StillPacket | TracksPacket | BacklogPacket | StatusPacket

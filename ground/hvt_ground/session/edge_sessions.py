@@ -1,0 +1,315 @@
+"""One edge at the ground: its packets are routed to its sessions, which begin and end here."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from hvt_common import __version__
+from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.protocol.messages import Info, WireError
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.transport.inbox import Received
+from hvt_ground.backlog.edge_backlog import EdgeBacklog
+from hvt_ground.backlog.recordings import BacklogRecordings
+from hvt_ground.link.other_sessions import PreSessionBuffer
+from hvt_ground.link.packets import (
+    BacklogPacket,
+    BasePacket,
+    Packet,
+    StatusPacket,
+    StillPacket,
+    TracksPacket,
+)
+from hvt_ground.link.reassemble import StreamCounters
+from hvt_ground.session.receiver import Receiver
+from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.session import GroundSession
+from hvt_ground.session.subscribe import EdgePort
+
+__all__ = ["EdgeSessions", "EdgeThread"]
+
+_log = logging.getLogger(__name__)
+
+_SECOND_NS = 1_000_000_000
+_ENDED_PATIENCE_NS = 2 * _SECOND_NS
+"""How long the rest of a session may take to arrive after its edge has said that it ended."""
+_INFO_TRIES = 3
+_BACKLOG_PAUSE_NS = 3 * _SECOND_NS
+"""After so long without another chunk the recording says how much of the backlog came."""
+_DRAIN_NS = _SECOND_NS
+"""How long what has already arrived is still taken in when the ground stops."""
+
+
+class EdgeSessions:
+    """Routes what comes to the session that is open; requests keyframes and lets the session report.
+
+    For one thread; `EdgeThread` is that of a ground.
+
+    Args:
+        port: of the edge.
+        open_session: makes what the messages of a session go to.
+        clock: the port's, Unix nanoseconds without steps; one of its own by default.
+        recordings: of sessions that are over, closed with this; without it nothing of one is taken.
+        patience_s: an edge whose token is gone and that sends nothing for so long has ended without saying so.
+    """
+
+    def __init__(
+        self,
+        port: EdgePort,
+        *,
+        open_session: Callable[[Info, ReceiverReports], GroundSession],
+        clock: Callable[[], int] | None = None,
+        recordings: BacklogRecordings | None = None,
+        patience_s: float = 5.0,
+    ) -> None:
+        self.port = port
+        self._open_session = open_session
+        self._patience_ns = round(patience_s * _SECOND_NS)
+        clock = clock or SteadyClock()
+        self.backlog = EdgeBacklog(port.edge, recordings=recordings)
+        """What was stored while the link was down."""
+        self._reports = ReceiverReports(
+            port.report, clock=clock, clock_offset=ClockOffset(), backlog=self.backlog
+        )
+        self._receiver = Receiver(port.edge, clock=clock)
+        self._pre_session = PreSessionBuffer()
+        self._counted = StreamCounters()
+        """When the session before ended."""
+        self._ended_ns: int | None = None
+        """When the edge said that the open session has ended."""
+        self._ended_id: int | None = None
+        self._backlog_ns: int | None = None
+        """When the last chunk of it came that nothing has been said of."""
+        self.session: GroundSession | None = None
+        """The one that is open."""
+        self.done: list[GroundSession] = []
+        """Those that have ended."""
+
+    @property
+    def idle(self) -> bool:
+        """Whether no session is open."""
+        return self.session is None
+
+    @property
+    def unusable(self) -> int:
+        """Messages that were skipped: damaged, foreign, or of another version."""
+        return self._receiver.unusable
+
+    def handle(self, item: Received) -> None:
+        """Take one message."""
+        for packet in self._receiver.receive(item):
+            self._route(packet)
+
+    def housekeep(self, *, pending: bool) -> None:
+        """What is due by now; ``pending``: messages wait. Call it after each message, and when none comes."""
+        session = self.session
+        if self._receiver.take_keyframe_request(pending=pending):
+            self.port.request_keyframe()
+            if session is not None:
+                session.note("warning", "keyframe requested")
+        if session is None:
+            return
+        session.raise_error()
+        session.count(self._receiver.counters.since(self._counted))
+        now_ns = time.monotonic_ns()
+        paused = self._backlog_ns is not None and now_ns - self._backlog_ns > _BACKLOG_PAUSE_NS
+        if paused and not self.backlog.working:
+            self._backlog_ns = None
+            session.report_backlog()
+        session.report_if_due()
+        if self._is_over(session, now_ns):
+            gone = self._ended_ns is None
+            self._end_session()
+            if gone:
+                self._receiver.wait_for_keyframe()  # should it come back, it starts with a keyframe
+
+    def refresh_clock(self, session_id: int | None = None) -> Info | None:
+        """Query the edge for its facts and its time; by default those of the session that is open.
+
+        Another edge of the same id may run on a machine with another clock.
+        """
+        session = self.session
+        if session_id is None and session is not None:
+            session_id = session.info.session_id
+        answer = self.port.query_info(session_id)
+        if answer is None:
+            return None
+        info, requested_ns, answered_ns = answer
+        if info.edge != self.port.edge:  # it names files and keys: another's name is nobody's
+            self._receiver.skip("info", WireError(f"the edge says that it is {info.edge!r:.40}"))
+            return None
+        self._reports.clock_offset.add(
+            t0_ns=requested_ns, t1_ns=info.received_ns, t2_ns=info.answered_ns, t3_ns=answered_ns
+        )
+        if info.software != __version__:
+            _log.info("%s runs version %s, this is %s", self.port.edge, info.software, __version__)
+        return info
+
+    def close(self) -> None:
+        """End the session that is open, and close the recordings of former ones."""
+        self._end_session()
+        self.backlog.close()
+
+    # Routing
+
+    def _route(self, packet: Packet) -> None:
+        session = self.session
+        try:
+            match packet:
+                case BasePacket():
+                    self._base(packet)
+                case StillPacket(header, item, media_type):
+                    if session is None:
+                        self._pre_session.still(packet)
+                    elif header.session_id != session.info.session_id:
+                        self._receiver.skip_stranger("roi", header.session_id)
+                    else:
+                        session.still(header, item, media_type=media_type)
+                case TracksPacket(step, item):
+                    if session is None or step.session_id != session.info.session_id:
+                        self._receiver.skip_stranger("tracks", step.session_id)
+                    else:
+                        session.tracks(step, item)
+                case BacklogPacket():
+                    self._backlog(packet)
+                case StatusPacket():
+                    self._status(packet)
+        except WireError as error:
+            self._receiver.skip(packet.item.key.rpartition("/")[2], error)
+
+    def _base(self, packet: BasePacket) -> None:
+        arrival = packet.arrival
+        session_id = arrival.header.session_id
+        if arrival.duplicate and self.session is not None:
+            text = self._receiver.duplicate_notice(session_id, shown=self.session.info.session_id)
+            if text is not None:
+                self.session.note("warning", text)
+        begins = arrival.starts_session and not self._goes_on(packet)
+        if begins or (arrival.starts_run and self.session is None and session_id != self._ended_id):
+            self._begin_session(session_id)
+            if self.session is None:
+                self._receiver.wait_for_keyframe()  # the next keyframe is the next try
+        session = self.session
+        if session is None or arrival.verdict not in ("decode", "skip"):
+            return
+        if session_id != session.info.session_id:
+            return
+        if arrival.lost_before:
+            session.note("warning", f"{arrival.lost_before} base messages lost; waiting for a keyframe")
+        if not session.base(packet):
+            self._receiver.wait_for_keyframe()
+
+    def _goes_on(self, packet: BasePacket) -> bool:
+        """Whether the open session comes back from an interruption that was none of its own."""
+        session, header = self.session, packet.arrival.header
+        if session is None or header.session_id != session.info.session_id:
+            return False
+        return header.frame_index > session.newest_index
+
+    def _backlog(self, packet: BacklogPacket) -> None:
+        session, header, item = self.session, packet.header, packet.item
+        if session is None:
+            raise WireError("it was stored, and no session is open to take it")
+        self._backlog_ns = time.monotonic_ns()
+        delivered = False
+        try:
+            delivered = self.backlog.chunk(header, item.payload, own=session.backlog, worker=session.worker)
+        finally:
+            session.backlog_chunk(header, item, delivered=delivered)
+
+    def _status(self, packet: StatusPacket) -> None:
+        session, status = self.session, packet.status
+        if session is None or status.session_id != session.info.session_id:
+            self._pre_session.status(packet)
+            return
+        session.status(status, packet.item)
+        if status.state == "ended":
+            self._ended_ns = time.monotonic_ns()
+
+    # Sessions
+
+    def _begin_session(self, session_id: int) -> None:
+        info = next((info for _ in range(_INFO_TRIES) if (info := self.refresh_clock(session_id))), None)
+        if info is None and self.session is not None and self.refresh_clock() is not None:
+            self._receiver.disown()
+            self._receiver.skip("base", WireError(f"the edge does not know of a session {session_id:016x}"))
+            return
+        self._end_session()
+        if info is None:
+            self._receiver.skip("info", WireError("the edge does not say what its session is"))
+            return
+        self.port.used.set()
+        self.session = self._open_session(info, self._reports)
+        for packet in self._pre_session.take():
+            self._route(packet)
+
+    def _end_session(self) -> None:
+        session, self.session = self.session, None
+        if session is None:
+            return
+        if self._ended_ns is not None:
+            self._ended_id = session.info.session_id
+        self._ended_ns = None
+        counters = self._receiver.counters
+        session.count(counters.since(self._counted))
+        self._counted = counters
+        self.done.append(session)
+        session.close()
+        session.report()
+        while self.backlog.unreported:  # one report names a few
+            session.report()
+        self.backlog.session_ended(session.info)
+
+    def _is_over(self, session: GroundSession, now_ns: int) -> bool:
+        if self._ended_ns is None:
+            return not self.port.present.is_set() and self._receiver.silent_ns > self._patience_ns
+        whole = session.is_whole and not self.backlog.working
+        return whole or now_ns - self._ended_ns > _ENDED_PATIENCE_NS
+
+
+class EdgeThread:
+    """The thread of one edge, which no callback of the link waits for."""
+
+    def __init__(self, sessions: EdgeSessions) -> None:
+        self.sessions = sessions
+        self.error: BaseException | None = None
+        """What ended the thread."""
+        self._inbox = sessions.port.inbox
+        self._stop = threading.Event()
+        self._stop_ns = 0
+        self._thread = threading.Thread(
+            target=self._run, name=f"hvt-receive-{sessions.port.edge}", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Begin to finish; `close` waits for it. Several threads finish in the time of one."""
+        if not self._stop.is_set():
+            self._stop_ns = time.monotonic_ns()
+            self._stop.set()
+            self._inbox.close()
+
+    def close(self, *, timeout_s: float = 4.0) -> bool:
+        """Finish what has arrived, close the session, join the thread; False where that took too long."""
+        self.stop()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            while not self._finished():
+                item = self._inbox.get(timeout_s=0.05)
+                if item is not None:
+                    self.sessions.handle(item)
+                self.sessions.housekeep(pending=len(self._inbox) > 0)
+            self.sessions.close()
+        except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
+            self.error = error
+
+    def _finished(self) -> bool:
+        if not self._stop.is_set():
+            return False
+        return len(self._inbox) == 0 or time.monotonic_ns() - self._stop_ns > _DRAIN_NS

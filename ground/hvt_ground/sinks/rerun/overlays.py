@@ -1,0 +1,302 @@
+"""What of an overlay is worth writing: only what a viewer would see change.
+
+A recording answers "what was here at frame N" with the latest value of every component, so a value that did not
+change need not be written again. Tracks are in three layers: those that the base stream shows and whose class rests
+on it alone, those known from reports only, and those that a still has spoken on.
+
+Boxes are held against jitter: a box keeps the place that is on screen until it has moved more than `CENTRE_STEP_PX`
+or grown more than `HALF_SIZE_STEP_PX`, and is then put on the nearest half pixel. Equal numbers in equal places are
+what the LZ4 compression of a chunk removes. A confidence is held in the same way.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_ground.events import Origin, Overlay
+
+__all__ = [
+    "CENTRE_STEP_PX",
+    "HALF_SIZE_STEP_PX",
+    "LAYERS",
+    "ORIGINS",
+    "REPORTED_MARK",
+    "BacklogOverlays",
+    "Identity",
+    "Layer",
+    "LayerUpdate",
+    "OverlayEncoder",
+    "confidence_text",
+]
+
+CENTRE_STEP_PX = 0.75
+HALF_SIZE_STEP_PX = 1.0
+CONFIDENCE_STEP_PCT = 5
+
+Layer = Literal["tracks", "reported", "refined"]
+LAYERS: tuple[Layer, ...] = ("tracks", "reported", "refined")
+
+ORIGINS: tuple[Origin, ...] = ("base", "edge", "edge+base", "still")
+"""Origins by the number that stands for them in a recording."""
+
+REPORTED_MARK = "○"
+_REPORTED: tuple[Origin, ...] = ("edge", "still")
+
+_BOX_BYTES = 16  # two centres and two half sizes, float32
+_ROW_BYTES = 40  # row id, two times, offsets
+_MOST_HOLES = 256
+_CONTINUES_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What the boxes of one layer are; N entries in the order of the boxes."""
+
+    track_ids: tuple[int, ...] = ()
+    classes_before: tuple[str, ...] = ()
+    classes_after: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LayerUpdate:
+    """What to write for one layer at one frame. A component that is not there is as before."""
+
+    layer: Layer
+    components: Mapping[str, Any]
+    """``boxes``: (N, 4) float32 centre and half size, whole or half base pixels; ``identity``: an `Identity`;
+    ``labels``: N texts, in the layer ``refined`` only; ``confidences``: N percents; ``origins``: N numbers of
+    `ORIGINS`, once a track was not of the base stream."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Screen:
+    """The values of every track of the last overlay that was written."""
+
+    ids: npt.NDArray[np.int64]
+    boxes: npt.NDArray[np.float32]
+    """(N, 4) centre and half size."""
+    percents: npt.NDArray[np.int64]
+
+
+class OverlayEncoder:
+    """Turns overlays into the smallest updates that show them.
+
+    Movement is written at the overlay's own rate while it costs less than ``share`` of the bytes received, and less
+    often beyond that; a change of the set of tracks, of a class or of a label is always written.
+
+    Args:
+        share: of the bytes received, for movement.
+        credit_bytes: for movement, before anything was received.
+        afresh: nothing is known of what is on the screen, so the first overlay is written whole.
+        with_origins: write origins from the first overlay on, not only once one is not of the base stream.
+    """
+
+    def __init__(
+        self,
+        *,
+        share: float = 0.125,
+        credit_bytes: int = 16_384,
+        afresh: bool = False,
+        with_origins: bool = False,
+    ) -> None:
+        self._share = share
+        self._limit = self._credit = float(credit_bytes)
+        self._newest_frame = -1
+        self.with_origins = with_origins
+        """Whether origins are written: a track was not of the base stream."""
+        nothing = np.empty((0, 4), np.float32)
+        self._screen = _Screen(np.empty(0, np.int64), nothing, np.empty(0, np.int64))
+        empty = {"boxes": nothing, "identity": Identity(), "labels": (), "confidences": (), "origins": ()}
+        self._written: dict[Layer, Mapping[str, Any]] = {layer: {} if afresh else empty for layer in LAYERS}
+
+    @property
+    def screen(self) -> list[LayerUpdate]:
+        """All that is on the screen, whole."""
+        return [LayerUpdate(layer, components) for layer, components in self._written.items()]
+
+    def earn(self, received_bytes: int) -> None:
+        """Credit the share of what was received on the link."""
+        self._credit = min(self._credit + self._share * received_bytes, self._limit)
+
+    def encode(self, overlay: Overlay) -> list[LayerUpdate]:
+        """The updates that bring the screen to ``overlay``; none where nothing visible changed.
+
+        An overlay of an earlier frame than the last has been drawn over, and changes nothing.
+        """
+        if overlay.frame_index < self._newest_frame:
+            return []
+        self._newest_frame = overlay.frame_index
+        self.with_origins = self.with_origins or any(origin != "base" for origin in overlay.origins)
+        screen = _held(self._screen, overlay)
+        wanted = dict(_layers(overlay, screen, with_origins=self.with_origins))
+        updates = []
+        for layer, components in wanted.items():
+            old = self._written[layer]
+            changed = {name: one for name, one in components.items() if not _same(old.get(name), one)}
+            if changed:
+                updates.append(LayerUpdate(layer, changed))
+        if not self._affordable(updates):
+            return []
+        self._screen, self._written = screen, dict(wanted)
+        return updates
+
+    def _affordable(self, updates: list[LayerUpdate]) -> bool:
+        cost = sum(
+            _movement_bytes(self._written[one.layer].get("boxes"), one.components.get("boxes"))
+            for one in updates
+        )
+        if cost > self._credit and not any({"identity", "labels"} & one.components.keys() for one in updates):
+            return False
+        self._credit -= cost
+        return True
+
+
+@dataclass(slots=True)
+class _Hole:
+    before: int
+    after: int | None
+    """Frame of the first overlay after it; None where there has been none."""
+    capture_ns: int = 0
+    """Of that."""
+    screen: tuple[LayerUpdate, ...] = ()
+    """All that is on the screen there."""
+    written: bool = False
+
+
+class BacklogOverlays:
+    """Boxes in a hole that is filled later: what to write so that they end where the live stream goes on.
+
+    A viewer shows the latest value before its time. Boxes that are written into a hole would stand over what follows
+    it, where that only said what had changed since before the hole. So at the first overlay after it all is written
+    once more. Of one recording; not safe for threads.
+
+    Args:
+        fps: frames a second.
+        least_s: shorter holes are none: the base stream leaves out frames, and boxes go on.
+    """
+
+    def __init__(self, *, fps: float, least_s: float = 1.0) -> None:
+        self._least = max(2, round(least_s * fps))
+        self._continues = round(_CONTINUES_S * fps)
+        self._newest: int | None = None
+        self._holes: deque[_Hole] = deque([_Hole(-1, None)], maxlen=_MOST_HOLES)
+        self._encoder: OverlayEncoder | None = None
+        self._last = -1
+        self._credit_bytes = 0
+
+    def note(self, overlay: Overlay, encoder: OverlayEncoder) -> None:
+        """A live overlay was written; ``encoder`` knows what is on the screen."""
+        frame, newest = overlay.frame_index, self._newest
+        if newest is not None and frame <= newest:
+            return
+        self._newest = frame
+        if newest is None:
+            self._holes.clear()
+        if newest is None or frame - newest >= self._least:
+            before = -1 if newest is None else newest
+            self._holes.append(_Hole(before, frame, overlay.capture_ns, tuple(encoder.screen)))
+
+    def earn(self, received_bytes: int) -> None:
+        """Credit what came of stored video, as `OverlayEncoder.earn`."""
+        self._credit_bytes += received_bytes
+
+    def encode(self, overlay: Overlay, *, with_origins: bool) -> list[tuple[int, int, LayerUpdate]]:
+        """What to write for an overlay of stored video, with frame and capture time; nothing outside a hole."""
+        frame = overlay.frame_index
+        holes = (
+            one for one in self._holes if one.before < frame and (one.after is None or frame < one.after)
+        )
+        hole = next(holes, None)
+        if hole is None:
+            return []
+        timed = []
+        if hole.after is not None and not hole.written:
+            hole.written = True
+            timed += [(hole.after, hole.capture_ns, update) for update in hole.screen]
+        if self._encoder is None or not 0 < frame - self._last <= self._continues:
+            self._encoder = OverlayEncoder(afresh=True, with_origins=with_origins)
+        self._last = frame
+        self._encoder.earn(self._credit_bytes)
+        self._credit_bytes = 0
+        return timed + [(frame, overlay.capture_ns, update) for update in self._encoder.encode(overlay)]
+
+
+def _held(screen: _Screen, overlay: Overlay) -> _Screen:
+    """The overlay's values on their grids, except where what is on screen is near enough."""
+    corners = overlay.boxes_base_px
+    boxes = np.hstack((corners[:, :2] + corners[:, 2:], corners[:, 2:] - corners[:, :2])) / 2
+    percents = np.round(overlay.confidences * 100).astype(np.int64)
+    result = _Screen(overlay.track_ids.copy(), (np.round(boxes * 2) / 2).astype(np.float32), percents.copy())
+    _, new, old = np.intersect1d(overlay.track_ids, screen.ids, assume_unique=True, return_indices=True)
+    moved = np.abs(boxes[new] - screen.boxes[old])
+    for columns, step_px in ((slice(2), CENTRE_STEP_PX), (slice(2, 4), HALF_SIZE_STEP_PX)):
+        near = (moved[:, columns] <= step_px).all(axis=1)
+        result.boxes[new[near], columns] = screen.boxes[old[near], columns]
+    near = np.abs(percents[new] - screen.percents[old]) < CONFIDENCE_STEP_PCT
+    result.percents[new[near]] = screen.percents[old[near]]
+    return result
+
+
+def _layers(
+    overlay: Overlay, screen: _Screen, *, with_origins: bool
+) -> Iterator[tuple[Layer, dict[str, Any]]]:
+    """All components of each layer."""
+    origins = overlay.origins or ("base",) * len(overlay.track_ids)
+    reported = np.array([origin in _REPORTED for origin in origins], np.bool_)
+    of_layer: dict[Layer, npt.NDArray[np.bool_]] = {
+        "tracks": ~overlay.refined & ~reported,
+        "reported": ~overlay.refined & reported,
+        "refined": overlay.refined,
+    }
+    for layer, mask in of_layer.items():
+        rows = np.flatnonzero(mask).tolist()
+        components: dict[str, Any] = {
+            "boxes": screen.boxes[mask],
+            "identity": Identity(
+                tuple(overlay.track_ids[mask].tolist()),
+                tuple(overlay.base_classes[row] for row in rows),
+                tuple(overlay.classes[row] for row in rows),
+            ),
+            "confidences": tuple(screen.percents[mask].tolist()),
+        }
+        if layer == "refined":
+            components["labels"] = tuple(_label(overlay, screen, row, reported=reported[row]) for row in rows)
+        if with_origins:
+            components["origins"] = tuple(ORIGINS.index(origins[row]) for row in rows)
+        yield layer, components
+
+
+def _same(old: object, new: object) -> bool:
+    if isinstance(new, np.ndarray):
+        return isinstance(old, np.ndarray) and np.array_equal(old, new)
+    return old == new
+
+
+def _movement_bytes(old: npt.NDArray[np.float32] | None, new: npt.NDArray[np.float32] | None) -> int:
+    """An estimate after compression: the boxes that differ from the row before, and the row itself."""
+    if new is None:
+        return 0
+    if old is None or len(old) != len(new):
+        return _ROW_BYTES + _BOX_BYTES * len(new)
+    moved = (old != new).reshape(-1, 2, 2).any(axis=2)  # centre, half size
+    return _ROW_BYTES + _BOX_BYTES // 2 * int(moved.sum())
+
+
+def _label(overlay: Overlay, screen: _Screen, row: int, *, reported: bool) -> str:
+    """``17 ✓`` where the still agreed with the base stream, ``17 car → van .93`` where it did not."""
+    mark = f" {REPORTED_MARK}" if reported else ""
+    track_id, before, after = overlay.track_ids[row], overlay.base_classes[row], overlay.classes[row]
+    if before == after:
+        return f"{track_id} ✓{mark}"
+    return f"{track_id} {before} → {after} {confidence_text(int(screen.percents[row]))}{mark}"
+
+
+def confidence_text(percent: int) -> str:
+    """``.07``, ``.93``, ``1.0``."""
+    return f".{percent:02d}" if percent < 100 else "1.0"

@@ -1,1 +1,0 @@
-"""The .rrd file itself: whole at every moment, bounded, complete at its end."""

@@ -1,0 +1,236 @@
+"""How rows become columns of a Rerun chunk. A table is one entity with one set of columns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import chain, pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk
+
+from hvt_ground.sinks.rerun.gallery import Placement
+from hvt_ground.sinks.rerun.palette import Rgb
+
+__all__ = [
+    "COLUMNS",
+    "FIXED_BYTES",
+    "TABLE_BYTES",
+    "Captions",
+    "CodedIdentity",
+    "LogText",
+    "PlacedJpeg",
+    "SizeLimit",
+    "Table",
+    "TableRow",
+    "static_chunk",
+]
+
+_LATEST_NS = 2**63 - 1
+FIXED_BYTES = 77_000
+"""About what the blueprint and the static values cost."""
+TABLE_BYTES = 2_000
+"""About what a table costs in each compaction before its first row: a chunk and its columns."""
+_HEAD_START_BYTES = 30_000
+"""Beyond the ratio, so that the first pictures of a flight are shown."""
+
+Columns = Iterable[rr.ComponentColumn]
+Captions = tuple[tuple[str, Rgb], ...]
+"""Text and colour for each slot of the gallery; an empty text hides its frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedJpeg:
+    """A JPEG with a place."""
+
+    data: bytes
+    place: Placement
+
+
+@dataclass(frozen=True, slots=True)
+class CodedIdentity:
+    """`overlays.Identity` with the class ids of the layer's annotation context."""
+
+    track_ids: tuple[int, ...]
+    before: tuple[int, ...]
+    after: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LogText:
+    """A line of the event log."""
+
+    text: str
+    level: str
+    colour: Rgb
+
+
+@dataclass(frozen=True, slots=True)
+class TableRow:
+    """A row for the table of an entity with these columns."""
+
+    path: str
+    columns: str
+    """A name of `COLUMNS`."""
+    value: Any
+    size_bytes: int = 64
+    """What it costs once compacted, about."""
+    at: tuple[int, int] | None = None
+    """Frame index and capture time, where they are not the event's."""
+
+
+@dataclass(slots=True)
+class Table:
+    """Rows of one entity that share their columns, gathered until they are compacted."""
+
+    path: str
+    columns: str
+    _frames: list[int] = field(default_factory=list)
+    _capture_ns: list[int] = field(default_factory=list)
+    _values: list[Any] = field(default_factory=list)
+
+    def add(self, frame: int, capture_ns: int, value: Any) -> Chunk:
+        """Gather a row; returns it as a chunk of its own, for the append log.
+
+        Times come from the wire and are reckoned on from there: what no timestamp can hold is held at its end.
+        """
+        self._frames.append(frame)
+        self._capture_ns.append(min(max(capture_ns, 0), _LATEST_NS))
+        self._values.append(value)
+        return self._chunk(slice(-1, None))
+
+    def __bool__(self) -> bool:
+        """Whether there are rows since the last `take`."""
+        return bool(self._values)
+
+    def take(self) -> Chunk:
+        """All rows since the last call as one chunk; there must be some."""
+        if any(one > other for one, other in pairwise(self._frames)):  # rows of a backlog come late
+            order = sorted(range(len(self._frames)), key=self._frames.__getitem__)
+            self._frames = [self._frames[place] for place in order]
+            self._capture_ns = [self._capture_ns[place] for place in order]
+            self._values = [self._values[place] for place in order]
+        chunk = self._chunk(slice(None))
+        self._frames, self._capture_ns, self._values = [], [], []
+        return chunk
+
+    def _chunk(self, rows: slice) -> Chunk:
+        indexes = [
+            rr.TimeColumn("frame", sequence=self._frames[rows]),
+            rr.TimeColumn("capture_time", timestamp=np.array(self._capture_ns[rows], "datetime64[ns]")),
+        ]
+        return Chunk.from_columns(self.path, indexes, COLUMNS[self.columns](self._values[rows]))
+
+
+class SizeLimit:
+    """How large a recording may be: what is worth writing depends on how many bytes the link brought."""
+
+    def __init__(self) -> None:
+        self.received_bytes = 0
+        self.logged_bytes = FIXED_BYTES
+        """About, once compacted."""
+
+    def has(self, size_bytes: int, *, ratio: float) -> bool:
+        """Whether the recording stays below ``ratio`` times the bytes received with so much more in it."""
+        allowed = ratio * self.received_bytes + FIXED_BYTES + _HEAD_START_BYTES
+        return self.logged_bytes + size_bytes <= allowed
+
+
+def static_chunk(path: str, values: rr.AsComponents) -> Chunk:
+    """Values that hold for the whole recording."""
+    columns = [batch.partition([len(batch.as_arrow_array())]) for batch in values.as_component_batches()]
+    return Chunk.from_columns(path, [], columns)
+
+
+def _shapes(shape: type[rr.Boxes2D | rr.Ellipses2D], rows: Sequence[npt.NDArray[np.float32]]) -> Columns:
+    boxes = np.concatenate(rows)
+    columns = shape.columns(centers=boxes[:, :2], half_sizes=boxes[:, 2:])
+    return columns.partition([len(row) for row in rows])
+
+
+def _identities(shape: type[rr.Boxes2D | rr.Ellipses2D], rows: Sequence[CodedIdentity]) -> Columns:
+    lengths = [len(row.track_ids) for row in rows]
+    drawn = shape.columns(class_ids=np.array([i for row in rows for i in row.after], np.uint16))
+    values = rr.AnyValues.columns(
+        track_id=pa.array([i for row in rows for i in row.track_ids], pa.uint32()),
+        class_before=pa.array([i for row in rows for i in row.before], pa.uint16()),
+    )
+    return [*drawn.partition(lengths), *values.partition(lengths)]
+
+
+def _bytes(name: str, rows: Sequence[tuple[int, ...]]) -> Columns:
+    values = rr.AnyValues.columns(**{name: pa.array(chain.from_iterable(rows), pa.uint8())})
+    return values.partition([len(row) for row in rows])
+
+
+def _labels(rows: Sequence[tuple[str, ...]]) -> Columns:
+    texts = pa.array(chain.from_iterable(rows), pa.utf8())
+    return rr.Boxes2D.columns(labels=texts).partition([len(row) for row in rows])
+
+
+def _places(rows: Sequence[Placement]) -> rr.ComponentColumnList:
+    # The viewer reads a transform as a whole: what a row leaves out is not taken from the row before.
+    return rr.Transform3D.columns(
+        translation=[(place.x, place.y, 0.0) for place in rows],
+        scale=[(place.scale, place.scale, 1.0) for place in rows],
+    )
+
+
+def _patches(rows: Sequence[PlacedJpeg | None]) -> Columns:
+    there = [row for row in rows if row is not None]
+    lengths = [int(row is not None) for row in rows]
+    blobs = rr.EncodedImage.columns(blob=[row.data for row in there])
+    return [*blobs.partition(lengths), *_places([row.place for row in there]).partition(lengths)]
+
+
+def _captions(rows: Sequence[Captions]) -> Columns:
+    captions = list(chain.from_iterable(rows))
+    return rr.Boxes2D.columns(
+        labels=[text for text, _ in captions],
+        colors=np.array([packed(colour) if text else 0 for text, colour in captions], np.uint32),
+    ).partition([len(row) for row in rows])
+
+
+def _texts(rows: Sequence[LogText]) -> Columns:
+    return rr.TextLog.columns(
+        text=[row.text for row in rows],
+        level=[row.level for row in rows],
+        color=np.array([packed(row.colour) for row in rows], np.uint32),
+    )
+
+
+def _lines(rows: Sequence[tuple[float, ...]]) -> Columns:
+    scalars = np.array(rows, np.float64).ravel()
+    return rr.Scalars.columns(scalars=scalars).partition([len(row) for row in rows])
+
+
+def packed(colour: Rgb) -> int:
+    """Opaque RGBA as one number, which is how Rerun stores a colour."""
+    return colour[0] << 24 | colour[1] << 16 | colour[2] << 8 | 0xFF
+
+
+COLUMNS: dict[str, Callable[[Sequence[Any]], Columns]] = {
+    "video": lambda rows: rr.VideoStream.columns(sample=list(rows)),
+    "boxes": lambda rows: _shapes(rr.Boxes2D, rows),
+    "ellipses": lambda rows: _shapes(rr.Ellipses2D, rows),
+    "identity of boxes": lambda rows: _identities(rr.Boxes2D, rows),
+    "identity of ellipses": lambda rows: _identities(rr.Ellipses2D, rows),
+    "labels": _labels,
+    "confidences": lambda rows: _bytes("confidence_pct", rows),
+    "origins": lambda rows: _bytes("origin", rows),
+    "jpeg": lambda rows: rr.EncodedImage.columns(blob=list(rows)),
+    "placed jpeg": lambda rows: [
+        *rr.EncodedImage.columns(blob=[row.data for row in rows]),
+        *_places([row.place for row in rows]),
+    ],
+    "place": _places,
+    "patch": _patches,
+    "captions": _captions,
+    "text": _texts,
+    "lines": _lines,
+}
+"""What the values of a row become, by name. ``patch``: a placed JPEG, or None, which takes it off."""
