@@ -22,10 +22,10 @@ from rich.progress import Progress
 
 from bench.material import ROOT, data
 from hvt_common.runtime.reporting import write_json
-from hvt_study.commands.sight import print_result
-from hvt_study.compare_methods import METHODS
-from hvt_study.compare_plot import plot
-from hvt_study.sight import ComparePlan, CompareResult, CompareRow, compare
+from hvt_study.commands.compare import print_result
+from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow, compare
+from hvt_study.report.figures.compare_plot import plot
+from hvt_study.runs.compare_methods import METHODS
 
 _RATES = (150_000, 200_000, 300_000, 400_000, 800_000)
 _CLIPS = {

@@ -1,6 +1,6 @@
 """The procedurally drawn aerial scene of ``--source demo``, with exact ground truth."""
 
-from hvt_scene.look import Look
+from hvt_scene.appearance import Look
 from hvt_scene.scene import Scene
 from hvt_scene.truth import Truth, write_truth
 

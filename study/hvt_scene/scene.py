@@ -10,14 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Image, View
-from hvt_scene.camera import Camera, Matrix
-from hvt_scene.cast import Cast
-from hvt_scene.compose import Bgra, blend, darken
-from hvt_scene.foliage import Grove
-from hvt_scene.ground import paint_ground
-from hvt_scene.layout import Layout, plan
-from hvt_scene.look import Look
-from hvt_scene.project import (
+from hvt_scene.appearance import Look
+from hvt_scene.drawing.cast import Cast
+from hvt_scene.drawing.foliage import Grove
+from hvt_scene.drawing.ground import paint_ground
+from hvt_scene.drawing.vehicles import CLASS_NAMES
+from hvt_scene.truth import Truth, write_truth
+from hvt_scene.view.camera import Camera, Matrix
+from hvt_scene.view.compose import Bgra, blend, darken
+from hvt_scene.view.project import (
     Floats,
     bounds,
     near_frame,
@@ -27,9 +28,8 @@ from hvt_scene.project import (
     to_centres,
     turns,
 )
-from hvt_scene.traffic import set_in_motion
-from hvt_scene.truth import Truth, write_truth
-from hvt_scene.vehicles import CLASS_NAMES
+from hvt_scene.world.layout import Layout, plan
+from hvt_scene.world.traffic import set_in_motion
 
 __all__ = ["Scene"]
 

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.values import Boxes, Detections, Image, View
-from hvt_scene.vehicles import CLASS_NAMES
-from hvt_train.places import Picture
-from hvt_train.pool import BASE_SIZE, HELD_OUT_SEED, Shot, coded, shoot
+from hvt_scene.drawing.vehicles import CLASS_NAMES
+from hvt_train.pictures.places import Picture
+from hvt_train.pictures.pool import BASE_SIZE, HELD_OUT_SEED, Shot, coded, shoot
 
 __all__ = [
     "CLEAN",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hvt_study.datasets.labels import NO_ID, FrameLabels
-from hvt_study.metrics.contract import FrameView
+from hvt_study.metrics.frames import FrameView
 
 __all__ = ["labels", "square", "view"]
 

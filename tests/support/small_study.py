@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from hvt_scene import Scene
-from hvt_study.report.table_file import read_results
+from hvt_study.report.data.table_file import read_results
 from processes import eventually
 
 __all__ = [

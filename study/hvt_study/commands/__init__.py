@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 from typing import Final, Protocol
 
-from hvt_study.commands import plan, report, run, score, sight, sweep, track, tune
+from hvt_study.commands import compare as sight
+from hvt_study.commands import plan, report, run, score, sweep, track, tune
 
 __all__ = ["COMMANDS", "Command"]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import print_table
-from hvt_study.commands.study_arguments import (
+from hvt_study.commands.arguments import (
     add_accounting,
     add_plan_arguments,
     add_pool_arguments,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
-from hvt_study.commands.study_arguments import add_accounting
+from hvt_study.commands.arguments import add_accounting
 
 __all__ = ["SUMMARY", "add_arguments", "run"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from hvt_common.errors import UserError
-from hvt_study.commands.study_arguments import add_accounting, add_plan_arguments, add_pool_arguments
+from hvt_study.commands.arguments import add_accounting, add_plan_arguments, add_pool_arguments
 
 __all__ = ["SUMMARY", "add_arguments", "run"]
 

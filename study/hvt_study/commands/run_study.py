@@ -10,18 +10,18 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
-from hvt_study.commands.run_progress import RunProgress
-from hvt_study.commands.study_arguments import make_out, open_pool, open_sequences, study_plan
+from hvt_study.commands.arguments import make_out, open_pool, open_sequences, study_plan
+from hvt_study.commands.progress import RunProgress
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.matrix.earlier import check_parameters, staying
-from hvt_study.matrix.execute import run_spec
 from hvt_study.matrix.plan import StudyPlan, first_runs
 from hvt_study.matrix.schedule import Row, in_order, run_all
-from hvt_study.report.example_store import load_example, save_example
-from hvt_study.report.examples import choose_run
-from hvt_study.report.fly_again import fly_again
-from hvt_study.report.table_file import RESULTS, read_results, write_results
+from hvt_study.report.data.table_file import RESULTS, read_results, write_results
+from hvt_study.report.example.choice import choose_run
+from hvt_study.report.example.fly_again import fly_again
+from hvt_study.report.example.store import load_example, save_example
 from hvt_study.report.write import write_report
+from hvt_study.runs.execute import run_spec
 
 __all__ = ["run_study"]
 

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from hvt_common.units import parse_size
 from hvt_scene import Scene
-from hvt_study.score import Score, read_tracks, read_truth, score
+from hvt_study.metrics.track_table_score import Score, read_tracks, read_truth, score
 
 __all__ = ["SUMMARY", "add_arguments", "run"]
 

@@ -17,7 +17,7 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.video import VideoSource
-from hvt_study.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
+from hvt_study.matrix.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
 
 __all__ = ["SUMMARY", "add_arguments", "run"]
 

@@ -12,8 +12,7 @@ from rich.table import Table
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
-from hvt_study.commands.run_progress import RunProgress
-from hvt_study.commands.study_arguments import (
+from hvt_study.commands.arguments import (
     add_plan_arguments,
     add_pool_arguments,
     make_out,
@@ -21,6 +20,7 @@ from hvt_study.commands.study_arguments import (
     open_sequences,
     study_plan,
 )
+from hvt_study.commands.progress import RunProgress
 
 if TYPE_CHECKING:
     from hvt_study.matrix.tune import Tuned

@@ -25,9 +25,9 @@ from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_common.values import Boxes, Image
 from hvt_edge.perception.crop import PADDING, crop_box
 from hvt_edge.source.resample import Resizer
-from hvt_study.cached_detector import CachedDetector
-from hvt_study.datasets.contract import Sequence
+from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.datasets.labels import NO_ID, FrameLabels, inside_frame
+from hvt_study.datasets.sequence import Sequence
 
 __all__ = ["CONFIDENCE", "ReferenceLabels", "open_reference_detector", "reference_labels", "with_labels"]
 

@@ -10,14 +10,14 @@ from itertools import islice
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_study.datasets.clips import open_clips
-from hvt_study.datasets.contract import Sequence
-from hvt_study.datasets.demo import open_demo
-from hvt_study.datasets.mot import open_mot
-from hvt_study.datasets.options import Options, split_options
-from hvt_study.datasets.still import open_stills
-from hvt_study.datasets.uavdt import open_uavdt
-from hvt_study.datasets.visdrone import open_visdrone
+from hvt_study.datasets.layouts.clips import open_clips
+from hvt_study.datasets.layouts.demo import open_demo
+from hvt_study.datasets.layouts.mot import open_mot
+from hvt_study.datasets.layouts.options import Options, split_options
+from hvt_study.datasets.layouts.still import open_stills
+from hvt_study.datasets.layouts.uavdt import open_uavdt
+from hvt_study.datasets.layouts.visdrone import open_visdrone
+from hvt_study.datasets.sequence import Sequence
 
 __all__ = ["DATASETS", "open_dataset", "open_datasets"]
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
+from hvt_study.cache.results import content_key
 from hvt_study.matrix.accounting import in_accounting
-from hvt_study.matrix.cache import content_key
 from hvt_study.matrix.plan import StudyPlan
 
 __all__ = ["check_parameters", "staying"]

@@ -8,12 +8,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hvt_common.errors import UserError
-from hvt_study.compare_clip import staged_bytes
-from hvt_study.datasets.contract import Sequence
-from hvt_study.matrix.execute import run_spec
-from hvt_study.matrix.methods import METHODS, Kind, MatrixMethod
+from hvt_study.datasets.clip import staged_bytes
+from hvt_study.datasets.sequence import Sequence
 from hvt_study.matrix.plan import StudyPlan, first_runs
-from hvt_study.matrix.run_context import open_run_context
+from hvt_study.runs.execute import run_spec
+from hvt_study.runs.methods import METHODS, Kind, MatrixMethod
+from hvt_study.runs.run_context import open_run_context
 
 __all__ = ["Estimate", "estimate", "time_of_a_tick"]
 

@@ -10,8 +10,8 @@ from typing import Any, Literal
 from hvt_common.errors import UserError
 from hvt_common.units import parse_bitrate
 from hvt_edge.config import REGIMES
-from hvt_study.matrix.methods import METHODS, Kind, MatrixMethod
-from hvt_study.matrix.spec import ModelChoice, RunSpec, Target
+from hvt_study.runs.methods import METHODS, Kind, MatrixMethod
+from hvt_study.runs.spec import ModelChoice, RunSpec, Target
 
 __all__ = ["Regime", "StudyPlan", "first_runs", "following_runs", "parse_regimes"]
 

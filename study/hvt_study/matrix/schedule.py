@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any, Protocol
 
-from hvt_study.matrix.match import grid_target
-from hvt_study.matrix.methods import METHODS, Kind
 from hvt_study.matrix.plan import StudyPlan, first_runs, following_runs
-from hvt_study.matrix.spec import RunSpec
+from hvt_study.runs.match_total import grid_target
+from hvt_study.runs.methods import METHODS, Kind
+from hvt_study.runs.spec import RunSpec
 
 __all__ = ["Pool", "Row", "in_order", "run_all"]
 

@@ -19,12 +19,12 @@ import optuna
 
 from hvt_common.errors import UserError
 from hvt_edge.stills.policy.registry import METHODS
-from hvt_study.matrix.execute import run_spec
-from hvt_study.matrix.methods import METHODS as FLOWN
 from hvt_study.matrix.plan import StudyPlan
 from hvt_study.matrix.schedule import Pool
-from hvt_study.matrix.spec import RunSpec
-from hvt_study.matrix.tuned import tuning_texts
+from hvt_study.matrix.tuning import tuning_texts
+from hvt_study.runs.execute import run_spec
+from hvt_study.runs.methods import METHODS as FLOWN
+from hvt_study.runs.spec import RunSpec
 
 __all__ = ["HeldOut", "Tuned", "split", "tunable", "tune"]
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from sklearn.metrics import f1_score
 
-from hvt_study.metrics.contract import Ticks
+from hvt_study.metrics.frames import Ticks
 from hvt_study.metrics.judged import Judged, judged
 from hvt_study.metrics.match import LEAST_IOU, matched_rows
 from hvt_study.metrics.sizes import LIMITS_PX2, SIZES, Size, of_size

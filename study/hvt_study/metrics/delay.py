@@ -1,4 +1,4 @@
-"""Delay over a serial link of B_tot, by simulation (`hvt_study.serial_link`): capture to arrival."""
+"""Delay over a serial link of B_tot, by simulation (`hvt_study.flights.serial_link`): capture to arrival."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvt_study.flights.serial_link import LinkReport, SerialLink
 from hvt_study.metrics.stills import StillArrival
-from hvt_study.serial_link import LinkReport, SerialLink
 
 __all__ = ["DelayScore", "Sent", "delay_score", "simulated"]
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from faster_coco_eval import COCO
 from faster_coco_eval.core.faster_eval_api import COCOeval_faster
 
-from hvt_study.metrics.contract import Ticks
+from hvt_study.metrics.frames import Ticks
 from hvt_study.metrics.judged import Judged, judged
 from hvt_study.metrics.sizes import LARGEST_PX2, LIMITS_PX2, SIZES, Size
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_study.metrics.contract import NO_ID, Ticks
+from hvt_study.metrics.frames import NO_ID, Ticks
 from hvt_study.metrics.judged import Judged, judged
 from hvt_study.metrics.match import LEAST_IOU, matched_rows
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from hvt_common.inference.class_names import MOVING
 from hvt_common.values import Boxes, iou
 from hvt_study.datasets.labels import FrameLabels, covered_share
-from hvt_study.metrics.contract import FrameView, Ticks, rows_of
+from hvt_study.metrics.frames import FrameView, Ticks, rows_of
 from hvt_study.metrics.match import LEAST_IOU
 
 __all__ = ["Judged", "judged"]

@@ -17,8 +17,8 @@ from typing import Any, Final
 import motmetrics
 import numpy as np
 
-from hvt_common.values import iou
-from hvt_study.metrics.contract import NO_ID, Ticks
+from hvt_common.boxes import iou
+from hvt_study.metrics.frames import NO_ID, Ticks
 from hvt_study.metrics.hota import Hota, IdBoxes, hota
 from hvt_study.metrics.judged import judged
 from hvt_study.metrics.match import LEAST_IOU

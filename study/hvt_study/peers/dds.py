@@ -23,13 +23,13 @@ from hvt_common.inference.detect import Detector
 from hvt_common.values import Frame
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.source.resample import Resizer
-from hvt_study.compare_clip import NOMINAL_FPS, Clip, FrameSource
-from hvt_study.flight import FlightReport, coded_ticks
+from hvt_study.datasets.clip import NOMINAL_FPS, Clip, FrameSource
+from hvt_study.flights.flight import FlightReport, coded_ticks
+from hvt_study.flights.serial_link import LinkReport
 from hvt_study.peers.dds_edge import DdsEdge, pass_rates
 from hvt_study.peers.dds_ground import DdsGround
 from hvt_study.peers.dds_line import Line
 from hvt_study.peers.dds_settings import DdsSettings
-from hvt_study.serial_link import LinkReport
 
 __all__ = ["DdsSettings", "fly_dds"]
 
@@ -54,7 +54,8 @@ def fly_dds(
     The list of a tick is the final one of that very frame, as an operator sees it when it is known, which is later
     than with a stream that is shown as it comes: the delays of ``FlightReport.link`` are, for each coded frame, from
     capture to the arrival of the pass that completes it (segment, question, second pass, and the frames before it).
-    ``picture_age_p95_ms`` is of the newest picture at the ground, that of a first pass, as in `hvt_study.flight.fly`.
+    ``picture_age_p95_ms`` is of the newest picture at the ground, that of a first pass, as in
+    `hvt_study.flights.flight.fly`.
 
     Raises:
         UserError: the budget is too small for two passes of this size and frame rate.
@@ -120,7 +121,7 @@ def _report(ticks: int, *, edge: DdsEdge, ground: DdsGround, line: Line) -> Flig
 
 
 def _picture_age_p95_ms(shown_ns: list[tuple[int, int]], ticks: int) -> float:
-    """Over the ticks from the first picture on, as `hvt_study.flight` has it."""
+    """Over the ticks from the first picture on, as `hvt_study.flights.flight` has it."""
     shown = np.array(shown_ns, np.int64).reshape(-1, 2)
     at_ns = np.array([_tick_ns(tick) for tick in range(ticks)], np.int64)
     at_ns = at_ns[at_ns >= shown[0, 0]] if len(shown) else at_ns[:0]

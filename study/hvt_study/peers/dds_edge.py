@@ -15,7 +15,7 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.video.x265 import VBV_S, BaseEncoder, EncoderSettings, keyframe_floor_bytes, minimum_bps
-from hvt_study.compare_clip import NOMINAL_FPS
+from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.peers.dds_line import Line, header_bps
 from hvt_study.peers.dds_regions import Blocks, block_grid, pasted
 from hvt_study.peers.dds_request import RegionRequest

@@ -14,9 +14,9 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import AccessUnit, Detections, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
-from hvt_study.compare_clip import NOMINAL_FPS
-from hvt_study.metrics.contract import NO_ID, FrameView
-from hvt_study.metrics.seen import ObservedFrame
+from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.metrics.frames import NO_ID, FrameView
+from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.peers.dds_edge import most_kept
 from hvt_study.peers.dds_line import Line
 from hvt_study.peers.dds_regions import Blocks, asked_blocks, asked_boxes, combined, pasted

@@ -13,7 +13,7 @@ from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
 from hvt_common.protocol.messages import BaseHeader, Flags
 from hvt_common.values import AccessUnit
 from hvt_edge.link.budget import RollingBudget
-from hvt_study.serial_link import Arrival, SerialLink
+from hvt_study.flights.serial_link import Arrival, SerialLink
 
 __all__ = ["HEADER_BYTES", "PASS_ROWS", "Line", "UnitMessage", "header_bps"]
 

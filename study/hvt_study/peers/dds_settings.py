@@ -8,7 +8,7 @@ from typing import Literal
 
 from hvt_common.errors import UserError
 from hvt_edge.video.x265 import PRESETS
-from hvt_study.compare_clip import NOMINAL_FPS
+from hvt_study.datasets.clip import NOMINAL_FPS
 
 __all__ = ["RATES", "DdsSettings"]
 

@@ -10,8 +10,8 @@ import pytest
 
 from hvt_common.values import View
 from hvt_scene import Look, Scene, write_truth
-from hvt_scene.project import turns
-from hvt_scene.vehicles import CLASS_NAMES, draw_vehicle
+from hvt_scene.drawing.vehicles import CLASS_NAMES, draw_vehicle
+from hvt_scene.view.project import turns
 
 CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 

@@ -1,0 +1,1 @@
+"""Paints what is there: ground, plants, vehicles and people, and their shadows."""

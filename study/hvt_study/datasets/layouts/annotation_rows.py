@@ -1,0 +1,120 @@
+"""Annotation files: lines of numbers between commas. What is wrong is said with the file and the line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.errors import UserError
+from hvt_study.datasets.mot_files import LAST_FRAME
+
+__all__ = ["Rows", "read_rows"]
+
+_LARGEST = 1e9
+"""Beyond it no pixel and no id lies; ids stay exact in floats."""
+_SHOWN_CHARS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """The numbers of a file, in its order."""
+
+    path: Path
+    table: npt.NDArray[np.float64]
+    """(N, C), finite."""
+    columns: tuple[str, ...]
+    """C names."""
+    lines: npt.NDArray[np.int64]
+    """(N,) line in the file, from 1."""
+    text: tuple[str, ...]
+    """N lines."""
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, column: str) -> npt.NDArray[np.float64]:
+        """(N,) values of a column; -1 where the file does not have it."""
+        if column not in self.columns:
+            return np.full(len(self), -1.0)
+        return np.asarray(self.table[:, self.columns.index(column)])
+
+    def check(self, good: npt.NDArray[np.bool_], *, accepted: str) -> None:
+        """Name the first row that is not good; `UserError`."""
+        for row in np.flatnonzero(~good)[:1]:
+            line = self.text[row]
+            shown = line if len(line) <= _SHOWN_CHARS else line[:_SHOWN_CHARS] + "…"
+            raise UserError(f"{self.path}, line {self.lines[row]} is {shown!r}; accepted is {accepted}")
+
+    def boxes(self, *, origin: float = 0.0) -> npt.NDArray[np.float32]:
+        """(N, 4) float32 x1 y1 x2 y2 from ``x,y,w,h``; ``origin`` is the first pixel's number."""
+        x, y = self["x"] - origin, self["y"] - origin
+        return np.stack([x, y, x + self["w"], y + self["h"]], axis=1).astype(np.float32)
+
+
+def read_rows(path: Path, *, columns: str, least: int, frames: bool = True) -> Rows:
+    """Read a file of which the columns are called so; further ones, blank lines and a comma at the end are no matter.
+
+    Args:
+        path: the file, which may be empty.
+        columns: names between commas.
+        least: how many of them every line must have; all lines have as many as the first.
+        frames: whether the first one is a frame number.
+
+    Raises:
+        UserError: names the file that cannot be read, or the first line that is not so.
+    """
+    numbered = [
+        (number, line.strip())
+        for number, line in enumerate(_text(path).splitlines(), start=1)
+        if line.strip()
+    ]
+    names = tuple(columns.split(","))
+    lines = tuple(line for _, line in numbered)
+    count = min(len(names), len(lines[0].rstrip(",").split(","))) if lines else least
+    count = max(count, least)
+    wanted = f"finite numbers {','.join(names[:least])}" + (",…" if len(names) > least else "")
+    table = _numbers(lines, count)
+    good = np.asarray((np.abs(table) < _LARGEST).all(axis=1), np.bool_)  # false for NaN
+    if frames:
+        wanted += f" with a whole frame number from 0 to {LAST_FRAME}"
+        with np.errstate(invalid="ignore"):
+            whole = (table[:, 0] % 1 == 0) & (table[:, 0] >= 0) & (table[:, 0] <= LAST_FRAME)
+        good = np.logical_and(good, whole)
+    rows = Rows(path, table, names[:count], np.array([number for number, _ in numbered], np.int64), lines)
+    rows.check(good, accepted=wanted)
+    return rows
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise UserError(f"annotations {path} are not text; accepted are lines of numbers") from None
+    except OSError as error:
+        raise UserError(f"annotations {path} cannot be read: {error.strerror or error}") from None
+
+
+def _numbers(lines: tuple[str, ...], count: int) -> npt.NDArray[np.float64]:
+    """(N, count); a line that is not so many numbers becomes NaN."""
+    if not lines:
+        return np.empty((0, count))
+    convert: Callable[..., Any] = np.loadtxt
+    try:
+        return np.asarray(
+            convert(lines, delimiter=",", usecols=range(count), ndmin=2, comments=None), np.float64
+        )
+    except ValueError:
+        return np.array([_line(line, count) for line in lines], np.float64).reshape(-1, count)
+
+
+def _line(line: str, count: int) -> list[float]:
+    try:
+        values = [float(cell) for cell in line.split(",")[:count]]
+    except ValueError:
+        values = []
+    return values if len(values) == count else [np.nan] * count

@@ -1,0 +1,1 @@
+"""The example flight of a report: which run, flown again, stored beside the table."""

@@ -1,0 +1,1 @@
+"""One run from its specification to its row: methods, settings, materials, matched totals, scores."""

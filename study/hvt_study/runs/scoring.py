@@ -1,0 +1,148 @@
+"""From a flight and its labels to the figures of a row."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from hvt_common.protocol.channels import Channel
+from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.flights.flight import FlightReport
+from hvt_study.metrics.bits import Accounting, bit_split, still_counts
+from hvt_study.metrics.classes import class_score
+from hvt_study.metrics.delay import delay_score
+from hvt_study.metrics.detection import detection_score
+from hvt_study.metrics.first_correct import first_correct
+from hvt_study.metrics.observed import (
+    arrivals,
+    detected_ticks,
+    refined_objects,
+    refined_ticks,
+    shown_times_s,
+)
+from hvt_study.metrics.proxy import proxies
+from hvt_study.metrics.tracking import tracking_score
+from hvt_study.runs.run_context import RunContext
+
+__all__ = ["figures"]
+
+_DIGITS = 6
+
+
+def figures(report: FlightReport, shop: RunContext) -> dict[str, Any]:
+    """Every metric column of `hvt_study.runs.columns.COLUMNS`; None where a run has none."""
+    found = {**_bits(report, shop), **_labelled(report, shop), **_delays(report), **_proxies(report)}
+    found |= {"digest": report.digest, "edge_cpu_ms": report.edge_cpu_ms}
+    return {name: _plain(value) for name, value in found.items()}
+
+
+def _bits(report: FlightReport, shop: RunContext) -> dict[str, Any]:
+    stills, refined = arrivals(report.lists), refined_objects(report.lists)
+
+    def split(accounting: Accounting) -> tuple[float, ...]:
+        one = bit_split(
+            report.line_bytes,
+            processed_s=report.duration_s,
+            clip_s=shop.sequence.duration_s,
+            accounting=accounting,
+        )
+        return one.total_bps, one.base_bps, one.roi_bps, one.track_bps, one.other_bps
+
+    counts = still_counts(stills, refined, processed_s=report.duration_s)
+    total, base, roi, tracks, other = map(round, split("span"))
+    pilot = tuple(map(round, split("pilot")))
+    return {
+        "duration_s": report.duration_s,
+        "clip_s": shop.sequence.duration_s,
+        "total_bps": total,
+        "base_bps": base,
+        "roi_bps": roi,
+        "track_bps": tracks,
+        "other_bps": other,
+        "back_bps": round(8 * _back_bytes(report) / report.duration_s),
+        "total_bps_pilot": pilot[0],
+        "base_bps_pilot": pilot[1],
+        "roi_bps_pilot": pilot[2],
+        "fps": report.messages.get("base", 0) / report.duration_s,
+        "stills": counts.stills,
+        "stills_per_min": counts.stills_per_min,
+        "mean_still_bytes": counts.mean_bytes,
+        "tracks_refined": counts.tracks_refined,
+    }
+
+
+def _back_bytes(report: FlightReport) -> int:
+    """Of a server its questions, which are a row of what crossed the line."""
+    return report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)
+
+
+def _labelled(report: FlightReport, shop: RunContext) -> dict[str, Any]:
+    words: dict[str, Any] = {"word": shop.classes.word, "classes": shop.classes.classes}
+    ticks = refined_ticks(report.lists, shop.labels)
+    detection = detection_score(detected_ticks(report.lists, shop.labels), **words)
+    after = class_score(ticks, **words)
+    before = class_score(ticks, refined=False, **words)
+    tracking = tracking_score(ticks, **words)
+    first = first_correct(ticks, fps=NOMINAL_FPS, shown_s=shown_times_s(report.lists), **words)
+    return {
+        "map_50": detection.mean.at_50,
+        "map_50_95": detection.mean.at_50_95,
+        **{f"map_50_{size}": one.at_50 for size, one in detection.by_size.items()},
+        "recall": after.recall,
+        "precision": after.precision,
+        "f1": after.f1,
+        "top1_before": before.counts.top1_found,
+        "top1": after.counts.top1_found,
+        "top1_all_before": before.counts.top1_all,
+        "top1_all": after.counts.top1_all,
+        "macro_f1_before": before.macro_f1_found,
+        "macro_f1": after.macro_f1_found,
+        "macro_f1_all_before": before.macro_f1_all,
+        "macro_f1_all": after.macro_f1_all,
+        **{f"top1_{size}": one.top1_found for size, one in after.by_size.items()},
+        **{f"top1_all_{size}": one.top1_all for size, one in after.by_size.items()},
+        "mota": tracking.mota,
+        "idf1": tracking.idf1,
+        "hota": tracking.hota,
+        "id_switches": tracking.switches if tracking.objects else None,
+        "first_correct_p50_s": first.median_s,
+        "first_correct_p90_s": first.p90_s,
+        "first_correct_never": first.never / first.tracks if first.tracks else None,
+    }
+
+
+def _delays(report: FlightReport) -> dict[str, Any]:
+    delays = delay_score(report.link, arrivals(report.lists))
+    return {
+        "delay_p50_ms": delays.base_p50_ms,
+        "delay_p95_ms": delays.base_p95_ms,
+        "still_delay_p50_ms": delays.still_p50_ms,
+        "still_delay_p95_ms": delays.still_p95_ms,
+    }
+
+
+def _proxies(report: FlightReport) -> dict[str, Any]:
+    said = proxies(refined_objects(report.lists))
+    return {
+        "confidence_base": said.every.confidence_base,
+        "confidence_refined": said.every.confidence_still,
+        "confidence_gain": said.every.gain,
+        "positive_rate": said.every.positive_rate,
+        "change_rate": said.every.change_rate,
+        "entropy_gain_nats": said.every.entropy_gain_nats,
+        "proxy_pairs": said.every.pairs,
+        "small_confidence_base": said.small.confidence_base,
+        "small_confidence_refined": said.small.confidence_still,
+        "small_confidence_gain": said.small.gain,
+        "small_positive_rate": said.small.positive_rate,
+        "small_change_rate": said.small.change_rate,
+        "small_entropy_gain_nats": said.small.entropy_gain_nats,
+        "small_pairs": said.small.pairs,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """No NaN, no digits that nobody can repeat; a wait that never ended stays infinite, or means would flatter."""
+    if isinstance(value, float):
+        return None if math.isnan(value) else round(value, _DIGITS)
+    return value

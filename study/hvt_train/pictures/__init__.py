@@ -1,0 +1,1 @@
+"""Makes the drawn pictures and crops that the models are trained on."""
