@@ -23,7 +23,7 @@ from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.resample import Resizer, capture_time_ns
 from hvt_scene import Scene
-from hvt_study.datasets.layouts.virtual_camera import SCHEME, open_camera
+from hvt_study.datasets.virtual_camera import SCHEME, open_camera
 from hvt_study.metrics.list_score import Listed
 
 __all__ = [

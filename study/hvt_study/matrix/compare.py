@@ -24,9 +24,9 @@ from hvt_common.inference.detect import MOTION
 from hvt_common.inference.store import resolve_model
 from hvt_study.datasets.clip import NOMINAL_FPS, clip_name, share_clip
 from hvt_study.flights.flight import FlightReport
-from hvt_study.matrix.compare_worker import Job, Refused, RunContext, class_names, fly_job, label_job, prepare
 from hvt_study.metrics.list_score import Listed, ListScore, score_lists
 from hvt_study.runs.compare_methods import MethodRow
+from hvt_study.runs.compare_worker import Job, Refused, RunContext, class_names, fly_job, label_job, prepare
 
 __all__ = ["ComparePlan", "CompareResult", "CompareRow", "Missing", "compare"]
 

@@ -1,7 +1,7 @@
 """Vehicles, people and boxes as small solids of flat faces, so that they can be seen at any angle.
 
 The demo's sprites (`hvt_scene.drawing.vehicles`) are flat pictures seen straight from above. A real camera sees
-sides, sloping glass, reflections and lean towards the edges of the picture; these solids have them, and vary far more in
+sides, sloping glass, reflections and lean towards the edges; these solids have them, and vary far more in
 shape, paint and glass than any real car park. Body axes: x to the nose, y to the right, z up, metres; the origin is
 on the ground in the middle.
 """

@@ -64,7 +64,7 @@ def test_each_classifier_is_a_study_of_its_own(tmp_path, capsys):
 
 def test_hours_are_of_every_flight(tmp_path):
     """DDS and the best frame rate are several flights in one row: the estimate would be a fifth of the truth."""
-    from hvt_study.datasets.uri import open_dataset
+    from hvt_study.datasets.layouts.uri import open_dataset
 
     write_visdrone(tmp_path, "a", "b", count=60)
     sequences = open_dataset(f"visdrone:{tmp_path}")

@@ -16,9 +16,9 @@ from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, MOVING,
 from hvt_common.values import Posterior
 from hvt_study.datasets.class_map import map_classes
 from hvt_study.datasets.labels import covered_share
-from hvt_study.datasets.layouts.virtual_camera import VirtualCamera
+from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.reference import open_reference_detector, reference_labels, with_labels
-from hvt_study.datasets.uri import open_dataset
+from hvt_study.datasets.virtual_camera import VirtualCamera
 from layouts import SIZE, square_xywh, write_visdrone
 
 BLOCKS = [(300, 200, 40, 24), (620, 330, 30, 40), (480, 260, 24, 24)]
@@ -143,7 +143,7 @@ def test_a_real_picture_with_its_annotations(tmp_path, data):
 def test_two_hundred_real_annotations(data):
     """Categories, scores and commas as the annotators left them."""
     files = sorted((data / "visdrone" / "annotations").glob("*.txt"))
-    from hvt_study.datasets.layouts.virtual_camera import read_annotations
+    from hvt_study.datasets.virtual_camera import read_annotations
 
     found = [read_annotations(file) for file in files]
     assert len(files) == 200

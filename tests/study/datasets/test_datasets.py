@@ -19,12 +19,12 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_study.datasets.annotation_rows import read_rows
 from hvt_study.datasets.clip import stage_clip
 from hvt_study.datasets.content import content_hash
 from hvt_study.datasets.layouts import demo
-from hvt_study.datasets.layouts.annotation_rows import read_rows
 from hvt_study.datasets.layouts.mot import mot_table
-from hvt_study.datasets.uri import open_dataset, open_datasets
+from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
 from layouts import SIZE, square_xywh, write_images, write_mot, write_uavdt, write_visdrone

@@ -8,7 +8,7 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_study.datasets.clip import clip_name, share_clip
-from hvt_study.datasets.layouts.virtual_camera import VirtualCamera, open_camera, read_annotations
+from hvt_study.datasets.virtual_camera import VirtualCamera, open_camera, read_annotations
 
 BOX = (300, 200, 40, 24)  # x, y, w, h of a white block
 

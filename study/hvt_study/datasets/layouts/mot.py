@@ -30,8 +30,8 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_common.inference.labels import read_labels
+from hvt_study.datasets.annotation_rows import Rows, read_rows
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
-from hvt_study.datasets.layouts.annotation_rows import Rows, read_rows
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.sequence import Sequence

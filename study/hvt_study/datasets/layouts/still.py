@@ -2,7 +2,7 @@
 
 VisDrone-DET's layout (ROOT/images/NAME.jpg, ROOT/annotations/NAME.txt), a folder of pictures with NAME.txt beside
 NAME.jpg, or a single picture. Real pixels and real labels, and boxes that follow exactly; the way is drawn from a
-seed. See `hvt_study.datasets.layouts.virtual_camera`.
+seed. See `hvt_study.datasets.virtual_camera`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from hvt_study.datasets.label_table import file_stamp
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.image_sequence import find_folders
 from hvt_study.datasets.layouts.options import Options
-from hvt_study.datasets.layouts.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
 from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
 
 __all__ = ["StillLabels", "open_stills"]
 

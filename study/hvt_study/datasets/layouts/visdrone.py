@@ -19,8 +19,8 @@ from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
 from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
 from hvt_study.datasets.layouts.options import Options
-from hvt_study.datasets.layouts.visdrone_rows import VisDroneRows, read_video_rows
 from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.visdrone_rows import VisDroneRows, read_video_rows
 
 __all__ = ["open_visdrone", "table_of", "visdrone_table"]
 

@@ -27,7 +27,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
 from hvt_study.datasets.labels import FrameLabels, covered_share
-from hvt_study.datasets.layouts.visdrone_rows import read_image_rows
+from hvt_study.datasets.visdrone_rows import read_image_rows
 
 __all__ = [
     "SCHEME",

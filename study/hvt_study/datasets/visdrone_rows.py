@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes
-from hvt_study.datasets.layouts.annotation_rows import Rows, read_rows
+from hvt_study.datasets.annotation_rows import Rows, read_rows
 
 __all__ = ["VisDroneRows", "read_image_rows", "read_video_rows"]
 
