@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Look"]
+__all__ = ["Appearance"]
 
 Bgr = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Look:
+class Appearance:
     """Light, surfaces, camera and density of one scene; angles in degrees, lengths in metres."""
 
     shadow_azimuth_deg: float = 38.0
@@ -50,7 +50,7 @@ class Look:
         return (self.shadow_per_m * math.cos(angle), self.shadow_per_m * math.sin(angle))
 
     @classmethod
-    def random(cls, seed: int) -> Look:
+    def random(cls, seed: int) -> Appearance:
         """A strongly varied look for training: light, season, altitude, tilt, density."""
         rng = np.random.Generator(np.random.PCG64([seed, 77]))
         width = float(rng.uniform(70, 150))

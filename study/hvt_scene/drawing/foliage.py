@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_scene.appearance import Look
+from hvt_scene.appearance import Appearance
 from hvt_scene.view.project import Floats
 from hvt_scene.world.layout import MAIN_HALF_M, SIDE_HALF_M, WORLD_M, Layout, Tree
 
@@ -29,8 +29,8 @@ class Grove:
         radii_m: (T,).
     """
 
-    def __init__(self, layout: Layout, look: Look, *, rng: np.random.Generator) -> None:
-        self.canopies = [_canopy(rng, look) for _ in range(_VARIANTS)]
+    def __init__(self, layout: Layout, appearance: Appearance, *, rng: np.random.Generator) -> None:
+        self.canopies = [_canopy(rng, appearance) for _ in range(_VARIANTS)]
         self._levels = [_pyramid(canopy) for canopy in self.canopies]
         trees = [tree for tree in layout.trees if _overhangs(tree, layout)]
         self.places_m = np.array([(tree.x, tree.y) for tree in trees]).reshape(-1, 2)
@@ -89,13 +89,13 @@ def _pyramid(picture: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.uint8]]:
     return levels
 
 
-def _canopy(rng: np.random.Generator, look: Look) -> npt.NDArray[np.uint8]:
+def _canopy(rng: np.random.Generator, appearance: Appearance) -> npt.NDArray[np.uint8]:
     side = _CANOPY_PX
     bgr = np.zeros((side, side, 3), np.uint8)
     alpha = np.zeros((side, side), np.uint8)
-    away = np.array(look.shadow_vector)
-    away = away / max(float(np.hypot(*away)), 1e-6)
-    base = np.array(look.grass_bgr) * np.array([0.62, 0.86, 0.66]) * rng.uniform(0.82, 1.15)
+    outward = np.array(appearance.shadow_vector)
+    outward = outward / max(float(np.hypot(*outward)), 1e-6)
+    base = np.array(appearance.grass_bgr) * np.array([0.62, 0.86, 0.66]) * rng.uniform(0.82, 1.15)
     base = base + rng.normal(0, 6, 3)
     clumps = 150
     turn, reach = rng.uniform(0, 2 * np.pi, clumps), np.sqrt(rng.uniform(0, 1, clumps))
@@ -104,7 +104,7 @@ def _canopy(rng: np.random.Generator, look: Look) -> npt.NDArray[np.uint8]:
         direction = np.array([np.cos(angle), np.sin(angle)])
         spot = side / 2 + direction * radius * side * 0.39
         size = int(side * rng.uniform(0.035, 0.075))
-        lit = 1.0 - 0.42 * radius * float(direction @ away) - 0.14 * radius + float(rng.normal(0, 0.10))
+        lit = 1.0 - 0.42 * radius * float(direction @ outward) - 0.14 * radius + float(rng.normal(0, 0.10))
         centre = np.round(spot).astype(int)
         dark = np.clip(base * lit * 0.62, 0, 255).tolist()
         bright = np.clip(base * lit * 1.22, 0, 255).tolist()
@@ -112,7 +112,7 @@ def _canopy(rng: np.random.Generator, look: Look) -> npt.NDArray[np.uint8]:
         cv2.circle(bgr, centre.tolist(), size + 1, dark, -1, cv2.LINE_8)
         cv2.circle(
             bgr,
-            np.round(spot - away * size * 0.3).astype(int).tolist(),
+            np.round(spot - outward * size * 0.3).astype(int).tolist(),
             int(size * 0.72),
             bright,
             -1,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_scene.appearance import Bgr, Look
+from hvt_scene.appearance import Appearance, Bgr
 from hvt_scene.drawing.foliage import CANOPY_SPAN
 from hvt_scene.world.layout import MAIN_HALF_M, PAVEMENT_M, SIDE_HALF_M, WORLD_M, Building, Layout, Rect, Tree
 
@@ -45,10 +45,15 @@ class Ground:
 
 
 def paint_ground(
-    layout: Layout, look: Look, *, rng: _Rng, canopies: Sequence[npt.NDArray[np.uint8]], m_per_px: float
+    layout: Layout,
+    appearance: Appearance,
+    *,
+    rng: _Rng,
+    canopies: Sequence[npt.NDArray[np.uint8]],
+    m_per_px: float,
 ) -> Ground:
     """Paint everything that neither moves nor hides anything; all trees are painted, as flat as the grass."""
-    painter = _Painter(look, rng=rng, m_per_px=m_per_px)
+    painter = _Painter(appearance, rng=rng, m_per_px=m_per_px)
     painter.surface("grass", Rect(0, 0, *WORLD_M))
     for kind, rect in layout.surfaces:
         painter.surface(kind, rect)
@@ -66,8 +71,8 @@ def paint_ground(
 class _Painter:
     """The picture under work, addressed in metres."""
 
-    def __init__(self, look: Look, *, rng: _Rng, m_per_px: float) -> None:
-        self._look, self._m_per_px = look, m_per_px
+    def __init__(self, appearance: Appearance, *, rng: _Rng, m_per_px: float) -> None:
+        self._appearance, self._m_per_px = appearance, m_per_px
         high, wide = (round(metres / m_per_px) for metres in (WORLD_M[1], WORLD_M[0]))
         self.bgr = np.zeros((high, wide, 3), np.uint8)
         self._shade = np.zeros((high, wide), np.uint8)
@@ -80,18 +85,18 @@ class _Painter:
 
     def surface(self, kind: str, rect: Rect) -> None:
         """Cover a rectangle with a material."""
-        look = self._look
+        appearance = self._appearance
         materials: dict[
             str, tuple[Bgr, float, float, float]
         ] = {  # colour, strength of fine, middle, coarse noise
-            "grass": (look.grass_bgr, 0.11, 0.07, 0.10),
-            "island": (_gain(look.grass_bgr, 0.92), 0.13, 0.10, 0.05),
-            "soil": (look.soil_bgr, 0.08, 0.07, 0.09),
-            "lot": (_gain(look.asphalt_bgr, 1.06), 0.05, 0.025, 0.06),
-            "road": (_gain(look.asphalt_bgr, 0.9), 0.05, 0.02, 0.04),
-            "concrete": (_gain(look.paving_bgr, 0.94), 0.035, 0.025, 0.06),
-            "paving": (look.paving_bgr, 0.04, 0.02, 0.05),
-            "gravelpath": (_mix(look.soil_bgr, look.paving_bgr), 0.09, 0.04, 0.04),
+            "grass": (appearance.grass_bgr, 0.11, 0.07, 0.10),
+            "island": (_gain(appearance.grass_bgr, 0.92), 0.13, 0.10, 0.05),
+            "soil": (appearance.soil_bgr, 0.08, 0.07, 0.09),
+            "lot": (_gain(appearance.asphalt_bgr, 1.06), 0.05, 0.025, 0.06),
+            "road": (_gain(appearance.asphalt_bgr, 0.9), 0.05, 0.02, 0.04),
+            "concrete": (_gain(appearance.paving_bgr, 0.94), 0.035, 0.025, 0.06),
+            "paving": (appearance.paving_bgr, 0.04, 0.02, 0.05),
+            "gravelpath": (_mix(appearance.soil_bgr, appearance.paving_bgr), 0.09, 0.04, 0.04),
             "court": ((118.0, 96.0, 62.0), 0.03, 0.015, 0.02),
             "gravel": ((138.0, 142.0, 144.0), 0.12, 0.03, 0.04),
             "metal": ((176.0, 172.0, 164.0), 0.02, 0.015, 0.04),
@@ -99,18 +104,22 @@ class _Painter:
             "tiles": ((70.0, 86.0, 150.0), 0.07, 0.05, 0.04),
         }
         colour, fine, middle, coarse = materials[kind]
-        cut = self._slice(rect)
-        gain = self._look.texture_gain
-        noise = (fine * self._fine[cut] + middle * self._middle[cut] + coarse * self._coarse[cut]) * gain + 1
+        region = self._slice(rect)
+        gain = self._appearance.texture_gain
+        noise = (
+            fine * self._fine[region] + middle * self._middle[region] + coarse * self._coarse[region]
+        ) * gain + 1
         tint = np.array(colour, np.float32)
         if kind in {"grass", "island"}:  # dry patches lean towards the soil
-            dry = np.clip(0.20 + 0.22 * self._coarse[cut] + 0.1 * self._middle[cut], 0, 0.75)[..., None]
-            picture = (tint * (1 - dry) + np.array(self._look.soil_bgr, np.float32) * dry) * noise[..., None]
+            dry = np.clip(0.20 + 0.22 * self._coarse[region] + 0.1 * self._middle[region], 0, 0.75)[..., None]
+            picture = (tint * (1 - dry) + np.array(self._appearance.soil_bgr, np.float32) * dry) * noise[
+                ..., None
+            ]
         else:
             picture = tint * noise[..., None]
-        self.bgr[cut] = np.clip(picture, 0, 255)
+        self.bgr[region] = np.clip(picture, 0, 255)
         if kind in {"lot", "court"}:
-            self.frame(rect, wide_m=0.25, colour=_gain(look.paving_bgr, 0.98))
+            self.frame(rect, wide_m=0.25, colour=_gain(appearance.paving_bgr, 0.98))
         if kind == "court":
             _paint_court(self, rect)
         if kind in {"paving", "concrete"}:
@@ -118,9 +127,13 @@ class _Painter:
 
     def _slabs(self, rect: Rect, *, step_m: float) -> None:
         for x in np.arange(rect.x0 + step_m, rect.x1, step_m):
-            self.stroke((x, rect.y0), (x, rect.y1), wide_m=0.05, colour=_gain(self._look.paving_bgr, 0.84))
+            self.stroke(
+                (x, rect.y0), (x, rect.y1), wide_m=0.05, colour=_gain(self._appearance.paving_bgr, 0.84)
+            )
         for y in np.arange(rect.y0 + step_m, rect.y1, step_m):
-            self.stroke((rect.x0, y), (rect.x1, y), wide_m=0.05, colour=_gain(self._look.paving_bgr, 0.84))
+            self.stroke(
+                (rect.x0, y), (rect.x1, y), wide_m=0.05, colour=_gain(self._appearance.paving_bgr, 0.84)
+            )
 
     def frame(self, rect: Rect, *, wide_m: float, colour: Bgr) -> None:
         """Draw a rectangle's edge."""
@@ -154,7 +167,7 @@ class _Painter:
 
     def shadows(self, layout: Layout) -> None:
         """Darken what lies in the shade of buildings and trees."""
-        dx, dy = self._look.shadow_vector
+        dx, dy = self._appearance.shadow_vector
         for building in layout.buildings:
             rect, height = building.rect, building.height_m
             foot = np.array([(rect.x0, rect.y0), (rect.x1, rect.y0), (rect.x1, rect.y1), (rect.x0, rect.y1)])
@@ -166,10 +179,10 @@ class _Painter:
             radius = round(0.92 * tree.r / self._m_per_px * 16)
             cv2.circle(self._shade, centre.tolist(), radius, 225, -1, cv2.LINE_AA, _SHIFT)
         self._shade = np.asarray(cv2.blur(self._shade, (5, 5)), np.uint8)
-        dark = 1 - self._look.shadow_strength * (self._shade.astype(np.float32) / 255)
+        dark = 1 - self._appearance.shadow_strength * (self._shade.astype(np.float32) / 255)
         # Skylight is blue, so a shadow keeps a little more of it.
-        for channel, keep in enumerate((1.10, 1.03, 1.0)):
-            plane = self.bgr[..., channel] * np.minimum(dark * np.where(dark < 1, keep, 1), 1)
+        for channel, share in enumerate((1.10, 1.03, 1.0)):
+            plane = self.bgr[..., channel] * np.minimum(dark * np.where(dark < 1, share, 1), 1)
             self.bgr[..., channel] = plane
 
     def canopy(self, tree: Tree, picture: npt.NDArray[np.uint8]) -> None:
@@ -177,19 +190,19 @@ class _Painter:
         side = max(3, round(CANOPY_SPAN * tree.r / self._m_per_px))
         small = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
         left, top = (round(at / self._m_per_px - side / 2) for at in (tree.x, tree.y))
-        cut = (slice(max(top, 0), max(top + side, 0)), slice(max(left, 0), max(left + side, 0)))
-        ground = self.bgr[cut]
+        region = (slice(max(top, 0), max(top + side, 0)), slice(max(left, 0), max(left + side, 0)))
+        ground = self.bgr[region]
         inside = small[max(-top, 0) :, max(-left, 0) :][: ground.shape[0], : ground.shape[1]]
         ground[:] = (ground * (1 - inside[..., 3:] / 255.0) + inside[..., :3]).astype(np.uint8)
 
     def finish(self) -> Ground:
         """The painted ground, exposed."""
-        if self._look.exposure != 1.0:
-            self.bgr[:] = cv2.convertScaleAbs(self.bgr, alpha=self._look.exposure)
+        if self._appearance.exposure != 1.0:
+            self.bgr[:] = cv2.convertScaleAbs(self.bgr, alpha=self._appearance.exposure)
         step = 0.5
         size = (round(WORLD_M[0] / step), round(WORLD_M[1] / step))
         shade = cv2.resize(self._shade, size, interpolation=cv2.INTER_AREA)
-        light = (1 - self._look.shadow_strength * shade / 255.0).astype(np.float32)
+        light = (1 - self._appearance.shadow_strength * shade / 255.0).astype(np.float32)
         bgra = np.asarray(cv2.cvtColor(self.bgr, cv2.COLOR_BGR2BGRA), np.uint8)
         return Ground(bgra, self._m_per_px, light, step)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_scene.appearance import Look
+from hvt_scene.appearance import Appearance
 
 __all__ = ["Camera", "Matrix"]
 
@@ -26,7 +26,7 @@ class Camera:
     """A slow flight from ``start_m`` to ``end_m``: pan, zoom, roll, tilt and shake, continuous in time."""
 
     size: tuple[int, int]
-    look: Look
+    appearance: Appearance
     duration_s: float
     start_m: tuple[float, float]
     end_m: tuple[float, float]
@@ -38,9 +38,11 @@ class Camera:
         eased = _ease(share)
         wide, high = self.size
         centre = [a + (b - a) * eased for a, b in zip(self.start_m, self.end_m, strict=True)]
-        roll = math.radians(self.look.roll_deg[0] + (self.look.roll_deg[1] - self.look.roll_deg[0]) * eased)
+        roll = math.radians(
+            self.appearance.roll_deg[0] + (self.appearance.roll_deg[1] - self.appearance.roll_deg[0]) * eased
+        )
         shake = self._shake(t_s)
-        roll += 0.0006 * self.look.shake_px * math.sin(1.9 * t_s + self.phases[3])
+        roll += 0.0006 * self.appearance.shake_px * math.sin(1.9 * t_s + self.phases[3])
         scale = wide / self._width_m(share)
         cosine, sine = scale * math.cos(roll), scale * math.sin(roll)
         plane = np.array(
@@ -54,18 +56,18 @@ class Camera:
         return np.asarray(shift @ self._tilt() @ plane, np.float64)
 
     def _width_m(self, share: float) -> float:
-        first, middle, last = self.look.width_m
+        first, middle, last = self.appearance.width_m
         if share < 0.5:
             return first + (middle - first) * _ease(share * 2)
         return middle + (last - middle) * _ease(share * 2 - 1)
 
     def _tilt(self) -> Matrix:
         """A pinhole whose focal length is 1.2 picture widths, turned about the picture's horizontal axis."""
-        angle, focal = math.radians(self.look.tilt_deg), 1.2 * self.size[0]
+        angle, focal = math.radians(self.appearance.tilt_deg), 1.2 * self.size[0]
         return np.array([[1, 0, 0], [0, math.cos(angle), 0], [0, -math.sin(angle) / focal, 1]])
 
     def _shake(self, t_s: float) -> tuple[float, float]:
-        gain = self.look.shake_px * self.size[0] / 1920
+        gain = self.appearance.shake_px * self.size[0] / 1920
         first, second, third, _ = self.phases
         x = math.sin(2.3 * t_s + first) + 0.35 * math.sin(7.1 * t_s + second)
         y = math.sin(1.7 * t_s + third) + 0.35 * math.sin(6.3 * t_s + first)

@@ -21,10 +21,10 @@ def darken(frame: Bgra, shadows_px: Floats, *, strength: float) -> None:
     """Take ``strength`` (0…1) of the light inside the hulls of (N, M, 2) points, once even where they overlap."""
     high, wide = frame.shape[:2]
     mask = np.full((high, wide), 255, np.uint8)
-    keep = 255 * (1 - strength)
+    left_over = 255 * (1 - strength)
     fixed = np.round((shadows_px - 0.5) * (1 << _SHIFT)).astype(np.int32)
     for points in fixed:
-        cv2.fillConvexPoly(mask, cv2.convexHull(points), keep, cv2.LINE_AA, _SHIFT)
+        cv2.fillConvexPoly(mask, cv2.convexHull(points), left_over, cv2.LINE_AA, _SHIFT)
     for x0, y0, x1, y1 in bounds(shadows_px, size=(wide, high), margin_px=1).tolist():
         if x1 > x0 and y1 > y0:
             light = mask[y0:y1, x0:x1]

@@ -38,7 +38,7 @@ def project(points_m: Floats, local: Floats) -> Floats:
 def near_frame(local: Floats, reach_m: Floats, *, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
     """(N,) whether a thing that reaches so far from its place may touch the frame."""
     grain = np.sqrt(np.abs(np.linalg.det(local[:, :, :2])))
-    # A tilted camera stretches one axis more than the other; one and a half covers what `Look` allows.
+    # A tilted camera stretches one axis more than the other; one and a half covers what `Appearance` allows.
     margin = (1.5 * reach_m * grain)[:, None]
     spots = local[:, :, 2]
     return np.asarray(((spots > -margin) & (spots < np.array(size) + margin)).all(1), np.bool_)

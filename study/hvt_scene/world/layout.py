@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hvt_scene.appearance import Look
+from hvt_scene.appearance import Appearance
 
 __all__ = ["WORLD_M", "Building", "Layout", "Parked", "Rect", "Tree", "plan"]
 
@@ -90,13 +90,17 @@ class Layout:
     """Straight footpaths x0 y0 x1 y1 that people use."""
 
 
-def plan(rng: _Rng, look: Look) -> Layout:
+def plan(rng: _Rng, appearance: Appearance) -> Layout:
     """Lay out a world; the same generator state gives the same one."""
     layout = Layout(main_y=WORLD_M[1] / 2 + float(rng.uniform(-3, 3)), side_x=float(rng.uniform(122, 144)))
     for block, kinds in zip(_blocks(layout), _kinds(rng), strict=True):
         split = block.x0 + block.size[0] * float(rng.uniform(0.46, 0.56))
-        _fill(layout, Rect(block.x0, block.y0, split, block.y1), kind=kinds[0], rng=rng, look=look)
-        _fill(layout, Rect(split, block.y0, block.x1, block.y1), kind=kinds[1], rng=rng, look=look)
+        _fill(
+            layout, Rect(block.x0, block.y0, split, block.y1), kind=kinds[0], rng=rng, appearance=appearance
+        )
+        _fill(
+            layout, Rect(split, block.y0, block.x1, block.y1), kind=kinds[1], rng=rng, appearance=appearance
+        )
     _roadside(layout, rng)
     return layout
 
@@ -123,9 +127,9 @@ def _blocks(layout: Layout) -> list[Rect]:
     ]
 
 
-def _fill(layout: Layout, plot: Rect, *, kind: str, rng: _Rng, look: Look) -> None:
+def _fill(layout: Layout, plot: Rect, *, kind: str, rng: _Rng, appearance: Appearance) -> None:
     if kind == "parking":
-        _parking(layout, plot, rng=rng, look=look)
+        _parking(layout, plot, rng=rng, appearance=appearance)
     elif kind == "yard":
         _yard(layout, plot, rng=rng)
     elif kind == "roofs":
@@ -136,7 +140,7 @@ def _fill(layout: Layout, plot: Rect, *, kind: str, rng: _Rng, look: Look) -> No
         _park(layout, plot, rng=rng, court=kind == "court")
 
 
-def _parking(layout: Layout, plot: Rect, *, rng: _Rng, look: Look) -> None:
+def _parking(layout: Layout, plot: Rect, *, rng: _Rng, appearance: Appearance) -> None:
     """Double rows of stalls between aisles, planted islands at their ends, and a tour around the aisles."""
     layout.surfaces.append(("grass", plot))
     lot = plot.inset(2.2)
@@ -147,11 +151,11 @@ def _parking(layout: Layout, plot: Rect, *, rng: _Rng, look: Look) -> None:
     aisles: list[float] = []
     y = lot.y0 + 0.3
     while y + deep <= lot.y1:
-        _stall_row(layout, (left, y), stalls=stalls, rng=rng, look=look)
+        _stall_row(layout, (left, y), stalls=stalls, rng=rng, appearance=appearance)
         y += deep
         paired = len(aisles) > 0 and y + deep + _AISLE_M <= lot.y1
         if paired:
-            _stall_row(layout, (left, y), stalls=stalls, rng=rng, look=look)
+            _stall_row(layout, (left, y), stalls=stalls, rng=rng, appearance=appearance)
             for x in (left - 1.6, left + stalls * wide + 1.6):
                 island = Rect(x - 1.2, y - deep + 0.4, x + 1.2, y + deep - 0.4)
                 layout.surfaces.append(("island", island))
@@ -169,13 +173,15 @@ def _parking(layout: Layout, plot: Rect, *, rng: _Rng, look: Look) -> None:
         )
 
 
-def _stall_row(layout: Layout, corner: tuple[float, float], *, stalls: int, rng: _Rng, look: Look) -> None:
+def _stall_row(
+    layout: Layout, corner: tuple[float, float], *, stalls: int, rng: _Rng, appearance: Appearance
+) -> None:
     wide, deep = _STALL_M
     left, top = corner
     layout.lines.extend((left + i * wide, top, left + i * wide, top + deep) for i in range(stalls + 1))
     layout.lines.append((left, top + deep / 2, left, top + deep / 2))
     for index in range(stalls):
-        if rng.random() > look.occupancy:
+        if rng.random() > appearance.occupancy:
             continue
         kind = _stall_class(float(rng.random()))
         x = left + (index + 0.5) * wide + float(rng.normal(0, 0.1))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hvt_scene.appearance import Look
+from hvt_scene.appearance import Appearance
 from hvt_scene.world.layout import MAIN_HALF_M, PAVEMENT_M, SIDE_HALF_M, WORLD_M, Layout
 
 __all__ = ["SAMPLES_HZ", "Mover", "set_in_motion"]
@@ -37,7 +37,7 @@ class _Driver:
     class_name: str
     s_m: float
     v_mps: float
-    wish_mps: float
+    desired_mps: float
     length_m: float
 
 
@@ -50,14 +50,14 @@ class _Lane:
     length_m: float
     stop_m: float
     main: bool
-    wish_mps: float
+    desired_mps: float
 
 
-def set_in_motion(layout: Layout, look: Look, *, rng: _Rng, duration_s: float) -> list[Mover]:
+def set_in_motion(layout: Layout, appearance: Appearance, *, rng: _Rng, duration_s: float) -> list[Mover]:
     """Simulate everybody for the whole clip; the same generator state gives the same tracks."""
     movers: list[Mover] = []
     for lane in _lanes(layout):
-        movers += _drive(lane, look=look, rng=rng, duration_s=duration_s)
+        movers += _drive(lane, appearance=appearance, rng=rng, duration_s=duration_s)
     for loop in layout.loops:
         movers.append(_circle(loop, rng=rng, duration_s=duration_s))
     for walk in layout.walks:
@@ -73,13 +73,13 @@ def _lanes(layout: Layout) -> list[_Lane]:
     out = _OUTSIDE_M
     back = SIDE_HALF_M + PAVEMENT_M + 2.0
     lanes = []
-    for offset, wish in ((1.8, 14.0), (5.3, 12.0)):
+    for offset, desired in ((1.8, 14.0), (5.3, 12.0)):
         y = layout.main_y
         lanes.append(
-            _Lane((-out, y + offset), (1, 0), wide + 2 * out, layout.side_x - back + out, True, wish)
+            _Lane((-out, y + offset), (1, 0), wide + 2 * out, layout.side_x - back + out, True, desired)
         )
         stop = wide - layout.side_x - back + out
-        lanes.append(_Lane((wide + out, y - offset), (-1, 0), wide + 2 * out, stop, True, wish))
+        lanes.append(_Lane((wide + out, y - offset), (-1, 0), wide + 2 * out, stop, True, desired))
     back = MAIN_HALF_M + PAVEMENT_M + 2.0
     x = layout.side_x
     lanes.append(_Lane((x - 2.0, -out), (0, 1), deep + 2 * out, layout.main_y - back + out, False, 10.0))
@@ -99,16 +99,16 @@ def _road_class(draw: float) -> tuple[str, float]:
     return next(((name, length) for bound, name, length in table if draw < bound), ("motor", 2.2))
 
 
-def _drive(lane: _Lane, *, look: Look, rng: _Rng, duration_s: float) -> list[Mover]:
+def _drive(lane: _Lane, *, appearance: Appearance, rng: _Rng, duration_s: float) -> list[Mover]:
     """A column of vehicles along one lane, by the Intelligent Driver Model (Treiber et al., 2000)."""
     column: list[_Driver] = []
-    s = lane.length_m - float(rng.uniform(0, look.traffic_gap_m))
-    reach = -lane.wish_mps * (duration_s + _WARM_UP_S)
+    s = lane.length_m - float(rng.uniform(0, appearance.traffic_gap_m))
+    reach = -lane.desired_mps * (duration_s + _WARM_UP_S)
     while s > reach:
         name, length = _road_class(float(rng.random()))
-        wish = lane.wish_mps * float(rng.uniform(0.88, 1.12))
-        column.append(_Driver(name, s, wish, wish, length))
-        s -= length + 6.0 + float(rng.exponential(max(look.traffic_gap_m - 6.0, 1.0)))
+        desired = lane.desired_mps * float(rng.uniform(0.88, 1.12))
+        column.append(_Driver(name, s, desired, desired, length))
+        s -= length + 6.0 + float(rng.exponential(max(appearance.traffic_gap_m - 6.0, 1.0)))
     steps = round((duration_s + _WARM_UP_S) * SAMPLES_HZ) + 1
     history = np.empty((steps, len(column)))
     for step in range(steps):
@@ -147,9 +147,11 @@ def _advance(column: list[_Driver], *, stop_m: float | None) -> None:
             gaps.append((stop_m - front + standstill_m - 0.5, v))
         interaction = 0.0
         for gap, closing in gaps:
-            wish = standstill_m + max(0.0, v * headway_s + v * closing / (2 * math.sqrt(speed_up * brake)))
-            interaction = max(interaction, wish / max(gap, 0.3))
-        ratio = v / driver.wish_mps
+            desired_gap = standstill_m + max(
+                0.0, v * headway_s + v * closing / (2 * math.sqrt(speed_up * brake))
+            )
+            interaction = max(interaction, desired_gap / max(gap, 0.3))
+        ratio = v / driver.desired_mps
         accel = speed_up * (1 - ratio * ratio * ratio * ratio - interaction * interaction)
         ahead = (driver.s_m - driver.length_m / 2, v)
         driver.v_mps = max(0.0, v + max(accel, -7.0) * step_s)

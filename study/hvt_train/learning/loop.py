@@ -39,19 +39,19 @@ class LoopSettings:
 class Average:
     """Exponential moving average of a network's weights (Polyak); what is exported and measured."""
 
-    def __init__(self, net: nn.Module, keep: float) -> None:
+    def __init__(self, net: nn.Module, decay: float) -> None:
         self.net = copy.deepcopy(net).eval()
-        self._keep, self._count = keep, 0
+        self._decay, self._count = decay, 0
 
     def update(self, net: nn.Module) -> None:
         """Take a step towards ``net``; faster in the beginning."""
         self._count += 1
-        keep = min(self._keep, (1 + self._count) / (10 + self._count))
+        decay = min(self._decay, (1 + self._count) / (10 + self._count))
         with torch.no_grad():
             mine, theirs = self.net.state_dict(), net.state_dict()
             for name, value in mine.items():
                 if value.dtype.is_floating_point:
-                    value.lerp_(theirs[name], 1 - keep)
+                    value.lerp_(theirs[name], 1 - decay)
                 else:
                     value.copy_(theirs[name])
 

@@ -145,10 +145,10 @@ def _assign(
     rank = cost.argsort(1).argsort(1)
     chosen = (rank < wanted[:, None]) & allowed
     owner, slot = torch.nonzero(chosen, as_tuple=True)
-    return _settled(numbers[owner, slot], owner, cost[owner, slot], pictures, real, total=rows.shape[1])
+    return _resolved(numbers[owner, slot], owner, cost[owner, slot], pictures, real, total=rows.shape[1])
 
 
-def _settled(
+def _resolved(
     cells: Tensor, owner: Tensor, cost: Tensor, pictures: Tensor, real: Tensor, *, total: int
 ) -> tuple[Tensor, Tensor]:
     """A cell that several objects want goes to the cheapest."""
@@ -156,8 +156,8 @@ def _settled(
     order = cost.argsort(descending=True)
     winner = torch.full((int(key.max()) + 1 if len(key) else 1,), -1, dtype=torch.long)
     winner[key[order]] = order  # the last write, which is the cheapest, stays
-    kept = winner[key] == torch.arange(len(key))
-    return cells[kept], real[owner[kept]]
+    won = winner[key] == torch.arange(len(key))
+    return cells[won], real[owner[won]]
 
 
 def _forgive(weights: Tensor, grid: Tensor, stride: Tensor, pictures: Tensor, boxes: Tensor) -> None:

@@ -18,7 +18,7 @@ from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import HELD_OUT_SEED, SOURCE_SIZE, TRAIN_SEED, Shot, shoot
 from hvt_train.pictures.views import degrade, read_picture
 
-__all__ = ["CROP_SIDE", "CropSource", "Crops", "cut_crops", "held_out_crops", "pool_crops", "scene_crops"]
+__all__ = ["CROP_SIDE", "CropSource", "Crops", "collect_crops", "held_out_crops", "pool_crops", "scene_crops"]
 
 CROP_SIDE = 96
 """Pixels of the classifier's square input."""
@@ -41,7 +41,7 @@ class Crops:
     class_ids: npt.NDArray[np.int32]
 
 
-def cut_crops(picture: Picture, *, most: int, rng: _Rng) -> Crops:
+def collect_crops(picture: Picture, *, most: int, rng: _Rng) -> Crops:
     """Up to ``most`` crops of what is well visible, rare classes first, and one of the ground as "other"."""
     sides = (picture.boxes_px[:, 2:] - picture.boxes_px[:, :2]).max(1)
     rows = np.nonzero((picture.visible >= _LEAST_VISIBLE) & (sides >= _LEAST_SIDE_PX))[0]
@@ -55,9 +55,9 @@ def cut_crops(picture: Picture, *, most: int, rng: _Rng) -> Crops:
         if empty is not None:
             boxes.append(empty)
             kinds.append(CLASS_NAMES.index("other"))
-    cut = [_stored(picture.image_bgr, box) for box in boxes]
-    inner = np.array([box for _, box in cut], np.float32).reshape(-1, 4)
-    return Crops([image for image, _ in cut], inner, np.array(kinds, np.int32))
+    crops = [_stored(picture.image_bgr, box) for box in boxes]
+    inner = np.array([box for _, box in crops], np.float32).reshape(-1, 4)
+    return Crops([image for image, _ in crops], inner, np.array(kinds, np.int32))
 
 
 def _empty_box(picture: Picture, rng: _Rng) -> npt.NDArray[np.float32] | None:
@@ -89,23 +89,23 @@ def scene_crops(numbers: range, *, moments: int, most: int) -> Iterator[Crops]:
     """Crops of training scenes at the source's full size."""
     for number in numbers:
         rng = np.random.default_rng([TRAIN_SEED, 2, number])
-        scene = shoot(TRAIN_SEED + 50_000 + number, demo_look=number % 3 == 0)
+        scene = shoot(TRAIN_SEED + 50_000 + number, demo_appearance=number % 3 == 0)
         for t_s in rng.uniform(0, scene.duration_s, moments):
-            yield cut_crops(Shot(scene, float(t_s)).picture(SOURCE_SIZE), most=most, rng=rng)
+            yield collect_crops(Shot(scene, float(t_s)).picture(SOURCE_SIZE), most=most, rng=rng)
 
 
 def pool_crops(pool: list[Path], *, most: int) -> Iterator[Crops]:
     """Crops of the detector's clean pictures: places, and demo scenes from further away than `scene_crops`."""
     clean = [path for path in pool if path.name.startswith(("place", "demo"))]
     for number, path in enumerate(clean):
-        yield cut_crops(read_picture(path), most=most, rng=np.random.default_rng([TRAIN_SEED, 3, number]))
+        yield collect_crops(read_picture(path), most=most, rng=np.random.default_rng([TRAIN_SEED, 3, number]))
 
 
 def held_out_crops(seeds: range, *, moments: int, quality_pct: int = 65) -> Iterator[tuple[Image, str]]:
     """Stills of held-out scenes as the ground decodes them, each with its true class."""
     codec = JpegCodec()
     for seed in seeds:
-        scene = shoot(HELD_OUT_SEED + seed, demo_look=seed % 2 == 0)
+        scene = shoot(HELD_OUT_SEED + seed, demo_appearance=seed % 2 == 0)
         for t_s in np.linspace(1.0, scene.duration_s - 1, moments):
             picture = Shot(scene, float(t_s)).picture(SOURCE_SIZE)
             for box, kind, share in zip(picture.boxes_px, picture.class_ids, picture.visible, strict=True):

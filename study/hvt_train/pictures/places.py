@@ -101,8 +101,8 @@ class _View:
 
     def lean(self, foot_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(2,) pixels by which a point one metre above ``foot_px`` is displaced."""
-        away = math.sin(self.tilt) * self.up + (foot_px - self.centre) / self.height_px
-        return np.asarray(away * self.px_per_m, np.float64)
+        lean_m = math.sin(self.tilt) * self.up + (foot_px - self.centre) / self.height_px
+        return np.asarray(lean_m * self.px_per_m, np.float64)
 
     def shade_px(self) -> npt.NDArray[np.float64]:
         """(2,) pixels of shadow on the ground per metre of height; the sun's azimuth is that of the picture."""
@@ -141,34 +141,34 @@ class _Stage:
         boxes = np.array([(*hulls[i].min(0), *hulls[i].max(0)) for i in rows], np.float32).reshape(-1, 4)
         area = np.array([cv2.contourArea(hulls[i].astype(np.float32)) for i in rows])
         boxes = boxes.clip(0, size)
-        keep = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
+        large = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
         visible = np.minimum(drawn[rows] / np.maximum(area, 1), 1).astype(np.float32)
         kinds = np.array([CLASS_NAMES.index(things[i].solid.class_name) for i in rows], np.int32)
-        return Picture(self._image, boxes[keep], kinds[keep], visible[keep])
+        return Picture(self._image, boxes[large], kinds[large], visible[large])
 
     def _shade(self, things: list[Thing], feet: list[npt.NDArray[np.float64]], rng: _Rng) -> None:
         """Cast shadows, and a little darkness right around whatever touches the ground."""
         view = self._view
         cast = np.zeros(self._image.shape[:2], np.uint8)
         near = np.zeros(self._image.shape[:2], np.uint8)
-        away = view.shade_px()
+        lean_m = view.shade_px()
         for thing, foot in zip(things, feet, strict=True):
             ground = thing.solid.foot_m @ view.linear(thing.heading).T + foot
-            both = np.concatenate([ground, ground + away * thing.solid.height_m * 0.92])
+            both = np.concatenate([ground, ground + lean_m * thing.solid.height_m * 0.92])
             _fill(cast, cv2.convexHull(both.astype(np.float32))[:, 0], 255)
             _fill(near, (ground - foot) * 1.1 + foot, 255)
         blur = float(rng.uniform(0.5, 3.0))
         dark = cv2.GaussianBlur(cast, (0, 0), blur).astype(np.float32) * (view.shadow / 255)
         soft = cv2.GaussianBlur(near, (0, 0), 0.25 * view.px_per_m).astype(np.float32)
-        keep = (1 - dark) * (1 - soft * (float(rng.uniform(0.0, 0.5)) / 255))
-        tint = 1 - (1 - keep[..., None]) * np.array([0.9, 0.96, 1.0], np.float32)
+        light = (1 - dark) * (1 - soft * (float(rng.uniform(0.0, 0.5)) / 255))
+        tint = 1 - (1 - light[..., None]) * np.array([0.9, 0.96, 1.0], np.float32)
         self._image[:] = (self._image * tint).astype(np.uint8)
 
     def _draw(self, thing: Thing, foot: npt.NDArray[np.float64], number: int) -> npt.NDArray[np.float64]:
         view = self._view
         lean, linear = view.lean(foot), view.linear(thing.heading)
-        away = linear.T @ lean
-        parts = sorted(thing.solid.parts, key=lambda part: -part.x * away[0])
+        lean_m = linear.T @ lean
+        parts = sorted(thing.solid.parts, key=lambda part: -part.x * lean_m[0])
         points = np.concatenate([corners for part in parts for corners in part.points_m])
         pixels = points[:, :2] @ linear.T + points[:, 2:] * lean + foot
         hull = cv2.convexHull(pixels.astype(np.float32))[:, 0].astype(np.float64)
@@ -180,7 +180,7 @@ class _Stage:
             for corners, colour, matt in zip(part.points_m, part.colours, part.matt, strict=True):
                 face = pixels[start : start + len(corners)]
                 start += len(corners)
-                if _turns_away(face):
+                if _faces_back(face):
                     continue
                 light = 1.0 if matt else self._light(corners, thing.heading)
                 _fill(self._image, face, tuple(min(255.0, c * light) for c in colour))
@@ -199,7 +199,7 @@ class _Stage:
         return float((view.ambient + (1 - view.ambient) * direct) / level)
 
 
-def _turns_away(face: npt.NDArray[np.float64]) -> bool:
+def _faces_back(face: npt.NDArray[np.float64]) -> bool:
     x, y = face[:, 0], face[:, 1]
     return bool((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() <= 0)
 

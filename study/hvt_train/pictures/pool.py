@@ -19,7 +19,7 @@ import numpy as np
 from hvt_common.values import Frame, Image, View
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
-from hvt_scene import Look, Scene
+from hvt_scene import Appearance, Scene
 from hvt_train.pictures.places import Picture, draw_place
 
 __all__ = [
@@ -67,9 +67,9 @@ class Shot:
         return Picture(image, boxes, truth.class_ids.astype(np.int32), truth.visible.astype(np.float32))
 
 
-def shoot(seed: int, *, demo_look: bool) -> Scene:
+def shoot(seed: int, *, demo_appearance: bool) -> Scene:
     """The demo's scene of a seed, in the demo's look or in a random one."""
-    return Scene(seed, size=SOURCE_SIZE, look=None if demo_look else Look.random(seed))
+    return Scene(seed, size=SOURCE_SIZE, appearance=None if demo_appearance else Appearance.random(seed))
 
 
 def coded(shot: Shot, *, bitrates_bps: Sequence[int], frames: int = _CODED_FRAMES) -> list[Image]:
@@ -122,7 +122,7 @@ def _draw(job: tuple[Path, str, int, int]) -> list[Path]:
 def _pictures(number: int, moments: int) -> Iterator[Picture]:
     """First the clean pictures of all moments, then the coded ones."""
     rng = np.random.default_rng([TRAIN_SEED, 1, number])
-    scene = shoot(TRAIN_SEED + number, demo_look=number % 4 == 0)
+    scene = shoot(TRAIN_SEED + number, demo_appearance=number % 4 == 0)
     clean = [
         Shot(scene, float(t_s)).picture(BASE_SIZE) for t_s in rng.uniform(0.4, scene.duration_s, moments)
     ]

@@ -68,13 +68,13 @@ class ViewSource:
         files = self._files[kind]
         picture = read_picture(files[int(rng.integers(len(files)))])
         scale = _scale(kind, rng)
-        view = self._cut(picture, scale)
+        view = self._cropped(picture, scale)
         view = _turned(view, rng)
         strength, compress = _DAMAGE[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
         return View(image, view.boxes_px, view.class_ids)
 
-    def _cut(self, picture: Picture, scale: float) -> View:
+    def _cropped(self, picture: Picture, scale: float) -> View:
         """A square window, usually around an object, every class that is there as often."""
         side, rng = self._settings.side, self._rng
         high, wide = picture.image_bgr.shape[:2]
@@ -86,9 +86,9 @@ class ViewSource:
             middle = (box[:2] + box[2:]) / 2 + rng.uniform(-0.4, 0.4, 2) * window
         else:
             middle = rng.uniform(0, (wide, high))
-        room = np.array([wide, high]) - window  # negative where the picture is smaller than the window
+        slack = np.array([wide, high]) - window  # negative where the picture is smaller than the window
         margin = rng.uniform(0, 0.06, 2) * window
-        low = np.clip(middle - window / 2, np.minimum(room, 0) - margin, np.maximum(room, 0) + margin)
+        low = np.clip(middle - window / 2, np.minimum(slack, 0) - margin, np.maximum(slack, 0) + margin)
         return self._window(picture, low, scale)
 
     def _window(self, picture: Picture, low: npt.NDArray[np.float64], scale: float) -> View:
@@ -108,10 +108,10 @@ class ViewSource:
         sides = boxes[:, 2:] - boxes[:, :2]
         area = np.maximum((whole[:, 2:] - whole[:, :2]).prod(1), 1e-6)
         seen = picture.visible * sides.prod(1) / area
-        keep = (sides > 1).all(1)
+        valid = (sides > 1).all(1)
         ignored = (seen < settings.least_visible) | (sides.max(1) < settings.least_side_px)
         kinds = np.where(ignored, -1, picture.class_ids).astype(np.int32)
-        return View(np.asarray(small, np.uint8), boxes[keep], kinds[keep])
+        return View(np.asarray(small, np.uint8), boxes[valid], kinds[valid])
 
 
 def read_picture(path: Path) -> Picture:
@@ -198,8 +198,8 @@ def _lit(image: Image, rng: _Rng, strength: float) -> Image:
     image = np.asarray(cv2.LUT(image, table), np.uint8)
     if rng.random() < 0.5:
         grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
-        keep = 0.0 if rng.random() < 0.08 else float(rng.uniform(0.3, 1.5))
-        image = np.asarray(cv2.addWeighted(image, keep, grey, 1 - keep, 0), np.uint8)
+        colour = 0.0 if rng.random() < 0.08 else float(rng.uniform(0.3, 1.5))
+        image = np.asarray(cv2.addWeighted(image, colour, grey, 1 - colour, 0), np.uint8)
     if rng.random() < 0.2 * strength:  # light that falls off across the picture
         side = len(image)
         slope = np.linspace(rng.uniform(0.6, 1.3), rng.uniform(0.6, 1.3), side, dtype=np.float32)
