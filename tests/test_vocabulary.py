@@ -30,7 +30,8 @@ swallowed tick ticks told unchanging waiting weigh weighed whereabouts wish wish
 _NO_NAME = frozenset(_ONCE_NAMES.split())
 _NO_CLASS = frozenset({"Early", "Reception", "Row", "Seen"})
 _OF_LIBRARIES = """
-haveImageWriter keep_blank_values set_log_tick_enabled set_xticks set_yticks tick_params xticks yticks
+ask haveImageWriter keep_blank_values keep_trailing_newline
+set_log_tick_enabled set_xticks set_yticks tick_params xticks yticks
 """
 _LIBRARIES_SAY = frozenset(_OF_LIBRARIES.split())
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z0-9]+")
@@ -65,6 +66,8 @@ def test_words_that_went_stay_away():
     found = []
     for file in _tracked("*.py", "*.md", "*.toml", "Makefile", "*.yaml", "*.service"):
         for number, line in enumerate((ROOT / file).read_text(encoding="utf-8").splitlines(), 1):
+            if "former name" in line:  # one that works for one more release, or is answered with the new one
+                continue
             said = line
             for name in _LIBRARIES_SAY:
                 said = said.replace(name, "")

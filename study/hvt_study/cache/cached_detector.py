@@ -71,9 +71,9 @@ class CachedDetector(OnnxDetector):
         path = self._folder / self._key(image_bgr)
         known = _read(path)
         if known is None:
-            asked_s = time.process_time()
+            began_s = time.process_time()
             found = super().detect(image_bgr)
-            cost_s = time.process_time() - asked_s
+            cost_s = time.process_time() - began_s
             _write(path, found, cost_s)
         else:
             found, cost_s = known

@@ -40,7 +40,7 @@ __all__ = [
     "study_plan",
 ]
 
-_LEAST_TICKS = 30
+_LEAST_FRAMES = 30
 _MOST_JOBS = 256
 _ALL_AT_ONCE = 10_000
 """A cluster has a queue of its own."""
@@ -131,12 +131,12 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
         type=int,
         default=5,
         metavar="N",
-        help="ticks from one detection to the next at edge and ground; DDS looks at every frame that it codes, and "
+        help="frames from one detection to the next at edge and ground; DDS looks at every frame that it codes, and "
         "with 1 so does the rest",
     )
     parser.add_argument("--size", default="1280x720", metavar="WxH", help="size of the base stream")
     parser.add_argument(
-        "--max-frames", type=int, default=argparse.SUPPRESS, metavar="N", help="ticks of a sequence"
+        "--max-frames", type=int, default=argparse.SUPPRESS, metavar="N", help="frames of a sequence"
     )
     parser.add_argument(
         "--limit", type=int, default=argparse.SUPPRESS, metavar="N", help="sequences of a dataset"
@@ -176,9 +176,9 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
     """What the arguments ask for, with these of `open_sequences`; `UserError` for what cannot be."""
     size = parse_size(arguments.size, name="--size")
     check_shape(size=size, fps=15)
-    ticks = getattr(arguments, "max_frames", None)
-    if ticks is not None and ticks < _LEAST_TICKS:
-        raise UserError(f"--max-frames {ticks} is too few: give {_LEAST_TICKS} or more")
+    frames = getattr(arguments, "max_frames", None)
+    if frames is not None and frames < _LEAST_FRAMES:
+        raise UserError(f"--max-frames {frames} is too few: give {_LEAST_FRAMES} or more")
     if arguments.detect_every < 1:
         raise UserError(
             f"--detect-every {arguments.detect_every} is not accepted: give a whole number from 1"
@@ -195,7 +195,7 @@ def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequenc
         labels=arguments.labels,
         cache=_cache(arguments).absolute(),
         size=size,
-        max_ticks=ticks,
+        max_frames=frames,
         detect_every=arguments.detect_every,
         tune=_tune(arguments),
     )

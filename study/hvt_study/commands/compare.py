@@ -1,28 +1,27 @@
-"""``hvt-study sight``: what do I see at this budget, on my clip, with each method?"""
+"""``hvt-study compare``: what does the ground show at this budget, on my clip, with each method?"""
 
 from __future__ import annotations
 
 import argparse
 import math
-import os
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import check_shape
-from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow, compare
-from hvt_study.runs.compare_methods import METHODS, method_rows
+from hvt_study.commands.arguments import add_pool_arguments, open_pool
+from hvt_study.commands.progress import RunProgress
+from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult, CompareRow, compare
+from hvt_study.report.figures.compare_plot import plot
+from hvt_study.runs.methods import chosen_names
+from hvt_study.runs.spec import ModelChoice
 
-__all__ = ["SUMMARY", "add_arguments", "print_result", "run"]
+__all__ = ["add_arguments", "print_result", "run"]
 
-SUMMARY = "Fly every method at every rate over a clip and say what the ground sees."
 
 _LEAST_KBPS, _MOST_KBPS = 20.0, 100_000.0
 _LEAST_FRAMES = 30
@@ -42,22 +41,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--edge-detector", default=argparse.SUPPRESS, metavar="FILE", help="of the edge (default: the same)"
     )
     parser.add_argument("--rates", default="150,200,300,400,800", metavar="KBPS,…", help="budgets in kbps")
-    parser.add_argument("--methods", default=",".join(METHODS), metavar="NAME,…", help="which to fly")
+    parser.add_argument("--methods", default=",".join(COMPARED), metavar="NAME,…", help="which to fly")
     parser.add_argument(
         "--out",
         type=Path,
         required=True,
         default=argparse.SUPPRESS,
         metavar="DIR",
-        help="sight.json, sight.png",
+        help="compare.json, compare.png, and cache, where finished flights lie",
     )
     parser.add_argument("--size", default="1280x720", metavar="WxH", help="size of the base stream")
     parser.add_argument(
-        "--max-frames", type=int, default=300, metavar="N", help="ticks of the clip, 15 a second"
+        "--max-frames", type=int, default=300, metavar="N", help="frames of the clip, 15 a second"
     )
-    parser.add_argument(
-        "--jobs", type=int, default=argparse.SUPPRESS, metavar="N", help="processes (default: the cores)"
-    )
+    add_pool_arguments(parser)
     parser.add_argument(
         "--labels",
         default="auto",
@@ -75,21 +72,14 @@ def run(arguments: argparse.Namespace) -> int:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"--out {folder} cannot be made ({error.strerror}): name a folder") from None
-    plot = _plotter()
-    with _progress() as progress:
-        tasks: dict[str, TaskID] = {}
-
-        def on_step(what: str, done: int, of: int) -> None:
-            if what not in tasks:
-                tasks[what] = progress.add_task(what, total=of)
-            progress.update(tasks[what], completed=done, total=of)
-
-        result = compare(plan, on_step=on_step)
+    pool, _ = open_pool(arguments)
+    with RunProgress("runs") as progress, pool as workers:
+        result = compare(plan, pool=workers, on_run=progress.update)
     if not result.rows:
         raise UserError(f"nothing could be flown: {result.missing[0].reason}")
     try:
-        write_json(folder / "sight.json", [asdict(row) for row in result.rows])
-        plot(result, folder / "sight.png")
+        write_json(folder / "compare.json", list(result.rows))
+        plot(result, folder / "compare.png")
     except OSError as error:
         raise UserError(f"--out {folder} cannot be written ({error.strerror}): name another") from None
     print_result(result)
@@ -101,7 +91,7 @@ def print_result(result: CompareResult) -> None:
     console = Console(highlight=False)
     table = Table(
         title=f"{result.clip}, {result.labels} labels, first and second half",
-        caption="all to tracks: kbps; kB: largest frame; p95: delay of frames, ms; CPU: of the edge, ms a tick",
+        caption="all to tracks: kbps; kB: largest frame; p95: delay of frames, ms; CPU: of the edge, ms a frame",
         caption_justify="left",
         title_justify="left",
         title_style="bold",
@@ -115,10 +105,10 @@ def print_result(result: CompareResult) -> None:
         table.add_column(head, justify="right", no_wrap=True)
     before = None
     for first, second in zip(result.rows[::2], result.rows[1::2], strict=True):
-        if before not in (None, first.rate_kbps):
+        if before not in (None, first["rate_kbps"]):
             table.add_section()
-        before = first.rate_kbps
-        table.add_row(f"{first.rate_kbps:g}", first.method, *_cells(first, second))
+        before = first["rate_kbps"]
+        table.add_row(f"{first['rate_kbps']:g}", first["method"], *_cells(first, second))
     console.print(table)
     for one in result.missing:
         console.print(f"{one.method} at {one.rate_kbps:g} kbps: not available, {one.reason}", markup=False)
@@ -126,42 +116,41 @@ def print_result(result: CompareResult) -> None:
 
 def _cells(first: CompareRow, second: CompareRow) -> tuple[str, ...]:
     return (
-        _pair(first.f1, second.f1),
-        _pair(first.class_agreement, second.class_agreement),
-        f"{first.total_bps / 1e3:.0f}",
-        f"{first.base_bps / 1e3:.0f}",
-        f"{first.roi_bps / 1e3:.0f}",
-        f"{first.track_bps / 1e3:.1f}",
-        f"{first.fps:.1f}",
-        f"{first.max_frame_bytes / 1e3:.1f}",
-        f"{first.delay_p95_ms:.0f}",
-        f"{first.edge_cpu_ms:.0f}",
+        f"{_share(first['f1'])} {_share(second['f1'])}",
+        f"{_share(first['class_agreement'])} {_share(second['class_agreement'])}",
+        f"{first['total_bps'] / 1e3:.0f}",
+        f"{first['base_bps'] / 1e3:.0f}",
+        f"{first['roi_bps'] / 1e3:.0f}",
+        f"{first['track_bps'] / 1e3:.1f}",
+        f"{first['fps']:.1f}",
+        f"{first['max_frame_bytes'] / 1e3:.1f}",
+        f"{first['delay_p95_ms']:.0f}",
+        f"{first['edge_cpu_ms']:.0f}",
     )
 
 
-def _pair(first: float, second: float) -> str:
-    return f"{first:.3f} {second:.3f}".replace("0.", ".")
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}".replace("0.", ".")
 
 
 def _plan(arguments: argparse.Namespace) -> ComparePlan:
     size = parse_size(arguments.size, name="--size")
     check_shape(size=size, fps=15)
-    jobs = getattr(arguments, "jobs", os.cpu_count() or 1)
-    if not 1 <= jobs <= 256:
-        raise UserError(f"--jobs {jobs} is not accepted: give a whole number from 1 to 256")
     if arguments.max_frames < _LEAST_FRAMES:
         raise UserError(f"--max-frames {arguments.max_frames} is too few: give {_LEAST_FRAMES} or more")
     return ComparePlan(
         clip=arguments.clip,
-        detector=arguments.detector,
-        edge_detector=getattr(arguments, "edge_detector", arguments.detector),
+        models=ModelChoice(
+            detector=arguments.detector,
+            edge_detector=getattr(arguments, "edge_detector", arguments.detector),
+            provider=arguments.provider,
+        ),
         rates_bps=_rates(arguments.rates),
-        methods=method_rows(arguments.methods),
+        cache=(arguments.out / "cache").absolute(),
+        methods=chosen_names(arguments.methods, COMPARED),
         size=size,
         max_frames=arguments.max_frames,
-        jobs=jobs,
         labels=arguments.labels,
-        provider=arguments.provider,
     )
 
 
@@ -179,23 +168,3 @@ def _rates(text: str) -> tuple[int, ...]:
             )
         rates.add(round(kbps * 1000))
     return tuple(sorted(rates))
-
-
-def _plotter() -> Callable[[CompareResult, Path], None]:
-    """Matplotlib comes with ``hvt[study]``; the other commands do without it."""
-    try:
-        from hvt_study.report.figures.compare_plot import plot  # noqa: PLC0415
-    except ImportError:
-        raise UserError("the plot needs matplotlib: pip install 'hvt[study]'") from None
-    return plot
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    )

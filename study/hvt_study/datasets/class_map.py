@@ -8,7 +8,7 @@ have the very same ones, else they become one word. Where a dataset has one clas
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from hvt_common.errors import UserError
@@ -24,25 +24,13 @@ _SHOWN = 12
 
 
 @dataclass(frozen=True, slots=True)
-class ClassMap(Mapping[str, tuple[str, ...]]):
-    """Model class → classes of the dataset that it speaks of; classes that speak of none are not in it."""
+class ClassMap:
+    """Which names of a model and of a dataset mean the same."""
 
     spoken: Mapping[str, tuple[str, ...]]
+    """Model class to classes of the dataset that it speaks of; classes that speak of none are not in it."""
     words: Mapping[str, str]
     """Word in which a name is compared, for all names of model and dataset that have a partner."""
-    unmatched_dataset: tuple[str, ...]
-    """Classes of the dataset of which the model cannot speak, sorted."""
-    unmatched_model: tuple[str, ...]
-    """Classes of the model that the dataset does not have, sorted."""
-
-    def __getitem__(self, name: str) -> tuple[str, ...]:
-        return self.spoken[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.spoken)
-
-    def __len__(self) -> int:
-        return len(self.spoken)
 
     def word(self, name: str) -> str:
         """The word in which a name of either side is compared; its own plain form where it has no partner."""
@@ -50,26 +38,8 @@ class ClassMap(Mapping[str, tuple[str, ...]]):
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Words that both sides have, sorted: what metrics can be asked of."""
+        """Words that both sides have, sorted: what metrics are of."""
         return tuple(sorted(set(self.words.values())))
-
-    def __str__(self) -> str:
-        """One line for logs and reports."""
-        merged: dict[str, set[str]] = defaultdict(set)
-        for names in self.spoken.values():
-            for name in names:
-                merged[self.words[name]].add(name)
-        text = _some(
-            [
-                word if names == {word} else f"{word} ({'+'.join(sorted(names))})"
-                for word, names in sorted(merged.items())
-            ]
-        )
-        if self.unmatched_dataset:
-            text += f"; the model has no {_some(self.unmatched_dataset)}"
-        if self.unmatched_model:
-            text += f"; the dataset has no {_some(self.unmatched_model)}"
-        return text
 
 
 def map_classes(model_names: Iterable[str], dataset_classes: Iterable[str]) -> ClassMap:
@@ -97,12 +67,7 @@ def map_classes(model_names: Iterable[str], dataset_classes: Iterable[str]) -> C
             f"the model's classes ({_some(models)}) and those of the dataset ({_some(classes)}) have nothing in "
             "common: give a model of one of these kinds, or labels=reference"
         )
-    return ClassMap(
-        spoken={name: spoken[name] for name in models if name in spoken},
-        words=words,
-        unmatched_dataset=tuple(sorted(name for name in classes if name not in words)),
-        unmatched_model=tuple(sorted(name for name in models if name not in spoken)),
-    )
+    return ClassMap({name: spoken[name] for name in models if name in spoken}, words)
 
 
 def _pair(

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from hvt_common.units import exact_rate
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
-from hvt_study.datasets.labels import NO_ID, UNKNOWN, FrameLabels
+from hvt_study.datasets.labels import NO_ID, FrameLabels
 
-__all__ = ["NO_ID", "UNKNOWN", "FrameLabels", "Sequence", "shown_frame"]
+__all__ = ["NO_ID", "FrameLabels", "Sequence", "shown_frame"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +22,9 @@ class Sequence:
     dataset: str
     """Scheme of its URI: ``visdrone``, ``uavdt``, ``mot``, ``clips``, ``demo`` or ``still``."""
     clip: Clip
-    """What the flight plays, ``clip.ticks`` ticks at 15 a second."""
+    """What the flight plays, ``clip.frame_count`` frames at 15 a second."""
     frame_count: int
-    """Source frames of the whole sequence, of which `cut` takes nothing away."""
+    """Source frames of the whole sequence, of which `limited` takes nothing away."""
     fps: float
     """Source frames a second."""
     source_size: tuple[int, int]
@@ -38,36 +38,36 @@ class Sequence:
     """What else is known, such as ``weather: fog``."""
     files: tuple[Path, ...] = ()
     """Everything that its pictures and labels are made from: files, and folders of images."""
-    tick_frames: tuple[int, ...] | None = None
-    """Source frame of each tick where the frame rate is not constant; None where `shown_frame` says it."""
+    source_frames: tuple[int, ...] | None = None
+    """Source frame of each frame of the clip where the rate is not constant; None where `shown_frame` says it."""
 
     @property
-    def ticks(self) -> int:
-        """How many ticks the flight plays."""
-        return self.clip.ticks
+    def clip_frames(self) -> int:
+        """How many frames the flight plays."""
+        return self.clip.frame_count
 
     @property
     def duration_s(self) -> float:
         """Of the whole sequence, however little of it is played."""
         return self.frame_count / self.fps
 
-    def frame_at_tick(self, tick: int) -> int:
-        """The source frame that a tick shows: the latest one at or before its time."""
-        if self.tick_frames is not None:
-            return self.tick_frames[min(tick, len(self.tick_frames) - 1)]
-        return min(shown_frame(tick, fps=self.fps), self.frame_count - 1)
+    def source_frame(self, frame_index: int) -> int:
+        """The source frame that a frame of the clip shows: the latest one at or before its time."""
+        if self.source_frames is not None:
+            return self.source_frames[min(frame_index, len(self.source_frames) - 1)]
+        return min(shown_frame(frame_index, fps=self.fps), self.frame_count - 1)
 
-    def labels_at_tick(self, tick: int) -> FrameLabels | None:
-        """What is in the picture that a tick shows; None without labels."""
-        return None if self.labels is None else self.labels(self.frame_at_tick(tick))
+    def labels_at(self, frame_index: int) -> FrameLabels | None:
+        """What is in a frame of the clip; None without labels."""
+        return None if self.labels is None else self.labels(self.source_frame(frame_index))
 
-    def cut(self, ticks: int | None) -> Sequence:
-        """At most so many ticks from the beginning; None: all."""
-        if ticks is None or ticks >= self.ticks:
+    def limited(self, frames: int | None) -> Sequence:
+        """At most so many frames from the beginning; None: all."""
+        if frames is None or frames >= self.clip_frames:
             return self
-        return replace(self, clip=replace(self.clip, ticks=ticks))
+        return replace(self, clip=replace(self.clip, frame_count=frames))
 
 
-def shown_frame(tick: int, *, fps: float) -> int:
-    """The latest of frames taken ``fps`` times a second at or before a tick, the first at 0, in exact fractions."""
-    return int(tick * exact_rate(fps) / exact_rate(NOMINAL_FPS))
+def shown_frame(frame_index: int, *, fps: float) -> int:
+    """Of source frames taken ``fps`` times a second, the latest at or before a frame of the clip, exactly."""
+    return int(frame_index * exact_rate(fps) / exact_rate(NOMINAL_FPS))

@@ -53,7 +53,6 @@ _NOISE_LEVELS = 2.0
 """Standard deviation of the noise of a small camera's sensor by day, of 256 levels."""
 _LEAST_VISIBLE = 0.6
 """An object of which the window shows less is not asked for."""
-_WHOLE = 0.999
 _LEAST_SIDE_PX = 64
 _ACROSS, _DOWN = range(-3, 4), range(-2, 3)
 """Mirror images on each axis: enough for the widest view on its whole way."""
@@ -107,8 +106,6 @@ class Annotations:
     """(K, 4): regions of which nothing is known."""
     beside_px: Boxes
     """(P, 4): single objects that are not asked for."""
-    occlusion: npt.NDArray[np.int8]
-    """(N,) 0 none, 1 partly, 2 heavily hidden; -1 unknown."""
 
 
 def annotation_file(picture: Path) -> Path:
@@ -127,13 +124,12 @@ def read_annotations(path: Path) -> Annotations:
     rows = read_image_rows(path)
     solid = (rows.boxes[:, 2:] > rows.boxes[:, :2]).all(axis=1)
     hidden = covered_share(rows.boxes, rows.boxes[rows.land & solid]) >= _COVERED
-    asked = rows.counts & solid & ~hidden
+    judged = rows.counts & solid & ~hidden
     return Annotations(
-        boxes_px=rows.boxes[asked],
-        classes=tuple(VISDRONE_NAMES[kind - 1] for kind in rows.categories[asked].tolist()),
+        boxes_px=rows.boxes[judged],
+        classes=tuple(VISDRONE_NAMES[kind - 1] for kind in rows.categories[judged].tolist()),
         ignored_px=rows.boxes[rows.land & solid],
         beside_px=rows.boxes[~rows.counts & ~rows.land & solid],
-        occlusion=rows.occlusion[asked],
     )
 
 
@@ -206,19 +202,12 @@ class VirtualCamera:
         noise = np.random.default_rng(0).normal(0, _NOISE_LEVELS, shape)
         return np.clip(noise.round(), -127, 127).astype(np.int8)
 
-    def truth(self, index: int) -> tuple[Boxes, tuple[str, ...], Boxes] | None:
-        """Boxes, class names and ignored regions of a frame in its pixels, clipped to it; None without annotations.
-
-        Objects of which less than 0.6 is inside the frame, and those that are not asked for, are ignored regions.
-        """
-        labels = self.labels(index)
-        if labels is None:
-            return None
-        passed = np.concatenate([labels.ignored_xyxy_px, labels.beside_xyxy_px])
-        return labels.boxes_xyxy_px, labels.class_names, passed
-
     def labels(self, index: int) -> FrameLabels | None:
-        """The same with identities: each mirror image of an object is one of its own, and keeps its id."""
+        """What is in a frame, in its pixels, clipped to it; None without annotations.
+
+        Each mirror image of an object is one of its own, and keeps its id. Objects of which less than 0.6 is inside
+        the frame are not judged.
+        """
         if self.annotations is None:
             return None
         boxes, visible = self._seen(self.annotations.boxes_px, index)
@@ -232,8 +221,6 @@ class VirtualCamera:
             class_names=tuple(self.annotations.classes[row] for row in rows.tolist()),
             ignored_xyxy_px=ignored[there > 0],
             beside_xyxy_px=np.concatenate([beside[near > 0], partly]),
-            occlusion=self.annotations.occlusion[rows],
-            truncation=(visible[rows] < _WHOLE).astype(np.int8),
         )
 
     def _to_frame(self, index: int) -> npt.NDArray[np.float64]:
@@ -291,7 +278,6 @@ def _mirrored(found: Annotations, *, size: tuple[int, int]) -> Annotations:
         classes=found.classes * len(tiles),
         ignored_px=np.concatenate(ignored),
         beside_px=np.concatenate(beside),
-        occlusion=np.tile(found.occlusion, len(tiles)),
     )
 
 

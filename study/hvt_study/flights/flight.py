@@ -5,8 +5,8 @@ The edge is `hvt_edge.app.Edge` with its borders replaced: where frames come fro
 time: a message acts at the ground when the link has delivered it and not before, and what the ground says of a still
 is heard at the edge as much later as that still took to cross. The same input gives the same flight, always.
 
-A *tick* is a frame of the clip at 15 a second; the ground's list is taken at every tick, coded or not. At a tick that
-was not coded it is taken as late after its capture as the last picture was.
+The ground's list is taken at every frame of the clip (15 a second), coded or not. At a frame that was not coded it is
+taken as late after its capture as the last picture was.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from hvt_ground.wiring import Models
 from hvt_study.cache.cached_detector import CachedDetector
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip, FrameSource
 from hvt_study.flights.flight_ground import GroundSide, InlineExecutor
-from hvt_study.flights.serial_link import LinkReport, SerialLink
-from hvt_study.metrics.list_score import Listed
+from hvt_study.metrics.observed import ObservedFrame
+from hvt_study.serial_link import LinkReport, SerialLink
 
-__all__ = ["FlightPlan", "FlightReport", "coded_ticks", "fly", "weigh"]
+__all__ = ["FlightPlan", "FlightReport", "coded_frames", "dry_run", "fly"]
 
 _START_NS = 1_700_000_000_000_000_000
 _SESSION = 1 << 40  # as many bytes on the wire as a random one
@@ -59,7 +59,7 @@ class FlightPlan:
 
     clip: Clip
     edge: EdgeConfig
-    """Its pace is lockstep, and its frame rate one of those that `coded_ticks` knows, or ``auto``."""
+    """Its pace is lockstep, and its frame rate one of those that `coded_frames` knows, or ``auto``."""
     ground: GroundConfig
     link_bps: int
 
@@ -68,8 +68,8 @@ class FlightPlan:
 class FlightReport:
     """What a flight cost and what it showed."""
 
-    lists: tuple[Listed, ...]
-    """The ground's list at every tick, source pixels."""
+    lists: tuple[ObservedFrame, ...]
+    """The ground's list at every frame, source pixels."""
     account: LedgerSummary
     """The edge's ledger over the whole clip."""
     line_bytes: Mapping[str, int]
@@ -80,9 +80,9 @@ class FlightReport:
     link: LinkReport
     """Its delays are those of the base stream, from capture to arrival."""
     picture_age_p95_ms: float
-    """How old the newest picture at the ground is, seen at every tick."""
+    """How old the newest picture at the ground is, seen at every frame."""
     edge_cpu_ms: float
-    """CPU of the edge's stages a tick, whatever the number of cores."""
+    """CPU of the edge's stages a frame, whatever the number of cores."""
     digest: str
     """Of all payloads: two flights that sent the same have the same."""
     back_bytes: int = 0
@@ -99,10 +99,12 @@ class FlightReport:
         return round(size_bytes * 8 / self.duration_s)
 
 
-def coded_ticks(ticks: int, fps: float) -> frozenset[int]:
-    """Which ticks a fixed frame rate codes: the first at or after each instant ``k / fps``."""
-    count = math.ceil(ticks * fps / NOMINAL_FPS)
-    return frozenset(tick for k in range(count) if (tick := math.ceil(k * NOMINAL_FPS / fps)) < ticks)
+def coded_frames(frames: int, fps: float) -> frozenset[int]:
+    """Which frames a fixed frame rate codes: the first at or after each instant ``k / fps``."""
+    count = math.ceil(frames * fps / NOMINAL_FPS)
+    return frozenset(
+        frame_index for k in range(count) if (frame_index := math.ceil(k * NOMINAL_FPS / fps)) < frames
+    )
 
 
 def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport:
@@ -120,7 +122,7 @@ def fly(plan: FlightPlan, *, detector: Detector, models: Models) -> FlightReport
     return edge.report(saved_cpu_s=saved_s)
 
 
-def weigh(plan: FlightPlan, *, detector: Detector) -> float:
+def dry_run(plan: FlightPlan, *, detector: Detector) -> float:
     """Fly without a ground; return the line bits a second, headers and transport included.
 
     Where nothing that a ground says matters (methods without stills), that is to the bit what `fly` spends.
@@ -128,9 +130,9 @@ def weigh(plan: FlightPlan, *, detector: Detector) -> float:
     Raises:
         UserError: the edge refuses its settings.
     """
-    edge = _Scales(plan, detector=detector)
+    edge = _DryRun(plan, detector=detector)
     edge.run()
-    return edge.line_bytes * 8 / (plan.clip.ticks / NOMINAL_FPS)
+    return edge.line_bytes * 8 / (plan.clip.frame_count / NOMINAL_FPS)
 
 
 class _MediaClock(SteadyClock):
@@ -228,7 +230,7 @@ class _Pace(LockstepPace):
         super().__init__(*stages, inbox=inbox, **named)
         self._worker = InlineExecutor()
         self._feedback, self._ground, self._outlet = inbox, ground, outlet
-        self._next_tick = 0
+        self._next_frame = 0
         self.cpu_s = 0.0
 
     def step(self, frame: Frame) -> None:
@@ -239,20 +241,22 @@ class _Pace(LockstepPace):
         self.pass_over(frame.index)
         if self._outlet.last_frame != frame.index:
             self._ground.pass_over(frame.index, capture_ns=frame.capture_ns)
-        self._next_tick = frame.index + 1
+        self._next_frame = frame.index + 1
         self._ground.advance(frame.capture_ns)
         self._feedback.due += self._ground.results
         self._ground.results.clear()
 
-    def pass_over(self, until_tick: int) -> None:
-        """The source did not give the ticks before this one."""
-        for tick in range(self._next_tick, until_tick):
-            self._ground.pass_over(tick, capture_ns=_START_NS + round(tick * _SECOND_NS / NOMINAL_FPS))
-        self._next_tick = max(self._next_tick, until_tick)
+    def pass_over(self, until_frame: int) -> None:
+        """The source did not give the frames before this one."""
+        for frame_index in range(self._next_frame, until_frame):
+            self._ground.pass_over(
+                frame_index, capture_ns=_START_NS + round(frame_index * _SECOND_NS / NOMINAL_FPS)
+            )
+        self._next_frame = max(self._next_frame, until_frame)
 
 
 class _Edge(Edge):
-    """The edge's own app over a clip of ticks and a simulated link."""
+    """The edge's own app over a clip of frames and a simulated link."""
 
     def __init__(self, plan: FlightPlan, *, detector: Detector, models: Models | None) -> None:
         # The detector is open already: the app is told of one that costs nothing to open.
@@ -268,17 +272,17 @@ class _Edge(Edge):
 
     def report(self, *, saved_cpu_s: float) -> FlightReport:
         """After `run`."""
-        ticks, outlet, pace = self._plan.clip.ticks, self._outlet, self._pace
+        frames, outlet, pace = self._plan.clip.frame_count, self._outlet, self._pace
         assert pace is not None, "run() makes it"
         return FlightReport(
-            lists=tuple(self.ground.lists[tick] for tick in range(ticks)),
-            account=self._ledger.summary(ticks / NOMINAL_FPS),
+            lists=tuple(self.ground.lists[frame_index] for frame_index in range(frames)),
+            account=self._ledger.summary(frames / NOMINAL_FPS),
             line_bytes=dict(outlet.line_bytes),
             messages=dict(outlet.messages),
             max_frame_bytes=outlet.max_frame_bytes,
             link=LinkReport.of(self.ground.base_delays_ns, self.ground.arrivals),
             picture_age_p95_ms=self._picture_age_p95_ms(),
-            edge_cpu_ms=1e3 * (pace.cpu_s + saved_cpu_s) / ticks,
+            edge_cpu_ms=1e3 * (pace.cpu_s + saved_cpu_s) / frames,
             digest=outlet.digest,
             back_bytes=self.ground.back_bytes,
         )
@@ -290,10 +294,10 @@ class _Edge(Edge):
 
     def _open_source(self) -> FrameSource:
         config, clip = self._plan.edge, self._plan.clip
-        # With --fps auto the edge sees every tick, and leaves out by itself what it does not code.
+        # With --fps auto the edge sees every frame, and leaves out by itself what it does not code.
         fps = NOMINAL_FPS if isinstance(config.fps, str) else config.fps
         resizer = Resizer(clip.source_size, base_size(config), fit=cast("Fit", config.fit))
-        return FrameSource(clip, resizer, ticks=coded_ticks(clip.ticks, fps))
+        return FrameSource(clip, resizer, frames=coded_frames(clip.frame_count, fps))
 
     def _open_link(self, stack: ExitStack, source: Source, class_names: tuple[str, ...]) -> Any:  # noqa: ARG002
         link: SerialLink[Received] = SerialLink(rate_bps=self._plan.link_bps)
@@ -317,7 +321,7 @@ class _Edge(Edge):
             ground=self.ground,
             outlet=self._outlet,
             keyframes=self._keyframes,
-            fps=NOMINAL_FPS,  # frame indices count ticks
+            fps=NOMINAL_FPS,  # frame indices count frames
             counts=self._counts,
             heard=self._outlet.heard,
             stop=self._stop,
@@ -327,14 +331,14 @@ class _Edge(Edge):
     def _say_goodbye(self, flow: Any) -> None:
         super()._say_goodbye(flow)
         if self._pace is not None:
-            self._pace.pass_over(self._plan.clip.ticks)
+            self._pace.pass_over(self._plan.clip.frame_count)
 
     def _picture_age_p95_ms(self) -> float:
-        """Over the ticks from the first picture on."""
+        """Over the frames from the first picture on."""
         shown = np.array(self.ground.shown_ns, np.int64).reshape(-1, 2)
-        at_ns = _START_NS + np.round(np.arange(self._plan.clip.ticks) * _SECOND_NS / NOMINAL_FPS).astype(
-            np.int64
-        )
+        at_ns = _START_NS + np.round(
+            np.arange(self._plan.clip.frame_count) * _SECOND_NS / NOMINAL_FPS
+        ).astype(np.int64)
         at_ns = at_ns[at_ns >= shown[0, 0]]
         newest = shown[np.searchsorted(shown[:, 0], at_ns, side="right") - 1, 1]
         return float(np.percentile((at_ns - newest) / 1e6, 95)) if len(at_ns) else 0.0
@@ -347,7 +351,7 @@ class _Nobody:
         self._link = link
         self.results: deque[tuple[int, StillResult]] = deque()
 
-    def pass_over(self, tick: int, *, capture_ns: int) -> None:
+    def pass_over(self, frame_index: int, *, capture_ns: int) -> None:
         """Nothing is listed."""
 
     def advance(self, now_ns: int | None) -> None:
@@ -355,7 +359,7 @@ class _Nobody:
         self._link.arrived(now_ns)
 
 
-class _Scales(_Edge):
+class _DryRun(_Edge):
     """The same edge, of which only the bytes are of interest."""
 
     def __init__(self, plan: FlightPlan, *, detector: Detector) -> None:

@@ -1,4 +1,4 @@
-"""The ground's end of a flight: takes what the link delivers, when it does, and keeps the list of every tick."""
+"""The ground's end of a flight: takes what the link delivers, when it does, and keeps the list of every frame."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from hvt_ground.perception.worker import LockstepWorker, Read, See, Step
 from hvt_ground.session.session import GroundSession
 from hvt_ground.wiring import Models, make_pipeline
 from hvt_study.flights.flight_record import FlightRecord, Watch
-from hvt_study.flights.serial_link import Arrival, SerialLink
 from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.observed import ObservedFrame
+from hvt_study.serial_link import Arrival, SerialLink
 
 __all__ = ["GroundSide", "InlineExecutor", "SharedModels"]
 
@@ -69,7 +69,7 @@ class SharedModels(Models):
 
 
 class _Worker(LockstepWorker):
-    """Sees at once; stills that come within one tick are read together, as in real time."""
+    """Sees at once; stills that come within one frame are read together, as in real time."""
 
     def __init__(self, see: See, step: Step, read: Read, *, name: str) -> None:
         super().__init__(see, step, read, name=name)
@@ -110,9 +110,9 @@ class _Session(GroundSession):
 
 
 class GroundSide:
-    """Takes what arrives over ``link`` as time goes on; keeps the list of every tick, in source pixels.
+    """Takes what arrives over ``link`` as time goes on; keeps the list of every frame, in source pixels.
 
-    ``info`` is the edge's, with the rate of ticks as its frame rate.
+    ``info`` is the edge's, with the rate of frames as its frame rate.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class GroundSide:
         shared = SharedModels(detector, classifier)
         self._session = _Session(
             info,
-            pipeline_of=lambda emit: make_pipeline(config, shared, info=info, emit=self._heard_by(emit)),
+            pipeline_of=lambda emit: make_pipeline(config, shared, info=info, emit=self._observed_by(emit)),
             to_local_ns=lambda at_ns: at_ns,
             clock=lambda: self._now_ns,
             report=lambda: None,
@@ -144,7 +144,7 @@ class GroundSide:
         """By how much the newest picture came after its capture."""
         self._uncoded: deque[tuple[int, int]] = deque()
         self.lists: dict[int, ObservedFrame] = {}
-        """By tick."""
+        """By frame."""
         self.results: deque[tuple[int, StillResult]] = deque()
         """What the edge is to hear, with the time at which it does."""
         self.back_bytes = 0
@@ -156,9 +156,9 @@ class GroundSide:
         self.shown_ns: list[tuple[int, int]] = []
         """(arrival, capture) of every picture."""
 
-    def pass_over(self, tick: int, *, capture_ns: int) -> None:
-        """This tick is not coded; its list is taken when the others of its time are."""
-        self._uncoded.append((tick, capture_ns))
+    def pass_over(self, frame_index: int, *, capture_ns: int) -> None:
+        """This frame is not coded; its list is taken when the others of its time are."""
+        self._uncoded.append((frame_index, capture_ns))
 
     def advance(self, now_ns: int | None) -> None:
         """Take in what has arrived by now; None: all there is, to the end."""
@@ -251,25 +251,25 @@ class GroundSide:
 
     def _take_uncoded(self, *, until_ns: int | None) -> None:
         while self._uncoded:
-            tick, capture_ns = self._uncoded[0]
+            frame_index, capture_ns = self._uncoded[0]
             at_ns = capture_ns + self._behind_ns
             if until_ns is not None and at_ns > until_ns:
                 return
             self._uncoded.popleft()
-            self._take_list(tick, at_ns=at_ns)
+            self._take_list(frame_index, at_ns=at_ns)
 
-    def _take_list(self, tick: int, *, at_ns: int) -> None:
-        """What an operator is shown at a tick of which no picture comes."""
+    def _take_list(self, frame_index: int, *, at_ns: int) -> None:
+        """What an operator is shown at a frame of which no picture comes."""
         if self._decoded:
-            self._note(self._session.pipeline.list_at(tick))
-        self._put_down(tick, at_ns=at_ns)
+            self._note(self._session.pipeline.list_at(frame_index))
+        self._put_down(frame_index, at_ns=at_ns)
 
-    def _put_down(self, tick: int, *, at_ns: int, detections: FrameView | None = None) -> None:
-        self.lists[tick] = self._record.complete(
+    def _put_down(self, frame_index: int, *, at_ns: int, detections: FrameView | None = None) -> None:
+        self.lists[frame_index] = self._record.complete(
             self._newest, lists=self.lists, at_ns=at_ns, detections=detections
         )
 
-    def _heard_by(self, emit: Callable[[Event], None]) -> Callable[[Event], None]:
+    def _observed_by(self, emit: Callable[[Event], None]) -> Callable[[Event], None]:
         def tell(event: Event) -> None:
             if isinstance(event, Overlay):
                 self._note(event)

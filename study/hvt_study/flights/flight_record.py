@@ -1,7 +1,7 @@
-"""What a flight's ground detects, lists and makes of stills, noted tick by tick for the metrics.
+"""What a flight's ground detects, lists and makes of stills, noted frame by frame for the metrics.
 
-The ground's own eyes see; `Watch` stands between them and their detector and refiner, passes everything on and
-remembers the last answer. Nothing here changes what is shown or sent.
+`Watch` stands between the ground's pipeline and its detector and refiner, passes everything on and remembers the last
+answer. Nothing here changes what is shown or sent.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from hvt_ground.events.events import Overlay, Refinement
 from hvt_ground.perception.pipeline import Pipeline
 from hvt_ground.perception.stills.classify import Decoded, object_crops
 from hvt_ground.perception.stills.refine import Refiner, Shown
-from hvt_study.flights.serial_link import Arrival
 from hvt_study.metrics.frames import NO_ID, FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.metrics.proxy import score_entropy_nats
 from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival
+from hvt_study.serial_link import Arrival
 
 __all__ = ["FlightRecord", "Watch"]
 
@@ -34,7 +34,7 @@ _SAME_OBJECT_IOU = 0.4
 
 
 class Watch:
-    """Between a ground's eyes and two of their parts."""
+    """Between a ground's pipeline and two of its parts."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         parts = pipeline._parts  # noqa: SLF001 - events say neither raw detections nor confidences without refinement
@@ -109,7 +109,7 @@ class FlightRecord:
 
     Args:
         view: between source and base pixels.
-        started_ns: capture of the first tick.
+        started_ns: capture of the first frame.
         classes: how many the detector knows.
         classifier: the ground's, which is asked of each still and of the base crop at its place; None takes what
             re-detection said of the still, and what the list said of the object at the still's frame.
@@ -133,7 +133,7 @@ class FlightRecord:
         self._stills.append(
             StillArrival(
                 sequence=header.sequence,
-                cut_s=self._seconds(header.capture_ns),
+                capture_s=self._seconds(header.capture_ns),
                 sent_s=self._seconds(arrival.enter_ns),
                 arrived_s=self._seconds(arrival.arrival_ns),
                 size_bytes=len(arrival.message.payload),
@@ -154,7 +154,7 @@ class FlightRecord:
         header = self._headers[event.still_sequence]
         box = np.array([event.box_base_px], np.float32)
         width, height = self._view.base_size
-        base, still = self._asked(event, header)
+        base, still = self._opinions_on(event, header)
         done = RefinedObject(
             still_sequence=event.still_sequence,
             track_id=NO_ID if event.track_id is None else event.track_id,
@@ -214,7 +214,7 @@ class FlightRecord:
             refined=seen.refined + refined,
         )
 
-    def _asked(self, event: Refinement, header: RoiHeader) -> tuple[Opinion | None, Opinion | None]:
+    def _opinions_on(self, event: Refinement, header: RoiHeader) -> tuple[Opinion | None, Opinion | None]:
         """What the classifier says of the base crop and of the still."""
         if self._classifier is None or event.base_crop_bgr is None or event.still_bgr is None:
             return None, None

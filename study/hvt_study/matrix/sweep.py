@@ -52,11 +52,11 @@ def sweep(frames: Mapping[int, RawDetections], *, frame_area_px: float) -> list[
     with_raw = sum(1 for found in frames.values() if found.confidences)
     rows = []
     for selector in SELECTORS:
-        kept = [
+        counts = [
             len(select(selector, found.boxes_xyxy_px, found.confidences, found.class_names, frame_area_px))
             for found in frames.values()
         ]
-        selected, covered = sum(kept), sum(1 for count in kept if count)
+        selected, covered = sum(counts), sum(1 for count in counts if count)
         rows.append(SweepRow(selector.name, selected, selected / max(1, raw), covered / max(1, with_raw)))
     return rows
 

@@ -1,1 +1,1 @@
-"""Metrics of the study: pure functions on what the ground showed, tick by tick, and what was there."""
+"""Metrics of the study: pure functions on what the ground showed, frame by frame, and what was there."""

@@ -1,6 +1,6 @@
-"""What every metric is given: for each tick what was there, and what the ground showed.
+"""What every metric is given: for each frame what was there, and what the ground showed.
 
-All boxes are x1 y1 x2 y2 in source pixels. A tick is a frame of the source at the study's rate (15 a second); the
+All boxes are x1 y1 x2 y2 in source pixels. A frame is a frame of the source at the study's rate (15 a second); the
 ground's list is judged at every one of them, coded or not, unless a metric says otherwise.
 """
 
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from hvt_common.values import Boxes
 from hvt_study.datasets.labels import NO_ID, FrameLabels
 
-__all__ = ["NO_ID", "FrameLabels", "FrameView", "Rows", "Tick", "Ticks", "rows_of"]
+__all__ = ["NO_ID", "FrameLabels", "FrameView", "LabelledFrame", "LabelledFrames", "Rows", "rows_of"]
 
 Rows: TypeAlias = npt.NDArray[np.bool_] | npt.NDArray[np.intp]
 """Which rows of parallel arrays: a mask, or indices."""
@@ -36,7 +36,7 @@ def _no_numbers() -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True)
 class FrameView:
-    """What the ground shows at one tick, N boxes; an empty one shows nothing."""
+    """What the ground shows at one frame, N boxes; an empty one shows nothing."""
 
     boxes_xyxy_px: Boxes = field(default_factory=_no_boxes)
     """(N, 4) float32, source pixels, inside the frame."""
@@ -56,30 +56,25 @@ class FrameView:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def before(self) -> FrameView:
-        """The same boxes with the classes that they had without refinement."""
-        names = self.names_before
-        return FrameView(self.boxes_xyxy_px, self.ids, names, self.confidences, names)
-
-    def rows(self, keep: Rows) -> FrameView:
+    def rows(self, chosen: Rows) -> FrameView:
         """Only these rows."""
         return FrameView(
-            self.boxes_xyxy_px[keep],
-            self.ids[keep],
-            rows_of(self.class_names, keep),
-            self.confidences[keep],
-            rows_of(self.names_before, keep),
+            self.boxes_xyxy_px[chosen],
+            self.ids[chosen],
+            rows_of(self.class_names, chosen),
+            self.confidences[chosen],
+            rows_of(self.names_before, chosen),
         )
 
 
-def rows_of(names: Sequence[str], keep: Rows) -> tuple[str, ...]:
+def rows_of(names: Sequence[str], chosen: Rows) -> tuple[str, ...]:
     """The names of some rows."""
-    indices = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep
+    indices = np.flatnonzero(chosen) if chosen.dtype == np.bool_ else chosen
     return tuple(names[index] for index in indices.tolist())
 
 
-Tick: TypeAlias = tuple[FrameLabels, FrameView]
+LabelledFrame: TypeAlias = tuple[FrameLabels, FrameView]
 """What was there, and what was shown."""
 
-Ticks: TypeAlias = Sequence[Tick]
+LabelledFrames: TypeAlias = Sequence[LabelledFrame]
 """Of one sequence, in order; it may be empty."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_study.metrics.classes import class_score
-from hvt_study.metrics.frames import NO_ID, FrameLabels, FrameView, Tick
+from hvt_study.metrics.frames import NO_ID, FrameLabels, FrameView, LabelledFrame
 
 __all__ = ["Labelled", "Score", "read_tracks", "read_truth", "score"]
 
@@ -89,10 +89,10 @@ def score(
 ) -> Score:
     """Match tracks to objects frame by frame and count; ``frames`` limits it to some (default: all of the truth)."""
     nothing = _labelled([])
-    ticks = [
-        _tick(truth.get(frame, nothing), tracks.get(frame, nothing)) for frame in frames or sorted(truth)
+    labelled = [
+        _frame(truth.get(frame, nothing), tracks.get(frame, nothing)) for frame in frames or sorted(truth)
     ]
-    one = class_score(ticks, limits_px2=(SMALL_SHARE * frame_area_px, math.inf))
+    one = class_score(labelled, limits_px2=(SMALL_SHARE * frame_area_px, math.inf))
     return Score(
         objects=one.counts.labels,
         recall=_or_zero(one.recall),
@@ -103,7 +103,7 @@ def score(
     )
 
 
-def _tick(wanted: Labelled, found: Labelled) -> Tick:
+def _frame(wanted: Labelled, found: Labelled) -> LabelledFrame:
     ids = np.full(len(found.classes), NO_ID, np.int64)
     labels = FrameLabels(
         wanted.boxes_xyxy_px.astype(np.float32),

@@ -30,7 +30,7 @@ def answer(found: Sequence[Setting]) -> Iterator[str | Drawing]:
         ahead = " ".join(filter(None, written(best.interval(DECIDES), metric, sign=True)))
         yield (
             f"{setting.name}, labels: {setting.labels}. The method furthest ahead of video at the same bits is "
-            f"{best.arm.name} in the {best.arm.regime} regime, {ahead} {metric.name} "
+            f"{best.arm.name} in the {best.arm.regime} regime, {ahead} {metric.title} "
             f"(n = {len(best.gaps(DECIDES))}). {_tally(plain)}"
         )
     for setting in found[:1]:

@@ -13,14 +13,13 @@ from hvt_study.report.data.document import Drawing, Pictures, Report
 from hvt_study.report.data.table_file import RESULTS, SWEEP, read_results
 from hvt_study.report.example.store import load_example
 from hvt_study.report.make import make_report
-from hvt_study.report.pages.html_page import html_page
-from hvt_study.report.pages.markdown_page import FIGURES, markdown_page
+from hvt_study.report.pages.render import FIGURES, html_page, markdown_page
 from hvt_study.report.tables.sweep_table import sweep_table
 
 __all__ = ["write_report"]
 
 _OURS = re.compile(
-    r"(?:(?:answer|timeline|(?:differences|equal-sight|utility|codecs)-\d+)(?:-[A-Za-z0-9.-]+)?\.(?:svg|pdf)"
+    r"(?:(?:answer|timeline|(?:differences|equal-quality|utility|codecs)-\d+)(?:-[A-Za-z0-9.-]+)?\.(?:svg|pdf)"
     r"|crop-\d+-(?:source|base|still)\.png)"
 )
 """Files that a report of ours may have written."""

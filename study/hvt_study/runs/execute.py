@@ -13,32 +13,31 @@ from typing import Any, TypeVar
 
 from hvt_common.errors import UserError
 from hvt_study.cache.results import CacheError, ResultCache, content_key
-from hvt_study.matrix.plan import StudyPlan
 from hvt_study.runs.columns import COLUMNS
 from hvt_study.runs.match_total import match, within
 from hvt_study.runs.materials import Materials, open_materials
 from hvt_study.runs.methods import METHODS
 from hvt_study.runs.paths import located
 from hvt_study.runs.run_context import RunContext, open_run_context
-from hvt_study.runs.run_settings import edge_flags, flown, settings, weighed
+from hvt_study.runs.run_settings import dry_run_bps, edge_flags, flown, settings
 from hvt_study.runs.scoring import figures
 from hvt_study.runs.spec import RunSpec
 
 __all__ = ["run_spec"]
 
-Row = dict[str, Any]
+RunRow = dict[str, Any]
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 _in_flight = threading.Lock()
 """Flights of one process take turns with its detectors; a Dask worker may have several threads."""
 
 
-def run_spec(spec: RunSpec, plan: StudyPlan, *, folder: Path = Path()) -> Row:
+def run_spec(spec: RunSpec, *, cache: Path, folder: Path = Path()) -> RunRow:
     """Do one run; what the edge refuses, or no one has foreseen, is a row that says so.
 
     Args:
         spec: what to do.
-        plan: the study that it is of.
+        cache: folder of what was computed before.
         folder: what paths that are not absolute begin at, such as the folder in which the study was started.
 
     Raises:
@@ -46,14 +45,14 @@ def run_spec(spec: RunSpec, plan: StudyPlan, *, folder: Path = Path()) -> Row:
     """
     with _in_flight:
         here = located(spec, folder=folder)
-        found = open_materials(here, cache=plan.cache)
-        bench = _Bench(spec, plan, found, here)
+        found = open_materials(here, cache=cache)
+        flights = _Flights(spec, cache, found, here)
         try:
-            row = bench.best()
+            row = flights.best()
             failed = "" if _matches(spec, row) else _missed(spec, row)
         except (_RefusedError, _BrokenError) as error:
             row, failed = {}, str(error)
-    row = {**row, **_identity(spec), "failed": failed, "matched": not failed, "wall_s": bench.wall_s}
+    row = {**row, **_identity(spec), "failed": failed, "matched": not failed, "wall_s": flights.wall_s}
     row["config"] = json.dumps({"run": asdict(spec), **row.pop("settings", {})})
     row |= {"versions": json.dumps(found.software), "content": json.dumps(found.content)}
     return {column.name: row.get(column.name) for column in COLUMNS}
@@ -67,19 +66,19 @@ class _BrokenError(Exception):
     """A flight ended in an error that nobody has foreseen: the run has failed at whatever rate, the study goes on."""
 
 
-class _Bench:
+class _Flights:
     """The flights of one run, each done once in the life of the cache; ``here`` has the paths that are opened."""
 
-    def __init__(self, spec: RunSpec, plan: StudyPlan, found: Materials, here: RunSpec) -> None:
-        self._spec, self._plan, self._found, self._here = spec, plan, found, here
-        self._cache = ResultCache(plan.cache / "flights")
+    def __init__(self, spec: RunSpec, cache: Path, found: Materials, here: RunSpec) -> None:
+        self._spec, self._folder, self._found, self._here = spec, cache, found, here
+        self._cache = ResultCache(cache / "flights")
         self.wall_s = 0.0
         """What all of them took, whenever that was."""
 
-    def best(self) -> Row:
+    def best(self) -> RunRow:
         """The flight that counts; of several frame rates the one that shows most."""
         choices: tuple[float | None, ...] = METHODS[self._spec.method].fps_choices or (None,)
-        done: list[Row] = []
+        done: list[RunRow] = []
         refused: list[_RefusedError] = []
         for fps in choices:
             try:
@@ -91,7 +90,7 @@ class _Bench:
             raise refused[-1]  # of the slowest, for which there was most hope
         return max(matching, key=_worth)
 
-    def _at_rate(self, fps: float | None) -> Row:
+    def _at_rate(self, fps: float | None) -> RunRow:
         spec = self._spec
         if spec.target is None:
             return self._flight(spec.budget_bps, fps)
@@ -109,11 +108,11 @@ class _Bench:
             raise refused[0]
         return self._flight(found.budget_bps, fps)
 
-    def _flight(self, budget_bps: int, fps: float | None) -> Row:
-        def fly(shop: RunContext) -> Row:
-            report = _asked(lambda: flown(self._spec, shop, budget_bps=budget_bps, fps=fps))
-            used = settings(self._spec, shop, budget_bps=budget_bps, fps=fps)
-            return {**figures(report, shop), "settings": used}
+    def _flight(self, budget_bps: int, fps: float | None) -> RunRow:
+        def fly(context: RunContext) -> RunRow:
+            report = _or_refused(lambda: flown(self._spec, context, budget_bps=budget_bps, fps=fps))
+            used = settings(self._spec, context, budget_bps=budget_bps, fps=fps)
+            return {**figures(report, context), "settings": used}
 
         spec, words = self._spec, dict(self._found.classes.words)
         return self._known(self._key("flight", budget_bps, fps, spec.budget_bps, spec.labels, words), fly)
@@ -121,12 +120,14 @@ class _Bench:
     def _weight(self, budget_bps: int, fps: float | None) -> float:
         """What a flight at this budget spends; without a ground, which has no say in it."""
 
-        def weigh(shop: RunContext) -> Row:
-            return {"bps": _asked(lambda: weighed(self._spec, shop, budget_bps=budget_bps, fps=fps))}
+        def dry_run(context: RunContext) -> RunRow:
+            return {
+                "bps": _or_refused(lambda: dry_run_bps(self._spec, context, budget_bps=budget_bps, fps=fps))
+            }
 
-        return float(self._known(self._key("weight", budget_bps, fps), weigh)["bps"])
+        return float(self._known(self._key("weight", budget_bps, fps), dry_run)["bps"])
 
-    def _known(self, key: str, make: Callable[[RunContext], Row]) -> Row:
+    def _known(self, key: str, make: Callable[[RunContext], RunRow]) -> RunRow:
         """Out of the cache; else it is made, which alone needs pictures."""
         row = self._cache.get(key)
         if row is None:
@@ -137,9 +138,9 @@ class _Bench:
         self.wall_s += row["wall_s"]
         return row
 
-    def _made(self, make: Callable[[RunContext], Row]) -> Row:
+    def _made(self, make: Callable[[RunContext], RunRow]) -> RunRow:
         try:
-            return make(open_run_context(self._here, cache=self._plan.cache))
+            return make(open_run_context(self._here, cache=self._folder))
         except (UserError, _RefusedError, MemoryError):
             raise
         except Exception as error:  # noqa: BLE001 - one bad flight of thousands must not end them all
@@ -150,12 +151,12 @@ class _Bench:
     def _key(self, what: str, budget_bps: int, fps: float | None, *more: Any) -> str:
         spec, found = self._spec, self._found
         flags = edge_flags(spec, budget_bps=budget_bps, fps=fps)
-        ticks = found.sequence.ticks
+        frames = found.sequence.clip_frames
         said = (asdict(spec.models), spec.detect_every, found.content, found.software)
-        return content_key(what, flags, ticks, *said, *more)
+        return content_key(what, flags, frames, *said, *more)
 
 
-def _asked(fly: Callable[[], _T]) -> _T:
+def _or_refused(fly: Callable[[], _T]) -> _T:
     """A cache that cannot be written is no refusal: it ends the study."""
     try:
         return fly()
@@ -165,22 +166,22 @@ def _asked(fly: Callable[[], _T]) -> _T:
         raise _RefusedError(str(error)) from None
 
 
-def _worth(row: Row) -> tuple[float, float]:
+def _worth(row: RunRow) -> tuple[float, float]:
     """By this the best frame rate is chosen: objects found and named, and of equal ones the boxes."""
     return row["top1_all"] or 0.0, row["f1"] or 0.0
 
 
-def _matches(spec: RunSpec, row: Row) -> bool:
+def _matches(spec: RunSpec, row: RunRow) -> bool:
     return spec.target is None or within(row["total_bps"], spec.target.total_bps)
 
 
-def _missed(spec: RunSpec, row: Row) -> str:
+def _missed(spec: RunSpec, row: RunRow) -> str:
     assert spec.target is not None, "without a target nothing is missed"
     off_pct = 100 * (row["total_bps"] / spec.target.total_bps - 1)
     return f"spends {row['total_bps']} bps, {off_pct:+.1f} % off the {spec.target.total_bps} of {spec.target.method}"
 
 
-def _identity(spec: RunSpec) -> Row:
+def _identity(spec: RunSpec) -> RunRow:
     target = spec.target
     return {
         "key": spec.key,

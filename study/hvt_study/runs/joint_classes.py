@@ -32,21 +32,19 @@ def joint_classes(
     found = map_classes(detector_names, class_set)
     if reader_names is None:
         return found
-    asked = tuple(name for name in dict.fromkeys(class_set) if name in found.words)
-    read = map_classes(reader_names, asked)
-    common = {name: _common_word(name, found, read) for name in asked}
+    shared = tuple(name for name in dict.fromkeys(class_set) if name in found.words)
+    read = map_classes(reader_names, shared)
+    common = {name: _common_word(name, found, read) for name in shared}
     spoken = {**read.spoken, **found.spoken}
     words = {name: common[classes[0]] for name, classes in spoken.items()} | common
     models = tuple(dict.fromkeys((*detector_names, *reader_names)))
     return ClassMap(
         spoken={
-            name: tuple(one for one in asked if common[one] == words[name])
+            name: tuple(one for one in shared if common[one] == words[name])
             for name in models
             if name in spoken
         },
         words=words,
-        unmatched_dataset=found.unmatched_dataset,
-        unmatched_model=tuple(sorted(name for name in models if name not in spoken)),
     )
 
 

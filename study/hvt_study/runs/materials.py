@@ -81,7 +81,7 @@ def open_materials(spec: RunSpec, *, cache: Path) -> Materials:
     own = spec.labels == "reference"
     class_set = tuple(map(first_synonym, read or detector.class_names)) if own else sequence.class_set
     return Materials(
-        sequence=sequence.cut(spec.max_ticks),
+        sequence=sequence.limited(spec.max_frames),
         classes=joint_classes(detector.class_names, read, class_set),
         detector=detector,
         edge_detector=_detector("edge", spec.models.edge_detector, spec.models.provider, memory),

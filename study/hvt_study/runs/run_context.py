@@ -35,7 +35,7 @@ class RunContext:
 
     sequence: Sequence
     labels: tuple[FrameLabels, ...]
-    """Of every tick, source pixels."""
+    """Of every frame, source pixels."""
     classes: ClassMap
     """Between the ground's models and the labels."""
     detector: Detector
@@ -49,7 +49,7 @@ class RunContext:
 
 
 def open_run_context(spec: RunSpec, *, cache: Path) -> RunContext:
-    """The workshop for this run; the one before is kept, so that runs over one sequence open it once.
+    """The context of this run; the last one stays open, so that runs over one sequence open it once.
 
     Raises:
         UserError: the dataset, a model or their labels cannot be used.
@@ -66,7 +66,7 @@ def _open(spec: RunSpec, cache: Path) -> RunContext:
     sequence = replace(found.sequence, clip=clip)
     if spec.labels == "reference":
         sequence = _with_reference(sequence, found, cache, base_size=spec.size)
-    truth = (sequence.labels_at_tick(tick) for tick in range(sequence.ticks))
+    truth = (sequence.labels_at(frame_index) for frame_index in range(sequence.clip_frames))
     return RunContext(
         sequence=sequence,
         labels=tuple(one for one in truth if one is not None),
@@ -94,9 +94,9 @@ def _staged(clip: Clip) -> tuple[Clip, object]:
     staged = stage_clip(clip, folder=Path(folder.name))
     if staged.pixels is not None and not _OPEN_FILES.is_dir():
         return staged, folder
-    kept = None if staged.pixels is None else _OpenFile(staged.pixels)
+    pixels = None if staged.pixels is None else _OpenFile(staged.pixels)
     folder.cleanup()
-    return (staged, None) if kept is None else (replace(staged, pixels=kept.path), kept)
+    return (staged, None) if pixels is None else (replace(staged, pixels=pixels.path), pixels)
 
 
 class _OpenFile:
@@ -118,7 +118,7 @@ def _with_reference(
     """
     smaller = any(side < base for side, base in zip(sequence.source_size, base_size, strict=True))
     size = base_size if smaller else None
-    name = content_key("labels", found.content, found.software, sequence.ticks, size)
+    name = content_key("labels", found.content, found.software, sequence.clip_frames, size)
     store = ResultCache(cache / "labels")
     try:
         with FileLock(cache / "labels" / f"{name}.lock"):

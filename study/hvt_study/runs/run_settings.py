@@ -12,7 +12,7 @@ from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_study.datasets.clip import NOMINAL_FPS
-from hvt_study.flights.flight import FlightPlan, FlightReport, fly, weigh
+from hvt_study.flights.flight import FlightPlan, FlightReport, dry_run, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.peers.dds import fly_dds
 from hvt_study.peers.dds_settings import DdsSettings
@@ -21,7 +21,7 @@ from hvt_study.runs.methods import METHODS, Kind
 from hvt_study.runs.run_context import RunContext
 from hvt_study.runs.spec import RunSpec
 
-__all__ = ["edge_flags", "flight_plan", "flown", "settings", "weighed"]
+__all__ = ["dry_run_bps", "edge_flags", "flight_plan", "flown", "settings"]
 
 
 def edge_flags(spec: RunSpec, *, budget_bps: int, fps: float | None) -> tuple[str, ...]:
@@ -45,49 +45,51 @@ def edge_flags(spec: RunSpec, *, budget_bps: int, fps: float | None) -> tuple[st
     return tuple(flags)
 
 
-def flight_plan(spec: RunSpec, shop: RunContext, *, budget_bps: int, fps: float | None) -> FlightPlan:
+def flight_plan(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> FlightPlan:
     """The flight of this run at a budget; its link carries what the regime allows, whatever the budget.
 
     Raises:
         UserError: the edge does not take these settings.
     """
-    flags = ["--source", shop.sequence.clip.spec, *edge_flags(spec, budget_bps=budget_bps, fps=fps)]
+    flags = ["--source", context.sequence.clip.spec, *edge_flags(spec, budget_bps=budget_bps, fps=fps)]
     config, _ = load(EdgeConfig, flags, program="hvt-edge", description="")
     return FlightPlan(
-        clip=shop.sequence.clip,
+        clip=context.sequence.clip,
         edge=check_edge(config),
         ground=_ground_config(spec),
         link_bps=spec.budget_bps,
     )
 
 
-def flown(spec: RunSpec, shop: RunContext, *, budget_bps: int, fps: float | None) -> FlightReport:
+def flown(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> FlightReport:
     """Fly it."""
     if METHODS[spec.method].kind is Kind.PEER:
         return fly_dds(
-            shop.sequence.clip,
+            context.sequence.clip,
             budget_bps=budget_bps,
             link_bps=spec.budget_bps,
             size=spec.size,
-            detector=shop.detector,
+            detector=context.detector,
             settings=_dds_settings(fps),
         )
-    plan = flight_plan(spec, shop, budget_bps=budget_bps, fps=fps)
-    return fly(plan, detector=shop.edge_detector, models=SharedModels(shop.detector, shop.classifier))
+    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
+    return fly(
+        plan, detector=context.edge_detector, models=SharedModels(context.detector, context.classifier)
+    )
 
 
-def weighed(spec: RunSpec, shop: RunContext, *, budget_bps: int, fps: float | None) -> float:
+def dry_run_bps(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> float:
     """Line bits a second of a method that no ground's answer changes."""
-    plan = flight_plan(spec, shop, budget_bps=budget_bps, fps=fps)
-    return weigh(plan, detector=shop.edge_detector)
+    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
+    return dry_run(plan, detector=context.edge_detector)
 
 
-def settings(spec: RunSpec, shop: RunContext, *, budget_bps: int, fps: float | None) -> dict[str, Any]:
+def settings(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> dict[str, Any]:
     """All settings of a flight, as JSON holds them."""
     if METHODS[spec.method].kind is Kind.PEER:
         peer = {**asdict(_dds_settings(fps)), "budget_bps": budget_bps, "size": list(spec.size)}
         return {spec.method: peer}
-    plan = flight_plan(spec, shop, budget_bps=budget_bps, fps=fps)
+    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
     sides = {"edge": asdict(plan.edge), "ground": asdict(plan.ground)}
     known: dict[str, Any] = json.loads(json.dumps(sides, default=str))
     return known

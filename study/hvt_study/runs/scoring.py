@@ -10,17 +10,18 @@ from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.flights.flight import FlightReport
 from hvt_study.metrics.bits import Accounting, bit_split, still_counts
 from hvt_study.metrics.classes import class_score
-from hvt_study.metrics.delay import delay_score
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.first_correct import first_correct
+from hvt_study.metrics.frames import LabelledFrames
 from hvt_study.metrics.observed import (
     arrivals,
-    detected_ticks,
+    detected_frames,
+    refined_frames,
     refined_objects,
-    refined_ticks,
     shown_times_s,
 )
 from hvt_study.metrics.proxy import proxies
+from hvt_study.metrics.stills import still_delays_ms
 from hvt_study.metrics.tracking import tracking_score
 from hvt_study.runs.run_context import RunContext
 
@@ -29,21 +30,21 @@ __all__ = ["figures"]
 _DIGITS = 6
 
 
-def figures(report: FlightReport, shop: RunContext) -> dict[str, Any]:
+def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
     """Every metric column of `hvt_study.runs.columns.COLUMNS`; None where a run has none."""
-    found = {**_bits(report, shop), **_labelled(report, shop), **_delays(report), **_proxies(report)}
+    found = {**_bits(report, context), **_labelled(report, context), **_delays(report), **_proxies(report)}
     found |= {"digest": report.digest, "edge_cpu_ms": report.edge_cpu_ms}
     return {name: _plain(value) for name, value in found.items()}
 
 
-def _bits(report: FlightReport, shop: RunContext) -> dict[str, Any]:
+def _bits(report: FlightReport, context: RunContext) -> dict[str, Any]:
     stills, refined = arrivals(report.lists), refined_objects(report.lists)
 
     def split(accounting: Accounting) -> tuple[float, ...]:
         one = bit_split(
             report.line_bytes,
             processed_s=report.duration_s,
-            clip_s=shop.sequence.duration_s,
+            clip_s=context.sequence.duration_s,
             accounting=accounting,
         )
         return one.total_bps, one.base_bps, one.roi_bps, one.track_bps, one.other_bps
@@ -53,7 +54,7 @@ def _bits(report: FlightReport, shop: RunContext) -> dict[str, Any]:
     pilot = tuple(map(round, split("pilot")))
     return {
         "duration_s": report.duration_s,
-        "clip_s": shop.sequence.duration_s,
+        "clip_s": context.sequence.duration_s,
         "total_bps": total,
         "base_bps": base,
         "roi_bps": roi,
@@ -76,14 +77,14 @@ def _back_bytes(report: FlightReport) -> int:
     return report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)
 
 
-def _labelled(report: FlightReport, shop: RunContext) -> dict[str, Any]:
-    words: dict[str, Any] = {"word": shop.classes.word, "classes": shop.classes.classes}
-    ticks = refined_ticks(report.lists, shop.labels)
-    detection = detection_score(detected_ticks(report.lists, shop.labels), **words)
-    after = class_score(ticks, **words)
-    before = class_score(ticks, refined=False, **words)
-    tracking = tracking_score(ticks, **words)
-    first = first_correct(ticks, fps=NOMINAL_FPS, shown_s=shown_times_s(report.lists), **words)
+def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
+    words: dict[str, Any] = {"word": context.classes.word, "classes": context.classes.classes}
+    labelled = refined_frames(report.lists, context.labels)
+    detection = detection_score(detected_frames(report.lists, context.labels), **words)
+    after = class_score(labelled, **words)
+    before = class_score(labelled, refined=False, **words)
+    tracking = tracking_score(labelled, **words)
+    first = first_correct(labelled, fps=NOMINAL_FPS, shown_s=shown_times_s(report.lists), **words)
     return {
         "map_50": detection.mean.at_50,
         "map_50_95": detection.mean.at_50_95,
@@ -95,6 +96,7 @@ def _labelled(report: FlightReport, shop: RunContext) -> dict[str, Any]:
         "top1": after.counts.top1_found,
         "top1_all_before": before.counts.top1_all,
         "top1_all": after.counts.top1_all,
+        **_halves(labelled, words),
         "macro_f1_before": before.macro_f1_found,
         "macro_f1": after.macro_f1_found,
         "macro_f1_all_before": before.macro_f1_all,
@@ -111,13 +113,32 @@ def _labelled(report: FlightReport, shop: RunContext) -> dict[str, Any]:
     }
 
 
+def _halves(labelled: LabelledFrames, words: dict[str, Any]) -> dict[str, float]:
+    """Of the list in each half of the clip: what is tuned on one half must hold in the other."""
+    middle = len(labelled) // 2
+    found: dict[str, float] = {}
+    for half, part in enumerate((labelled[:middle], labelled[middle:]), start=1):
+        one = class_score(part, **words)
+        figures = {
+            "recall": one.recall,
+            "precision": one.precision,
+            "f1": one.f1,
+            "top1": one.counts.top1_found,
+        }
+        found |= {f"{name}_half_{half}": value for name, value in figures.items()}
+    return found
+
+
 def _delays(report: FlightReport) -> dict[str, Any]:
-    delays = delay_score(report.link, arrivals(report.lists))
+    still_p50_ms, still_p95_ms = still_delays_ms(arrivals(report.lists))
     return {
-        "delay_p50_ms": delays.base_p50_ms,
-        "delay_p95_ms": delays.base_p95_ms,
-        "still_delay_p50_ms": delays.still_p50_ms,
-        "still_delay_p95_ms": delays.still_p95_ms,
+        "delay_p50_ms": report.link.delay_p50_ms,
+        "delay_p95_ms": report.link.delay_p95_ms,
+        "still_delay_p50_ms": still_p50_ms,
+        "still_delay_p95_ms": still_p95_ms,
+        "picture_age_p95_ms": report.picture_age_p95_ms,
+        "worst_queue_bytes": report.link.worst_queue_bytes,
+        "max_frame_bytes": report.max_frame_bytes,
     }
 
 

@@ -57,10 +57,10 @@ class RunSpec:
     labels: LabelKind = "reference"
     size: tuple[int, int] = (1280, 720)
     """(width, height) of the base stream in pixels."""
-    max_ticks: int | None = None
+    max_frames: int | None = None
     """At 15 a second."""
     detect_every: int = 5
-    """Ticks from one detection to the next, at the edge and at the ground. The peer looks at all that it codes."""
+    """Frames from one detection to the next, at the edge and at the ground. The peer looks at all that it codes."""
     target: Target | None = None
     """For video-only methods: spend what this run spent; None: the budget itself."""
     tune: tuple[str, ...] = field(default=())

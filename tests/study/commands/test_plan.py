@@ -13,7 +13,7 @@ from hvt_edge.stills.policy.registry import METHODS
 from hvt_study.cli import main
 from hvt_study.commands.plan import hours_in_words
 from hvt_study.matrix.estimate import estimate
-from hvt_study.matrix.plan import StudyPlan, first_runs, following_runs, parse_regimes
+from hvt_study.matrix.plan import StudyPlan, first_runs, matched_runs, parse_regimes
 from hvt_study.matrix.tuning import tuned_methods
 from hvt_study.runs.methods import chosen_methods
 from hvt_study.runs.run_settings import edge_flags
@@ -42,10 +42,10 @@ def test_all_of_visdrone_by_nine_methods_and_two_budgets(tmp_path, capsys):
     assert told["sequences"] == f"{CLIPS}"
     # M0 and R0 at two budgets; seven others, each with both again at its total.
     assert told["runs"] == f"{CLIPS * 2 * (2 + 7 * 3)}"
-    assert told["ticks, 15 a second"] == f"{CLIPS * 3}"
+    assert told["frames, 15 a second"] == f"{CLIPS * 3}"
     assert told["pictures and annotations"].endswith("MB")
     assert re.search(r"^\d+\.\d+", told["hours with 1 process"])
-    assert re.fullmatch(r"[1-9]\d* ms", told["one tick of a flight"])
+    assert re.fullmatch(r"[1-9]\d* ms", told["one frame of a flight"])
     assert not (tmp_path / "out").exists()
     without = words[: words.index("--out")] + words[words.index("--out") + 2 :]
     assert main(["plan", *without]) == 0, "nothing is written: no place has to be named"
@@ -68,18 +68,19 @@ def test_hours_are_of_every_flight(tmp_path):
 
     write_visdrone(tmp_path, "a", "b", count=60)
     sequences = open_dataset(f"visdrone:{tmp_path}")
-    ticks = 60
-    assert sum(one.ticks for one in sequences) == ticks
+    frames = 60
+    assert sum(one.clip_frames for one in sequences) == frames
 
     def cpu_s(methods, **named):
-        return estimate(plan_of(methods, **named), sequences, tick_s=1.0).cpu_s
+        return estimate(plan_of(methods, **named), sequences, frame_s=1.0).cpu_s
 
-    assert cpu_s("M0") == 2 * ticks
-    assert cpu_s("M0-fps") == cpu_s("DDS") == 5 * cpu_s("M0")
+    assert cpu_s("M0") == 2 * frames
+    assert cpu_s("M0-fps") == 6 * cpu_s("M0")
+    assert cpu_s("DDS") == 5 * cpu_s("M0")
     assert cpu_s("M5") == 2 * cpu_s("M0")  # in two codecs
-    assert cpu_s("M0", labels="reference") == cpu_s("M0") + ticks
+    assert cpu_s("M0", labels="reference") == cpu_s("M0") + frames
     assert cpu_s("M0,M5") > cpu_s("M0") + 2 * cpu_s("M5")  # video at each total takes more than one coding
-    found = estimate(plan_of("M0,M5"), sequences, tick_s=1.0)
+    found = estimate(plan_of("M0,M5"), sequences, frame_s=1.0)
     assert found.hours(4) == found.cpu_s / 4 / 3600
     assert found.runs == 2 * 2 * (1 + 2 * 2)
     assert found.scratch_bytes == 30 * 160 * 96 * 3
@@ -124,7 +125,7 @@ def test_parameters_are_those_of_the_runs(tmp_path):
     tuned = next(spec for spec in first_runs(plan) if spec.method == "M5")
     flags = edge_flags(tuned, budget_bps=300_000, fps=None)
     assert [flags[at + 1] for at, flag in enumerate(flags) if flag == "--tune"] == list(tuned.tune)
-    (video,) = following_runs(plan, tuned, {"failed": "", "total_bps": 250_000})
+    (video,) = matched_runs(plan, tuned, {"failed": "", "total_bps": 250_000})
     assert (video.method, video.target.total_bps, video.tune) == ("M0", 250_000, ())
     usual = METHODS["M5"].parameters
     assert tuned_methods([f"M5:{name}={value!r}" for name, value in usual.items()]) == {}, "M5 as it is"
@@ -152,7 +153,7 @@ def test_wrong_parameters_are_one_sentence(tmp_path, monkeypatch, word, said):
 
 
 def test_short_and_long_are_told_in_a_unit_that_says_something():
-    """A fast machine plans a study of a tick, too: 9.9e-05 hours, or 0.0, tell nobody how long it takes."""
+    """A fast machine plans a study of a frame, too: 9.9e-05 hours, or 0.0, tell nobody how long it takes."""
     assert [hours_in_words(seconds / 3600) for seconds in (0.36, 40, 600, 3 * 3600 + 60)] == [
         "0.0001 (less than 1 s)",
         "0.0111 (40 s)",

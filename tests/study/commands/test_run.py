@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from hvt_study.cli import main
-from hvt_study.commands import run_study as command
+from hvt_study.commands import run as command
 from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
-from hvt_study.runs import execute, run_context
+from hvt_study.runs import execute
 from hvt_study.runs.columns import COLUMNS
 from hvt_study.runs.match_total import within
 from hvt_study.runs.materials import open_materials
@@ -21,14 +21,9 @@ from hvt_study.runs.run_settings import flown
 from hvt_study.runs.spec import ModelChoice
 from layouts import write_images, write_visdrone
 from onnx_models import colour_classifier, colour_detector
-from small_study import PATIENT_S, SIZE, arguments, entries, flights, said, study, table, write_scene
+from small_study import PATIENT_S, SIZE, arguments, entries, flights, said, study, table
 
 METHODS = ("--methods", "M0,R0,M5,DDS", "--regimes", "150kbps")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("scene"), "street")
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +73,7 @@ def test_a_row_for_every_run(done):
         assert not {name for name in everywhere if row[name] is None}, row["method"]
         config = json.loads(row["config"])
         assert config["run"]["method"] == row["method"]
-        assert config["run"]["max_ticks"] is None
+        assert config["run"]["max_frames"] is None
         assert {"numpy", "av", "motmetrics", "hvt", "code", "provider"} <= json.loads(row["versions"]).keys()
         assert json.loads(row["content"]).keys() == {"clip", "detector", "edge_detector"}
     m5 = next(row for row in rows if row["method"] == "M5")
@@ -97,9 +92,9 @@ def test_video_spends_what_the_others_really_spent(done):
     """Compared at other bits, either side could win."""
     rows = good(table(done))
     spent = {row["method"]: row["total_bps"] for row in rows if not row["matched_to"]}
-    followers = [row for row in rows if row["matched_to"]]
-    assert len(followers) == 4
-    for row in followers:
+    matching = [row for row in rows if row["matched_to"]]
+    assert len(matching) == 4
+    for row in matching:
         assert row["matched"], row["failed"]
         assert row["target_bps"] == spent[row["matched_to"]]
         assert within(row["total_bps"], row["target_bps"])
@@ -234,7 +229,7 @@ def test_an_error_in_one_flight_is_one_row(scene, tmp_path, monkeypatch, caplog)
 
     with monkeypatch.context() as broken:
         broken.setattr(execute, "flown", stumbles)
-        row = execute.run_spec(spec, plan)
+        row = execute.run_spec(spec, cache=plan.cache)
     assert row["failed"] == "AssertionError: the base frame 3 cannot be decoded"
     assert (row["matched"], row["total_bps"], row["method"]) == (False, None, "M0")
     assert "Traceback" in caplog.text
@@ -242,7 +237,7 @@ def test_an_error_in_one_flight_is_one_row(scene, tmp_path, monkeypatch, caplog)
     with monkeypatch.context() as full:
         full.setattr(execute, "flown", lambda *_, **__: (_ for _ in ()).throw(MemoryError))
         with pytest.raises(MemoryError):
-            execute.run_spec(spec, plan)
+            execute.run_spec(spec, cache=plan.cache)
 
 
 def test_a_classifier_names_the_reference_labels(scene, tmp_path):
@@ -261,7 +256,8 @@ def test_a_classifier_names_the_reference_labels(scene, tmp_path):
     assert said
     assert said <= set(names)
     shutil.rmtree(plan.cache / "detections")  # labels are remembered as they are
-    run_context._open.cache_clear()
+    other = plan_of(scene, tmp_path / "other")  # the last context alone stays open
+    open_run_context(*first_runs(other), cache=other.cache)
     again = open_run_context(spec, cache=plan.cache)
     assert not (plan.cache / "detections").exists()
     for one, other in zip(first.labels, again.labels, strict=True):

@@ -19,10 +19,10 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
+from hvt_scene import Scene
 from hvt_study.datasets.annotation_rows import read_rows
 from hvt_study.datasets.clip import stage_clip
 from hvt_study.datasets.content import content_hash
-from hvt_study.datasets.layouts import demo
 from hvt_study.datasets.layouts.mot import mot_table
 from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
 from hvt_study.flights.flight import FlightPlan, fly
@@ -47,8 +47,6 @@ def test_visdrone_labels(tmp_path):
         assert labels.boxes_xyxy_px.dtype == np.float32
         assert labels.class_names == ("van", "car")
         assert labels.ids.tolist() == [7, 8]
-        assert labels.occlusion.tolist() == [1, 0]
-        assert labels.truncation.tolist() == [0, 1]
         assert labels.ignored_xyxy_px.shape == labels.beside_xyxy_px.shape == (0, 4)
     labels = first.labels(1)
     assert labels.ids.tolist() == [7, 8]  # the pedestrian lies where nobody has labelled anything
@@ -56,21 +54,25 @@ def test_visdrone_labels(tmp_path):
     assert labels.beside_xyxy_px.tolist() == [[5, 80, 13, 88], [20, 80, 28, 88]]  # others, and a score of 0
 
 
-def test_a_tick_shows_the_frame_that_its_labels_are_of(tmp_path):
-    """At 15 ticks a second, every second frame of 30: labels a frame off are wrong for all that moves."""
+def test_a_frame_of_the_clip_shows_the_source_frame_of_its_labels(tmp_path):
+    """At 15 frames a second, every second frame of 30: labels a frame off are wrong for all that moves."""
     write_visdrone(tmp_path, "a", count=7)
     drawn = smooth_pictures(7, size=SIZE)
     for fps, shown in ((30, [0, 2, 4, 6]), (24, [0, 1, 3, 4, 6]), (10, [0, 0, 1, 2, 2, 3, 4, 4, 5, 6, 6])):
         (sequence,) = open_dataset(f"visdrone:{tmp_path}?fps={fps}")
-        assert sequence.ticks == len(shown)
-        assert [sequence.frame_at_tick(tick) for tick in range(sequence.ticks)] == shown
+        assert sequence.clip_frames == len(shown)
+        assert [sequence.source_frame(frame_index) for frame_index in range(sequence.clip_frames)] == shown
         pictures = list(sequence.clip.images())
         assert len(pictures) == len(shown)
         assert all(np.array_equal(one, drawn[index]) for one, index in zip(pictures, shown, strict=True))
-        box = sequence.labels_at_tick(2).boxes_xyxy_px[0]
+        box = sequence.labels_at(2).boxes_xyxy_px[0]
         assert box.tolist() == xyxy(*square_xywh(shown[2]))
-        cut = sequence.cut(2)
-        assert (cut.ticks, len(list(cut.clip.images())), cut.duration_s) == (2, 2, pytest.approx(7 / fps))
+        limited = sequence.limited(2)
+        assert (limited.clip_frames, len(list(limited.clip.images())), limited.duration_s) == (
+            2,
+            2,
+            pytest.approx(7 / fps),
+        )
 
 
 def test_several_splits_below_one_root(tmp_path):
@@ -190,7 +192,7 @@ def test_what_a_layout_lacks_is_one_sentence(tmp_path, spoil, said):
         ("still:{}?labels=some", "says labels=some"),
         ("still:{}?view=9", "says view=9"),
         ("still:{}", "holds no pictures"),
-        ("clips:{}", "holds no videos"),
+        ("clips:{}", "holds neither videos nor images"),
         ("uavdt:{}", "has no sequences"),
         ("mot:{}", "seqinfo.ini"),
         ("demo:", "asks for the seeds ''"),
@@ -212,7 +214,7 @@ def test_pictures_alone(tmp_path):
     shutil.rmtree(tmp_path / "annotations")
     (sequence,) = open_dataset(f"visdrone:{tmp_path}?labels=none")
     assert sequence.labels is None
-    assert sequence.labels_at_tick(0) is None
+    assert sequence.labels_at(0) is None
     assert len(list(sequence.clip.images())) == 3
 
 
@@ -227,8 +229,6 @@ def test_uavdt_labels(tmp_path):
     assert labels.boxes_xyxy_px.tolist() == [xyxy(*square_xywh(2))]
     assert (labels.class_names, labels.ids.tolist()) == (("bus",), [1])
     assert labels.ignored_xyxy_px.tolist() == [[100, 0, 160, 20]]
-    assert labels.occlusion.tolist() == [2]  # UAVDT's 2 is "large"
-    assert [sequence.labels(index).truncation.tolist() for index in (0, 1)] == [[1], [0]]
 
 
 def test_uavdt_without_classes_or_regions(tmp_path):
@@ -273,12 +273,12 @@ def test_mot_labels(tmp_path):
     assert sequence.class_set == ("pedestrian",)
     labels = sequence.labels(1)
     assert labels.boxes_xyxy_px.tolist() == [xyxy(*square_xywh(1))]
-    assert (labels.ids.tolist(), labels.occlusion.tolist()) == ([4], [1])
+    assert labels.ids.tolist() == [4]
     assert labels.ignored_xyxy_px.shape == (0, 4)
     assert labels.beside_xyxy_px.tolist() == [
         [30, 10, 39, 19]
     ]  # a distractor; neither the car nor the occluder
-    assert [sequence.frame_at_tick(tick) for tick in range(sequence.ticks)] == [0, 1, 3, 5]
+    assert [sequence.source_frame(frame_index) for frame_index in range(sequence.clip_frames)] == [0, 1, 3, 5]
     (alone,) = open_dataset(f"mot:{tmp_path / 'train' / 'MOT17-02'}")
     assert alone.name == "MOT17-02"
 
@@ -311,7 +311,7 @@ def test_mot15_has_no_classes(tmp_path, place):
     (sequence,) = open_dataset(f"mot:{tmp_path}")
     labels = sequence.labels(0)
     assert labels.class_names == sequence.class_set == ("pedestrian",)
-    assert (labels.ids.tolist(), labels.occlusion.tolist()) == ([1], [-1])
+    assert labels.ids.tolist() == [1]
     assert len(labels.beside_xyxy_px) == 0
 
 
@@ -324,7 +324,6 @@ def test_real_mot15_annotations(data, name, count):
     assert table.class_set == ("pedestrian",)
     assert len(table.frames) == len(truth.read_text().splitlines()) == count
     assert len(table.ignored.frames) == 0
-    assert set(table.occlusion.tolist()) == {-1}
 
 
 def test_mot_of_others(tmp_path):
@@ -375,7 +374,7 @@ def _write_video(path, count, *, fps):
 
 
 @pytest.mark.parametrize(("ending", "fps"), [("mkv", 25), ("avi", 10), ("mkv", 30)])
-def test_clips_tell_what_a_tick_shows(tmp_path, ending, fps):
+def test_clips_say_what_a_frame_shows(tmp_path, ending, fps):
     """Reference labels are kept by source frame; those of another frame would be of another picture."""
     _write_video(tmp_path / f"road.{ending}", 24, fps=fps)
     (tmp_path / "notes.txt").write_text("no video")
@@ -384,9 +383,9 @@ def test_clips_tell_what_a_tick_shows(tmp_path, ending, fps):
     assert (sequence.labels, sequence.class_set) == (None, ())
     drawn = smooth_pictures(24, size=SIZE)
     pictures = list(sequence.clip.images())
-    assert len(pictures) == sequence.ticks == -(-24 * 15 // fps)
-    for tick, picture in enumerate(pictures):
-        assert np.array_equal(picture, drawn[sequence.frame_at_tick(tick)])
+    assert len(pictures) == sequence.clip_frames == -(-24 * 15 // fps)
+    for frame_index, picture in enumerate(pictures):
+        assert np.array_equal(picture, drawn[sequence.source_frame(frame_index)])
 
 
 def test_a_broken_clip_is_named(tmp_path):
@@ -398,9 +397,9 @@ def test_a_broken_clip_is_named(tmp_path):
 
 @pytest.mark.realdata
 def test_real_clips_play_as_many_pictures_as_promised(data):
-    """A clip that ends early leaves ticks without a picture in every table."""
+    """A clip that ends early leaves frames without a picture in every table."""
     for sequence in open_dataset(f"clips:{data / 'clips'}", only=["intel*"]):
-        assert (sequence.frame_count, sequence.fps, sequence.ticks) == (377, 12.5, 453)
+        assert (sequence.frame_count, sequence.fps, sequence.clip_frames) == (377, 12.5, 453)
         assert sum(1 for _ in sequence.clip.images()) == 453
 
 
@@ -409,7 +408,7 @@ def test_demo_seeds():
     sequences = open_dataset("demo:0-1,7")
     assert [one.name for one in sequences] == ["demo-0", "demo-1", "demo-7"]
     last = sequences[2]
-    scene = demo._scene(7)
+    scene = Scene(7)
     labels, truth = last.labels(3), scene.truth(3 / 15)
     asked = truth.visible >= 0.5
     assert np.array_equal(labels.boxes_xyxy_px, truth.boxes_source_px[asked])
@@ -417,7 +416,7 @@ def test_demo_seeds():
     assert len(labels.ignored_xyxy_px) == 0
     assert len(labels.beside_xyxy_px) == (~asked).sum() > 0
     assert set(labels.class_names) <= set(last.class_set)
-    assert (last.ticks, last.frame_count, last.frame_at_tick(299)) == (300, 300, 299)
+    assert (last.clip_frames, last.frame_count, last.source_frame(299)) == (300, 300, 299)
     assert np.array_equal(next(last.clip.images()), scene.image(0.0))
 
 
@@ -446,9 +445,12 @@ def test_a_dataset_flies(tmp_path):
     ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
     plan = FlightPlan(sequence.clip, check_edge(edge), ground, 300_000)
     report = fly(plan, detector=RedSquares(), models=SharedModels(RedSquares()))
-    assert len(report.lists) == sequence.ticks == 30
-    tick = 20  # no jump in the last frames before it
-    shown, known = report.lists[tick].boxes_base_px[0], sequence.labels_at_tick(tick).boxes_xyxy_px[0]
+    assert len(report.lists) == sequence.clip_frames == 30
+    frame_index = 20  # no jump in the last frames before it
+    shown, known = (
+        report.lists[frame_index].boxes_xyxy_px[0],
+        sequence.labels_at(frame_index).boxes_xyxy_px[0],
+    )
     assert np.abs(shown - known).max() < 8
 
 

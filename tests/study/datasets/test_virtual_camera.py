@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_study.datasets.clip import clip_name, share_clip
+from hvt_study.datasets.clip import stage_clip
+from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.virtual_camera import VirtualCamera, open_camera, read_annotations
 
 BOX = (300, 200, 40, 24)  # x, y, w, h of a white block
@@ -30,12 +31,13 @@ def picture(tmp_path):
 @pytest.mark.parametrize("height", ["", "@0.5", "@2"])
 def test_boxes_follow_exactly(picture, height):
     """F1 at IoU 0.5 of small objects is lost by a pixel or two, in the mirrored land as in the picture."""
-    camera = open_camera(f"still:{picture}{height}", fps=15)
+    camera = open_camera(f"still:{picture}{height}", fps=3)
     seen = 0
     for index, image in enumerate(camera.images()):
-        boxes, names, _ = camera.truth(index)
+        labels = camera.labels(index)
+        boxes, names = labels.boxes_xyxy_px, labels.class_names
         assert image.shape[1::-1] == camera.size
-        if index % 30 or not len(boxes):
+        if index % 6 or not len(boxes):
             continue
         ys, xs = np.nonzero(image[:, :, 0] > 145)
         assert set(names) == {"car"}
@@ -63,17 +65,20 @@ def test_regions_without_labels_are_known(picture):
     assert found.ignored_px.tolist() == [[10, 10, 60, 60]]
     assert found.beside_px.tolist() == [[500, 300, 520, 320]]  # a single object: boxes on it alone
     camera = VirtualCamera(picture)
-    assert sum(len(camera.truth(index)[2]) for index in range(0, 200, 20)) > 0
+    seen = [camera.labels(index) for index in range(0, 200, 20)]
+    assert sum(len(one.ignored_xyxy_px) for one in seen) > 0
+    assert sum(len(one.beside_xyxy_px) for one in seen) > 0
 
 
 def test_shared_once_for_all(picture, tmp_path):
     """Processes must fly over the very same pixels."""
-    clip = share_clip(f"still:{picture}", max_frames=4, folder=tmp_path)
-    assert (clip.ticks, len(clip.truth)) == (4, 4)
+    (sequence,) = open_dataset(f"still:{picture}")
+    clip = stage_clip(sequence.limited(4).clip, folder=tmp_path)
+    assert clip.pixels is not None
     images = list(clip.images())
     again = VirtualCamera(picture).images()
     assert all(np.array_equal(image, next(again)) for image in images)
-    assert clip_name(clip.spec) == "street"
+    assert (sequence.name, len(images)) == ("street", 4)
 
 
 @pytest.mark.parametrize(

@@ -15,21 +15,20 @@ from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_study.datasets.clip import Clip
-from hvt_study.flights.flight import FlightPlan, coded_ticks, fly
+from hvt_study.flights.flight import FlightPlan, coded_frames, fly
 from hvt_study.flights.flight_ground import SharedModels
-from hvt_study.metrics.list_score import Listed, score_lists
+from metric_frames import list_f1
 
-TICKS = 46
+FRAMES = 46
 
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
-    """A red square that moves seven pixels a tick over a smooth ground, and jumps back once."""
-    pictures = np.stack(smooth_pictures(TICKS, size=SIZE))
+    """A red square that moves seven pixels a frame over a smooth ground, and jumps back once."""
+    pictures = np.stack(smooth_pictures(FRAMES, size=SIZE))
     path = tmp_path_factory.mktemp("clip") / "clip.bgr"
     path.write_bytes(pictures.tobytes())
-    truth = tuple(Listed(np.array([square_box(tick)], np.float32), ("car",)) for tick in range(TICKS))
-    return Clip("drawn", SIZE, TICKS, path, truth, ("car", "bus"))
+    return Clip("drawn", SIZE, FRAMES, path)
 
 
 def flown(clip, *flags, link_bps=200_000):
@@ -42,16 +41,16 @@ def flown(clip, *flags, link_bps=200_000):
     return fly(plan, detector=RedSquares(), models=SharedModels(RedSquares()))
 
 
-def f1_of(clip, report, ticks):
-    return score_lists((clip.truth[tick], report.lists[tick]) for tick in ticks).f1
+def f1_of(report, frames):
+    return list_f1(report, frames, lambda frame_index: ([square_box(frame_index)], ("car",)))
 
 
-def test_video_alone_shows_the_square_at_every_tick(clip):
+def test_video_alone_shows_the_square_at_every_frame(clip):
     """The list at the ground, its bits and its delay are what every table of the comparison is made of."""
     report = flown(clip, "--method", "M0")
-    assert len(report.lists) == TICKS
-    assert f1_of(clip, report, range(TICKS)) > 0.9
-    assert report.messages["base"] == TICKS
+    assert len(report.lists) == FRAMES
+    assert f1_of(report, range(FRAMES)) > 0.9
+    assert report.messages["base"] == FRAMES
     assert report.messages.get("roi", 0) == 0
     # What was put on the link is what the edge's own ledger says.
     assert report.bps() == report.account.total_bps
@@ -69,19 +68,19 @@ def test_the_same_flight_twice(clip):
     assert first.link == second.link
     for one, other in zip(first.lists, second.lists, strict=True):
         assert one.classes == other.classes
-        assert np.array_equal(one.boxes_base_px, other.boxes_base_px)
+        assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)
 
 
-def test_ticks_between_coded_frames_are_foretold(clip):
+def test_frames_between_coded_ones_are_predicted(clip):
     """Judged on coded frames only, a slow base stream would look as good as a fast one."""
     report = flown(clip, "--method", "M0", "--fps", "5")
-    coded = coded_ticks(TICKS, 5)
+    coded = coded_frames(FRAMES, 5)
     assert report.messages["base"] == len(coded) == 16
-    between = [tick for tick in range(9, 40) if tick not in coded]  # at 40 it jumps back
-    boxes = [report.lists[tick].boxes_base_px for tick in between]
+    between = [frame_index for frame_index in range(9, 40) if frame_index not in coded]  # at 40 it jumps back
+    boxes = [report.lists[frame_index].boxes_xyxy_px for frame_index in between]
     assert all(len(one) for one in boxes)
     # The square moves on between them: a list that was merely repeated would be 7 and 14 pixels behind.
-    assert f1_of(clip, report, between) > 0.8
+    assert f1_of(report, between) > 0.8
 
 
 def test_a_thin_link_delivers_late(clip):
@@ -101,9 +100,9 @@ def test_stills_cross_and_are_counted(clip):
     assert report.bps("roi") == report.account.roi_bps
 
 
-def test_coded_ticks():
-    """Two frames a second of fifteen ticks: every seventh or eighth, never two for one instant."""
-    assert sorted(coded_ticks(31, 2)) == [0, 8, 15, 23, 30]
-    assert coded_ticks(10, 15) == frozenset(range(10))
-    assert sorted(coded_ticks(10, 7.5)) == [0, 2, 4, 6, 8]
-    assert coded_ticks(1, 1) == {0}
+def test_coded_frames():
+    """Two frames a second of fifteen frames: every seventh or eighth, never two for one instant."""
+    assert sorted(coded_frames(31, 2)) == [0, 8, 15, 23, 30]
+    assert coded_frames(10, 15) == frozenset(range(10))
+    assert sorted(coded_frames(10, 7.5)) == [0, 2, 4, 6, 8]
+    assert coded_frames(1, 1) == {0}

@@ -11,7 +11,7 @@ import pytest
 
 from hvt_common.inference.store import resolve_model
 from processes import eventually, free_ports
-from small_study import PATIENT_S, arguments, flights, said, study, table, until, write_scene
+from small_study import PATIENT_S, arguments, flights, said, study, table, until
 
 pytest.importorskip("distributed")
 WORDS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
@@ -53,11 +53,6 @@ class Cluster:
 
 
 _WORKER = ("--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--memory-limit", "0")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("scene"), "street")
 
 
 def test_a_worker_is_lost_in_mid_run(scene, tmp_path):

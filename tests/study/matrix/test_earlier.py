@@ -31,7 +31,7 @@ def row(method, *, total=100_000, to="", target=None, sequence="one", provider="
         "regime": "low",
         "budget_bps": 300_000,
     }
-    spec |= {"still_codec": "", "labels": "annotations", "size": [1280, 720], "max_ticks": None}
+    spec |= {"still_codec": "", "labels": "annotations", "size": [1280, 720], "max_frames": None}
     spec |= {"detect_every": 5, "models": models, "target": aim, "tune": [], **run}
     rates = dict.fromkeys(("base_bps", "roi_bps", "track_bps", "other_bps", "back_bps", "stills_per_min"), 0)
     return {
@@ -55,7 +55,7 @@ def test_what_this_study_does_not_have_stays():
         row("M5"),
         row("M0", to="M5", target=100_000),
         row("M0", sequence="two"),
-        row("M0", max_ticks=90),
+        row("M0", max_frames=90),
     ]
     assert staying([row("M0"), row("M6")], earlier) == earlier
 

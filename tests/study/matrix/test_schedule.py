@@ -31,7 +31,7 @@ def plan_of(methods="M0,R0,M2,M5,M6", codecs=("jpeg", "residual"), regimes="low,
     )
 
 
-def result(spec, _plan):
+def result(spec):
     total = spec.target.total_bps if spec.target else SPENT.get(spec.method, spec.budget_bps)
     failed = "the budget is too small" if spec.method == "M2" and spec.regime == "300kbps" else ""
     return {"total_bps": None if failed else total, "failed": failed, "key": spec.key}
@@ -64,17 +64,17 @@ def test_one_flight_is_never_done_twice_at_once():
     """Two processes would fly the same video side by side, and only one be of use."""
     flying, most = Counter(), Counter()
 
-    def run(spec, plan):
+    def run(spec):
         if spec.target is not None:
             near = grid_target(spec.target.total_bps)
             flight = (spec.sequence, spec.regime, spec.method, near)
             flying[flight] += 1
             most[flight] = max(most[flight], flying[flight])
             time.sleep(0.005)  # long enough for another to begin
-            row = result(spec, plan)
+            row = result(spec)
             flying[flight] -= 1
             return row
-        return result(spec, plan)
+        return result(spec)
 
     with ThreadPoolExecutor(8) as pool:
         rows = run_all(plan_of(codecs=("jpeg", "webp")), pool=pool, run=run, at_once=8)
@@ -85,10 +85,10 @@ def test_one_flight_is_never_done_twice_at_once():
 def test_an_error_ends_the_study_and_leaves_nothing_running():
     """It would go on for hours after it had failed, or hang."""
 
-    def run(spec, plan):
+    def run(spec):
         if spec.method == "M5":
             raise UserError("cache is full")
-        return result(spec, plan)
+        return result(spec)
 
     with ThreadPoolExecutor(2) as pool, pytest.raises(UserError, match="full"):
         run_all(plan_of(), pool=pool, run=run, at_once=2)

@@ -9,14 +9,9 @@ import signal
 import psutil
 import pytest
 
-from small_study import PATIENT_S, arguments, entries, flights, said, study, table, until, write_scene
+from small_study import PATIENT_S, arguments, entries, flights, said, study, table, until
 
 METHODS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("scene"), "street")
 
 
 def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path):

@@ -6,18 +6,16 @@ import math
 
 import pytest
 
-from hvt_study.flights.serial_link import LinkReport
 from hvt_study.metrics.bits import StillCounts, bit_split, still_counts
-from hvt_study.metrics.delay import DelayScore, Sent, delay_score, simulated
 from hvt_study.metrics.frames import NO_ID
 from hvt_study.metrics.proxy import proxies, score_entropy_nats
-from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival
+from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival, still_delays_ms
 
 SECOND = 1_000_000_000
 
 
-def still(number, *, size=1000, cut_s=1.0, arrived_s=1.5):
-    return StillArrival(number, cut_s, cut_s + 0.1, arrived_s, size, size + 180, "due")
+def still(number, *, size=1000, capture_s=1.0, arrived_s=1.5):
+    return StillArrival(number, capture_s, capture_s + 0.1, arrived_s, size, size + 180, "due")
 
 
 def named(number, track, *, share=0.01, base=None, seen=None):
@@ -70,28 +68,10 @@ def test_stills_and_the_tracks_that_they_named():
     assert math.isnan(nothing.mean_bytes)
 
 
-def test_delay_on_a_slow_link():
-    """1000 bytes a second: a still that has begun is not interrupted, and the next frame waits for it."""
-    messages = [
-        Sent(0, 0, 500, urgent=True),
-        Sent(SECOND // 10, SECOND // 10, 1000, urgent=False),
-        Sent(6 * SECOND // 10, 6 * SECOND // 10, 500, urgent=True),
-    ]
-    score = simulated(messages, rate_bps=8000)
-    # Frames arrive after 0.5 and 1.4 s, the still after 1.4 s.
-    assert score.base_p50_ms == pytest.approx(950)
-    assert score.base_p95_ms == pytest.approx(1355)
-    assert (score.still_p50_ms, score.still_p95_ms) == (pytest.approx(1400), pytest.approx(1400))
-    assert score.worst_queue_bytes == 1500
-    assert math.isnan(simulated(messages[:1], rate_bps=8000).still_p95_ms)
-    assert math.isnan(simulated([], rate_bps=8000).base_p50_ms)
-
-
 def test_delay_of_a_flight():
     """Stills count from the capture of their frame, as base frames do."""
-    score = delay_score(LinkReport(40.0, 90.0, 5000), [still(1), still(2, arrived_s=1.7)])
-    assert score == DelayScore(40.0, 90.0, pytest.approx(600), pytest.approx(690), 5000)
-    assert math.isnan(delay_score(LinkReport(40.0, 90.0, 5000), []).still_p50_ms)
+    assert still_delays_ms([still(1), still(2, arrived_s=1.7)]) == (pytest.approx(600), pytest.approx(690))
+    assert math.isnan(still_delays_ms([])[0])
 
 
 def test_proxies():

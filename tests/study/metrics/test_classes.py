@@ -10,10 +10,10 @@ from hvt_common.inference.class_names import kind_of
 from hvt_study.metrics.classes import ClassCounts, class_score
 from hvt_study.metrics.first_correct import first_correct
 from hvt_study.metrics.frames import FrameView
-from metric_ticks import labels, square, view
+from metric_frames import labels, square, view
 
 
-def tick_of_four():
+def frame_of_four():
     """A car and a bus that a still mended are right, a truck is called car, a van missed; a bus is on nothing."""
     truth = labels(
         (square(0), "car"), (square(100, side=50), "bus"), (square(200), "truck"), (square(300), "van")
@@ -29,7 +29,7 @@ def tick_of_four():
 
 def test_after_refinement():
     """These figures are the study's answer; both kinds of share must be what they are called."""
-    score = class_score([tick_of_four()])
+    score = class_score([frame_of_four()])
     assert score.counts == ClassCounts(right=2, found=3, labels=4)
     assert score.counts.top1_found == pytest.approx(2 / 3)
     assert score.counts.top1_all == 0.5
@@ -42,13 +42,13 @@ def test_after_refinement():
 
 def test_before_refinement():
     """Without this the stills' gain could not be told from the detector's skill."""
-    score = class_score([tick_of_four()], refined=False)
+    score = class_score([frame_of_four()], refined=False)
     assert score.counts == ClassCounts(right=1, found=3, labels=4)
     # car 2·1/(1+3), the others 0
     assert score.macro_f1_found == pytest.approx(0.5 / 3)
 
 
-def test_every_tick_counts_not_only_the_refined_one():
+def test_every_frame_counts_not_only_the_refined_one():
     """A still that mends a class late must gain less than one that mends it early."""
     truth = labels((square(0), "bus"))
     wrong, right = view((square(0), "car", 1)), view((square(0), "bus", 1, 0.9, "car"))
@@ -59,7 +59,7 @@ def test_every_tick_counts_not_only_the_refined_one():
 
 def test_sizes_and_ignored_regions():
     """Small objects are what stills are for; unlabelled crowds are nobody's fault."""
-    score = class_score([tick_of_four()])
+    score = class_score([frame_of_four()])
     assert score.by_size["small"] == ClassCounts(right=1, found=2, labels=3)
     assert score.by_size["medium"] == ClassCounts(right=1, found=1, labels=1)
     assert math.isnan(score.by_size["large"].top1_all)
@@ -78,8 +78,8 @@ def test_a_refinement_cannot_take_a_false_box_out_of_the_account():
 
 def test_what_merely_moves_is_found_and_has_no_class():
     """The motion detector knows no classes: it must be credited with boxes and nothing more."""
-    tick = labels((square(0), "van")), view((square(0), "moving", 1))
-    score = class_score([tick], word=kind_of, classes={"car"})
+    frame_index = labels((square(0), "van")), view((square(0), "moving", 1))
+    score = class_score([frame_index], word=kind_of, classes={"car"})
     assert score.counts == ClassCounts(right=0, found=1, labels=1)
 
 
@@ -97,18 +97,20 @@ def test_nothing():
 
 
 def sequence(*lives):
-    """Five ticks; each life is the class that a bus is shown with at every tick: b, c, - for missed."""
+    """Five frames; each life is the class that a bus is shown with at every frame: b, c, - for missed."""
     word = {"b": "bus", "c": "car"}
-    ticks = []
-    for tick in range(5):
-        there = [(square(100 * track), "bus", track) for track, life in enumerate(lives) if tick < len(life)]
-        shown = [
-            (square(100 * track), word[life[tick]], 50 + track)
-            for track, life in enumerate(lives)
-            if tick < len(life) and life[tick] != "-"
+    frames = []
+    for frame_index in range(5):
+        there = [
+            (square(100 * track), "bus", track) for track, life in enumerate(lives) if frame_index < len(life)
         ]
-        ticks.append((labels(*there), view(*shown)))
-    return ticks
+        shown = [
+            (square(100 * track), word[life[frame_index]], 50 + track)
+            for track, life in enumerate(lives)
+            if frame_index < len(life) and life[frame_index] != "-"
+        ]
+        frames.append((labels(*there), view(*shown)))
+    return frames
 
 
 def test_time_to_the_first_right_class():

@@ -11,7 +11,7 @@ import pytest
 from hvt_common.inference.class_names import kind_of
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import FrameView
-from metric_ticks import labels, square, view
+from metric_frames import labels, square, view
 
 
 def test_a_curve_drawn_by_hand():
@@ -46,9 +46,9 @@ def test_classes_are_averaged_and_can_be_taken_as_one():
 
 def test_words_are_brought_into_one_vocabulary():
     """A COCO detector on VisDrone labels calls a van a car."""
-    tick = (labels((square(0), "van")), view((square(0), "car")))
-    assert detection_score([tick]).mean.at_50 == 0.0
-    assert detection_score([tick], word=kind_of).mean.at_50 == 1.0
+    frame_index = (labels((square(0), "van")), view((square(0), "car")))
+    assert detection_score([frame_index]).mean.at_50 == 0.0
+    assert detection_score([frame_index], word=kind_of).mean.at_50 == 1.0
 
 
 def test_classes_that_labels_do_not_know_are_left_out():
@@ -109,8 +109,8 @@ def test_sizes():
 def test_crowded_frames_count_whole():
     """COCO's limit of 100 boxes a frame would cap the recall on VisDrone, which has several hundred."""
     boxes = [square(20 * column, 20 * row) for row in range(10) for column in range(15)]
-    tick = labels(*((box, "car") for box in boxes)), view(*((box, "car") for box in boxes))
-    assert detection_score([tick]).mean.at_50 == pytest.approx(1.0)
+    frame_index = labels(*((box, "car") for box in boxes)), view(*((box, "car") for box in boxes))
+    assert detection_score([frame_index]).mean.at_50 == pytest.approx(1.0)
 
 
 def test_nothing():
@@ -125,10 +125,10 @@ def test_nothing():
     assert (score.labels, score.boxes) == (0, 0)
 
 
-def average_precision(ticks, threshold):
+def average_precision(frames, threshold):
     """Of one class: greedy matching by confidence within each frame, precision at 101 recalls."""
     hits, total = [], 0
-    for truth, shown in ticks:
+    for truth, shown in frames:
         free = set(range(len(truth.class_names)))
         total += len(free)
         overlap = iou(shown.boxes_xyxy_px, truth.boxes_xyxy_px)
@@ -148,16 +148,16 @@ def average_precision(ticks, threshold):
 def test_a_second_implementation_agrees():
     """The library, or what we hand it, would be wrong on real crowds of overlapping boxes."""
     rng = np.random.default_rng(6)
-    ticks = []
+    frames = []
     for _ in range(20):
         corners = rng.uniform(0, 120, (8, 2))
         boxes = np.hstack((corners, corners + rng.uniform(10, 40, (8, 2))))
         moved = (boxes + rng.normal(0, 2.5, boxes.shape))[: rng.integers(0, 9)]
         stray = square(300)
         shown = [(box, "car", 0, float(rng.uniform())) for box in [*moved.tolist(), stray]]
-        ticks.append((labels(*((box, "car") for box in boxes.tolist())), view(*shown)))
-    score = detection_score(ticks)
-    expected = [average_precision(ticks, threshold) for threshold in np.linspace(0.5, 0.95, 10)]
+        frames.append((labels(*((box, "car") for box in boxes.tolist())), view(*shown)))
+    score = detection_score(frames)
+    expected = [average_precision(frames, threshold) for threshold in np.linspace(0.5, 0.95, 10)]
     assert 0.2 < score.mean.at_50 < 0.9
     assert score.mean.at_50 == pytest.approx(expected[0], abs=1e-9)
     assert score.mean.at_50_95 == pytest.approx(np.mean(expected), abs=1e-9)

@@ -21,25 +21,23 @@ from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.metrics.bits import bit_split, still_counts
 from hvt_study.metrics.classes import class_score
-from hvt_study.metrics.delay import delay_score
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.first_correct import first_correct
 from hvt_study.metrics.frames import NO_ID
-from hvt_study.metrics.list_score import Listed
 from hvt_study.metrics.observed import (
     arrivals,
-    base_ticks,
-    detected_ticks,
+    detected_frames,
+    refined_frames,
     refined_objects,
-    refined_ticks,
     shown_times_s,
 )
 from hvt_study.metrics.proxy import proxies
+from hvt_study.metrics.stills import still_delays_ms
 from hvt_study.metrics.tracking import tracking_score
-from metric_ticks import labels
+from metric_frames import labels
 
-TICKS = 40
-TRUTH = [labels((square_box(tick), "bus", 1)) for tick in range(TICKS)]
+FRAMES = 40
+TRUTH = [labels((square_box(frame_index), "bus", 1)) for frame_index in range(FRAMES)]
 
 
 class Buses:
@@ -58,10 +56,10 @@ class Buses:
 def pictures():
     """A red square over a smooth ground, with detail of its own in every picture: a thin base cannot follow."""
     rng = np.random.default_rng(2)
-    drawn = np.stack(smooth_pictures(TICKS, size=SIZE))
-    for tick, picture in enumerate(drawn):
+    drawn = np.stack(smooth_pictures(FRAMES, size=SIZE))
+    for frame_index, picture in enumerate(drawn):
         grain = rng.integers(0, 90, (32, 32, 2), dtype=np.uint8)
-        left, top = (round(edge) for edge in square_box(tick)[:2])
+        left, top = (round(edge) for edge in square_box(frame_index)[:2])
         picture[top : top + 32, left : left + 32, :2] = grain
         picture[top : top + 32, left : left + 32, 2] = 255 - grain[..., 0] // 2
     return drawn
@@ -72,7 +70,7 @@ def clip(tmp_path_factory):
     """Those pictures as a clip."""
     path = tmp_path_factory.mktemp("clip") / "clip.bgr"
     path.write_bytes(pictures().tobytes())
-    return Clip("drawn", SIZE, TICKS, path, None, ("car", "bus"))
+    return Clip("drawn", SIZE, FRAMES, path)
 
 
 def flown(clip, *flags, classifier=None):
@@ -93,16 +91,19 @@ def flight(clip):
 
 def test_classes_before_and_after_refinement(flight):
     """The study's main figure: the same tracks, with and without what the stills say."""
-    ticks = refined_ticks(flight.lists, TRUTH)
-    after, before = class_score(ticks), class_score(ticks, refined=False)
+    frames = refined_frames(flight.lists, TRUTH)
+    after, before = class_score(frames), class_score(frames, refined=False)
     assert before.counts.found == after.counts.found > 30
     assert before.counts.right == 0
     assert after.counts.right > 20
     shown_s = shown_times_s(flight.lists)
-    assert all(tick / NOMINAL_FPS < at_s < tick / NOMINAL_FPS + 1 for tick, at_s in enumerate(shown_s))
-    waits = first_correct(ticks, fps=NOMINAL_FPS, shown_s=shown_s)
+    assert all(
+        frame_index / NOMINAL_FPS < at_s < frame_index / NOMINAL_FPS + 1
+        for frame_index, at_s in enumerate(shown_s)
+    )
+    waits = first_correct(frames, fps=NOMINAL_FPS, shown_s=shown_s)
     assert 0 < waits.median_s < 1
-    assert first_correct(ticks, fps=NOMINAL_FPS, refined=False).never == 1
+    assert first_correct(frames, fps=NOMINAL_FPS, refined=False).never == 1
     first = refined_objects(flight.lists)[0]
     # It is shown from the next list on.
     assert first.at_s <= waits.median_s + 1 / NOMINAL_FPS
@@ -110,7 +111,8 @@ def test_classes_before_and_after_refinement(flight):
 
 def test_the_base_alone(flight):
     """Confidences and names as the base stream gives them, for the very same tracks."""
-    base, shown = base_ticks(flight.lists, TRUTH), refined_ticks(flight.lists, TRUTH)
+    base = [(truth, one.base_view()) for truth, one in zip(TRUTH, flight.lists, strict=True)]
+    shown = refined_frames(flight.lists, TRUTH)
     for (_, alone), (_, both) in zip(base, shown, strict=True):
         assert np.array_equal(alone.ids, both.ids)
         assert set(alone.class_names) <= {"car"}
@@ -121,15 +123,15 @@ def test_the_base_alone(flight):
 
 
 def test_detections_on_base_frames(clip, flight):
-    """The mAP is of what the detector says of decoded frames, not of the tracks at every tick."""
-    ticks = detected_ticks(flight.lists, TRUTH)
-    assert len(ticks) == TICKS
-    assert all((found.ids == NO_ID).all() for _, found in ticks)
-    score = detection_score(ticks)
+    """The mAP is of what the detector says of decoded frames, not of the tracks at every frame."""
+    frames = detected_frames(flight.lists, TRUTH)
+    assert len(frames) == FRAMES
+    assert all((found.ids == NO_ID).all() for _, found in frames)
+    score = detection_score(frames)
     assert score.agnostic.at_50 > 0.9
     assert score.mean.at_50 == 0.0  # it says car
     slow = flown(clip, "--method", "M0", "--fps", "5")
-    assert len(detected_ticks(slow.lists, TRUTH)) == slow.messages["base"] < TICKS / 2
+    assert len(detected_frames(slow.lists, TRUTH)) == slow.messages["base"] < FRAMES / 2
 
 
 def test_stills_bits_and_delay(flight):
@@ -137,7 +139,7 @@ def test_stills_bits_and_delay(flight):
     stills = arrivals(flight.lists)
     assert len(stills) == flight.messages["roi"] > 3
     assert sum(one.line_bytes for one in stills) == flight.line_bytes["roi"]
-    assert all(0 <= one.cut_s <= one.sent_s < one.arrived_s for one in stills)
+    assert all(0 <= one.capture_s <= one.sent_s < one.arrived_s for one in stills)
     assert [one.arrived_s for one in stills] == sorted(one.arrived_s for one in stills)
     split = bit_split(flight.line_bytes, processed_s=flight.duration_s)
     assert round(split.total_bps) == flight.account.total_bps
@@ -145,7 +147,7 @@ def test_stills_bits_and_delay(flight):
     counts = still_counts(stills, refined_objects(flight.lists), processed_s=flight.duration_s)
     assert counts.tracks_refined == 1
     assert counts.mean_bytes == pytest.approx(flight.account.roi_bytes / len(stills))
-    assert delay_score(flight.link, stills).still_p50_ms > 0
+    assert still_delays_ms(stills)[0] > 0
 
 
 def test_what_stills_did_to_a_track(flight):
@@ -183,6 +185,5 @@ def test_recording_changes_nothing_and_goes_to_another_process(flight):
     """Runs are flown in processes of their own; what they record has to come back whole."""
     again = pickle.loads(pickle.dumps(flight))
     for one, other in zip(again.lists, flight.lists, strict=True):
-        assert np.array_equal(one.boxes_base_px, other.boxes_base_px)
+        assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)
         assert (one.classes, one.stills, one.refined) == (other.classes, other.stills, other.refined)
-    assert isinstance(flight.lists[0], Listed)

@@ -10,7 +10,7 @@ import pytest
 from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.hota import ALPHAS
 from hvt_study.metrics.tracking import TrackingScore, compare_tracks, tracking_score
-from metric_ticks import labels, square, view
+from metric_frames import labels, square, view
 
 SEQUENCES = ("TUD-Campus", "TUD-Stadtmitte")
 
@@ -55,7 +55,7 @@ def test_hota_is_that_of_its_authors(data):
 
 
 def test_hota_by_hand():
-    """One track of four ticks, found under two ids for two ticks each, boxes exact."""
+    """One track of four frames, found under two ids for two frames each, boxes exact."""
     there = np.array([1]), np.array([square(0)])
     frames = [(there, (np.array([10 + k // 2]), np.array([square(0)]))) for k in range(4)]
     score = compare_tracks(frames)
@@ -77,13 +77,13 @@ def test_hota_judges_how_well_boxes_fit():
 
 
 def two_that_cross(ids):
-    """Two labelled cars for six ticks; ``ids`` names the boxes on each, or None where one is not shown."""
-    ticks = []
+    """Two labelled cars for six frames; ``ids`` names the boxes on each, or None where one is not shown."""
+    frames = []
     for pair in ids:
         there = [(square(100 * k), "car", k) for k in range(2)]
         shown = [(square(100 * k), "car", name) for k, name in enumerate(pair) if name is not None]
-        ticks.append((labels(*there), view(*shown)))
-    return ticks
+        frames.append((labels(*there), view(*shown)))
+    return frames
 
 
 def test_switches_misses_and_false_positives():
@@ -92,7 +92,7 @@ def test_switches_misses_and_false_positives():
     score = tracking_score(two_that_cross(ids))
     assert (score.objects, score.misses, score.false_positives, score.switches) == (12, 1, 0, 2)
     assert score.mota == pytest.approx(1 - 3 / 12)
-    # Best assignment: 0 with 6 (4 ticks), 1 with 5 (3 ticks).
+    # Best assignment: 0 with 6 (4 frames), 1 with 5 (3 frames).
     assert (score.id_true_positives, score.idf1) == (7, pytest.approx(14 / (12 + 11)))
 
 
@@ -107,8 +107,8 @@ def test_ignored_regions_and_plain_detections():
 
 def test_nothing():
     """Reference labels know no tracks: no figure is better than a wrong one."""
-    for ticks in ([], [(labels((square(0), "car")), FrameView())], [(labels(), view())]):
-        score = tracking_score(ticks)
+    for frames in ([], [(labels((square(0), "car")), FrameView())], [(labels(), view())]):
+        score = tracking_score(frames)
         assert all(math.isnan(each) for each in (score.mota, score.idf1, score.hota, score.deta, score.assa))
     ghosts = tracking_score([(labels(), view((square(0), "car", 1)))])
     assert (ghosts.false_positives, math.isnan(ghosts.mota)) == (1, True)

@@ -13,11 +13,11 @@ from flight import CLASSES, SIZE, RedSquares, square_box
 from hvt_common.errors import UserError
 from hvt_common.values import Detections
 from hvt_study.datasets.clip import Clip
-from hvt_study.metrics.list_score import Listed, score_lists
-from hvt_study.metrics.observed import detected_ticks
+from hvt_study.metrics.observed import detected_frames
 from hvt_study.peers.dds import DdsSettings, fly_dds
+from metric_frames import list_f1
 
-TICKS = 46
+FRAMES = 46
 BUDGET_BPS = 200_000
 QUICK = DdsSettings(
     fps=15, high=0.5, preset="ultrafast", request_bytes=200, bundle_bytes=1000, camera_motion="off"
@@ -49,25 +49,27 @@ class Doubtful:
         return Detections(table[:, :4], table[:, 4], table[:, 5].astype(np.int32))
 
 
-def clip_of(pictures, folder, truth=None):
+def clip_of(pictures, folder):
     path = folder / "clip.bgr"
     path.write_bytes(np.stack(pictures).tobytes())
-    return Clip("drawn", SIZE, len(pictures), path, truth, CLASSES)
+    return Clip("drawn", SIZE, len(pictures), path)
 
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
     """A red square that moves over a smooth ground, and a checked one that stands still."""
-    pictures = smooth_pictures(TICKS, size=SIZE)
+    pictures = smooth_pictures(FRAMES, size=SIZE)
     x1, y1, x2, y2 = DIM_AT
     rows, columns = np.indices((y2 - y1, x2 - x1))
     checks = ((rows + columns) % 4 // 2 * 100 + columns // 16 * 40 + 40).astype(np.uint8)
     for picture in pictures:
         picture[y1:y2, x1:x2] = checks[..., None]
-    truth = tuple(
-        Listed(np.array([square_box(tick), DIM_AT], np.float32), ("car", "bus")) for tick in range(TICKS)
-    )
-    return clip_of(pictures, tmp_path_factory.mktemp("clip"), truth)
+    return clip_of(pictures, tmp_path_factory.mktemp("clip"))
+
+
+def f1_of(report, frames):
+    """Of the list, against where square and checks really are."""
+    return list_f1(report, frames, lambda frame_index: ([square_box(frame_index), DIM_AT], ("car", "bus")))
 
 
 def flown(clip, *, detector=None, budget_bps=BUDGET_BPS, link_bps=None, **changes):
@@ -89,11 +91,11 @@ def report(clip):
 
 def test_what_only_the_second_pass_shows_is_found(clip, report):
     """That is the whole idea of the peer; without it, it is video at half the budget."""
-    assert len(report.lists) == TICKS
-    assert all("bus" in report.lists[tick].classes for tick in range(2, TICKS))
+    assert len(report.lists) == FRAMES
+    assert all("bus" in report.lists[frame_index].classes for frame_index in range(2, FRAMES))
     row = report.lists[20].classes.index("bus")
     assert report.lists[20].confidences[row] == pytest.approx(0.8)
-    assert score_lists((clip.truth[tick], report.lists[tick]) for tick in range(2, 40)).f1 > 0.9
+    assert f1_of(report, range(2, 40)) > 0.9
     # The first pass alone had 0.3 for it.
     alone = flown(clip, scale=0.3, high=0.3)
     assert alone.messages.get("roi", 0) == 0
@@ -104,11 +106,11 @@ def test_every_byte_of_both_passes_counts_once(report):
     """A peer whose second pass came for free would beat everybody."""
     assert set(report.line_bytes) == {"base", "roi", "control"}
     sent = report.messages["roi"]
-    assert TICKS / 4 < sent < TICKS  # some frames share a message
-    assert report.messages == {"base": TICKS, "roi": sent, "control": 4}
+    assert FRAMES / 4 < sent < FRAMES  # some frames share a message
+    assert report.messages == {"base": FRAMES, "roi": sent, "control": 4}
     account = report.account
     assert sum(report.line_bytes.values()) == account.line_bytes
-    assert account.messages == {"base": TICKS, "roi": sent, "backlog": 0, "meta": 4}
+    assert account.messages == {"base": FRAMES, "roi": sent, "backlog": 0, "meta": 4}
     assert report.bps("base") == account.base_bps
     assert report.bps("roi") == account.roi_bps
     assert report.bps() == account.total_bps
@@ -119,7 +121,7 @@ def test_every_byte_of_both_passes_counts_once(report):
 @pytest.mark.parametrize("settings", [{}, {"share": 0.3}, {"share": 0.7, "segment_s": 0.2}, {"fps": 5}])
 def test_everything_together_stays_within_the_budget(tmp_path_factory, settings):
     """The study compares at equal bits; these pictures are noise, and take all that there is."""
-    pictures = hard_pictures(TICKS, size=SIZE)
+    pictures = hard_pictures(FRAMES, size=SIZE)
     clip = clip_of(pictures, tmp_path_factory.mktemp("hard"))
     everywhere = _Everywhere()
     report = flown(clip, detector=everywhere, **settings)
@@ -153,7 +155,7 @@ def test_the_same_flight_twice(clip, report):
     assert again.line_bytes == report.line_bytes
     for one, other in zip(again.lists, report.lists, strict=True):
         assert one.classes == other.classes
-        assert np.array_equal(one.boxes_base_px, other.boxes_base_px)
+        assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)
     assert flown(clip, scale=0.3, share=0.6).digest != report.digest
 
 
@@ -172,13 +174,13 @@ def test_what_the_ground_is_sure_of_is_not_sent_again(clip):
     detector = Doubtful(sharp=0.9, blurred=0.9)
     report = flown(clip, detector=detector)
     assert set(report.line_bytes) == {"base"}
-    assert detector.asked == TICKS
-    assert score_lists((clip.truth[tick], report.lists[tick]) for tick in range(2, 40)).f1 > 0.9
+    assert detector.asked == FRAMES
+    assert f1_of(report, range(2, 40)) > 0.9
 
 
 def test_delay_is_that_of_the_pass_that_completes_a_frame(report, clip):
     """Two passes are bought with delay; a table that hid it would mislead."""
-    # A segment of a second has to be whole before its question: its first frame waits for at least 14 ticks.
+    # A segment of a second has to be whole before its question: its first frame waits for at least 14 frames.
     assert report.link.delay_p95_ms > 930
     quick = flown(clip, scale=0.3, segment_s=0.2)
     assert quick.link.delay_p50_ms < report.link.delay_p50_ms
@@ -186,16 +188,16 @@ def test_delay_is_that_of_the_pass_that_completes_a_frame(report, clip):
     assert report.picture_age_p95_ms < 400  # of the first pass, which does not wait
 
 
-def test_ticks_between_coded_frames_are_foretold(clip):
+def test_frames_between_coded_ones_are_predicted(clip):
     """Judged on coded frames only, a slow stream would look as good as a fast one."""
     report = flown(clip, scale=0.3, fps=5)
     assert report.messages["base"] == 16
-    coded = [tick for tick, one in enumerate(report.lists) if one.detections is not None]
-    assert coded == list(range(0, TICKS, 3))
-    truth = [None] * TICKS
-    assert len(detected_ticks(report.lists, truth)) == 16
-    between = [tick for tick in range(9, 40) if tick % 3]
-    assert score_lists((clip.truth[tick], report.lists[tick]) for tick in between).f1 > 0.8
+    coded = [frame_index for frame_index, one in enumerate(report.lists) if one.detections is not None]
+    assert coded == list(range(0, FRAMES, 3))
+    truth = [None] * FRAMES
+    assert len(detected_frames(report.lists, truth)) == 16
+    between = [frame_index for frame_index in range(9, 40) if frame_index % 3]
+    assert f1_of(report, between) > 0.8
 
 
 def test_boxes_are_in_source_pixels(tmp_path_factory):
@@ -206,9 +208,9 @@ def test_boxes_are_in_source_pixels(tmp_path_factory):
     ]
     path = tmp_path_factory.mktemp("large") / "clip.bgr"
     path.write_bytes(np.stack(pictures).tobytes())
-    clip = Clip("drawn", (640, 384), 12, path, None, CLASSES)
+    clip = Clip("drawn", (640, 384), 12, path)
     report = flown(clip, detector=RedSquares())
-    (box,) = report.lists[5].boxes_base_px
+    (box,) = report.lists[5].boxes_xyxy_px
     assert np.abs(box - 2 * np.array(square_box(5))).max() < 8
 
 

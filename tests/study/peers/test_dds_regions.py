@@ -9,7 +9,14 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_common.values import Detections
-from hvt_study.peers.dds_regions import asked_blocks, asked_boxes, combined, merged, pasted, pixel_mask
+from hvt_study.peers.dds_regions import (
+    combined,
+    merged,
+    pasted,
+    pixel_mask,
+    requested_blocks,
+    requested_boxes,
+)
 from hvt_study.peers.dds_request import RegionRequest
 from hvt_study.peers.dds_settings import DdsSettings
 
@@ -23,31 +30,31 @@ def seen(*rows):
     return Detections(table[:, :4], table[:, 4], np.zeros(len(table), np.int32))
 
 
-def asked(*rows, rules=RULES):
-    return asked_boxes(seen(*rows), size=SIZE, settings=rules).tolist()
+def requested(*rows, rules=RULES):
+    return requested_boxes(seen(*rows), size=SIZE, settings=rules).tolist()
 
 
 def test_only_what_is_uncertain_is_asked_for():
     """Asked about what it knows, the peer would spend its second pass on nothing."""
     rows = [(10, 10, 30, 30, 0.6), (50, 10, 70, 30, 0.59), (90, 10, 110, 30, 0.2), (130, 10, 150, 30, 0.19)]
-    assert asked(*rows) == [[50, 10, 70, 30], [90, 10, 110, 30]]
-    assert asked() == []
-    assert asked((10, 10, 30, 30, 0.9)) == []
+    assert requested(*rows) == [[50, 10, 70, 30], [90, 10, 110, 30]]
+    assert requested() == []
+    assert requested((10, 10, 30, 30, 0.9)) == []
 
 
 def test_what_a_confident_result_explains_is_not_asked_for():
     """The detector's second thoughts about one and the same car would be sent again and again."""
     sure = (100, 100, 120, 120, 0.9)
     # 20x20 moved by 10: 200 shared of 600, IoU 1/3; by 11: 180 of 620, 0.29.
-    assert asked(sure, (110, 100, 130, 120, 0.4)) == []
-    assert asked(sure, (111, 100, 131, 120, 0.4)) == [[111, 100, 131, 120]]
+    assert requested(sure, (110, 100, 130, 120, 0.4)) == []
+    assert requested(sure, (111, 100, 131, 120, 0.4)) == [[111, 100, 131, 120]]
 
 
 def test_large_regions_are_not_asked_for():
     """One uncertain lorry in front of the camera would take the bits of all that is far away."""
     # A tenth of 320x192 is 6144.
-    assert asked((0, 0, 96, 64, 0.4)) == [[0, 0, 96, 64]]
-    assert asked((0, 0, 97, 64, 0.4)) == []
+    assert requested((0, 0, 96, 64, 0.4)) == [[0, 0, 96, 64]]
+    assert requested((0, 0, 97, 64, 0.4)) == []
 
 
 def test_overlapping_regions_become_one():
@@ -64,18 +71,18 @@ def test_overlapping_regions_become_one():
 def test_regions_are_enlarged_within_the_picture():
     """A box that is a little too small cuts the object that it is about."""
     rules = DdsSettings(low=0.2, high=0.6, enlarge=0.5)
-    assert asked((100, 100, 120, 110, 0.4), rules=rules) == [[90, 95, 130, 115]]
-    assert asked((0, 180, 20, 192, 0.4), rules=rules) == [[0, 174, 30, 192]]
+    assert requested((100, 100, 120, 110, 0.4), rules=rules) == [[90, 95, 130, 115]]
+    assert requested((0, 180, 20, 192, 0.4), rules=rules) == [[0, 174, 30, 192]]
 
 
 def test_blocks_and_pixels():
     """The edge and the ground have to mean the same pixels, also at a rim that is no whole block."""
     size = (40, 24)
-    blocks = asked_blocks(np.array([[15, 15, 17, 17]], np.float32), size=size, align_px=16)
+    blocks = requested_blocks(np.array([[15, 15, 17, 17]], np.float32), size=size, align_px=16)
     assert blocks.tolist() == [[True, True, False], [True, True, False]]
-    exact = asked_blocks(np.array([[16, 0, 32, 16]], np.float32), size=size, align_px=16)
+    exact = requested_blocks(np.array([[16, 0, 32, 16]], np.float32), size=size, align_px=16)
     assert exact.tolist() == [[False, True, False], [False, False, False]]
-    corner = asked_blocks(np.array([[33, 17, 40, 24]], np.float32), size=size, align_px=16)
+    corner = requested_blocks(np.array([[33, 17, 40, 24]], np.float32), size=size, align_px=16)
     mask = pixel_mask(corner, size=size, align_px=16)
     assert mask.shape == (24, 40)
     assert mask.sum() == 8 * 8
@@ -103,7 +110,7 @@ def test_a_question_comes_back_as_it_was():
     rng = np.random.default_rng(5)
     frames = tuple(rng.random((12, 20)) < share for share in (0.1, 0.0, 0.5, 0.5))
     read = RegionRequest.parse(RegionRequest(4711, frames).pack(), grid=(12, 20))
-    assert read.first_tick == 4711
+    assert read.first_frame == 4711
     assert len(read.frames) == 4
     assert all(np.array_equal(a, b) for a, b in zip(read.frames, frames, strict=True))
 
@@ -147,5 +154,5 @@ def test_settings_that_cannot_be(wrong):
 def test_the_frame_rate_follows_the_budget(budget_bps, fps):
     """At fifteen frames a second a thin budget leaves neither pass enough bits to see anything."""
     # 1280x720 at 0.1 bit a pixel is 92160 bits a frame.
-    assert DdsSettings().settled(budget_bps, size=(1280, 720)).rate == fps
-    assert DdsSettings(fps=5).settled(budget_bps, size=(1280, 720)).rate == 5
+    assert DdsSettings().resolved(budget_bps, size=(1280, 720)).rate == fps
+    assert DdsSettings(fps=5).resolved(budget_bps, size=(1280, 720)).rate == 5

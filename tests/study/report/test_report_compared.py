@@ -19,11 +19,11 @@ from hvt_study.report.data.pairs import pairs
 from hvt_study.report.data.table_file import write_results
 from hvt_study.report.example.choice import CropExample, Example, Timeline, choose_run
 from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
-from hvt_study.report.figures.drawing import PALETTE, look_of
+from hvt_study.report.figures.drawing import PALETTE, style_of
 from hvt_study.report.figures.example_figures import crop_pictures
 from hvt_study.report.figures.pair_figures import difference_figures
 from hvt_study.report.make import make_report
-from hvt_study.report.pages.html_page import inline_svg
+from hvt_study.report.pages.render import inline_svg
 from hvt_study.report.tables.appendix_tables import failed_table, metrics_table
 from hvt_study.report.tables.arm_tables import named_table, proxy_table, seen_table, size_table, spent_table
 from hvt_study.report.tables.pair_tables import differences_table, equal_table
@@ -40,7 +40,7 @@ def config(**run):
     usual = {
         "size": [1280, 720],
         "detect_every": 5,
-        "max_ticks": None,
+        "max_frames": None,
         "tune": [],
         "models": {"refine": "fuse"},
     }
@@ -70,7 +70,7 @@ def test_runs_under_other_conditions_are_not_averaged_together():
         assert set(found) == {5, 1}
         assert [cell.text for cell in column(named_table(found[5]), "found & named")] == ["0.500"]
         assert [cell.text for cell in column(named_table(found[1]), "found & named")] == ["0.100"]
-        assert "detection on every tick" in named_table(found[1]).caption
+        assert "detection on every frame" in named_table(found[1]).caption
         assert "detection" not in named_table(found[5]).caption
 
 
@@ -78,12 +78,12 @@ def test_runs_under_other_conditions_are_not_averaged_together():
     ("other", "says"),
     [
         ({"size": [960, 540]}, "base of 960x540"),
-        ({"max_ticks": 90}, "at most 90 ticks of each"),
+        ({"max_frames": 90}, "at most 90 frames of each"),
         ({"models": {"refine": "replace"}}, "--refine replace"),
     ],
 )
 def test_captions_say_which_conditions_are_not_the_usual(other, says):
-    """A table of ninety ticks at a quarter of the size looks like one of whole flights."""
+    """A table of ninety frames at a quarter of the size looks like one of whole flights."""
     rows = [row("a", "M5", 1, 0.5, config=config()), row("a", "M5", 1, 0.4, key="k", config=config(**other))]
     usual, unusual = settings(rows)
     assert says in seen_table(unusual).caption
@@ -331,10 +331,10 @@ def test_a_sweep_without_its_columns_or_rows_gets_one_sentence(tmp_path, text):
 
 def test_no_mark_of_a_method_can_be_taken_for_an_arrow_or_another_method():
     """An arrow to the left says that video shows more: a triangle to the left beside it says the same."""
-    looks = [look_of(name) for name in METHODS]
+    looks = [style_of(name) for name in METHODS]
     assert not {look.marker for look in looks} & {"<", ">"}
     assert len({(look.colour, look.marker) for look in looks}) == len(looks)
-    assert look_of("DDS").colour == PALETTE["sky"]
+    assert style_of("DDS").colour == PALETTE["sky"]
 
 
 def test_a_figure_is_of_one_regime():

@@ -10,7 +10,7 @@ from hvt_common.units import exact_rate
 from hvt_edge.source.resample import base_frame_count
 from hvt_scene import Scene
 from hvt_scene.drawing.vehicles import CLASS_NAMES
-from hvt_study.datasets.clip import DEMO_LEAST_VISIBLE, NOMINAL_FPS, Clip
+from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.options import parse_numbers
 from hvt_study.datasets.sequence import Sequence
@@ -18,6 +18,8 @@ from hvt_study.datasets.sequence import Sequence
 __all__ = ["DemoLabels", "open_demo"]
 
 _SIZE = (1920, 1080)
+_LEAST_VISIBLE = 0.5
+"""An object of which less is to be seen is not judged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +31,12 @@ class DemoLabels:
     def __call__(self, index: int) -> FrameLabels:
         """Of the frame at ``index / 15`` seconds."""
         truth = _scene(self.seed).truth(index / NOMINAL_FPS)
-        asked = truth.visible >= DEMO_LEAST_VISIBLE
+        judged = truth.visible >= _LEAST_VISIBLE
         return FrameLabels(
-            boxes_xyxy_px=truth.boxes_source_px[asked],
-            ids=truth.ids[asked],
-            class_names=tuple(CLASS_NAMES[kind] for kind in truth.class_ids[asked].tolist()),
-            beside_xyxy_px=truth.boxes_source_px[~asked],
+            boxes_xyxy_px=truth.boxes_source_px[judged],
+            ids=truth.ids[judged],
+            class_names=tuple(CLASS_NAMES[kind] for kind in truth.class_ids[judged].tolist()),
+            beside_xyxy_px=truth.boxes_source_px[~judged],
         )
 
 
@@ -48,7 +50,7 @@ def _open(seed: int) -> Sequence:
     return Sequence(
         name=f"demo-{seed}",
         dataset="demo",
-        clip=Clip("demo", _SIZE, count, None, None, seed=seed),
+        clip=Clip("demo", _SIZE, count, seed=seed),
         frame_count=count,
         fps=NOMINAL_FPS,
         source_size=_SIZE,

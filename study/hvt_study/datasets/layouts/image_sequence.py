@@ -65,13 +65,13 @@ class ImageSequence:
         attributes: Mapping[str, str] | None = None,
     ) -> Sequence:
         """The sequence as a flight plays it. Labels are read once, to say what is wrong before anything is flown."""
-        ticks = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
+        frame_count = base_frame_count(self.frame_count / exact_rate(fps), fps=exact_rate(NOMINAL_FPS))
         known = None if labels is None else labels.table()
         found = () if labels is None else (path for path in labels.arguments if isinstance(path, Path))
         return Sequence(
             name=name,
             dataset=dataset,
-            clip=Clip(str(self.folder), self.size, max(1, ticks), None, None, source_fps=fps),
+            clip=Clip(str(self.folder), self.size, max(1, frame_count), source_fps=fps),
             frame_count=self.frame_count,
             fps=fps,
             source_size=self.size,

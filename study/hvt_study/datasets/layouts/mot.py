@@ -79,47 +79,39 @@ def mot_table(
     rows = read_rows(truth, columns="frame,id,x,y,w,h,counts,class,visibility", least=7)
     own = names.is_file()
     class_names = read_labels(names) if own else _NAMES
-    kinds, visible = _kinds(rows, len(class_names) if own else _HIGHEST, own=own)
-    asked = rows["counts"] != 0
-    passed = ~asked
+    kinds = _kinds(rows, len(class_names) if own else _HIGHEST, own=own)
+    judged = rows["counts"] != 0
+    passed = ~judged
     if not own:
         passed = np.isin(kinds, beside)
-        asked &= ~passed & (kinds <= len(class_names))
-        used = np.unique(kinds[asked])  # only pedestrians count in the published sequences
+        judged &= ~passed & (kinds <= len(class_names))
+        used = np.unique(kinds[judged])  # only pedestrians count in the published sequences
         class_names = tuple(class_names[kind - 1] for kind in used.tolist())
         kinds = np.searchsorted(used, kinds) + 1
     boxes, frames = rows.boxes(origin=1.0), rows["frame"].astype(np.int64)
     return LabelTable.of(
-        frames=frames[asked],
-        boxes=boxes[asked],
-        ids=rows["id"].astype(np.int64)[asked],
-        class_ids=kinds[asked] - 1,
+        frames=frames[judged],
+        boxes=boxes[judged],
+        ids=rows["id"].astype(np.int64)[judged],
+        class_ids=kinds[judged] - 1,
         class_names=class_names,
         ignored=Regions(frames[passed], boxes[passed], np.zeros(int(passed.sum()), np.bool_)),
         size=size,
-        occlusion=_hidden(visible)[asked],
     )
 
 
-def _kinds(rows: Rows, highest: int, *, own: bool) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """Class from 1 on, and the visible share, -1 where it is not known."""
+def _kinds(rows: Rows, highest: int, *, own: bool) -> npt.NDArray[np.int64]:
+    """Class from 1 on."""
     if not own and _in_the_world(rows):
-        return np.full(len(rows), _PEDESTRIAN, np.int64), np.full(len(rows), -1.0)
-    kinds = rows["class"]
-    visible = np.where(kinds == -1, -1.0, rows["visibility"])
-    kinds = np.where(kinds == -1, _PEDESTRIAN, kinds)
+        return np.full(len(rows), _PEDESTRIAN, np.int64)
+    kinds = np.where(rows["class"] == -1, _PEDESTRIAN, rows["class"])
     rows.check(np.isin(kinds, np.arange(1, highest + 1)), accepted=f"a class from 1 to {highest} in column 8")
-    return kinds.astype(np.int64), visible
+    return kinds.astype(np.int64)
 
 
 def _in_the_world(rows: Rows) -> bool:
     """Whether columns 8 to 10 are MOT15's ``x,y,z``; MOT16 and all after it have nine columns."""
     return bool(rows.text) and len(rows.text[0].rstrip(",").split(",")) >= _MOT15_COLUMNS
-
-
-def _hidden(visible: npt.NDArray[np.float64]) -> npt.NDArray[np.int8]:
-    """0 none, 1 partly, 2 heavily hidden, from how much is visible."""
-    return np.select([visible < 0, visible > 0.9, visible > 0.5], [-1, 0, 1], 2).astype(np.int8)
 
 
 def _is_sequence(folder: Path) -> bool:
@@ -133,10 +125,10 @@ def _open(name: str, folder: Path, options: Options) -> Sequence:
             f"MOTChallenge sequence {folder} has no {_INFO}, which says the frame rate: "
             "add the file, or say the rate, such as ?fps=25"
         )
-    told = info or {}
-    images = _images(folder, told)
-    fps = options.fps or _rate(folder / _INFO, told)
-    labels = _labels(folder, told, images) if options.annotated else None
+    said = info or {}
+    images = _images(folder, said)
+    fps = options.fps or _rate(folder / _INFO, said)
+    labels = _labels(folder, said, images) if options.annotated else None
     return images.sequence(name=name, dataset="mot", fps=fps, labels=labels)
 
 
@@ -145,10 +137,10 @@ def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
     if not pictures.is_dir():
         raise UserError(f"MOTChallenge sequence {folder} has no folder {pictures.name} of images")
     images = ImageSequence(pictures)
-    told = info.get("seqLength", "")
-    if told.isdecimal() and images.frame_count < int(told):
+    said = info.get("seqLength", "")
+    if said.isdecimal() and images.frame_count < int(said):
         raise UserError(
-            f"MOTChallenge sequence {folder} says seqLength={told} and has {images.frame_count} images"
+            f"MOTChallenge sequence {folder} says seqLength={said} and has {images.frame_count} images"
         )
     return images
 

@@ -94,7 +94,7 @@ def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
     return Sequence(
         name=name,
         dataset="still",
-        clip=Clip(f"{SCHEME}{picture}@{view:g}", camera.size, camera.frame_count, None, None, seed=seed),
+        clip=Clip(f"{SCHEME}{picture}@{view:g}", camera.size, camera.frame_count, seed=seed),
         frame_count=camera.frame_count,
         fps=NOMINAL_FPS,
         source_size=camera.size,

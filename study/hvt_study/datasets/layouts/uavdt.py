@@ -8,9 +8,9 @@
     ROOT/UAV-benchmark-MOTD_v1.0/GT/M0203_gt.txt          frame,id,x,y,w,h,1,1,-1: without classes, for tracking
     ROOT/M_attr/test/M0203_attr.txt                       ten times 0 or 1
 
-Only the names of folders M0203 and files matter, not where below ROOT they lie. Categories are 1 car, 2 truck, 3 bus;
-out-of-view is 1 none, 2 medium, 3 small; occlusion is 1 none, 2 large, 3 medium, 4 small. Pixels count from 0. Where
-only ``_gt.txt`` is there, all objects are of class ``vehicle``: it is ``_gt_whole`` without what leaves the frame.
+Only the names of folders M0203 and files matter, not where below ROOT they lie. Categories are 1 car, 2 truck, 3 bus.
+Pixels count from 0. Where only ``_gt.txt`` is there, all objects are of class ``vehicle``: it is ``_gt_whole``
+without what leaves the frame.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from hvt_common.errors import UserError
 from hvt_study.datasets.annotation_rows import read_rows
@@ -37,8 +36,6 @@ _NAMES = ("car", "truck", "bus")
 _VEHICLE = "vehicle"
 _SEQUENCE = re.compile(r"M[0-9]{4}")
 _DEPTH = 3
-_OCCLUSION = np.array([-1, 0, 2, 1, 1], np.int8)
-"""By UAVDT's number, 0 being unknown."""
 _ATTRIBUTES = (
     *(("weather", word) for word in ("daylight", "night", "fog")),
     *(("altitude", word) for word in ("low", "medium", "high")),
@@ -73,7 +70,6 @@ def uavdt_table(whole: Path, ignore: Path, size: tuple[int, int]) -> LabelTable:
         rows.check(
             np.isin(rows["category"], (1, 2, 3)), accepted="a category of 1 car, 2 truck or 3 bus in column 9"
         )
-    hidden = np.clip(rows["occlusion"], 0, 4).astype(np.int64)
     return LabelTable.of(
         frames=rows["frame"].astype(np.int64),
         boxes=rows.boxes(),
@@ -82,8 +78,6 @@ def uavdt_table(whole: Path, ignore: Path, size: tuple[int, int]) -> LabelTable:
         class_names=(_VEHICLE,) if plain else _NAMES,
         ignored=_regions(ignore),
         size=size,
-        occlusion=None if plain else np.asarray(_OCCLUSION[hidden]),
-        truncation=None if plain else _outside(rows["out-of-view"]),
     )
 
 
@@ -121,11 +115,6 @@ def _regions(path: Path) -> Regions:
         return Regions(empty, np.empty((0, 4), np.float32), empty.astype(np.bool_))
     rows = read_rows(path, columns="frame,id,x,y,w,h", least=6)
     return Regions(rows["frame"].astype(np.int64), rows.boxes(), np.ones(len(rows), np.bool_))
-
-
-def _outside(number: npt.NDArray[np.float64]) -> npt.NDArray[np.int8]:
-    known = (number >= 1) & (number <= 3)
-    return np.where(known, number > 1, -1).astype(np.int8)
 
 
 def _attributes(path: Path | None) -> dict[str, str]:

@@ -58,17 +58,15 @@ def visdrone_table(path: Path, size: tuple[int, int]) -> LabelTable:
 
 def table_of(rows: VisDroneRows, *, size: tuple[int, int]) -> LabelTable:
     """Objects that are asked for, and what is not: regions, and single objects ("others", and those of score 0)."""
-    asked, passed = rows.counts, ~rows.counts
+    judged, passed = rows.counts, ~rows.counts
     return LabelTable.of(
-        frames=rows.frames[asked],
-        boxes=rows.boxes[asked],
-        ids=rows.ids[asked],
-        class_ids=rows.categories[asked] - 1,
+        frames=rows.frames[judged],
+        boxes=rows.boxes[judged],
+        ids=rows.ids[judged],
+        class_ids=rows.categories[judged] - 1,
         class_names=VISDRONE_NAMES,
         ignored=Regions(rows.frames[passed], rows.boxes[passed], rows.land[passed]),
         size=size,
-        occlusion=rows.occlusion[asked],
-        truncation=rows.truncation[asked],
     )
 
 

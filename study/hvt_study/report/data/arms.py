@@ -15,7 +15,7 @@ __all__ = [
     "Arm",
     "BySequence",
     "Models",
-    "Row",
+    "RunRow",
     "Setting",
     "counts",
     "is_video",
@@ -25,9 +25,9 @@ __all__ = [
     "values",
 ]
 
-Row: TypeAlias = Mapping[str, Any]
+RunRow: TypeAlias = Mapping[str, Any]
 """Of ``results.parquet``."""
-BySequence: TypeAlias = Mapping[str, Row]
+BySequence: TypeAlias = Mapping[str, RunRow]
 """One run of each sequence; the key is dataset and name."""
 _WHOSE = ("regime", "method", "still_codec", "matched_to", "matched_codec")
 _SAME_TOTAL = 1e-4
@@ -74,17 +74,17 @@ class Setting:
     """URIs."""
     labels: str
     models: Models
-    rows: tuple[Row, ...]
+    rows: tuple[RunRow, ...]
     """All, those that count nowhere too."""
     conditions: Conditions = USUAL
-    _counted: Mapping[tuple[str, ...], Mapping[str, tuple[Row, ...]]] = field(
+    _counted: Mapping[tuple[str, ...], Mapping[str, tuple[RunRow, ...]]] = field(
         init=False, repr=False, compare=False
     )
     """By whose they are and by sequence; of followers one a target."""
 
     def __post_init__(self) -> None:
-        counted: dict[tuple[str, ...], dict[str, tuple[Row, ...]]] = {}
-        places: dict[tuple[Any, ...], Row] = {}
+        counted: dict[tuple[str, ...], dict[str, tuple[RunRow, ...]]] = {}
+        places: dict[tuple[Any, ...], RunRow] = {}
         for row in sorted(filter(counts, self.rows), key=sequence_of):
             whose, name = tuple(row[column] for column in _WHOSE), sequence_of(row)
             first = places.setdefault((whose, name, row["target_bps"]), row)
@@ -150,20 +150,20 @@ class Setting:
 
     def matched(self, arm: Arm, reference: str) -> BySequence:
         """Runs of ``reference`` that were coded to the totals of the very runs of `runs`, within one per cent."""
-        followers = self._counted.get((arm.regime, reference, "", arm.method, arm.still_codec), {})
-        found = {name: _at_total(followers.get(name, ()), run) for name, run in self.runs(arm).items()}
+        matching = self._counted.get((arm.regime, reference, "", arm.method, arm.still_codec), {})
+        found = {name: _at_total(matching.get(name, ()), run) for name, run in self.runs(arm).items()}
         return {name: row for name, row in found.items() if row is not None}
 
-    def video(self, reference: str) -> dict[str, list[Row]]:
+    def video(self, reference: str) -> dict[str, list[RunRow]]:
         """All that count of a video-only method, by sequence, at whatever total."""
-        found: dict[str, list[Row]] = {}
+        found: dict[str, list[RunRow]] = {}
         for row in self.rows:
             if row["method"] == reference and counts(row):
                 found.setdefault(sequence_of(row), []).append(row)
         return found
 
 
-def counts(row: Row) -> bool:
+def counts(row: RunRow) -> bool:
     """Whether a run is in averages: it was flown, and it spends what it is to spend."""
     return not row["failed"] and bool(row["matched"])
 
@@ -173,13 +173,13 @@ def is_video(method: str) -> bool:
     return method in METHODS and METHODS[method].kind is Kind.VIDEO
 
 
-def settings(rows: Sequence[Row]) -> list[Setting]:
+def settings(rows: Sequence[RunRow]) -> list[Setting]:
     """The settings of a study: where several datasets share all else, all of them first, then each.
 
     Raises:
         UserError: two different runs count at one place.
     """
-    shared: dict[tuple[str, Models, Conditions], list[Row]] = {}
+    shared: dict[tuple[str, Models, Conditions], list[RunRow]] = {}
     for row in rows:
         models = Models(row["detector"], row["edge_detector"], row["classifier"])
         shared.setdefault((row["labels"], models, conditions_of(row)), []).append(row)
@@ -194,7 +194,7 @@ def settings(rows: Sequence[Row]) -> list[Setting]:
     return found
 
 
-def values(runs: Mapping[str, Row], column: str) -> dict[str, float]:
+def values(runs: Mapping[str, RunRow], column: str) -> dict[str, float]:
     """One figure of each run; NaN where it has none."""
     return {name: math.nan if row[column] is None else float(row[column]) for name, row in runs.items()}
 
@@ -206,7 +206,7 @@ def place(dataset: str) -> str:
     return f"{scheme} {where.rstrip('/').rpartition('/')[2]}".strip()
 
 
-def sequence_of(row: Row) -> str:
+def sequence_of(row: RunRow) -> str:
     """Dataset and name: what runs are paired by."""
     return f"{row['dataset']}#{row['sequence']}"
 
@@ -216,17 +216,17 @@ def _order(method: str) -> tuple[int, str]:
     return (names.index(method) if method in METHODS else len(names), method)
 
 
-def _at_total(followers: Sequence[Row], run: Row) -> Row | None:
+def _at_total(matching: Sequence[RunRow], run: RunRow) -> RunRow | None:
     """The follower whose target is this run's total: not that of another run of the same name."""
     total = run["total_bps"]
-    known = [row for row in followers if row["target_bps"] is not None]
+    known = [row for row in matching if row["target_bps"] is not None]
     nearest = min(known, key=lambda row: abs(row["target_bps"] - total), default=None)
     if nearest is None or abs(nearest["target_bps"] - total) > _SAME_TOTAL * total:
         return None
     return nearest
 
 
-def _conflict(one: Row, other: Row) -> str:
+def _conflict(one: RunRow, other: RunRow) -> str:
     name = f"{one['method']} {one['still_codec']}".strip()
     at = f" at the total of {one['matched_to']} {one['matched_codec']}".rstrip() if one["matched_to"] else ""
     return (
@@ -235,15 +235,15 @@ def _conflict(one: Row, other: Row) -> str:
     )
 
 
-def _one_tune_a_method(rows: Sequence[Row]) -> None:
-    first: dict[str, Row] = {}
+def _one_tune_a_method(rows: Sequence[RunRow]) -> None:
+    first: dict[str, RunRow] = {}
     for row in filter(counts, rows):
         other = first.setdefault(row["method"], row)
         if tune_of(other) != tune_of(row):
             raise UserError(_mixed_tune(other, row))
 
 
-def _mixed_tune(one: Row, other: Row) -> str:
+def _mixed_tune(one: RunRow, other: RunRow) -> str:
     said = " and ".join(" ".join(tune_of(row)) or "its defaults" for row in (one, other))
     return (
         f"runs of {one['method']} with other parameters would be averaged together ({said}): join studies that agree "

@@ -18,7 +18,7 @@ class Conditions:
     size: tuple[int, int] = (1280, 720)
     """(width, height) of the base stream in pixels."""
     detect_every: int = 5
-    max_ticks: int = 0
+    max_frames: int = 0
     """0: the whole clip."""
     refine: str = "fuse"
 
@@ -27,10 +27,10 @@ class Conditions:
         if self.size != USUAL.size:
             yield f"base of {self.size[0]}x{self.size[1]}"
         if self.detect_every != USUAL.detect_every:
-            every = "every tick" if self.detect_every == 1 else f"one tick in {self.detect_every}"
+            every = "every frame" if self.detect_every == 1 else f"one frame in {self.detect_every}"
             yield f"detection on {every}"
-        if self.max_ticks != USUAL.max_ticks:
-            yield f"at most {self.max_ticks} ticks of each"
+        if self.max_frames != USUAL.max_frames:
+            yield f"at most {self.max_frames} frames of each"
         if self.refine != USUAL.refine:
             yield f"--refine {self.refine}"
 
@@ -72,7 +72,7 @@ def _said(config: str) -> tuple[Conditions, tuple[str, ...]]:
     conditions = Conditions(
         size=(int(size[0]), int(size[1])),
         detect_every=int(run.get("detect_every") or USUAL.detect_every),
-        max_ticks=int(run.get("max_ticks") or USUAL.max_ticks),
+        max_frames=int(run.get("max_frames") or USUAL.max_frames),
         refine=str((models.get("refine") if isinstance(models, Mapping) else None) or USUAL.refine),
     )
     return conditions, tuple(map(str, run.get("tune") or ()))
@@ -95,10 +95,8 @@ def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
     """Without levels; the target is another run's, and has been compared."""
     found: dict[str, Any] = {}
     for name, value in content.items():
-        if isinstance(value, Mapping):
-            found |= _flat(value) if name != "target" else {}
-        else:
-            found[name] = value
+        found |= _flat(value) if isinstance(value, Mapping) and name != "target" else {name: value}
+    found.pop("target", None)
     return found
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeAlias
 
 __all__ = [
@@ -17,6 +19,7 @@ __all__ = [
     "Report",
     "Section",
     "Table",
+    "breaks_between",
     "numbered",
     "words",
 ]
@@ -57,6 +60,11 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     breaks: frozenset[int] = frozenset()
     """Rows before which a line is drawn."""
+
+
+def breaks_between(keys: Iterable[object]) -> frozenset[int]:
+    """Rows before which the key is another one than that of the row above: a line is drawn there."""
+    return frozenset(row for row, (one, other) in enumerate(pairwise(keys), start=1) if one != other)
 
 
 @dataclass(frozen=True, slots=True)

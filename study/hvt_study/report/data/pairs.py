@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvt_study.metrics.bootstrap import Interval
 from hvt_study.report.data.arms import Arm, BySequence, Setting, values
-from hvt_study.report.data.intervals import interval_of
+from hvt_study.report.data.intervals import Interval, interval_of
 
 __all__ = ["Pair", "pairs"]
 
@@ -37,7 +36,7 @@ class Pair:
         return {name: gap for name, gap in gaps.items() if not np.isnan(gap)}
 
     def interval(self, column: str) -> Interval:
-        """Of the mean gap, as `hvt_study.metrics.bootstrap.difference_interval` has it; none of few sequences."""
+        """Of the mean gap over the sequences of both; none of few sequences."""
         return interval_of(self.gaps(column).values())
 
     def most_off_pct(self) -> float:

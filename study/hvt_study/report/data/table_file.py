@@ -31,7 +31,7 @@ SCHEMA = pa.schema(
             column.name,
             _TYPES[column.type],
             nullable=column.type != "text",
-            metadata={"description": column.says} if column.says else None,
+            metadata={"description": column.description} if column.description else None,
         )
         for column in COLUMNS
     ],

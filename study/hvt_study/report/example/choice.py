@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from hvt_study.report.data.arms import Arm, BySequence, Row, Setting, is_video, settings, values
+from hvt_study.report.data.arms import Arm, BySequence, RunRow, Setting, is_video, settings, values
 from hvt_study.report.data.pairs import Pair, pairs
 
 __all__ = [
@@ -46,7 +46,7 @@ class CropExample:
     """Y-PSNR of the still less that of the base, both against the source."""
     base_db: float
     at_s: float
-    """Capture of its frame, from the first tick."""
+    """Capture of its frame, from the first frame."""
     track_id: int
     """Of the edge."""
     class_before: str
@@ -113,7 +113,7 @@ class Example:
     timeline: Timeline
 
 
-def choose_run(rows: Sequence[Row]) -> Choice | None:
+def choose_run(rows: Sequence[RunRow]) -> Choice | None:
     """The run of the sequence with the median gain, of those that sent stills; None where no such method counts.
 
     Of the methods that sent stills M6 is taken, or the last in the order of tables; in the thinnest regime; with the

@@ -25,22 +25,23 @@ from hvt_ground.events.events import Event, Refinement
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.flights.flight import FlightPlan, FlightReport, _Edge
 from hvt_study.flights.flight_ground import GroundSide, SharedModels
-from hvt_study.flights.serial_link import Arrival, SerialLink
 from hvt_study.matrix.plan import StudyPlan
 from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.frames import NO_ID
-from hvt_study.metrics.observed import ObservedFrame, refined_objects, refined_ticks
+from hvt_study.metrics.observed import refined_frames, refined_objects
 from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline, Word, percentile_rows
+from hvt_study.report.example.store import png_of
 from hvt_study.runs.run_context import RunContext, open_run_context
 from hvt_study.runs.run_settings import flight_plan
 from hvt_study.runs.spec import RunSpec
+from hvt_study.serial_link import Arrival, SerialLink
 
 __all__ = ["example_of", "fly_again"]
 
 _MOST_STILLS = 2000
 """Of which the pixels are kept."""
 _MOST_LANES = 14
-_SECOND_TICKS = round(NOMINAL_FPS)
+_SECOND_FRAMES = round(NOMINAL_FPS)
 _BEST_DB = 99.0
 """Stands for a still without any loss."""
 
@@ -51,20 +52,20 @@ def fly_again(spec: RunSpec, plan: StudyPlan, *, rule: str) -> Example:
     Raises:
         UserError: dataset or models cannot be used, or the edge refuses its settings.
     """
-    shop = open_run_context(spec, cache=plan.cache)
-    flight = flight_plan(spec, shop, budget_bps=spec.budget_bps, fps=None)
+    context = open_run_context(spec, cache=plan.cache)
+    flight = flight_plan(spec, context, budget_bps=spec.budget_bps, fps=None)
     title = f"{spec.sequence}, {spec.method} {spec.still_codec}, {spec.regime} regime, {spec.labels} labels"
-    return example_of(flight, shop, key=spec.key, rule=rule, title=title)
+    return example_of(flight, context, key=spec.key, rule=rule, title=title)
 
 
-def example_of(flight: FlightPlan, shop: RunContext, *, key: str, rule: str, title: str) -> Example:
+def example_of(flight: FlightPlan, context: RunContext, *, key: str, rule: str, title: str) -> Example:
     """Fly, and look at it.
 
     Raises:
         UserError: the edge refuses its settings.
     """
     edge = _WatchedEdge(
-        flight, detector=shop.edge_detector, models=SharedModels(shop.detector, shop.classifier)
+        flight, detector=context.edge_detector, models=SharedModels(context.detector, context.classifier)
     )
     edge.run()
     ground = edge.ground
@@ -80,7 +81,7 @@ def example_of(flight: FlightPlan, shop: RunContext, *, key: str, rule: str, tit
         title=title,
         stills=len(crops),
         crops=tuple(replace(crops[index], percentile=percentile) for percentile, index in rows),
-        timeline=_timeline(report, ground, shop, budget_bps=flight.link_bps),
+        timeline=_timeline(report, ground, context, budget_bps=flight.link_bps),
     )
 
 
@@ -120,29 +121,29 @@ class _WatchedGround(GroundSide):
         }
         return [_Shown(event, headers[number]) for number, event in sorted(self._events.items())]
 
-    def _heard_by(self, emit: Callable[[Event], None]) -> Callable[[Event], None]:
-        tell = super()._heard_by(emit)
+    def _observed_by(self, emit: Callable[[Event], None]) -> Callable[[Event], None]:
+        tell = super()._observed_by(emit)
 
         def watch(event: Event) -> None:
             if isinstance(event, Refinement) and len(self._events) < _MOST_STILLS:
-                self._keep(event)
+                self._note_still(event)
             tell(event)
 
         return watch
 
-    def _keep(self, event: Refinement) -> None:
+    def _note_still(self, event: Refinement) -> None:
         if event.still_bgr is not None and event.base_crop_bgr is not None:
             self._events.setdefault(event.still_sequence, event)
 
 
 def _compared(stills: Sequence[_Shown], clip: Clip, *, view: View) -> Iterator[CropExample]:
     """Each still against the source frame that it was cut from; frames are read once, one at a time."""
-    by_tick: dict[int, list[_Shown]] = {}
+    by_frame: dict[int, list[_Shown]] = {}
     for one in stills:
-        by_tick.setdefault(one.header.frame_index, []).append(one)
+        by_frame.setdefault(one.header.frame_index, []).append(one)
     with closing(clip.images()) as images:
-        for tick, image in enumerate(islice(images, max(by_tick, default=-1) + 1)):
-            for one in by_tick.get(tick, ()):
+        for frame_index, image in enumerate(islice(images, max(by_frame, default=-1) + 1)):
+            for one in by_frame.get(frame_index, ()):
                 yield _crop(one, np.asarray(image), view=view)
 
 
@@ -169,9 +170,9 @@ def _crop(one: _Shown, source_bgr: Image, *, view: View) -> CropExample:
         class_before=event.class_before,
         class_after=event.class_after,
         size_bytes=len(event.still),
-        source_png=_png(source),
-        base_png=_png(base),
-        still_png=_png(still),
+        source_png=png_of(source),
+        base_png=png_of(base),
+        still_png=png_of(still),
     )
 
 
@@ -182,8 +183,10 @@ def _view_of(patch: Image, crop_source_px: tuple[int, int, int, int], view: View
     return replace(view, base_size=(patch.shape[1], patch.shape[0]), offset_px=offset)
 
 
-def _timeline(report: FlightReport, ground: _WatchedGround, shop: RunContext, *, budget_bps: int) -> Timeline:
-    seconds = -(-len(report.lists) // _SECOND_TICKS)
+def _timeline(
+    report: FlightReport, ground: _WatchedGround, context: RunContext, *, budget_bps: int
+) -> Timeline:
+    seconds = -(-len(report.lists) // _SECOND_FRAMES)
     kbps = _rates(ground.arrivals, started_ns=ground.started_ns, seconds=seconds)
     lanes = list(_lanes(report))
     return Timeline(
@@ -191,7 +194,7 @@ def _timeline(report: FlightReport, ground: _WatchedGround, shop: RunContext, *,
         base_kbps=kbps["base"],
         roi_kbps=kbps["roi"],
         other_kbps=kbps["other"],
-        **_scores(report, shop),
+        **_scores(report, context),
         lanes=tuple(sorted(lanes, key=_interest)[:_MOST_LANES]),
         tracks_named=len(lanes),
     )
@@ -200,7 +203,7 @@ def _timeline(report: FlightReport, ground: _WatchedGround, shop: RunContext, *,
 def _rates(
     arrivals: Sequence[Arrival[Received]], *, started_ns: int, seconds: int
 ) -> Mapping[str, tuple[float, ...]]:
-    """Kilobits handed to the link in each second; what comes after the last tick is the last second's."""
+    """Kilobits handed to the link in each second; what comes after the last frame is the last second's."""
     size_bytes: Counter[tuple[str, int]] = Counter()
     for one in arrivals:
         row = _row_of(one)
@@ -214,11 +217,11 @@ def _rates(
     }
 
 
-def _scores(report: FlightReport, shop: RunContext) -> dict[str, tuple[float, ...]]:
+def _scores(report: FlightReport, context: RunContext) -> dict[str, tuple[float, ...]]:
     """Of each second, by the metrics of the table."""
-    ticks = refined_ticks(report.lists, shop.labels)
-    words: dict[str, Any] = {"word": shop.classes.word, "classes": shop.classes.classes}
-    parts = [ticks[first : first + _SECOND_TICKS] for first in range(0, len(ticks), _SECOND_TICKS)]
+    frames = refined_frames(report.lists, context.labels)
+    words: dict[str, Any] = {"word": context.classes.word, "classes": context.classes.classes}
+    parts = [frames[first : first + _SECOND_FRAMES] for first in range(0, len(frames), _SECOND_FRAMES)]
     after = [class_score(part, **words) for part in parts]
     before = [class_score(part, refined=False, **words) for part in parts]
     return {
@@ -234,9 +237,7 @@ def _lanes(report: FlightReport) -> Iterator[Lane]:
         if done.track_id != NO_ID:
             words.setdefault(done.track_id, []).append(Word(done.at_s, done.name_before, done.name_after))
     for track_id, said in words.items():
-        listed = [
-            isinstance(one, ObservedFrame) and bool((one.ids == track_id).any()) for one in report.lists
-        ]
+        listed = [bool((one.ids == track_id).any()) for one in report.lists]
         yield Lane(track_id, tuple(_spans(listed)), tuple(said))
 
 
@@ -255,9 +256,3 @@ def _spans(listed: Sequence[bool]) -> Iterator[tuple[float, float]]:
 
 def _row_of(arrival: Arrival[Received]) -> Channel | None:
     return (parse_key(arrival.message.key) or ("", None))[1]
-
-
-def _png(image_bgr: Image) -> bytes:
-    done, data = cv2.imencode(".png", image_bgr)
-    assert done, "a crop has pixels"
-    return data.tobytes()

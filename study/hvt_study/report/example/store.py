@@ -8,12 +8,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
+from hvt_common.values import Image
 from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline, Word
-from hvt_study.report.example.enlarge import is_picture
 
-__all__ = ["load_example", "save_example"]
+__all__ = ["enlarged", "load_example", "png_of", "save_example"]
 
 _FOLDER = "example"
 _FILE = "example.json"
@@ -67,7 +70,7 @@ def _crop(content: Mapping[str, Any], place: Path) -> CropExample:
     pictures: dict[str, Any] = {
         f"{name}_png": (place / f"{content['percentile']}-{name}.png").read_bytes() for name in _PICTURES
     }
-    if not all(map(is_picture, pictures.values())):
+    if not all(map(_is_picture, pictures.values())):
         raise ValueError("a picture is damaged")
     return CropExample(**{**content, **pictures})
 
@@ -83,3 +86,26 @@ def _timeline(content: Mapping[str, Any]) -> Timeline:
     )
     series = {name: tuple(value) for name, value in content.items() if isinstance(value, list)}
     return Timeline(**{**content, **series, "lanes": lanes})
+
+
+def _is_picture(png: bytes) -> bool:
+    """Whether it can be decoded."""
+    return bool(png) and cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR) is not None
+
+
+def enlarged(png: bytes, *, least_px: int) -> bytes:
+    """The PNG by the least whole factor that makes its longer side ``least_px``: every pixel becomes a square.
+
+    Readers of papers and Markdown smooth what they enlarge themselves.
+    """
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None, "pictures are looked at where they are read"
+    factor = -(-least_px // max(image.shape[:2]))
+    return png_of(np.asarray(image.repeat(factor, axis=0).repeat(factor, axis=1), np.uint8))
+
+
+def png_of(image_bgr: Image) -> bytes:
+    """The picture as a file."""
+    done, data = cv2.imencode(".png", image_bgr)
+    assert done, "it has pixels"
+    return data.tobytes()

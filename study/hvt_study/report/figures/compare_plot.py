@@ -8,20 +8,17 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hvt_study.matrix.compare import CompareResult, CompareRow
-from hvt_study.runs.compare_methods import METHODS
+from hvt_study.matrix.compare import COMPARED, CompareResult, CompareRow
 
-__all__ = ["plot"]
+__all__ = ["STYLES", "plot"]
 
 # Okabe and Ito's palette, told apart by every kind of colour vision; markers and dashes tell the rest apart in grey.
-_STYLES = {
+STYLES = {
     "M0": ("#000000", "o", "--"),
     "M0-fps": ("#000000", "s", "-"),
     "R0": ("#56B4E9", "^", "-"),
     "M5-jpeg": ("#E69F00", "v", "--"),
     "M5-residual": ("#E69F00", "D", "-"),
-    "pulse": ("#009E73", "P", "--"),
-    "rolling": ("#009E73", "X", "-"),
     "tracks": ("#CC79A7", "<", "-"),
     "M6": ("#D55E00", "*", "-"),
 }
@@ -34,7 +31,7 @@ def plot(result: CompareResult, path: Path, *, half: int = 2) -> None:
     """Write a PNG: F1 and class agreement of one half of the clip over kbps in all, a line a method."""
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True)
-    rows = [row for row in result.rows if row.half == half]
+    rows = [row for row in result.rows if row["half"] == half]
     for axes, (measure, label) in zip(panels, _MEASURES, strict=True):
         _draw(axes, rows, measure=measure)
         axes.set_ylabel(label)
@@ -42,7 +39,7 @@ def plot(result: CompareResult, path: Path, *, half: int = 2) -> None:
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside right center", frameon=False)
     figure.suptitle(
-        f"{result.clip}: the ground's list at every tick, {_HALVES[half]} half, {result.labels} labels",
+        f"{result.clip}: the ground's list at every mark, {_HALVES[half]} half, {result.labels} labels",
         fontsize="medium",
     )
     figure.savefig(path, dpi=_DPI, metadata={"Software": None})
@@ -50,11 +47,15 @@ def plot(result: CompareResult, path: Path, *, half: int = 2) -> None:
 
 def _draw(axes: Axes, rows: Sequence[CompareRow], *, measure: str) -> None:
     axes.set_xscale("log")
-    for name in METHODS:
-        points = sorted((row.total_bps / 1e3, getattr(row, measure)) for row in rows if row.method == name)
+    for name in COMPARED:
+        points = sorted(
+            (row["total_bps"] / 1e3, value)
+            for row in rows
+            if row["method"] == name and (value := row[measure]) is not None
+        )
         if not points:
             continue
-        colour, marker, dashes = _STYLES[name]
+        colour, marker, dashes = STYLES[name]
         axes.plot(
             [x for x, _ in points],
             [y for _, y in points],
@@ -65,8 +66,8 @@ def _draw(axes: Axes, rows: Sequence[CompareRow], *, measure: str) -> None:
             linewidth=1.6,
             label=name,
         )
-    ticks = sorted({row.rate_kbps for row in rows})
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    marks = sorted({row["rate_kbps"] for row in rows})
+    axes.set_xticks(marks, [f"{mark:g}" for mark in marks])
     axes.minorticks_off()
     axes.grid(visible=True, color="#dddddd", linewidth=0.6)
     for side in ("top", "right"):

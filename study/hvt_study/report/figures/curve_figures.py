@@ -13,7 +13,7 @@ from hvt_study.report.data.captions import INTERVALS, under
 from hvt_study.report.data.document import Drawing
 from hvt_study.report.data.intervals import interval_of, mean_of
 from hvt_study.report.data.metric_names import METRICS
-from hvt_study.report.figures.drawing import drawn, fill_of, look_of, mark_of, plain_axes, rate_axis
+from hvt_study.report.figures.drawing import drawn, fill_of, mark_of, plain_axes, rate_axis, style_of
 
 __all__ = ["codec_figure", "utility_figure"]
 
@@ -36,7 +36,7 @@ def utility_figure(setting: Setting, *, name: str) -> Drawing | None:
         for axes, column in zip(panels, shown, strict=True):
             for line in lines:
                 _draw_utility(axes, setting, line, column, shown=shown, codecs=codecs)
-            axes.set_ylabel(METRICS[column].name)
+            axes.set_ylabel(METRICS[column].title)
             axes.set_xlabel(_TOTAL.get(setting.accounting, "total, kbps"))
             rate_axis(axes, [_budget_kbps(setting, regime) for regime in setting.regimes])
             plain_axes(axes)
@@ -49,12 +49,12 @@ def utility_figure(setting: Setting, *, name: str) -> Drawing | None:
         height_in=2.75 + 0.17 * math.ceil(len(lines) / _LEGEND_COLUMNS),
         caption=(
             f"Utility over bitrate, {setting.name}: each method at the whole budget of each regime, over the mean "
-            "total really spent; ticks are the budgets. A line is the mean of those sequences that count in all its "
+            "total really spent; marks are the budgets. A line is the mean of those sequences that count in all its "
             "regimes and have the figures, of all of the setting unless the legend says n; without any such sequence "
             "marks are not joined, and each is of its own. Lines of other sequences are not to be compared. How sure "
             f"the differences are, the figure of pairs says. {under(setting)}"
         ),
-        alternative=f"{', '.join(METRICS[column].name for column in shown)} over total bitrate, a line a method",
+        alternative=f"{', '.join(METRICS[column].title for column in shown)} over total bitrate, a line a method",
     )
 
 
@@ -75,10 +75,10 @@ def codec_figure(setting: Setting, *, name: str) -> Drawing | None:
             for axes, column in zip(panels, _CODEC, strict=True):
                 for method in dict.fromkeys(arm.method for arm in setting.arms(regime)):
                     _draw_codecs(axes, setting, regime, method, column, codecs=codecs)
-                axes.set_title(f"{METRICS[column].name}, {regime}")
+                axes.set_title(f"{METRICS[column].title}, {regime}")
                 axes.set_xscale("log")
                 plain_axes(axes)
-        _size_ticks(grid[0][0])
+        _size_marks(grid[0][0])
         for axes in grid[-1]:
             axes.set_xlabel("bytes/still")
         named = {
@@ -110,14 +110,14 @@ def _line(setting: Setting, line: tuple[str, str], shown: list[str]) -> tuple[_P
     """Runs of a line's regimes, and of how many sequences each mean is: 0 where no sequence is in all of them."""
     arms = [Arm(regime, *line) for regime in setting.regimes]
     known = [(arm, runs) for arm in arms if (runs := setting.runs(arm))]
-    asked = [
+    needed = [
         name for name in shown if any(row[name] is not None for _, runs in known for row in runs.values())
     ]
     whole = [
-        (arm, {name: row for name, row in runs.items() if all(row[column] is not None for column in asked)})
+        (arm, {name: row for name, row in runs.items() if all(row[column] is not None for column in needed)})
         for arm, runs in known
     ]
-    points: _Points = [(arm, runs) for arm, runs in whole if runs and asked]
+    points: _Points = [(arm, runs) for arm, runs in whole if runs and needed]
     common = set.intersection(*(set(runs) for _, runs in points)) if points else set()
     if not common:
         return points, 0
@@ -134,17 +134,17 @@ def _draw_utility(
     codecs: tuple[str, ...],
 ) -> None:
     points, count = _line(setting, line, shown)
-    look, arm = look_of(line[0]), Arm("", *line)
+    style, arm = style_of(line[0]), Arm("", *line)
     means = [mean_of(values(runs, column).values()).mean for _, runs in points]
     n = "" if count == setting.sequences else f" (n = {count})" if count else " (n differs)"
     axes.plot(
         [float(np.mean([row["total_bps"] for row in runs.values()])) / 1e3 for _, runs in points],
         means,
-        color=look.colour,
-        marker=look.marker,
-        linestyle=look.dashes if count else "none",
+        color=style.colour,
+        marker=style.marker,
+        linestyle=style.dashes if count else "none",
         fillstyle=fill_of(arm, codecs),
-        markersize=1.1 * mark_of(look),
+        markersize=1.1 * mark_of(style),
         label=f"{arm.name}{n}",
     )
 
@@ -153,7 +153,7 @@ def _draw_codecs(
     axes: Axes, setting: Setting, regime: str, method: str, column: str, *, codecs: tuple[str, ...]
 ) -> None:
     """A mark a codec, joined in the order of sizes."""
-    look = look_of(method)
+    style = style_of(method)
     places: list[tuple[float, float]] = []
     for codec in codecs:
         arm = Arm(regime, method, codec)
@@ -162,12 +162,12 @@ def _draw_codecs(
             continue
         places.append((float(np.mean(sizes)), interval.mean))
         if not math.isnan(interval.low):
-            axes.vlines(places[-1][0], interval.low, interval.high, color=look.colour, linewidth=0.8)
+            axes.vlines(places[-1][0], interval.low, interval.high, color=style.colour, linewidth=0.8)
         axes.plot(
             *places[-1],
-            color=look.colour,
-            marker=look.marker,
-            markersize=1.1 * mark_of(look),
+            color=style.colour,
+            marker=style.marker,
+            markersize=1.1 * mark_of(style),
             fillstyle=fill_of(arm, codecs),
             linestyle="none",
             label=arm.name,
@@ -175,8 +175,8 @@ def _draw_codecs(
     if places:
         axes.plot(
             *zip(*sorted(places), strict=True),
-            color=look.colour,
-            linestyle=look.dashes,
+            color=style.colour,
+            linestyle=style.dashes,
             linewidth=0.8,
             zorder=1,
         )
@@ -188,15 +188,15 @@ def _sizes(setting: Setting, arm: Arm) -> list[float]:
     return [value for value in found if value > 0]
 
 
-def _size_ticks(axes: Axes) -> None:
+def _size_marks(axes: Axes) -> None:
     low, high = axes.get_xlim()
-    ticks = [step * 10**power for power in range(1, 7) for step in (1, 2, 5)]
-    inside = [tick for tick in ticks if low <= tick <= high]
+    marks = [step * 10**power for power in range(1, 7) for step in (1, 2, 5)]
+    inside = [mark for mark in marks if low <= mark <= high]
     if len(inside) < 2:
         middle = math.sqrt(low * high)
         inside = [round(value, 1 - int(math.log10(value))) for value in (low, middle, high)]
         inside = [value for value in inside if low <= value <= high]
-    axes.set_xticks(inside, [f"{tick:g}" for tick in inside])
+    axes.set_xticks(inside, [f"{mark:g}" for mark in inside])
     axes.minorticks_off()
 
 

@@ -20,13 +20,13 @@ __all__ = [
     "INK",
     "PALETTE",
     "WIDTH_IN",
-    "Look",
+    "Style",
     "drawn",
     "fill_of",
-    "look_of",
     "mark_of",
     "plain_axes",
     "rate_axis",
+    "style_of",
 ]
 
 WIDTH_IN = 7.2
@@ -46,7 +46,7 @@ PALETTE: Mapping[str, str] = MappingProxyType(
         "purple": "#CC79A7",
     }
 )
-"""Okabe and Ito 2008, without yellow, which paper swallows."""
+"""Okabe and Ito 2008, without yellow, which paper hides."""
 
 _RC: Mapping[str, Any] = MappingProxyType(
     {
@@ -72,7 +72,7 @@ _RC: Mapping[str, Any] = MappingProxyType(
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Style:
     """Of a method: any of the three tells it from its neighbours."""
 
     colour: str
@@ -80,35 +80,33 @@ class Look:
     dashes: str
 
 
-_LOOKS: Mapping[str, Look] = MappingProxyType(
+_STYLES: Mapping[str, Style] = MappingProxyType(
     {
-        "M0": Look(PALETTE["black"], "o", "--"),
-        "M0-fps": Look(PALETTE["black"], "s", "-"),
-        "R0": Look(PALETTE["sky"], "^", "-"),
-        "pulse": Look(PALETTE["green"], "P", "--"),
-        "rolling": Look(PALETTE["green"], "X", "-"),
-        "M1": Look(PALETTE["blue"], "o", ":"),
-        "M2": Look(PALETTE["blue"], "v", "--"),
-        "M3": Look(PALETTE["blue"], "D", "-."),
-        "M4": Look(PALETTE["orange"], "^", ":"),
-        "M5": Look(PALETTE["orange"], "D", "-"),
-        "M6": Look(PALETTE["vermillion"], "*", "-"),
+        "M0": Style(PALETTE["black"], "o", "--"),
+        "M0-fps": Style(PALETTE["black"], "s", "-"),
+        "R0": Style(PALETTE["sky"], "^", "-"),
+        "M1": Style(PALETTE["blue"], "o", ":"),
+        "M2": Style(PALETTE["blue"], "v", "--"),
+        "M3": Style(PALETTE["blue"], "D", "-."),
+        "M4": Style(PALETTE["orange"], "^", ":"),
+        "M5": Style(PALETTE["orange"], "D", "-"),
+        "M6": Style(PALETTE["vermillion"], "*", "-"),
         # No triangle to the left or right: in figures of bits arrows say where a curve ends.
-        "tracks": Look(PALETTE["purple"], "p", "-"),
-        "permissive": Look(PALETTE["purple"], "s", ":"),
-        "conf_size_top1": Look(PALETTE["purple"], "8", "--"),
-        "strict_small_only": Look(PALETTE["purple"], "d", "-."),
-        "balanced_top2": Look(PALETTE["purple"], "h", ":"),
-        "DDS": Look(PALETTE["sky"], "H", "-."),
+        "tracks": Style(PALETTE["purple"], "p", "-"),
+        "permissive": Style(PALETTE["purple"], "s", ":"),
+        "conf_size_top1": Style(PALETTE["purple"], "8", "--"),
+        "strict_small_only": Style(PALETTE["purple"], "d", "-."),
+        "balanced_top2": Style(PALETTE["purple"], "h", ":"),
+        "DDS": Style(PALETTE["sky"], "H", "-."),
     }
 )
-_OTHER = Look(GREY, "x", "-")
+_OTHER = Style(GREY, "x", "-")
 _FILLS = ("full", "none", "left", "top", "right", "bottom")
 
 
-def look_of(method: str) -> Look:
+def style_of(method: str) -> Style:
     """The same in every figure."""
-    return _LOOKS.get(method, _OTHER)
+    return _STYLES.get(method, _OTHER)
 
 
 def fill_of(arm: Arm, codecs: tuple[str, ...]) -> Any:
@@ -116,9 +114,9 @@ def fill_of(arm: Arm, codecs: tuple[str, ...]) -> Any:
     return _FILLS[codecs.index(arm.still_codec) % len(_FILLS)] if arm.still_codec in codecs else _FILLS[0]
 
 
-def mark_of(look: Look) -> float:
+def mark_of(style: Style) -> float:
     """Size of a marker: a star has little area."""
-    return 6.5 if look.marker == "*" else 4.5
+    return 6.5 if style.marker == "*" else 4.5
 
 
 def plain_axes(axes: Axes, *, grid: str = "both") -> None:
@@ -129,13 +127,13 @@ def plain_axes(axes: Axes, *, grid: str = "both") -> None:
 
 
 def rate_axis(axes: Axes, kbps: list[float]) -> None:
-    """A logarithmic axis of bitrates with ticks at these, as far as they do not touch each other."""
+    """A logarithmic axis of bitrates with marks at these, as far as they do not touch each other."""
     axes.set_xscale("log")
-    ticks: list[float] = []
+    marks: list[float] = []
     for value in sorted(set(kbps)):
-        if not ticks or value > 1.25 * ticks[-1]:
-            ticks.append(value)
-    axes.set_xticks(ticks, [f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in ticks])
+        if not marks or value > 1.25 * marks[-1]:
+            marks.append(value)
+    axes.set_xticks(marks, [f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in marks])
     axes.minorticks_off()
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from hvt_study.report.data.document import Drawing, Picture, PictureRow, Pictures
 from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline
-from hvt_study.report.example.enlarge import enlarged
+from hvt_study.report.example.store import enlarged
 from hvt_study.report.figures.drawing import GREY, INK, PALETTE, drawn, plain_axes
 
 __all__ = ["crop_pictures", "timeline_figure"]
@@ -35,27 +35,27 @@ def crop_pictures(example: Example) -> Pictures:
 
 def timeline_figure(example: Example, *, name: str) -> Drawing:
     """Rate, stills with their track, and what is seen, over time."""
-    told = example.timeline
+    timeline = example.timeline
 
     def paint(figure: Figure) -> None:
-        heights = (1.2, max(0.5, _LANE_IN * len(told.lanes)), 1.3)
+        heights = (1.2, max(0.5, _LANE_IN * len(timeline.lanes)), 1.3)
         rate, lanes, seen = figure.subplots(3, 1, sharex=True, height_ratios=heights)
-        _draw_rate(rate, told)
-        _draw_lanes(lanes, told.lanes)
-        _draw_seen(seen, told)
+        _draw_rate(rate, timeline)
+        _draw_lanes(lanes, timeline.lanes)
+        _draw_seen(seen, timeline)
         seen.set_xlabel("time, s")
-        seen.set_xlim(0, max(1, len(told.f1)))
+        seen.set_xlim(0, max(1, len(timeline.f1)))
 
     lanes_said = (
-        f"{len(told.lanes)} of {told.tracks_named} named tracks, first those whose class changed most often, then "
-        "those of which stills spoke most"
-        if len(told.lanes) < told.tracks_named
+        f"{len(timeline.lanes)} of {timeline.tracks_named} named tracks, first those whose class changed most often, "
+        "then those of which stills spoke most"
+        if len(timeline.lanes) < timeline.tracks_named
         else "all tracks that stills named"
     )
     return drawn(
         name,
         paint,
-        height_in=3.4 + max(0.5, _LANE_IN * len(told.lanes)),
+        height_in=3.4 + max(0.5, _LANE_IN * len(timeline.lanes)),
         caption=(
             f"Timeline, {example.title}. Top: what was handed to the link in each second of the flight (whatever "
             "tables divide by), and B_tot; the last second may be a part of one, and has what was sent after the "
@@ -103,13 +103,13 @@ def _which(example: Example) -> str:
     return f"of its {example.stills} stills those at the {several} of the gain in PSNR"
 
 
-def _draw_rate(axes: Axes, told: Timeline) -> None:
-    seconds = np.arange(len(told.base_kbps) + 1)
-    floor = np.zeros(len(told.base_kbps))
+def _draw_rate(axes: Axes, timeline: Timeline) -> None:
+    seconds = np.arange(len(timeline.base_kbps) + 1)
+    floor = np.zeros(len(timeline.base_kbps))
     parts = (
-        ("base", told.base_kbps, PALETTE["sky"], ""),
-        ("stills", told.roi_kbps, PALETTE["vermillion"], "////"),
-        ("tracks and status", told.other_kbps, PALETTE["green"], ""),
+        ("base", timeline.base_kbps, PALETTE["sky"], ""),
+        ("stills", timeline.roi_kbps, PALETTE["vermillion"], "////"),
+        ("tracks and status", timeline.other_kbps, PALETTE["green"], ""),
     )
     for label, kbps, colour, hatch in parts:
         top = floor + np.asarray(kbps)
@@ -125,7 +125,7 @@ def _draw_rate(axes: Axes, told: Timeline) -> None:
             linewidth=0.4,
         )
         floor = top
-    axes.axhline(told.budget_bps / 1e3, color=INK, linewidth=0.8, linestyle="--", label="B_tot")
+    axes.axhline(timeline.budget_bps / 1e3, color=INK, linewidth=0.8, linestyle="--", label="B_tot")
     axes.set_ylabel("kbps")
     plain_axes(axes, grid="y")
     axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=4, frameon=False, borderaxespad=0)
@@ -156,12 +156,17 @@ def _draw_lanes(axes: Axes, lanes: Sequence[Lane]) -> None:
     plain_axes(axes, grid="x")
 
 
-def _draw_seen(axes: Axes, told: Timeline) -> None:
-    middle = np.arange(len(told.f1)) + 0.5
+def _draw_seen(axes: Axes, timeline: Timeline) -> None:
+    middle = np.arange(len(timeline.f1)) + 0.5
     curves = (
-        ("F1 of the list", told.f1, INK, ":"),
-        ("found & named", told.named, PALETTE["vermillion"], "-"),
-        ("found & named, before", told.named_before, PALETTE["sky"], "--"),  # last: seen where they are equal
+        ("F1 of the list", timeline.f1, INK, ":"),
+        ("found & named", timeline.named, PALETTE["vermillion"], "-"),
+        (
+            "found & named, before",
+            timeline.named_before,
+            PALETTE["sky"],
+            "--",
+        ),  # last: seen where they are equal
     )
     for label, series, colour, dashes in curves:
         axes.plot(middle, series, color=colour, linestyle=dashes, label=label)

@@ -17,7 +17,7 @@ from hvt_study.report.data.document import Drawing
 from hvt_study.report.data.equal_quality import EqualQuality
 from hvt_study.report.data.metric_names import METRICS
 from hvt_study.report.data.pairs import Pair
-from hvt_study.report.figures.drawing import GREY, INK, drawn, look_of, mark_of, plain_axes
+from hvt_study.report.figures.drawing import GREY, INK, drawn, mark_of, plain_axes, style_of
 
 __all__ = ["difference_figures", "equal_figures"]
 
@@ -26,7 +26,7 @@ _DOT = 9.0
 _LEFT, _RIGHT = r"$\leftarrow$", r"$\rightarrow$"
 _THIN: Mapping[str, Any] = MappingProxyType({"markeredgewidth": 0.2, "linestyle": "none", "zorder": 4})
 """Of arrows: an edge blurs their heads."""
-_RATIO_TICKS = (0.1, 0.2, 0.5, 0.8, 1.0, 1.25, 1.6, 2.0, 3.0, 5.0, 10.0, 20.0)
+_RATIO_MARKS = (0.1, 0.2, 0.5, 0.8, 1.0, 1.25, 1.6, 2.0, 3.0, 5.0, 10.0, 20.0)
 
 
 def difference_figures(
@@ -70,18 +70,18 @@ def _differences(setting: Setting, found: Sequence[Pair], *, name: str, column: 
             axes.axvline(0, color=INK, linewidth=0.7)
             axes.set_title(f"against {reference}")
             _row_axis(axes, arms)
-        figure.supxlabel(f"difference in {METRICS[column].name} at the same bits", fontsize=8)
+        figure.supxlabel(f"difference in {METRICS[column].title} at the same bits", fontsize=8)
 
     return drawn(
         name,
         paint,
         height_in=0.9 + _ROW_IN * len(arms),
         caption=(
-            f"Paired differences in {METRICS[column].name} at matched totals, {setting.name}, {arms[0].regime}: "
+            f"Paired differences in {METRICS[column].title} at matched totals, {setting.name}, {arms[0].regime}: "
             f"mean and {INTERVALS}; small dots are sequences. To the right of the line the method shows more than "
             f"video at the same bits. {under(setting)}"
         ),
-        alternative=f"Forest plot of the difference in {METRICS[column].name} of each method to video",
+        alternative=f"Forest plot of the difference in {METRICS[column].title} of each method to video",
     )
 
 
@@ -100,11 +100,11 @@ def _ratios(setting: Setting, found: Sequence[EqualQuality], *, name: str, colum
                 _draw_ratios(axes, one, row=arms.index(one.arm), ends=(low, high))
             axes.axvline(1, color=INK, linewidth=0.7)
             axes.set_xlim(low / 1.08, high * 1.08)
-            _ratio_ticks(axes, low, high)
+            _ratio_marks(axes, low, high)
             axes.set_title(f"bits of {reference}")
             _row_axis(axes, arms)
         figure.supxlabel(
-            f"bits that video needs / bits of the method, at equal {METRICS[column].name}", fontsize=8
+            f"bits that video needs / bits of the method, at equal {METRICS[column].title}", fontsize=8
         )
 
     return drawn(
@@ -112,7 +112,7 @@ def _ratios(setting: Setting, found: Sequence[EqualQuality], *, name: str, colum
         paint,
         height_in=0.9 + _ROW_IN * len(arms),
         caption=(
-            f"Bits at equal accuracy ({METRICS[column].name}), {setting.name}, {arms[0].regime}: small dots are "
+            f"Bits at equal accuracy ({METRICS[column].title}), {setting.name}, {arms[0].regime}: small dots are "
             "sequences, the large mark is their median. An arrow to the right: no video that was flown shows as "
             "much; to the left: the least video that was flown shows more; what lies beyond cannot be read. "
             f"{under(setting)}"
@@ -122,7 +122,7 @@ def _ratios(setting: Setting, found: Sequence[EqualQuality], *, name: str, colum
 
 
 def _draw_gap(axes: Axes, pair: Pair, column: str, *, row: int) -> None:
-    look, interval = look_of(pair.arm.method), pair.interval(column)
+    style, interval = style_of(pair.arm.method), pair.interval(column)
     gaps = list(pair.gaps(column).values())
     axes.scatter(gaps, [row] * len(gaps), s=_DOT, color=GREY, alpha=0.55, linewidths=0, zorder=2)
     if not math.isnan(interval.low):
@@ -130,14 +130,14 @@ def _draw_gap(axes: Axes, pair: Pair, column: str, *, row: int) -> None:
             interval.mean,
             row,
             xerr=[[interval.mean - interval.low], [interval.high - interval.mean]],
-            color=look.colour,
+            color=style.colour,
             elinewidth=1.2,
             capsize=2.5,
             capthick=1.2,
             zorder=3,
         )
     axes.plot(
-        [interval.mean], [row], color=look.colour, marker=look.marker, markersize=mark_of(look), zorder=4
+        [interval.mean], [row], color=style.colour, marker=style.marker, markersize=mark_of(style), zorder=4
     )
 
 
@@ -145,15 +145,17 @@ def _draw_ratios(axes: Axes, one: EqualQuality, *, row: int, ends: tuple[float, 
     low, high = ends
     read = [ratio for ratio in one.ratios if 0 < ratio < math.inf]
     axes.scatter(read, [row] * len(read), s=_DOT, color=GREY, alpha=0.6, linewidths=0, zorder=2)
-    look, middle = look_of(one.arm.method), one.median
+    style, middle = style_of(one.arm.method), one.median
     for place, marker, count in ((low, _LEFT, one.below), (high, _RIGHT, one.above)):
         if count:
             axes.plot([place], [row], color=GREY, marker=marker, markersize=7, **_THIN)
     if 0 < middle < math.inf:
-        axes.plot([middle], [row], color=look.colour, marker=look.marker, markersize=mark_of(look), zorder=4)
+        axes.plot(
+            [middle], [row], color=style.colour, marker=style.marker, markersize=mark_of(style), zorder=4
+        )
     else:
         place, marker = (low, _LEFT) if middle == 0 else (high, _RIGHT)
-        axes.plot([place], [row], color=look.colour, marker=marker, markersize=11, **_THIN)
+        axes.plot([place], [row], color=style.colour, marker=marker, markersize=11, **_THIN)
 
 
 def _row_axis(axes: Axes, arms: Sequence[Arm]) -> None:
@@ -163,7 +165,7 @@ def _row_axis(axes: Axes, arms: Sequence[Arm]) -> None:
     plain_axes(axes, grid="x")
 
 
-def _ratio_ticks(axes: Axes, low: float, high: float) -> None:
-    ticks = [tick for tick in _RATIO_TICKS if low <= tick <= high]
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+def _ratio_marks(axes: Axes, low: float, high: float) -> None:
+    marks = [mark for mark in _RATIO_MARKS if low <= mark <= high]
+    axes.set_xticks(marks, [f"{mark:g}" for mark in marks])
     axes.minorticks_off()

@@ -4,30 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from hvt_study.report.data.arms import Row, counts, place
-from hvt_study.report.data.document import Cell, Table, words
-from hvt_study.report.data.metric_names import METRICS, NOTHING
+from hvt_study.report.data.arms import RunRow, counts, place
+from hvt_study.report.data.document import Cell, Table, breaks_between, words
+from hvt_study.report.data.metric_names import METRICS, NOTHING, definition
 
 __all__ = ["failed_table", "metrics_table"]
 
 
 def metrics_table(accounting: str) -> Table:
     """What each figure is, where rates are of this accounting."""
-    rows: list[tuple[Cell, ...]] = []
-    breaks, group = set(), ""
-    for metric in METRICS.values():
-        if metric.group != group:
-            breaks.add(len(rows))
-        group = metric.group
-        better = {"more": "higher", "less": "lower", "": NOTHING}[metric.better]
-        says = metric.definition(accounting)
-        rows.append((Cell(metric.group), Cell(metric.name), Cell(metric.column), Cell(says), Cell(better)))
+    better = {"more": "higher", "less": "lower", "": NOTHING}
+    rows = tuple(
+        (
+            Cell(one.group),
+            Cell(one.title),
+            Cell(one.name),
+            Cell(definition(one, accounting)),
+            Cell(better[one.better]),
+        )
+        for one in METRICS.values()
+    )
     titles = ("about", "metric", "column", "definition", "better")
     caption = "Metrics. A figure that a run cannot have is null in the table and a dash here, never 0."
-    return Table(caption, words(*titles), tuple(rows), frozenset(breaks - {0}))
+    return Table(caption, words(*titles), rows, breaks_between(one.group for one in METRICS.values()))
 
 
-def failed_table(rows: Iterable[Row]) -> Table | None:
+def failed_table(rows: Iterable[RunRow]) -> Table | None:
     """Every run that counts nowhere, by name, with the reason; None where all count."""
     failed = [row for row in rows if not counts(row)]
     if not failed:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from hvt_study.report.data.arms import BySequence, Setting, values
 from hvt_study.report.data.captions import INTERVALS, same_sequences, under
-from hvt_study.report.data.document import Cell, Head, Table, words
+from hvt_study.report.data.document import Cell, Head, Table, breaks_between, words
 from hvt_study.report.data.intervals import interval_of, mean_of, median_of
-from hvt_study.report.data.metric_names import METRICS, NOTHING, written
+from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, written
 
 __all__ = ["named_table", "pilot_table", "proxy_table", "seen_table", "size_table", "spent_table"]
 
@@ -39,93 +40,66 @@ _PROXIES = (
 _BENEATH = f"means over sequences, beneath the {INTERVALS}, and n where fewer than the row's have the figure"
 
 
-def spent_table(setting: Setting) -> Table:
-    """End to end, what was spent: bits, stills, delay."""
-    caption = (
-        f"End-to-end results, what was spent, {setting.name}: means over sequences. {same_sequences(setting)}"
-        f"{under(setting)}"
-    )
-    return _by_arm(setting, _SPENT, caption=caption)
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """One of the tables."""
+
+    title: str
+    says: str
+    columns: Sequence[str]
+    intervals: bool = False
+    only_with: str = ""
+    """A column without which an arm is left out."""
+
+    def __call__(self, setting: Setting) -> Table:
+        """A row an arm, a line between regimes. Columns and arms that have no figure at all are left out."""
+        arms = [(arm, setting.runs(arm)) for regime in setting.regimes for arm in setting.arms(regime)]
+        if self.only_with:
+            arms = [(arm, runs) for arm, runs in arms if _has_any(runs, self.only_with)]
+        shown = [name for name in self.columns if any(_has_any(runs, name) for _, runs in arms)]
+        rows: list[tuple[Cell, ...]] = []
+        for arm, runs in arms:
+            n = f"{len(runs)} of {setting.sequences}" if len(runs) < setting.sequences else str(len(runs))
+            cells = [Cell(arm.regime), Cell(arm.method), Cell(arm.still_codec or NOTHING), Cell(n)]
+            rows.append((*cells, *(_mean_cell(runs, name, interval=self.intervals) for name in shown)))
+        heads = (*words("regime", "method", "codec"), Head("n", says="sequences whose run counts"))
+        metrics = [METRICS[name] for name in shown]
+        heads += tuple(Head(one.title, says=definition(one, setting.accounting)) for one in metrics)
+        caption = f"{self.title}, {setting.name}: {self.says}. {same_sequences(setting)}{under(setting)}"
+        return Table(caption, heads, tuple(rows), breaks_between(arm.regime for arm, _ in arms))
 
 
-def seen_table(setting: Setting) -> Table:
-    """End to end, what was found and kept track of for it, with intervals."""
-    caption = (
-        f"End-to-end results, what was seen, {setting.name}: {_BENEATH}. "
-        f"{same_sequences(setting)}{under(setting)}"
-    )
-    return _by_arm(setting, _SEEN, caption=caption, intervals=True)
+spent_table = _Kind("End-to-end results, what was spent", "means over sequences", _SPENT)
+seen_table = _Kind("End-to-end results, what was seen", _BENEATH, _SEEN, intervals=True)
+named_table = _Kind(
+    "End-to-end results, classes",
+    f"{_BENEATH}. Before: the same run without the stills' word. Of the times to the first right class the median "
+    "over sequences (of two middle ones the lower), infinite where that share of tracks was never named right",
+    _NAMED,
+    intervals=True,
+)
+size_table = _Kind(
+    "By size of objects",
+    f"small below 32², large from 96² source pixels; {_BENEATH}",
+    _SIZES,
+    intervals=True,
+)
+pilot_table = _Kind(
+    "Both accountings",
+    "bytes by the processed span, and by the length of the whole clip, as the pilot's notebooks had it. Means over "
+    "sequences",
+    _PILOT,
+)
+proxy_table = _Kind(
+    "The pilot's proxies",
+    "what one model says of the still and of the base at its place; they need no labels. Means over sequences",
+    _PROXIES,
+    only_with="confidence_gain",
+)
 
 
-def named_table(setting: Setting) -> Table:
-    """End to end, what it was called, with intervals."""
-    caption = (
-        f"End-to-end results, classes, {setting.name}: {_BENEATH}. Before: the same run without the stills' word. Of "
-        "the times to the first right class the median over sequences (of two middle ones the lower), infinite where "
-        f"that share of tracks was never named right. {same_sequences(setting)}{under(setting)}"
-    )
-    return _by_arm(setting, _NAMED, caption=caption, intervals=True)
-
-
-def size_table(setting: Setting) -> Table:
-    """Accuracy by the size of objects."""
-    caption = (
-        f"By size of objects, {setting.name}: small below 32², large from 96² source pixels; {_BENEATH}. "
-        f"{same_sequences(setting)}{under(setting)}"
-    )
-    return _by_arm(setting, _SIZES, caption=caption, intervals=True)
-
-
-def pilot_table(setting: Setting) -> Table:
-    """Both accountings side by side."""
-    caption = (
-        f"Both accountings, {setting.name}: bytes by the processed span, and by the length of the whole clip, as the "
-        f"pilot's notebooks had it. Means over sequences. {same_sequences(setting)}{under(setting)}"
-    )
-    return _by_arm(setting, _PILOT, caption=caption)
-
-
-def proxy_table(setting: Setting) -> Table:
-    """The pilot's proxies, of methods that send stills."""
-    caption = (
-        f"The pilot's proxies, {setting.name}: what one model says of the still and of the base at its place; they "
-        f"ask no labels. Means over sequences. {same_sequences(setting)}{under(setting)}"
-    )
-    return _by_arm(setting, _PROXIES, caption=caption, only_with=("confidence_gain",))
-
-
-def _by_arm(
-    setting: Setting,
-    columns: Sequence[str],
-    *,
-    caption: str,
-    intervals: bool = False,
-    only_with: tuple[str, ...] = (),
-) -> Table:
-    """A row an arm, a line between regimes. Columns and arms that have no figure at all are left out."""
-    arms = [(arm, setting.runs(arm)) for regime in setting.regimes for arm in setting.arms(regime)]
-    if only_with:
-        arms = [(arm, runs) for arm, runs in arms if _has_any(runs, only_with)]
-    shown = [name for name in columns if any(_has_any(runs, (name,)) for _, runs in arms)]
-    rows: list[tuple[Cell, ...]] = []
-    breaks, regime = set(), ""
-    for arm, runs in arms:
-        if regime not in ("", arm.regime):
-            breaks.add(len(rows))
-        regime = arm.regime
-        n = f"{len(runs)} of {setting.sequences}" if len(runs) < setting.sequences else str(len(runs))
-        cells = [Cell(arm.regime), Cell(arm.method), Cell(arm.still_codec or NOTHING), Cell(n)]
-        rows.append((*cells, *(_mean_cell(runs, name, interval=intervals) for name in shown)))
-    heads = words("regime", "method", "codec")
-    heads += (Head("n", says="sequences whose run counts"),)
-    heads += tuple(
-        Head(METRICS[name].name, says=METRICS[name].definition(setting.accounting)) for name in shown
-    )
-    return Table(caption, heads, tuple(rows), frozenset(breaks))
-
-
-def _has_any(runs: BySequence, columns: Iterable[str]) -> bool:
-    return any(row[name] is not None for row in runs.values() for name in columns)
+def _has_any(runs: BySequence, column: str) -> bool:
+    return any(row[column] is not None for row in runs.values())
 
 
 def _mean_cell(runs: BySequence, column: str, *, interval: bool) -> Cell:

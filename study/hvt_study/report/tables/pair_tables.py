@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 from hvt_study.report.data.arms import Setting, values
 from hvt_study.report.data.captions import INTERVALS, under
-from hvt_study.report.data.document import Cell, Head, Table, words
+from hvt_study.report.data.document import Cell, Head, Table, breaks_between, words
 from hvt_study.report.data.equal_quality import EqualQuality
 from hvt_study.report.data.intervals import ENOUGH
-from hvt_study.report.data.metric_names import METRICS, NOTHING, written
+from hvt_study.report.data.metric_names import METRICS, NOTHING, definition, written
 from hvt_study.report.data.pairs import Pair
 
 __all__ = ["differences_table", "equal_table", "ratio"]
@@ -27,29 +27,23 @@ def differences_table(setting: Setting, found: Sequence[Pair]) -> Table | None:
     if not found:
         return None
     shown = [name for name in _COMPARED if any(pair.gaps(name) for pair in found)]
-    rows: list[tuple[Cell, ...]] = []
-    breaks, before = set(), ("", "")
-    for pair in found:
-        own = (pair.arm.regime, pair.arm.name)
-        if before[0] and own != before:
-            breaks.add(len(rows))
-        before = own
-        rows.append((*_who(pair), *(_gap(pair, name) for name in shown), Cell(_ahead(pair))))
+    rows = tuple((*_who(pair), *(_gap(pair, name) for name in shown), Cell(_ahead(pair))) for pair in found)
+    breaks = breaks_between((pair.arm.regime, pair.arm.name) for pair in found)
     heads = words("regime", "method", "against")
     heads += (Head("n", says="sequences of which both runs count, of those of which the method's does"),)
     heads += (Head("kbps", says="mean total of the method and of its match"),)
     heads += tuple(
-        Head(f"Δ {METRICS[name].name}", says=METRICS[name].definition(setting.accounting)) for name in shown
+        Head(f"Δ {METRICS[name].title}", says=definition(METRICS[name], setting.accounting)) for name in shown
     )
-    heads += (Head("ahead", says=f"sequences with more {METRICS[_DECIDES].name}, with less"),)
+    heads += (Head("ahead", says=f"sequences with more {METRICS[_DECIDES].title}, with less"),)
     off = max(pair.most_off_pct() for pair in found)
     caption = (
         f"Paired differences at matched totals, {setting.name}: method less video-only method on the same sequence, "
         f"mean; beneath, the {INTERVALS}, and n where fewer than the row's have the figure. Bold where the interval "
-        f"leaves out 0. Ahead: sequences with more and with less {METRICS[_DECIDES].name}. The totals of no pair are "
-        f"more than {off:.2f} % apart. {under(setting)}"
+        f"leaves out 0. Ahead: sequences with more and with less {METRICS[_DECIDES].title}. The totals of no pair "
+        f"are more than {off:.2f} % apart. {under(setting)}"
     )
-    return Table(caption, heads, tuple(rows), frozenset(breaks))
+    return Table(caption, heads, rows, breaks)
 
 
 def equal_table(setting: Setting, found: Sequence[EqualQuality], *, column: str) -> Table | None:
@@ -70,8 +64,7 @@ def equal_table(setting: Setting, found: Sequence[EqualQuality], *, column: str)
         )
         for one in found
     )
-    regimes = [one.arm.regime for one in found]
-    breaks = {row for row in range(1, len(regimes)) if regimes[row] != regimes[row - 1]}
+    breaks = breaks_between(one.arm.regime for one in found)
     heads = words("regime", "method", "video")
     heads += (Head("bits needed", says="of video, by those of the method; median over sequences"),)
     heads += (Head("read", says="sequences in which the curve reaches the level"),)
@@ -81,13 +74,13 @@ def equal_table(setting: Setting, found: Sequence[EqualQuality], *, column: str)
         Head("unreadable", says="sequences with fewer than two totals of video, or without the figure"),
     )
     caption = (
-        f"Bits at equal accuracy ({METRICS[column].name}), {setting.name}: what video alone needs to show as much, "
+        f"Bits at equal accuracy ({METRICS[column].title}), {setting.name}: what video alone needs to show as much, "
         "by the bits of the method; median over sequences, the lower of two middle ones, bold where it is more than "
         f"1 and of {ENOUGH} sequences or more. Read off each sequence's own curve of video, straight over the "
         "logarithm of the bitrate, never beyond its ends: above and below count sequences where it ends too soon. "
         f"{under(setting)}"
     )
-    return Table(caption, heads, rows, frozenset(breaks))
+    return Table(caption, heads, rows, breaks)
 
 
 def ratio(value: float) -> str:

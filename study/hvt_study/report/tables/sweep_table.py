@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
+
+import pandas as pd
 
 from hvt_common.errors import UserError
 from hvt_study.matrix.sweep import COLUMNS as SWEEP_COLUMNS
 from hvt_study.report.data.document import Cell, Head, Table
 
 __all__ = ["sweep_table"]
+
+_TYPES = {"policy": str, "selected": int, "ratio": float, "frame_coverage": float}
 
 
 def sweep_table(path: Path) -> Table | None:
@@ -21,8 +24,10 @@ def sweep_table(path: Path) -> Table | None:
     if not path.exists():
         return None
     try:
-        cells = _cells(path)
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError, csv.Error):
+        found = pd.read_csv(path, dtype=_TYPES, usecols=list(_TYPES))
+        if found.empty or found.isna().any(axis=None):
+            raise ValueError("no rows, or cells without a value")  # noqa: TRY301
+    except (OSError, ValueError):
         raise UserError(
             f"{path} is not a table of {','.join(SWEEP_COLUMNS)}: write it with hvt-study sweep --out {path.parent}"
         ) from None
@@ -32,22 +37,14 @@ def sweep_table(path: Path) -> Table | None:
         Head("ratio", says="of the raw detections"),
         Head("frame coverage", says="share of frames with raw detections that keep at least one ROI"),
     )
-    caption = "Selector sweep: what each of the pilot's selectors keeps of raw detections in all. No labels."
-    return Table(caption, heads, cells)
-
-
-def _cells(path: Path) -> tuple[tuple[Cell, ...], ...]:
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
-        rows = list(reader)
-    if not rows or not set(SWEEP_COLUMNS) <= set(reader.fieldnames or ()):
-        raise ValueError("no rows, or other columns")
-    return tuple(
+    rows = tuple(
         (
-            Cell(row["policy"]),
-            Cell(str(int(row["selected"]))),
-            Cell(f"{float(row['ratio']):.4f}"),
-            Cell(f"{float(row['frame_coverage']):.4f}"),
+            Cell(row.policy),
+            Cell(str(row.selected)),
+            Cell(f"{row.ratio:.4f}"),
+            Cell(f"{row.frame_coverage:.4f}"),
         )
-        for row in rows
+        for row in found.itertuples()
     )
+    caption = "Selector sweep: what each of the pilot's selectors keeps of raw detections in all. No labels."
+    return Table(caption, heads, rows)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from hvt_study.datasets.labels import NO_ID, FrameLabels
+from hvt_study.metrics.classes import class_score
 from hvt_study.metrics.frames import FrameView
 
-__all__ = ["labels", "square", "view"]
+__all__ = ["labels", "list_f1", "square", "view"]
 
 
 def square(x, y=0, side=10):
@@ -34,3 +35,12 @@ def view(*rows):
         np.array([row[3] if len(row) > 3 else 0.5 for row in rows], np.float32),
         tuple(row[4] if len(row) > 4 else row[1] for row in rows),
     )
+
+
+def list_f1(report, frames, there):
+    """F1 of a flight's list at some frames, where ``there(frame)`` gives (boxes, classes) that are really there."""
+    pairs = []
+    for frame in frames:
+        boxes, names = there(frame)
+        pairs.append((labels(*zip(boxes, names, strict=True)), report.lists[frame].refined_view()))
+    return class_score(pairs).f1
