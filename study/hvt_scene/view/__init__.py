@@ -1,1 +1,1 @@
-"""From the world to pixels: the camera on its way, projection, and picture out of ground and sprites."""
+"""From the world to pixels: the camera on its way, projection, and composition of ground and sprites."""

@@ -1,1 +1,1 @@
-"""Keeps what was computed once on disk: flights, detections, named by the content and code that decide them."""
+"""Keeps on disk what was computed once, named by content and code: `ResultCache`, `CachedDetector`, `code_digest`."""

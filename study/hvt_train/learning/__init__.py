@@ -1,1 +1,1 @@
-"""Networks, losses and the training loops of detector and classifier, and their export to ONNX."""
+"""Networks, losses, training loops of detector and classifier, and `export_onnx`."""

@@ -1,1 +1,1 @@
-"""Makes the drawn pictures and crops that the models are trained on."""
+"""Makes what the models are trained on: drawn places, views and crops of them, and the pool on disk."""

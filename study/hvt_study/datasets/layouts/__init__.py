@@ -1,1 +1,1 @@
-"""One module a layout of datasets (VisDrone, UAVDT, MOT, clips, pictures, the demo): from URI to `Sequence`."""
+"""One module a layout of datasets, from URI to `Sequence`; others call `open_dataset`, `open_datasets` of `uri`."""

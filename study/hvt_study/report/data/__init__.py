@@ -1,1 +1,1 @@
-"""Values that tables and figures share: rows by arm and sequence, pairs, intervals, names of metrics."""
+"""Values that tables and figures share: `Setting`, `Arm`, `pairs`, `interval_of`, `METRICS`, `Report`."""

@@ -1,1 +1,1 @@
-"""The example flight of a report: which run, flown again, stored beside the table."""
+"""The flight that a report shows in pictures: `choose_run`, `fly_again`, `load_example`, `save_example`."""

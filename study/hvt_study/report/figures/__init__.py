@@ -1,1 +1,1 @@
-"""Figures of the report, each a function of rows (Matplotlib)."""
+"""Figures of the report in Matplotlib, each a function of a `Setting`, and the plot of ``hvt-study compare``."""

@@ -1,1 +1,1 @@
-"""Renders a report as one HTML page or as Markdown, with Jinja2 templates."""
+"""Renders a `Report` as one HTML page or as Markdown from Jinja2 templates: `html_page`, `markdown_page`."""
