@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence, needs_extra
-from hvt_common.runtime.allocator import limit_malloc_arenas
+from hvt_common.runtime.process import limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, start_log, write_json
 from hvt_ground.config import GroundConfig, check
 

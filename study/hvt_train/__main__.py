@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hvt_common.errors import UserError, exit_with_sentence, needs_extra
-from hvt_common.inference.embedded import CLASSIFIER, DETECTOR, embedded_model
+from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
+from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
+from hvt_common.inference.store import embedded_models
 
 __all__ = ["main"]
 

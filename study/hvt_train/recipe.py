@@ -16,7 +16,8 @@ from torch import nn
 
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
-from hvt_common.inference.embedded import CLASSIFIER, DETECTOR
+from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
+from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.evaluate import CLEAN, drawn_pictures, evaluate_drawn
 from hvt_train.learning.classifier import export_classifier, train_classifier

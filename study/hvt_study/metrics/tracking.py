@@ -17,7 +17,7 @@ from typing import Any, Final
 import motmetrics
 import numpy as np
 
-from hvt_common.boxes import iou
+from hvt_common.values import iou
 from hvt_study.metrics.frames import NO_ID, LabelledFrames
 from hvt_study.metrics.hota import Hota, IdBoxes, hota
 from hvt_study.metrics.judged import LEAST_IOU, judged

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hvt_common.inference.class_names import kind_of
+from hvt_common.values import iou
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import FrameView
 from metric_frames import labels, square, view
