@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
 import sys
@@ -17,12 +18,18 @@ PARTS = ("tracker", "detector", "pipeline", "latency", "joining", "providers")
 
 
 def main(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
+    parser.add_argument("parts", nargs="*", metavar="NAME", help=", ".join(PARTS))
+    parts = parser.parse_args(argv).parts or PARTS
+    for part in parts:
+        if part not in PARTS:
+            parser.error(f"{part} is not known: choose from {', '.join(PARTS)}")
     console = Console(highlight=False)
     table = Table(title="make bench", title_justify="left")
     for name in ("part", "measure", "value", "bar", "holds"):
         table.add_column(name, justify="left" if name in ("part", "measure") else "right")
     found = []
-    for part in argv or PARTS:
+    for part in parts:
         with console.status(f"{part} …"):
             try:
                 rows = importlib.import_module(f"bench.{part}").rows()

@@ -96,10 +96,10 @@ def _first_picture_s(timing: Path) -> float:
     until_s = time.monotonic() + _PATIENCE_S
     while time.monotonic() < until_s:
         text = timing.read_text(encoding="ascii") if timing.exists() else ""
-        told = list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
-        shown_ns = [int(row["shown_ns"]) for row in told if row["kind"] == "base" and int(row["shown_ns"])]
+        rows = list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+        shown_ns = [int(row["shown_ns"]) for row in rows if row["kind"] == "base" and int(row["shown_ns"])]
         if shown_ns:
-            return (shown_ns[0] - min(int(row["received_ns"]) for row in told)) / 1e9
+            return (shown_ns[0] - min(int(row["received_ns"]) for row in rows)) / 1e9
         time.sleep(0.05)
     raise RuntimeError(f"no picture within {_PATIENCE_S:.0f} s")
 

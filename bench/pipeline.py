@@ -40,9 +40,9 @@ def rows() -> list[dict[str, object]]:
     edge, ground, floor_edge, floor_ground = [], [], [], []
     for _ in range(_ROUNDS):
         encode_s, units = _bare_encode(taken)
-        see_s = _bare_see(units)
-        floor_edge.append(encode_s + see_s)
-        floor_ground.append(see_s)
+        analyze_s = _bare_analysis(units)
+        floor_edge.append(encode_s + analyze_s)
+        floor_ground.append(analyze_s)
         edge.append(_edge())
         ground.append(_ground(units))
     return [
@@ -67,7 +67,7 @@ def _bare_encode(taken) -> tuple[float, list[AccessUnit]]:
     return (time.perf_counter() - began) / len(taken), units
 
 
-def _bare_see(units: list[AccessUnit]) -> float:
+def _bare_analysis(units: list[AccessUnit]) -> float:
     decoder, detector = BaseDecoder(), open_detector(str(nano()), provider="auto")
     began = time.perf_counter()
     for index, unit in enumerate(units):

@@ -37,7 +37,7 @@ from hvt_edge.video.x265 import BaseEncoder
 
 KBPS = (800, 400)
 TAKEN = range(12, 150, 18)
-"""Frames whose boxes are cut out, in ticks."""
+"""Frames whose boxes are cropped out, by index."""
 BOXES_A_FRAME = 26
 JUDGED_EVERY = 3
 """The classifier sees every third crop."""

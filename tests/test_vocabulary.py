@@ -30,7 +30,8 @@ swallowed tick ticks told unchanging waiting weigh weighed whereabouts wish wish
 _NO_NAME = frozenset(_ONCE_NAMES.split())
 _NO_CLASS = frozenset({"Early", "Reception", "Row", "Seen"})
 _OF_LIBRARIES = """
-haveImageWriter keep_blank_values set_log_tick_enabled set_xticks set_yticks tick_params xticks yticks
+ask haveImageWriter keep_blank_values keep_trailing_newline
+set_log_tick_enabled set_xticks set_yticks tick_params xticks yticks
 """
 _LIBRARIES_SAY = frozenset(_OF_LIBRARIES.split())
 _FORMER_OPTION = re.compile(r'^\s+"[a-z-]+": (_REFRESH_GONE|"give --)')
@@ -67,7 +68,7 @@ def test_words_that_went_stay_away():
     found = []
     for file in _tracked("*.py", "*.md", "*.toml", "Makefile", "*.yaml", "*.service"):
         for number, line in enumerate((ROOT / file).read_text(encoding="utf-8").splitlines(), 1):
-            said = "" if _FORMER_OPTION.match(line) else line
+            said = "" if _FORMER_OPTION.match(line) or "former name" in line else line
             for name in _LIBRARIES_SAY:
                 said = said.replace(name, "")
             found += [f"{file}:{number}: {match[0]}" for match in _NEVER.finditer(said)]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
-__all__ = ["UserError", "exit_with_sentence"]
+__all__ = ["UserError", "exit_with_sentence", "needs_extra"]
 
 
 class UserError(Exception):
@@ -26,3 +27,18 @@ def exit_with_sentence(
     except UserError as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
+
+
+@contextmanager
+def needs_extra(install: str) -> Iterator[None]:
+    """Within it a package that is not installed is a `UserError` that says what to install.
+
+    Args:
+        install: what ``pip install`` takes, such as ``'hvt[study]'``.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("hvt_"):
+            raise
+        raise UserError(f"the package {error.name!r} is missing: pip install {install}") from None

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from hvt_common.config import load, to_toml
-from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.errors import exit_with_sentence, needs_extra
 from hvt_common.runtime.process import limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, start_log, write_json
 from hvt_ground.config import GroundConfig, check
@@ -35,13 +35,9 @@ def _run(argv: Sequence[str] | None) -> int:
 
         if words[0] in control.COMMANDS:
             return control.run(words)
-    try:  # only now: without Rerun this is a sentence, not a traceback
+    with needs_extra("'hvt[ground]'"):  # only now: without Rerun this is a sentence, not a traceback
         from hvt_ground.app import Ground  # noqa: PLC0415
         from hvt_ground.status import table  # noqa: PLC0415
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"the package {error.name!r} is missing: install HVT with its extra, 'hvt[ground]'"
-        ) from None
     config, requested = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
     if requested.print_config:
         print(to_toml(config), end="")

@@ -1,7 +1,7 @@
 """The procedurally drawn aerial scene of ``--source demo``, with exact ground truth."""
 
-from hvt_scene.look import Look
+from hvt_scene.appearance import Appearance
 from hvt_scene.scene import Scene
 from hvt_scene.truth import Truth, write_truth
 
-__all__ = ["Look", "Scene", "Truth", "write_truth"]
+__all__ = ["Appearance", "Scene", "Truth", "write_truth"]

@@ -10,14 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Image, View
-from hvt_scene.camera import Camera, Matrix
-from hvt_scene.cast import Cast
-from hvt_scene.compose import Bgra, blend, darken
-from hvt_scene.foliage import Grove
-from hvt_scene.ground import paint_ground
-from hvt_scene.layout import Layout, plan
-from hvt_scene.look import Look
-from hvt_scene.project import (
+from hvt_scene.appearance import Appearance
+from hvt_scene.drawing.cast import Cast
+from hvt_scene.drawing.foliage import Grove
+from hvt_scene.drawing.ground import paint_ground
+from hvt_scene.drawing.vehicles import CLASS_NAMES
+from hvt_scene.truth import Truth, write_truth
+from hvt_scene.view.camera import Camera, Matrix
+from hvt_scene.view.compose import Bgra, blend, darken
+from hvt_scene.view.project import (
     Floats,
     bounds,
     near_frame,
@@ -27,9 +28,8 @@ from hvt_scene.project import (
     to_centres,
     turns,
 )
-from hvt_scene.traffic import set_in_motion
-from hvt_scene.truth import Truth, write_truth
-from hvt_scene.vehicles import CLASS_NAMES
+from hvt_scene.world.layout import Layout, plan
+from hvt_scene.world.traffic import set_in_motion
 
 __all__ = ["Scene"]
 
@@ -53,44 +53,46 @@ class Scene:
     duration_s = 20.0
 
     def __init__(
-        self, seed: int = 0, *, size: tuple[int, int] = (1920, 1080), look: Look | None = None
+        self, seed: int = 0, *, size: tuple[int, int] = (1920, 1080), appearance: Appearance | None = None
     ) -> None:
         self.size = size
-        self._look = look = look or Look()
+        self._appearance = appearance = appearance or Appearance()
         # Separate streams: a change in how a car is drawn must not move the trees.
         streams = np.random.SeedSequence(seed).spawn(5)
         plans, moves, paints, grounds, flight = (np.random.Generator(np.random.PCG64(s)) for s in streams)
-        layout = plan(plans, look)
-        movers = set_in_motion(layout, look, rng=moves, duration_s=self.duration_s)
-        self._cast = Cast(movers, layout.parked, rng=paints)
-        self._camera = _flight(layout, look, size=size, rng=flight, duration_s=self.duration_s)
-        self._grove = Grove(layout, look, rng=grounds)
-        finest = max(min(look.width_m) / size[0], 0.05)
-        self._ground = paint_ground(layout, look, rng=grounds, canopies=self._grove.canopies, m_per_px=finest)
+        layout = plan(plans, appearance)
+        movers = set_in_motion(layout, appearance, rng=moves, duration_s=self.duration_s)
+        self.cast = Cast(movers, layout.parked, rng=paints)
+        self._camera = _flight(layout, appearance, size=size, rng=flight, duration_s=self.duration_s)
+        self._grove = Grove(layout, appearance, rng=grounds)
+        finest = max(min(appearance.width_m) / size[0], 0.05)
+        self._ground = paint_ground(
+            layout, appearance, rng=grounds, canopies=self._grove.canopies, m_per_px=finest
+        )
 
     def image(self, t_s: float, *, without: Collection[int] = ()) -> Image:
         """The picture at ``t_s`` (0…`duration_s`), (height, width, 3) uint8 BGR; ids in ``without`` are not drawn."""
         pose, chosen, places, local = self._view(t_s, without=without)
         frame = self._warp_ground(pose)
         light = self._ground.light_at(places)
-        if self._look.shadow_strength > 0:
+        if self._appearance.shadow_strength > 0:
             self._cast_shadows(frame, chosen[light > 0.8], places[light > 0.8], local[light > 0.8])
-        self._draw_bodies(frame, chosen, places, local, gains=light * self._look.exposure)
+        self._draw_bodies(frame, chosen, places, local, gains=light * self._appearance.exposure)
         self._draw_trees(frame, pose)
         return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGRA2BGR), np.uint8)
 
     def truth(self, t_s: float) -> Truth:
         """What the picture at ``t_s`` shows, from the same geometry that draws it."""
         _, chosen, places, local = self._view(t_s)
-        pixels = project(self._cast.outlines_m[chosen] @ turns(places).transpose(0, 2, 1), local)
+        pixels = project(self.cast.outlines_m[chosen] @ turns(places).transpose(0, 2, 1), local)
         limit = np.array(self.size)
         boxes = np.concatenate([np.clip(pixels.min(1), 0, limit), np.clip(pixels.max(1), 0, limit)], axis=1)
-        keep = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
+        large = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
         return Truth(
-            ids=chosen[keep] + 1,
-            boxes_source_px=boxes[keep].astype(np.float32),
-            class_ids=self._cast.class_ids[chosen[keep]],
-            visible=self._visible(chosen[keep], places[keep], local[keep]),
+            ids=chosen[large] + 1,
+            boxes_source_px=boxes[large].astype(np.float32),
+            class_ids=self.cast.class_ids[chosen[large]],
+            visible=self._visible(chosen[large], places[large], local[large]),
         )
 
     def write_truth(self, path: Path, *, fps: float, view: View) -> int:
@@ -104,16 +106,16 @@ class Scene:
         if not 0 <= t_s <= self.duration_s:
             raise ValueError(f"time {t_s} s is outside 0…{self.duration_s} s")
         pose = self._camera.pose(t_s)
-        places = self._cast.places(t_s)
+        places = self.cast.places(t_s)
         local = tangents(pose, places)
-        near = near_frame(local, self._cast.reach_m + _LONGEST_SHADOW_M, size=self.size)
+        near = near_frame(local, self.cast.reach_m + _LONGEST_SHADOW_M, size=self.size)
         near[[number - 1 for number in without]] = False
         chosen = np.nonzero(near)[0]
         return pose, chosen, places[chosen], local[chosen]
 
     def _warp_ground(self, pose: Matrix) -> Bgra:
         matrix = to_centres(pose, m_per_px=self._ground.m_per_px)
-        if self._look.tilt_deg:
+        if self._appearance.tilt_deg:
             warped = cv2.warpPerspective(self._ground.bgra, matrix, self.size, borderMode=cv2.BORDER_REFLECT)
         else:
             warped = cv2.warpAffine(self._ground.bgra, matrix[:2], self.size, borderMode=cv2.BORDER_REFLECT)
@@ -122,10 +124,10 @@ class Scene:
     def _cast_shadows(
         self, frame: Bgra, chosen: npt.NDArray[np.int64], places: Floats, local: Floats
     ) -> None:
-        foot = self._cast.outlines_m[chosen] @ turns(places).transpose(0, 2, 1)
-        away = np.array(self._look.shadow_vector) * self._cast.heights_m[chosen, None]
-        shadows = project(np.concatenate([foot, foot + away[:, None]], axis=1), local)
-        darken(frame, shadows, strength=self._look.shadow_strength)
+        foot = self.cast.outlines_m[chosen] @ turns(places).transpose(0, 2, 1)
+        offset_m = np.array(self._appearance.shadow_vector) * self.cast.heights_m[chosen, None]
+        shadows = project(np.concatenate([foot, foot + offset_m[:, None]], axis=1), local)
+        darken(frame, shadows, strength=self._appearance.shadow_strength)
 
     def _draw_bodies(
         self,
@@ -137,11 +139,11 @@ class Scene:
         gains: npt.NDArray[np.float32],
     ) -> None:
         linear = local[:, :, :2] @ turns(places)
-        pixels = self._cast.outlines_m[chosen] @ linear.transpose(0, 2, 1) + local[:, None, :, 2]
+        pixels = self.cast.outlines_m[chosen] @ linear.transpose(0, 2, 1) + local[:, None, :, 2]
         boxes = bounds(pixels, size=self.size, margin_px=_MARGIN_PX).tolist()
         grains = 1 / np.sqrt(np.abs(np.linalg.det(linear)))
         for row, index in enumerate(chosen.tolist()):
-            picture, *grain = self._cast.sprites[index].level(float(grains[row]))
+            picture, *grain = self.cast.sprites[index].level(float(grains[row]))
             matrix = sprite_matrix(
                 linear[row], local[row, :, 2], shape=picture.shape, grain=(grain[0], grain[1])
             )
@@ -158,13 +160,13 @@ class Scene:
             linear = local[row, :, :2]
             picture, grain = grove.level(row, m_per_px=1 / float(np.sqrt(abs(np.linalg.det(linear)))))
             matrix = sprite_matrix(linear, local[row, :, 2], shape=picture.shape, grain=(grain, grain))
-            blend(frame, box, picture, matrix=matrix, gain=self._look.exposure)
+            blend(frame, box, picture, matrix=matrix, gain=self._appearance.exposure)
 
     def _visible(
         self, chosen: npt.NDArray[np.int64], places: Floats, local: Floats
     ) -> npt.NDArray[np.float32]:
         """(K,) share of each body in the frame and not under a crown, from a grid of points over it."""
-        half = np.abs(self._cast.outlines_m[chosen]).max(1) * 0.92
+        half = np.abs(self.cast.outlines_m[chosen]).max(1) * 0.92
         grid = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 9)), axis=-1).reshape(1, -1, 2)
         points = (grid * half[:, None]) @ turns(places).transpose(0, 2, 1)
         pixels = project(points, local)
@@ -174,7 +176,12 @@ class Scene:
 
 
 def _flight(
-    layout: Layout, look: Look, *, size: tuple[int, int], rng: np.random.Generator, duration_s: float
+    layout: Layout,
+    appearance: Appearance,
+    *,
+    size: tuple[int, int],
+    rng: np.random.Generator,
+    duration_s: float,
 ) -> Camera:
     """A pan along the main road past the crossing, eastwards or westwards."""
     reach = float(rng.uniform(46, 54))
@@ -182,4 +189,4 @@ def _flight(
     if rng.random() < 0.5:
         ends.reverse()
     first, second, third, fourth = (float(phase) for phase in rng.uniform(0, 6.28, 4))
-    return Camera(size, look, duration_s, ends[0], ends[1], (first, second, third, fourth))
+    return Camera(size, appearance, duration_s, ends[0], ends[1], (first, second, third, fourth))

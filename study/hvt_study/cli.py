@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import NoReturn
 
-from hvt_common.errors import UserError, exit_with_sentence
-from hvt_study.commands import COMMANDS
+from hvt_common.errors import UserError, exit_with_sentence, needs_extra
+from hvt_study.commands import COMMANDS, RENAMED
 
 __all__ = ["main"]
 
@@ -36,15 +37,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and words[0] in RENAMED:
+        now = RENAMED[words[0]]
+        print(f"{_PROGRAM}: {words[0]} is called {now} from this release on", file=sys.stderr)
+        words[0] = now
     parser = _Parser(prog=_PROGRAM, description="Experiments with the stages of HVT, without a network.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for name, command in COMMANDS.items():
-        own = commands.add_parser(
-            name,
-            help=command.SUMMARY,
-            description=command.SUMMARY,
-            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        )
-        command.add_arguments(own)
-    arguments = parser.parse_args(argv)
-    return COMMANDS[arguments.command].run(arguments)
+    with needs_extra("'hvt[study]'"):
+        for name, summary in COMMANDS.items():
+            own = commands.add_parser(
+                name,
+                help=summary,
+                description=summary,
+                formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+            )
+            if name in words[:1]:
+                command = import_module(f"hvt_study.commands.{name}")
+                command.add_arguments(own)
+        arguments = parser.parse_args(words)
+        return int(command.run(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

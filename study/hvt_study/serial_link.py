@@ -22,7 +22,7 @@ _SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class _Waiting(Generic[_T]):
+class _Queued(Generic[_T]):
     enter_ns: int
     number: int
     size_bytes: int = field(compare=False)
@@ -70,7 +70,7 @@ class SerialLink(Generic[_T]):
         if not rate_bps > 0:
             raise ValueError(f"rate_bps is {rate_bps}, must be above 0")
         self._byte_ns = 8 * _SECOND_NS / rate_bps
-        self._waiting: dict[bool, list[_Waiting[_T]]] = {True: [], False: []}
+        self._queued: dict[bool, list[_Queued[_T]]] = {True: [], False: []}
         self._under_way: deque[Arrival[_T]] = deque()
         self._free_ns = 0.0
         self._count = 0
@@ -81,7 +81,7 @@ class SerialLink(Generic[_T]):
         Messages may be put in another order than they enter, as long as none enters before a time that `arrived` was
         asked for already.
         """
-        insort(self._waiting[urgent], _Waiting(enter_ns, self._count, size_bytes, message))
+        insort(self._queued[urgent], _Queued(enter_ns, self._count, size_bytes, message))
         self._count += 1
 
     def arrived(self, now_ns: int | None) -> list[Arrival[_T]]:
@@ -97,12 +97,12 @@ class SerialLink(Generic[_T]):
         return there
 
     def _next_start_ns(self) -> float | None:
-        first_ns = min((queue[0].enter_ns for queue in self._waiting.values() if queue), default=None)
+        first_ns = min((queue[0].enter_ns for queue in self._queued.values() if queue), default=None)
         return None if first_ns is None else max(self._free_ns, first_ns)
 
     def _serve(self, start_ns: float) -> None:
-        urgent = bool(self._waiting[True]) and self._waiting[True][0].enter_ns <= start_ns
-        one = self._waiting[urgent].pop(0)
+        urgent = bool(self._queued[True]) and self._queued[True][0].enter_ns <= start_ns
+        one = self._queued[urgent].pop(0)
         self._free_ns = start_ns + one.size_bytes * self._byte_ns
         self._under_way.append(
             Arrival(one.message, one.size_bytes, urgent, one.enter_ns, round(self._free_ns))

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.errors import UserError, exit_with_sentence, needs_extra
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_common.inference.store import embedded_models
@@ -86,10 +86,8 @@ def _curve(arguments: argparse.Namespace) -> int:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    try:
+    with needs_extra("torch onnx"):
         from hvt_train.recipe import run_recipe  # noqa: PLC0415  # PyTorch is needed for this alone
-    except ModuleNotFoundError as error:
-        raise UserError(f"training needs the package {error.name}: pip install torch onnx") from None
     run_recipe(arguments)
     return 0
 
@@ -98,7 +96,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from hvt_train.report import print_drawn, print_real, print_speed  # noqa: PLC0415
 
     if not (arguments.drawn or arguments.real or arguments.speed):
-        raise UserError("eval was asked for nothing; give --drawn, --speed, or --real with --reference")
+        raise UserError("eval has nothing to do; give --drawn, --speed, or --real with --reference")
     if (arguments.real is None) != (arguments.reference is None):
         raise UserError(
             "--real and --reference belong together: a clip, and the model whose boxes count as true"

@@ -19,7 +19,7 @@ def draw_curve(log: Path, out: Path, *, title: str, quality: str) -> None:
     """Draw loss (left axis) and what the checks measured (right axis, 0…1) over the steps of a log.
 
     Args:
-        log: JSON lines of `hvt_train.loop.train`.
+        log: JSON lines of `hvt_train.learning.loop.train`.
         out: the SVG file.
         title: above the curve.
         quality: what the right axis shows.

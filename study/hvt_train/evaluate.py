@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from hvt_common.inference.detect import Detector, open_detector
 from hvt_common.values import Boxes, Detections, Image, View
-from hvt_scene.vehicles import CLASS_NAMES
-from hvt_train.places import Picture
-from hvt_train.pool import BASE_SIZE, HELD_OUT_SEED, Shot, coded, shoot
+from hvt_scene.drawing.vehicles import CLASS_NAMES
+from hvt_train.pictures.places import Picture
+from hvt_train.pictures.pool import BASE_SIZE, HELD_OUT_SEED, Shot, coded, shoot
 
 __all__ = [
     "CLEAN",
@@ -74,7 +74,7 @@ def drawn_pictures(
     pictures: dict[int, list[Picture]] = {bitrate_bps: [] for bitrate_bps in bitrates_bps}
     lossy = [bitrate_bps for bitrate_bps in bitrates_bps if bitrate_bps != CLEAN]
     for seed in seeds:
-        scene = shoot(HELD_OUT_SEED + seed, demo_look=seed % 2 == 0)
+        scene = shoot(HELD_OUT_SEED + seed, demo_appearance=seed % 2 == 0)
         for t_s in np.linspace(2.0, scene.duration_s - 1.0, moments):
             shot = Shot(scene, float(t_s))
             clean = shot.picture(BASE_SIZE)
@@ -118,14 +118,14 @@ def _matches(
     rows = found.class_ids == kind_found
     boxes, scores = found.boxes_xyxy_px[rows], found.confidences[rows]
     table = overlaps(boxes, wanted)
-    hits, keep = np.zeros(len(boxes), bool), np.ones(len(boxes), bool)
+    hits, counted = np.zeros(len(boxes), bool), np.ones(len(boxes), bool)
     for row in range(len(boxes)):
         best = int(table[row].argmax()) if len(wanted) else -1
         if best >= 0 and table[row, best] >= 0.5:
             hits[row], table[:, best] = True, 0
         elif len(ignored) and _inside_share(boxes[row], ignored).max() > 0.5:
-            keep[row] = False
-    return scores[keep], hits[keep], len(wanted)
+            counted[row] = False
+    return scores[counted], hits[counted], len(wanted)
 
 
 def _inside_share(box: npt.NDArray[np.float32], others: Boxes) -> npt.NDArray[np.float32]:
@@ -176,12 +176,12 @@ def _vehicles(detector: Detector, frame: Image) -> Boxes:
 
 def _one_each(boxes: Boxes) -> Boxes:
     """Drop what lies over a better box: to "vehicle or not", car and van on one spot are one vehicle."""
-    kept: list[int] = []
+    chosen: list[int] = []
     table = overlaps(boxes, boxes)
     for row in range(len(boxes)):
-        if not kept or table[row, kept].max() < 0.6:
-            kept.append(row)
-    return boxes[kept]
+        if not chosen or table[row, chosen].max() < 0.6:
+            chosen.append(row)
+    return boxes[chosen]
 
 
 def evaluate_real(detector: Detector, frames: Sequence[Image], truth: Sequence[Boxes]) -> RealResult:

@@ -18,15 +18,15 @@ from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
-from hvt_scene.vehicles import CLASS_NAMES
-from hvt_train.classifier import export_classifier, train_classifier
-from hvt_train.crops import CropSource, held_out_crops, pool_crops, scene_crops
+from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.evaluate import CLEAN, drawn_pictures, evaluate_drawn
-from hvt_train.export import metadata
-from hvt_train.loop import LoopSettings
-from hvt_train.pool import PoolPlan, fill_pool
-from hvt_train.train_detector import export_detector, train_detector
-from hvt_train.views import ViewSettings
+from hvt_train.learning.classifier import export_classifier, train_classifier
+from hvt_train.learning.export import metadata
+from hvt_train.learning.loop import LoopSettings
+from hvt_train.learning.train_detector import export_detector, train_detector
+from hvt_train.pictures.crops import CropSource, held_out_crops, pool_crops, scene_crops
+from hvt_train.pictures.pool import PoolPlan, fill_pool
+from hvt_train.pictures.views import ViewSettings
 
 __all__ = ["run_recipe"]
 

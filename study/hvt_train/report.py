@@ -11,7 +11,6 @@ from hvt_common.errors import UserError
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from hvt_train.crops import held_out_crops
 from hvt_train.evaluate import (
     CLEAN,
     clip_frames,
@@ -20,6 +19,7 @@ from hvt_train.evaluate import (
     evaluate_real,
     reference_vehicles,
 )
+from hvt_train.pictures.crops import held_out_crops
 
 __all__ = ["EVALUATION_FIRST", "print_drawn", "print_real", "print_speed"]
 

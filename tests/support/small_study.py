@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from hvt_scene import Scene
-from hvt_study.report.table_file import read_results
+from hvt_study.report.data.table_file import read_results
 from processes import eventually
 
 __all__ = [
+    "FRAMES",
     "PATIENT_S",
     "SIZE",
-    "TICKS",
     "arguments",
     "entries",
     "flights",
@@ -37,13 +37,13 @@ _MAIN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"  # a shell's background job ignores it
     "from hvt_study.cli import main; raise SystemExit(main())"
 )
-TICKS = 30
+FRAMES = 30
 _CATEGORIES = {"car": 4, "van": 5, "truck": 6, "bus": 9, "motor": 10, "pedestrian": 1}
 _CLOCKS = frozenset({"wall_s", "edge_cpu_ms"})
 """Columns that a second flight on another day fills in otherwise."""
 
 
-def write_scene(root: Path, *names: str, count: int = TICKS) -> str:
+def write_scene(root: Path, *names: str, count: int = FRAMES) -> str:
     """Sequences of the demo scene at 15 images a second, a seed each; the URI."""
     for seed, name in enumerate(names):
         _write_sequence(root, name, Scene(seed), count)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hvt_study.matrix.results import COLUMNS
-from hvt_study.report.document import Table
+from hvt_study.report.data.document import Table
+from hvt_study.runs.columns import COLUMNS
 
 EMPTY = {"text": "", "int": None, "real": None, "yes": None}
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, needs_extra
 from hvt_common.runtime.reporting import say
 from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
 from hvt_ground.pki.zenoh_files import KEYS_FOLDER, edge_file, ground_file, router_file
@@ -28,12 +28,8 @@ class _Parser(argparse.ArgumentParser):
 def run(argv: Sequence[str]) -> int:
     """Run ``hvt-ground keys …``; `UserError` where the user can mend something."""
     arguments = _parser().parse_args(argv)
-    try:  # only now: a ground that uses no keys needs no cryptography
+    with needs_extra("'hvt[ground]'"):  # only now: a ground that uses no keys needs no cryptography
         from hvt_ground.pki.authority import Authority  # noqa: PLC0415
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"the package {error.name!r} is missing: install HVT with its extra, 'hvt[ground]'"
-        ) from None
     folder: Path = arguments.dir
     if arguments.command == "new-ca":
         Authority.create(folder)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import TYPE_CHECKING
 
-from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import print_table
-from hvt_study.commands.study_arguments import (
+from hvt_study.commands.arguments import (
     add_accounting,
     add_plan_arguments,
     add_pool_arguments,
@@ -16,13 +14,10 @@ from hvt_study.commands.study_arguments import (
     open_sequences,
     study_plan,
 )
+from hvt_study.matrix.estimate import Estimate, estimate, time_of_a_frame
 
-if TYPE_CHECKING:
-    from hvt_study.matrix.estimate import Estimate
+__all__ = ["add_arguments", "hours_in_words", "run"]
 
-__all__ = ["SUMMARY", "add_arguments", "hours_in_words", "run"]
-
-SUMMARY = "Say how many runs, bytes and hours `hvt-study run` with the same arguments would take."
 _MANY_JOBS = 16
 
 
@@ -34,29 +29,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure a tick, count, print. Nothing is written."""
-    try:
-        from hvt_study.matrix.estimate import estimate, time_of_a_tick  # noqa: PLC0415 - other commands do without
-    except ImportError as error:
-        raise UserError(f"a study needs {error.name}: pip install 'hvt[study]'") from None
+    """Measure a frame, count, print. Nothing is written."""
     jobs = [jobs_of(arguments)] if hasattr(arguments, "jobs") else [1, os.cpu_count() or 1, _MANY_JOBS]
     sequences = open_sequences(arguments)
     plan = study_plan(arguments, sequences)
-    tick_s = time_of_a_tick(plan)
-    found = estimate(plan, tuple(sequence for _, sequence in sequences), tick_s=tick_s)
-    print_table("The study", _lines(found, tick_s=tick_s, jobs=tuple(dict.fromkeys(jobs))))
+    frame_s = time_of_a_frame(plan)
+    found = estimate(plan, tuple(sequence for _, sequence in sequences), frame_s=frame_s)
+    print_table("The study", _lines(found, frame_s=frame_s, jobs=tuple(dict.fromkeys(jobs))))
     return 0
 
 
-def _lines(found: Estimate, *, tick_s: float, jobs: tuple[int, ...]) -> list[tuple[str, str]]:
+def _lines(found: Estimate, *, frame_s: float, jobs: tuple[int, ...]) -> list[tuple[str, str]]:
     return [
         ("sequences", f"{found.sequences}"),
-        ("ticks, 15 a second", f"{found.ticks}"),
+        ("frames, 15 a second", f"{found.frames}"),
         ("runs", f"{found.runs}"),
         ("pictures and annotations", _bytes(found.source_bytes)),
         ("cache, up to about", _bytes(found.cache_bytes)),
         ("temporary files of each process", _bytes(found.scratch_bytes)),
-        ("one tick of a flight", f"{1e3 * tick_s:.0f} ms"),
+        ("one frame of a flight", f"{1e3 * frame_s:.0f} ms"),
         *(
             (f"hours with {many} process{'es' * (many > 1)}", hours_in_words(found.hours(many)))
             for many in jobs

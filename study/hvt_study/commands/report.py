@@ -7,13 +7,11 @@ from pathlib import Path
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import say
-from hvt_study.commands.study_arguments import add_accounting
+from hvt_study.commands.arguments import add_accounting
+from hvt_study.report.join import join_studies
+from hvt_study.report.write import write_report
 
-__all__ = ["SUMMARY", "add_arguments", "run"]
-
-SUMMARY = (
-    "Make report.html, report.md and figures again from a study's results.parquet, or of several joined."
-)
+__all__ = ["add_arguments", "run"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,11 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write them; say where."""
-    try:
-        from hvt_study.report.join import join_studies  # noqa: PLC0415 - the other commands do without
-        from hvt_study.report.write import write_report  # noqa: PLC0415
-    except ImportError as error:
-        raise UserError(f"the report needs {error.name}: pip install 'hvt[study]'") from None
     out: Path | None = getattr(arguments, "out", None)
     if out is not None:
         join_studies(arguments.folders, out)

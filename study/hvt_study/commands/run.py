@@ -1,17 +1,37 @@
-"""``hvt-study run``: every method at every budget on every sequence, at matched totals."""
+"""``hvt-study run``: every method at every budget on every sequence, at matched totals; table and report."""
 
 from __future__ import annotations
 
 import argparse
+import logging
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_study.commands.study_arguments import add_accounting, add_plan_arguments, add_pool_arguments
-
-__all__ = ["SUMMARY", "add_arguments", "run"]
-
-SUMMARY = (
-    "Fly every method at every budget on datasets, at matched totals; write results.parquet and a report."
+from hvt_common.runtime.reporting import say
+from hvt_study.commands.arguments import (
+    add_accounting,
+    add_plan_arguments,
+    add_pool_arguments,
+    make_out,
+    open_pool,
+    open_sequences,
+    study_plan,
 )
+from hvt_study.commands.progress import RunProgress
+from hvt_study.matrix.accounting import in_accounting
+from hvt_study.matrix.earlier import check_parameters, staying
+from hvt_study.matrix.plan import StudyPlan, first_runs
+from hvt_study.matrix.schedule import RunRow, in_order, run_all
+from hvt_study.report.data.table_file import RESULTS, read_results, write_results
+from hvt_study.report.example.choice import choose_run
+from hvt_study.report.example.fly_again import fly_again
+from hvt_study.report.example.store import load_example, save_example
+from hvt_study.report.write import write_report
+from hvt_study.runs.execute import run_spec
+
+__all__ = ["add_arguments", "run"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,9 +42,101 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run all, write the table and the report."""
+    """Run all, and write the table and the report; the table also where something ends the study.
+
+    Rows of an earlier table in ``--out`` stay, behind those of this study: of methods, budgets, sequences or
+    conditions that this study does not have, and of runs that it was not given the time to do. What it did itself
+    takes the place of what was there. A table that cannot be read (an older version wrote it) is set aside.
+
+    Raises:
+        UserError: what was asked for cannot be done, an earlier table has the same methods with other parameters, or
+            every run failed.
+    """
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    plan = study_plan(arguments, open_sequences(arguments))
+    table = make_out(arguments.out, name=RESULTS)
+    earlier = _earlier(table)
+    check_parameters(plan, earlier, out=arguments.out)
+    rows = _flown(plan, arguments, table, earlier)
+    others = staying(rows, earlier)
+    _write([*rows, *others], arguments, table)
+    _add_example(rows, plan, arguments.out)
+    write_report(arguments.out)
+    failed = [row for row in rows if row["failed"]]
+    if len(failed) == len(rows):
+        raise UserError(f"every run failed, the first: {_failure(failed[0])}")
+    say(f"{len(rows)} runs, {len(failed)} failed: {arguments.out / 'report.html'}")
+    if others:
+        say(f"{len(others)} runs of earlier studies stay beside them: for these alone name another --out")
+    return 0
+
+
+def _earlier(table: Path) -> list[RunRow]:
+    if not table.exists():
+        return []
     try:
-        from hvt_study.commands.run_study import run_study  # noqa: PLC0415 - the other commands do without
-    except ImportError as error:
-        raise UserError(f"a study needs {error.name}: pip install 'hvt[study]'") from None
-    return run_study(arguments)
+        return read_results(table)
+    except UserError as error:
+        aside = table.with_name(f"earlier-{table.name}")
+        try:
+            table.replace(aside)
+        except OSError as why:
+            raise UserError(f"{table} cannot be moved ({why.strerror}): name another --out") from None
+        say(f"{error}; it is {aside.name} from now on")
+        return []
+
+
+def _write(rows: list[RunRow], arguments: argparse.Namespace, table: Path) -> None:
+    write_results(in_accounting(rows, arguments.accounting), table)
+
+
+def _flown(
+    plan: StudyPlan, arguments: argparse.Namespace, table: Path, earlier: list[RunRow]
+) -> list[RunRow]:
+    done: list[RunRow] = []
+    pool, at_once = open_pool(arguments)
+    progress = RunProgress("runs")
+
+    def on_row(row: RunRow, count: int, of: int) -> None:
+        done.append(row)
+        if row["failed"]:
+            progress.note(_failure(row))
+        progress.update(count, of, failed=sum(bool(one["failed"]) for one in done))
+
+    try:
+        with progress, pool as workers:
+            # Workers may have been started elsewhere.
+            fly = partial(run_spec, cache=plan.cache, folder=Path.cwd())
+            return run_all(plan, pool=workers, run=fly, at_once=at_once, on_row=on_row)
+    except BaseException:
+        if done:
+            with suppress(UserError):  # what ended the study is what is said
+                others = staying(done, earlier)
+                _write([*in_order(plan, done), *others], arguments, table)
+                beside = f", and {len(others)} of before" if others else ""
+                progress.note(
+                    f"{len(done)} finished runs are in {table}{beside}; the same command goes on from there"
+                )
+        raise
+
+
+def _failure(row: RunRow) -> str:
+    matching = (
+        f" at the bits of {row['matched_to']} {row['matched_codec']}".rstrip() if row["matched_to"] else ""
+    )
+    method = f"{row['method']} {row['still_codec']}".rstrip()
+    return f"{method}{matching} on {row['sequence']}, {row['regime']}, failed: {row['failed']}"
+
+
+def _add_example(rows: list[RunRow], plan: StudyPlan, folder: Path) -> None:
+    """The report shows one flight in pictures; it is flown again for them."""
+    choice = choose_run(rows)
+    if choice is None:
+        return
+    digest = next(row["digest"] for row in rows if row["key"] == choice.key)
+    known = None
+    with suppress(UserError):  # one that was cut off is made again
+        known = load_example(folder)
+    if known is None or (known.key, known.digest, known.rule) != (choice.key, digest, choice.rule):
+        spec = next(one for one in first_runs(plan) if one.key == choice.key)
+        save_example(folder, fly_again(spec, plan, rule=choice.rule))

@@ -11,11 +11,9 @@ from rich.table import Table
 
 from hvt_common.units import parse_size
 from hvt_scene import Scene
-from hvt_study.score import Score, read_tracks, read_truth, score
+from hvt_study.metrics.track_table_score import Score, read_tracks, read_truth, score
 
-__all__ = ["SUMMARY", "add_arguments", "run"]
-
-SUMMARY = "Score the tracks of hvt-ground --tracks against ground truth."
+__all__ = ["add_arguments", "run"]
 
 
 _ROWS = (

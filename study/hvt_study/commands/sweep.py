@@ -17,9 +17,9 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.units import parse_size
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.video import VideoSource
-from hvt_study.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
+from hvt_study.matrix.sweep import COLUMNS, RawDetections, SweepRow, detect_clip, read_csv, sweep
 
-__all__ = ["SUMMARY", "add_arguments", "run"]
+__all__ = ["add_arguments", "run"]
 
 _ANY_SIZE = (64, 64)  # of base frames, which the sweep does not look at
 
@@ -27,8 +27,6 @@ _USUAL = {"detect_every": 5, "confidence": 0.25, "nms_iou": 0.45}
 """Of a clip."""
 _OF_A_CLIP = ("detector", *_USUAL)
 _OF_A_TABLE = ("size",)
-
-SUMMARY = "Apply the pilot's four selectors to raw detections and print what each keeps."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

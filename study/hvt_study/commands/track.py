@@ -11,11 +11,9 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_study.mot_files import LAST_FRAME, detections_by_frame, read_mot, rows_of_tracks, write_mot
+from hvt_study.datasets.mot_files import LAST_FRAME, detections_by_frame, read_mot, rows_of_tracks, write_mot
 
-__all__ = ["SUMMARY", "add_arguments", "run"]
-
-SUMMARY = "Run ByteTrack over a MOTChallenge file of detections."
+__all__ = ["add_arguments", "run"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

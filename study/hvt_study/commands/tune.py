@@ -5,15 +5,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.reporting import write_json
-from hvt_study.commands.run_progress import RunProgress
-from hvt_study.commands.study_arguments import (
+from hvt_study.commands.arguments import (
     add_plan_arguments,
     add_pool_arguments,
     make_out,
@@ -21,13 +19,11 @@ from hvt_study.commands.study_arguments import (
     open_sequences,
     study_plan,
 )
+from hvt_study.commands.progress import RunProgress
+from hvt_study.matrix.tune import Tuned, split, tunable, tune
 
-if TYPE_CHECKING:
-    from hvt_study.matrix.tune import Tuned
+__all__ = ["add_arguments", "run"]
 
-__all__ = ["SUMMARY", "add_arguments", "run"]
-
-SUMMARY = "Search for a method's parameters on some sequences; report what they are worth on others."
 _MOST_TRIALS = 100_000
 _HIGHEST_SEED = 2**32 - 1
 
@@ -49,10 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Search, print, write tune.json."""
-    try:
-        from hvt_study.matrix.tune import split, tunable, tune  # noqa: PLC0415 - Optuna is an extra
-    except ImportError as error:
-        raise UserError(f"tuning needs {error.name}: pip install 'hvt[study]'") from None
     if not 1 <= arguments.trials <= _MOST_TRIALS:
         raise UserError(
             f"--trials {arguments.trials} is not accepted: give a whole number from 1 to {_MOST_TRIALS}"

@@ -1,1 +1,1 @@
-"""Datasets by URI: pictures that a flight can play, and what is really in them; one layout a file."""
+"""What a dataset is: `Sequence`, `Clip`, `FrameLabels`, `ClassMap`, `reference_labels`; `layouts` opens them."""

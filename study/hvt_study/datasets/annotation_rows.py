@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_study.mot_files import LAST_FRAME
+from hvt_study.datasets.mot_files import LAST_FRAME
 
 __all__ = ["Rows", "read_rows"]
 

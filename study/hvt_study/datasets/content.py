@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hvt_edge.source.folder import sequence_files
-from hvt_study.datasets.contract import Sequence
+from hvt_study.datasets.sequence import Sequence
 
 __all__ = ["content_hash"]
 

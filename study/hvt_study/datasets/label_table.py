@@ -43,8 +43,6 @@ class LabelTable:
     """Index into ``class_names``."""
     class_names: tuple[str, ...]
     ignored: Regions
-    occlusion: npt.NDArray[np.int8] | None = None
-    truncation: npt.NDArray[np.int8] | None = None
 
     @classmethod
     def of(
@@ -57,13 +55,11 @@ class LabelTable:
         class_names: tuple[str, ...],
         ignored: Regions,
         size: tuple[int, int],
-        occlusion: npt.NDArray[np.int8] | None = None,
-        truncation: npt.NDArray[np.int8] | None = None,
     ) -> LabelTable:
         """From rows in any order: boxes are cut at the frame of this (width, height), empty ones left out."""
         boxes, regions = inside_frame(boxes, size), inside_frame(ignored.boxes, size)
-        rows = _kept(frames, boxes)
-        places = _kept(ignored.frames, regions)
+        rows = _rows_with_area(frames, boxes)
+        places = _rows_with_area(ignored.frames, regions)
         return cls(
             frames=frames[rows],
             boxes=boxes[rows],
@@ -71,8 +67,6 @@ class LabelTable:
             class_ids=class_ids[rows],
             class_names=class_names,
             ignored=Regions(ignored.frames[places], regions[places], ignored.land[places]),
-            occlusion=None if occlusion is None else occlusion[rows],
-            truncation=None if truncation is None else truncation[rows],
         )
 
     @property
@@ -100,8 +94,6 @@ class LabelTable:
             class_names=tuple(self.class_names[kind] for kind in self.class_ids[rows].tolist()),
             ignored_xyxy_px=regions[land],
             beside_xyxy_px=regions[~land],
-            occlusion=None if self.occlusion is None else self.occlusion[rows],
-            truncation=None if self.truncation is None else self.truncation[rows],
         )
 
 
@@ -144,7 +136,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
     return status.st_mtime_ns, status.st_size
 
 
-def _kept(frames: npt.NDArray[np.int64], boxes: Boxes) -> npt.NDArray[np.intp]:
+def _rows_with_area(frames: npt.NDArray[np.int64], boxes: Boxes) -> npt.NDArray[np.intp]:
     """Rows whose boxes have an area, by frame and then as in the file."""
     order = np.argsort(frames, kind="stable")
     sides = boxes[order, 2:] - boxes[order, :2]

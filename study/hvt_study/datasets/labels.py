@@ -9,12 +9,10 @@ import numpy.typing as npt
 
 from hvt_common.values import Boxes
 
-__all__ = ["NO_ID", "UNKNOWN", "FrameLabels", "covered_share", "inside_frame", "no_boxes"]
+__all__ = ["NO_ID", "FrameLabels", "covered_share", "inside_frame", "no_boxes"]
 
 NO_ID = -1
 """Of an object whose dataset knows no identities."""
-UNKNOWN = -1
-"""Occlusion or truncation of which the dataset says nothing."""
 
 
 def no_boxes() -> Boxes:
@@ -35,12 +33,8 @@ class FrameLabels:
     ignored_xyxy_px: Boxes = field(default_factory=no_boxes)
     """(M, 4) float32: regions in which nothing counts, neither for nor against."""
     beside_xyxy_px: Boxes = field(default_factory=no_boxes)
-    """(P, 4) float32: single objects that are not asked for. Boxes on them count neither for nor against; labels in
+    """(P, 4) float32: single objects that are not judged. Boxes on them count neither for nor against; labels in
     front of them are labels."""
-    occlusion: npt.NDArray[np.int8] | None = None
-    """(N,) 0 none, 1 partly, 2 heavily hidden, `UNKNOWN`; None where the dataset never says."""
-    truncation: npt.NDArray[np.int8] | None = None
-    """(N,) 0 wholly inside the frame, 1 partly outside, `UNKNOWN`; None where the dataset never says."""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -65,7 +59,7 @@ def covered_share(boxes: Boxes, regions: Boxes) -> npt.NDArray[np.float64]:
 
 
 def inside_frame(boxes: Boxes, size: tuple[int, int]) -> Boxes:
-    """The boxes cut at the edges of a frame of this (width, height)."""
+    """The boxes cropped at the edges of a frame of this (width, height)."""
     return np.asarray(np.clip(boxes, 0, np.array([*size, *size], np.float32)), np.float32)
 
 

@@ -7,29 +7,25 @@ that a run that was killed does not ask twice.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.errors import UserError
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import MOTION, Detector
+from hvt_common.inference.detect import Detector
 from hvt_common.inference.labels import first_synonym
-from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_common.values import Boxes, Image
 from hvt_edge.perception.crop import PADDING, crop_box
 from hvt_edge.source.resample import Resizer
-from hvt_study.cached_detector import CachedDetector
-from hvt_study.datasets.contract import Sequence
 from hvt_study.datasets.labels import NO_ID, FrameLabels, inside_frame
+from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["CONFIDENCE", "ReferenceLabels", "open_reference_detector", "reference_labels", "with_labels"]
+__all__ = ["CONFIDENCE", "ReferenceLabels", "reference_labels", "with_labels"]
 
 CONFIDENCE = 0.25
 """From which a detection is a label."""
@@ -37,14 +33,14 @@ CONFIDENCE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class ReferenceLabels:
-    """Labels of those source frames that ticks show. Small, and it can be sent to another process."""
+    """Labels of those source frames that frames show. Small, and it can be sent to another process."""
 
     frames: Mapping[int, FrameLabels]
     class_set: tuple[str, ...]
     """All that the model can say, sorted."""
 
     def __call__(self, index: int) -> FrameLabels:
-        """Of a source frame that a tick shows."""
+        """Of a source frame that a frame shows."""
         return self.frames[index]
 
     def pack(self) -> dict[str, Any]:
@@ -68,47 +64,33 @@ class ReferenceLabels:
         )
 
 
-def open_reference_detector(spec: str, *, provider: str, folder: Path) -> CachedDetector:
-    """The network that ``spec`` names, with its memory in ``folder``; it shares answers with the flights' own.
-
-    Raises:
-        UserError: no such model; or the motion detector, which knows no single frames.
-    """
-    if spec == MOTION:
-        raise UserError(f"reference labels cannot come from {MOTION!r}: give a detection network")
-    return CachedDetector(spec, confidence=weak_confidence(CONFIDENCE), provider=provider, folder=folder)
-
-
 def reference_labels(
     sequence: Sequence,
     *,
     detector: Detector,
     classifier: Classifier | None = None,
     size: tuple[int, int] | None = None,
-    ticks: range | None = None,
-    on_tick: Callable[[int], None] = lambda _: None,
+    frames: range | None = None,
 ) -> ReferenceLabels:
-    """Label the frames that ticks show, one at a time.
+    """Label the source frames that the clip shows, one at a time.
 
     Args:
         sequence: its own labels are not looked at.
         detector: speaks of boxes and classes; its answers below `CONFIDENCE` are passed over.
         classifier: names each box anew, by its crop with the margin of stills.
         size: (width, height) to which frames are brought for the detector; None: as they are.
-        ticks: which of them, with step 1; None: all that the sequence plays.
-        on_tick: called with each when it is done.
+        frames: which of them, with step 1; None: all that the sequence plays.
     """
-    chosen = range(sequence.ticks) if ticks is None else ticks
+    chosen = range(sequence.clip_frames) if frames is None else frames
     resizer = None if size is None else Resizer(sequence.source_size, size, fit="letterbox")
-    frames: dict[int, FrameLabels] = {}
+    found: dict[int, FrameLabels] = {}
     with closing(sequence.clip.images()) as images:
-        for tick, image in zip(chosen, islice(images, chosen.start, chosen.stop), strict=False):
-            index = sequence.frame_at_tick(tick)
-            if index not in frames:
-                frames[index] = _label(np.asarray(image), detector, classifier, resizer)
-            on_tick(tick)
+        for frame_index, image in zip(chosen, islice(images, chosen.start, chosen.stop), strict=False):
+            index = sequence.source_frame(frame_index)
+            if index not in found:
+                found[index] = _label(np.asarray(image), detector, classifier, resizer)
     model = detector if classifier is None else classifier
-    return ReferenceLabels(frames, tuple(sorted({first_synonym(name) for name in model.class_names})))
+    return ReferenceLabels(found, tuple(sorted({first_synonym(name) for name in model.class_names})))
 
 
 def with_labels(sequence: Sequence, labels: ReferenceLabels) -> Sequence:

@@ -39,10 +39,6 @@ class VisDroneRows:
     """(N,) True for an object that is asked for; the others are regions and objects to be passed over."""
     land: npt.NDArray[np.bool_]
     """(N,) True for a region whose objects nobody has labelled."""
-    truncation: npt.NDArray[np.int8]
-    """(N,) 0 none, 1 partly; -1 unknown."""
-    occlusion: npt.NDArray[np.int8]
-    """(N,) 0 none, 1 partly, 2 heavily; -1 unknown."""
 
 
 def read_image_rows(path: Path) -> VisDroneRows:
@@ -61,15 +57,13 @@ def _meant(rows: Rows) -> VisDroneRows:
     rows.check(
         known, accepted=f"a category from 0 to {_OTHERS} in column {rows.columns.index('category') + 1}"
     )
-    asked = (category >= 1) & (category <= len(VISDRONE_NAMES)) & (rows["score"] != 0)
+    judged = (category >= 1) & (category <= len(VISDRONE_NAMES)) & (rows["score"] != 0)
     frames = rows["frame"] if "frame" in rows.columns else np.zeros(len(rows))
     return VisDroneRows(
         frames=frames.astype(np.int64),
         ids=rows["id"].astype(np.int64),
         boxes=rows.boxes(),
         categories=category.astype(np.int64),
-        counts=asked,
+        counts=judged,
         land=category == _REGION,
-        truncation=np.clip(rows["truncation"], -1, 1).astype(np.int8),
-        occlusion=np.clip(rows["occlusion"], -1, 2).astype(np.int8),
     )

@@ -1,1 +1,1 @@
-"""The matrix of the study: every method at every budget on every sequence, at matched totals, one row a run."""
+"""Which runs a study takes, and where they are done: `StudyPlan`, `run_all`, `compare`, `estimate`, `tune`."""

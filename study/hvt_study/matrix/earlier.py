@@ -13,19 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import UserError
+from hvt_study.cache.results import content_key
 from hvt_study.matrix.accounting import in_accounting
-from hvt_study.matrix.cache import content_key
 from hvt_study.matrix.plan import StudyPlan
 
 __all__ = ["check_parameters", "staying"]
 
-Row = Mapping[str, Any]
-_CONDITIONS = ("dataset", "sequence", "regime", "budget_bps", "labels", "size", "max_ticks", "detect_every")
+RunRow = Mapping[str, Any]
+_CONDITIONS = ("dataset", "sequence", "regime", "budget_bps", "labels", "size", "max_frames", "detect_every")
 _SAME_TOTAL = 1e-4
 """Of a total: rates that come back from another accounting are rounded."""
 
 
-def staying(done: Iterable[Row], earlier: Iterable[Row]) -> list[dict[str, Any]]:
+def staying(done: Iterable[RunRow], earlier: Iterable[RunRow]) -> list[dict[str, Any]]:
     """Which earlier rows belong beside those that were done now, in their order, rates by the processed span.
 
     Not those of which there is a newer one, whatever its parameters and whatever ran its networks; and no video at
@@ -41,7 +41,7 @@ def staying(done: Iterable[Row], earlier: Iterable[Row]) -> list[dict[str, Any]]
     ]
 
 
-def check_parameters(plan: StudyPlan, earlier: Iterable[Row], *, out: Path) -> None:
+def check_parameters(plan: StudyPlan, earlier: Iterable[RunRow], *, out: Path) -> None:
     """`UserError` where a table holds runs of a method of this study with other parameters: no report takes both."""
     tunes = {method.name: list((plan.tune or {}).get(method.name, ())) for method in plan.methods}
     for row in earlier:
@@ -55,7 +55,7 @@ def check_parameters(plan: StudyPlan, earlier: Iterable[Row], *, out: Path) -> N
         )
 
 
-def _run(row: Row) -> Mapping[str, Any]:
+def _run(row: RunRow) -> Mapping[str, Any]:
     try:
         run = json.loads(row["config"])["run"]
     except (ValueError, KeyError, TypeError):  # no row of ours
@@ -63,7 +63,7 @@ def _run(row: Row) -> Mapping[str, Any]:
     return run if isinstance(run, Mapping) else {}
 
 
-def _up_to_date(row: Row, totals: Mapping[str, int | None]) -> bool:
+def _up_to_date(row: RunRow, totals: Mapping[str, int | None]) -> bool:
     if not row["matched_to"] or _place(row) not in totals:
         return True
     total, target = totals[_place(row)], row["target_bps"]
@@ -72,7 +72,7 @@ def _up_to_date(row: Row, totals: Mapping[str, int | None]) -> bool:
     return math.isclose(target, total, rel_tol=_SAME_TOTAL)
 
 
-def _place(row: Row) -> str:
+def _place(row: RunRow) -> str:
     """Names a run that decides what it spends, by what it is and not by how: those that match its total share it."""
     run = _run(row)
     if not run:

@@ -1,4 +1,4 @@
-"""What a study will take, before it is begun: runs, bytes, hours. The time of a tick is measured, not assumed."""
+"""What a study will take, before it is begun: runs, bytes, hours. The time of a frame is measured, not assumed."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hvt_common.errors import UserError
-from hvt_study.compare_clip import staged_bytes
-from hvt_study.datasets.contract import Sequence
-from hvt_study.matrix.execute import run_spec
-from hvt_study.matrix.methods import METHODS, Kind, MatrixMethod
+from hvt_study.datasets.clip import staged_bytes
+from hvt_study.datasets.sequence import Sequence
 from hvt_study.matrix.plan import StudyPlan, first_runs
-from hvt_study.matrix.run_context import open_run_context
+from hvt_study.runs.execute import run_spec
+from hvt_study.runs.methods import METHODS, Kind, Method
+from hvt_study.runs.run_context import open_run_context
 
-__all__ = ["Estimate", "estimate", "time_of_a_tick"]
+__all__ = ["Estimate", "estimate", "time_of_a_frame"]
 
-_TRIAL_TICKS = 30
+_TRIAL_FRAMES = 30
 _USUAL_WEIGHTS = 2.2
 """Times that video is coded without a ground until its total is right; measured on drone_carpark and the demo."""
 _WEIGHT_SHARE = 0.5
@@ -32,7 +32,7 @@ class Estimate:
     """Of a whole study."""
 
     sequences: int
-    ticks: int
+    frames: int
     """Of all sequences."""
     runs: int
     """Rows of results.parquet; where methods spend the same, several rows share one flight, and it takes less."""
@@ -49,9 +49,9 @@ class Estimate:
         return self.cpu_s / jobs / 3600
 
 
-def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, tick_s: float) -> Estimate:
-    """Count what `hvt_study.matrix.schedule.run_all` would do; ``tick_s`` is what a flight takes for a tick."""
-    ticks = sum(one.cut(plan.max_ticks).ticks for one in sequences)
+def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, frame_s: float) -> Estimate:
+    """Count what `hvt_study.matrix.schedule.run_all` would do; ``frame_s`` is what a flight takes for a frame."""
+    frames = sum(one.limited(plan.max_frames).clip_frames for one in sequences)
     video = [method for method in plan.methods if method.kind is Kind.VIDEO]
     each = len(plan.regimes) * len(plan.models)
     others = [method for method in plan.methods if method.kind is not Kind.VIDEO]
@@ -60,44 +60,43 @@ def estimate(plan: StudyPlan, sequences: tuple[Sequence, ...], *, tick_s: float)
     matched = hybrids * sum(_flights(one) for one in video)
     labelled = plan.labels == "reference"
     flights = at_budget + matched * (1 + _USUAL_WEIGHTS * _WEIGHT_SHARE) + labelled * len(plan.models)
-    looks = (at_budget + matched) / plan.detect_every + labelled * len(plan.models)
+    detections = (at_budget + matched) / plan.detect_every + labelled * len(plan.models)
     runs = len(sequences) * (hybrids + each * len(video) + hybrids * len(video))
     return Estimate(
         sequences=len(sequences),
-        ticks=ticks,
+        frames=frames,
         runs=runs,
         source_bytes=sum(_size(path) for one in sequences for path in one.files),
-        cache_bytes=runs * _ROW_BYTES + round(ticks * looks * _DETECTION_BYTES),
-        scratch_bytes=max(staged_bytes(one.cut(plan.max_ticks).clip) for one in sequences),
-        cpu_s=ticks * flights * tick_s,
+        cache_bytes=runs * _ROW_BYTES + round(frames * detections * _DETECTION_BYTES),
+        scratch_bytes=max(staged_bytes(one.limited(plan.max_frames).clip) for one in sequences),
+        cpu_s=frames * flights * frame_s,
     )
 
 
-def time_of_a_tick(plan: StudyPlan) -> float:
-    """Fly the first hybrid of the plan (or the first method) for two seconds, and return what a tick took.
+def time_of_a_frame(plan: StudyPlan) -> float:
+    """Fly the first hybrid of the plan (or the first method) for two seconds, and return what a frame took.
 
     Raises:
         UserError: the first sequence or a model cannot be used, or the edge does not take the settings.
     """
     specs = list(first_runs(replace(plan, sequences=plan.sequences[:1])))
     spec = next((one for one in specs if METHODS[one.method].kind is Kind.HYBRID), specs[0])
-    spec = replace(spec, max_ticks=_TRIAL_TICKS)
+    spec = replace(spec, max_frames=_TRIAL_FRAMES)
     with TemporaryDirectory(prefix="hvt-study-") as folder:
-        trial = replace(plan, cache=Path(folder))
-        shop = open_run_context(spec, cache=trial.cache)  # what is done once for all runs over a sequence
+        context = open_run_context(spec, cache=Path(folder))  # what is done once for all runs over a sequence
         began_s = time.monotonic()
-        row = run_spec(spec, trial)
+        row = run_spec(spec, cache=Path(folder))
         took_s = time.monotonic() - began_s
     if row["failed"]:
         raise UserError(f"{spec.method} at {spec.regime} cannot be flown: {row['failed']}")
-    return took_s / shop.sequence.ticks
+    return took_s / context.sequence.clip_frames
 
 
-def _variants(method: MatrixMethod, plan: StudyPlan) -> int:
+def _variants(method: Method, plan: StudyPlan) -> int:
     return len(plan.still_codecs) if method.sends_stills else 1
 
 
-def _flights(method: MatrixMethod) -> int:
+def _flights(method: Method) -> int:
     return max(1, len(method.fps_choices))
 
 

@@ -10,10 +10,10 @@ from typing import Any, Literal
 from hvt_common.errors import UserError
 from hvt_common.units import parse_bitrate
 from hvt_edge.config import REGIMES
-from hvt_study.matrix.methods import METHODS, Kind, MatrixMethod
-from hvt_study.matrix.spec import ModelChoice, RunSpec, Target
+from hvt_study.runs.methods import METHODS, Kind, Method
+from hvt_study.runs.spec import ModelChoice, RunSpec, Target
 
-__all__ = ["Regime", "StudyPlan", "first_runs", "following_runs", "parse_regimes"]
+__all__ = ["Regime", "StudyPlan", "first_runs", "matched_runs", "parse_regimes", "spec_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +30,14 @@ class StudyPlan:
 
     sequences: tuple[tuple[str, str], ...]
     """(URI of the dataset, name of the sequence)."""
-    methods: tuple[MatrixMethod, ...]
+    methods: tuple[Method, ...]
     regimes: tuple[Regime, ...]
     still_codecs: tuple[str, ...]
     models: tuple[ModelChoice, ...]
     labels: Literal["annotations", "reference"]
     cache: Path
     size: tuple[int, int] = (1280, 720)
-    max_ticks: int | None = None
+    max_frames: int | None = None
     detect_every: int = 5
     tune: Mapping[str, tuple[str, ...]] | None = None
     """Parameters by method."""
@@ -70,10 +70,10 @@ def first_runs(plan: StudyPlan) -> Iterator[RunSpec]:
             for regime in plan.regimes:
                 for method in plan.methods:
                     for codec in plan.still_codecs if method.sends_stills else ("",):
-                        yield _spec(plan, dataset, sequence, method, regime, models, codec)
+                        yield spec_of(plan, dataset, sequence, method, regime, models, codec)
 
 
-def following_runs(plan: StudyPlan, spec: RunSpec, row: Mapping[str, Any]) -> Iterator[RunSpec]:
+def matched_runs(plan: StudyPlan, spec: RunSpec, row: Mapping[str, Any]) -> Iterator[RunSpec]:
     """Video at the total that this run really spent; nothing for a run that failed, or is video itself."""
     if METHODS[spec.method].kind is Kind.VIDEO or row["failed"] or not row["total_bps"]:
         return
@@ -81,19 +81,20 @@ def following_runs(plan: StudyPlan, spec: RunSpec, row: Mapping[str, Any]) -> It
     for method in plan.methods:
         if method.kind is Kind.VIDEO:
             regime = Regime(spec.regime, spec.budget_bps)
-            yield _spec(plan, spec.dataset, spec.sequence, method, regime, spec.models, "", target)
+            yield spec_of(plan, spec.dataset, spec.sequence, method, regime, spec.models, "", target)
 
 
-def _spec(
+def spec_of(
     plan: StudyPlan,
     dataset: str,
     sequence: str,
-    method: MatrixMethod,
+    method: Method,
     regime: Regime,
     models: ModelChoice,
     codec: str,
     target: Target | None = None,
 ) -> RunSpec:
+    """One run of the plan."""
     return RunSpec(
         dataset=dataset,
         sequence=sequence,
@@ -104,7 +105,7 @@ def _spec(
         still_codec=codec,
         labels=plan.labels,
         size=plan.size,
-        max_ticks=plan.max_ticks,
+        max_frames=plan.max_frames,
         detect_every=plan.detect_every,
         target=target,
         tune=(plan.tune or {}).get(method.name, ()),

@@ -11,20 +11,20 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any, Protocol
 
-from hvt_study.matrix.match import grid_target
-from hvt_study.matrix.methods import METHODS, Kind
-from hvt_study.matrix.plan import StudyPlan, first_runs, following_runs
-from hvt_study.matrix.spec import RunSpec
+from hvt_study.matrix.plan import StudyPlan, first_runs, matched_runs
+from hvt_study.runs.match_total import grid_target
+from hvt_study.runs.methods import METHODS, Kind
+from hvt_study.runs.spec import RunSpec
 
-__all__ = ["Pool", "Row", "in_order", "run_all"]
+__all__ = ["Pool", "RunRow", "in_order", "run_all"]
 
-Row = dict[str, Any]
+RunRow = dict[str, Any]
 
 
 class Pool(Protocol):
     """Where runs are done."""
 
-    def submit(self, fn: Callable[..., Row], /, *arguments: Any) -> Future[Row]:
+    def submit(self, fn: Callable[..., RunRow], /, *arguments: Any) -> Future[RunRow]:
         """Do this some time."""
         ...
 
@@ -33,24 +33,24 @@ def run_all(
     plan: StudyPlan,
     *,
     pool: Pool,
-    run: Callable[[RunSpec, StudyPlan], Row],
+    run: Callable[[RunSpec], RunRow],
     at_once: int,
-    on_row: Callable[[Row, int, int], None] = lambda *_: None,
-) -> list[Row]:
+    on_row: Callable[[RunRow, int, int], None] = lambda *_: None,
+) -> list[RunRow]:
     """Run everything; return the rows in the order of the plan (`in_order`).
 
-    ``run(spec, plan)`` is done in the pool. ``on_row(row, done, of)`` is called for each finished run; ``of`` sinks
+    ``run(spec)`` is done in the pool. ``on_row(row, done, of)`` is called for each finished run; ``of`` sinks
     where a run has failed that others were to match. No more than ``at_once`` runs are handed to the pool at a time:
     what follows from a finished run goes before what has not begun, so that a sequence's pictures are looked at while
     they are warm.
     """
     agenda = _Agenda(plan)
-    rows: list[Row] = []
-    running: dict[Future[Row], RunSpec] = {}
+    rows: list[RunRow] = []
+    running: dict[Future[RunRow], RunSpec] = {}
     try:
         while agenda or running:
             for spec in agenda.take(at_once - len(running)):
-                running[pool.submit(run, spec, plan)] = spec
+                running[pool.submit(run, spec)] = spec
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 spec = running.pop(future)
@@ -63,16 +63,16 @@ def run_all(
     return in_order(plan, rows)
 
 
-def in_order(plan: StudyPlan, rows: Iterable[Row]) -> list[Row]:
+def in_order(plan: StudyPlan, rows: Iterable[RunRow]) -> list[RunRow]:
     """Rows of a study, finished or not, in the order of its plan: those that match a run's total behind that run."""
-    waiting = {row["key"]: row for row in rows}
-    order: list[Row] = []
+    pending = {row["key"]: row for row in rows}
+    order: list[RunRow] = []
     for spec in first_runs(plan):
-        first = waiting.pop(spec.key, None)
+        first = pending.pop(spec.key, None)
         if first is None:
             continue
-        following = (waiting.pop(one.key, None) for one in following_runs(plan, spec, first))
-        order += [first, *(row for row in following if row is not None)]
+        matched = (pending.pop(one.key, None) for one in matched_runs(plan, spec, first))
+        order += [first, *(row for row in matched if row is not None)]
     return order
 
 
@@ -82,17 +82,17 @@ class _Agenda:
     def __init__(self, plan: StudyPlan) -> None:
         self._plan = plan
         self._first: deque[RunSpec] = deque(first_runs(plan))
-        self._following: deque[RunSpec] = deque()
+        self._matched: deque[RunSpec] = deque()
         self._busy: set[tuple[object, ...]] = set()
         self._video = sum(method.kind is Kind.VIDEO for method in plan.methods)
         self.total = sum(1 + self._expected(spec) for spec in self._first)
 
     def __bool__(self) -> bool:
-        return bool(self._first or self._following)
+        return bool(self._first or self._matched)
 
     def take(self, count: int) -> Iterator[RunSpec]:
         """Up to so many that may be begun now."""
-        for queue in (self._following, self._first):
+        for queue in (self._matched, self._first):
             for spec in tuple(queue):
                 if count <= 0:
                     return
@@ -104,17 +104,17 @@ class _Agenda:
                 count -= 1
                 yield spec
 
-    def finished(self, spec: RunSpec, row: Row) -> None:
+    def finished(self, spec: RunSpec, row: RunRow) -> None:
         """Make room, and note what follows."""
         self._busy.discard(_flight(spec))
-        following = list(following_runs(self._plan, spec, row))
-        self._following += following
-        self.total += len(following) - self._expected(spec)
+        matched = list(matched_runs(self._plan, spec, row))
+        self._matched += matched
+        self.total += len(matched) - self._expected(spec)
 
     def _expected(self, spec: RunSpec) -> int:
         """How many runs follow from one, if it does not fail."""
-        follows = spec.target is None and METHODS[spec.method].kind is not Kind.VIDEO
-        return self._video if follows else 0
+        is_matched = spec.target is None and METHODS[spec.method].kind is not Kind.VIDEO
+        return self._video if is_matched else 0
 
 
 def _flight(spec: RunSpec) -> tuple[object, ...]:

@@ -1,7 +1,7 @@
 """Search for a method's parameters on some sequences, and say what they are worth on others.
 
 Optuna's TPE sampler (Bergstra et al. 2011) proposes, every proposal is flown over all training sequences, and the
-worth of a flight is the share of all labelled objects that are shown with their class, over every tick. The sequences
+worth of a flight is the share of all labelled objects that are shown with their class, at all frames. The sequences
 that are held out are flown twice, once as the method is and once with the best that was found, and no proposal hangs
 on either. The search begins with the defaults, and where nothing is better it ends with them.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,11 @@ import optuna
 
 from hvt_common.errors import UserError
 from hvt_edge.stills.policy.registry import METHODS
-from hvt_study.matrix.execute import run_spec
-from hvt_study.matrix.methods import METHODS as FLOWN
-from hvt_study.matrix.plan import StudyPlan
+from hvt_study.matrix.plan import StudyPlan, spec_of
 from hvt_study.matrix.schedule import Pool
-from hvt_study.matrix.spec import RunSpec
-from hvt_study.matrix.tuned import tuning_texts
+from hvt_study.matrix.tuning import tuning_texts
+from hvt_study.runs.execute import run_spec
+from hvt_study.runs.methods import METHODS as FLOWN
 
 __all__ = ["HeldOut", "Tuned", "split", "tunable", "tune"]
 
@@ -100,8 +99,8 @@ def split(
         )
     order = sorted(sequences, key=lambda one: hashlib.sha256(one[1].encode()).digest())
     count = min(len(order) - 1, max(1, round(held_out * len(order))))
-    kept = set(order[:count])
-    return [one for one in sequences if one not in kept], [one for one in sequences if one in kept]
+    chosen = set(order[:count])
+    return [one for one in sequences if one not in chosen], [one for one in sequences if one in chosen]
 
 
 def tune(
@@ -159,26 +158,18 @@ class _Desk:
     def rows(self, sequences: Sequence[tuple[str, str]], texts: tuple[str, ...]) -> list[dict[str, Any]]:
         plan = self._plan
         specs = [
-            RunSpec(
-                dataset=dataset,
-                sequence=sequence,
-                method=self._method,
-                regime=regime.name,
-                budget_bps=regime.budget_bps,
-                models=models,
-                still_codec=plan.still_codecs[0],
-                labels=plan.labels,
-                size=plan.size,
-                max_ticks=plan.max_ticks,
-                detect_every=plan.detect_every,
+            replace(
+                spec_of(plan, dataset, sequence, FLOWN[self._method], regime, models, plan.still_codecs[0]),
                 tune=texts,
             )
             for dataset, sequence in sequences
             for models in plan.models
             for regime in plan.regimes
         ]
-        run = partial(run_spec, folder=Path.cwd())  # workers may have been started elsewhere
-        rows = [future.result() for future in [self._pool.submit(run, spec, plan) for spec in specs]]
+        run = partial(
+            run_spec, cache=plan.cache, folder=Path.cwd()
+        )  # workers may have been started elsewhere
+        rows = [future.result() for future in [self._pool.submit(run, spec) for spec in specs]]
         for row in rows:
             if row["failed"] and not texts:
                 raise UserError(f"{self._method} cannot be flown over {row['sequence']}: {row['failed']}")

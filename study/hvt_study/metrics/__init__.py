@@ -1,1 +1,1 @@
-"""Metrics of the study: pure functions on what the ground showed, tick by tick, and what was there."""
+"""Pure functions on what was there and what the ground showed: `class_score`, `tracking_score` and others."""

@@ -1,8 +1,8 @@
-"""Classes of tracks over time: every track at every tick, before and after refinement.
+"""Classes of tracks over time: every track at every frame, before and after refinement.
 
-Boxes and labels are matched at each tick as `match` does, whatever their classes; then the names of each pair are
-compared. A still that names one track right for the rest of its life counts at every tick from then on, and a track
-that was never refined counts as often as one that was.
+Boxes and labels are matched at each frame (`judged.matched_rows`), whatever their classes; then the names of each
+pair are compared. A still that names one track right for the rest of its life counts at every frame from then on, and
+a track that was never refined counts as often as one that was.
 
 Macro-F1 is scikit-learn's ``f1_score(average="macro")`` over the classes of the labels.
 """
@@ -17,10 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from sklearn.metrics import f1_score
 
-from hvt_study.metrics.contract import Ticks
-from hvt_study.metrics.judged import Judged, judged
-from hvt_study.metrics.match import LEAST_IOU, matched_rows
-from hvt_study.metrics.sizes import LIMITS_PX2, SIZES, Size, of_size
+from hvt_study.metrics.frames import LabelledFrames
+from hvt_study.metrics.judged import LEAST_IOU, LIMITS_PX2, SIZES, Judged, Size, judged, matched_rows, of_size
 
 __all__ = ["ClassCounts", "ClassScore", "class_score"]
 
@@ -33,7 +31,7 @@ _Codes = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class ClassCounts:
-    """Labels over some ticks."""
+    """Labels over some frames."""
 
     right: int = 0
     """Found, and shown with their class."""
@@ -105,7 +103,7 @@ class _Pairs:
 
 
 def class_score(
-    ticks: Ticks,
+    labelled: LabelledFrames,
     *,
     refined: bool = True,
     word: Callable[[str], str] = str,
@@ -113,17 +111,17 @@ def class_score(
     least_iou: float = LEAST_IOU,
     limits_px2: tuple[float, float] = LIMITS_PX2,
 ) -> ClassScore:
-    """Count right classes over all ticks.
+    """Count right classes over all frames.
 
     Args:
-        ticks: every tick of the sequence, also those without a picture.
+        labelled: every frame of the sequence, also those without a picture.
         refined: names as shown; False takes those before refinement, of the very same boxes.
         word: see `judged.judged`.
         classes: likewise.
         least_iou: from which on a box is on a label.
         limits_px2: areas in source pixels between small and medium, and between medium and large.
     """
-    frames = judged(ticks, word=word, classes=classes)
+    frames = judged(labelled, word=word, classes=classes)
     pairs = _paired(frames, refined=refined, least_iou=least_iou)
     every = np.ones(len(pairs.true), np.bool_)
     return ClassScore(

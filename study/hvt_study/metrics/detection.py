@@ -5,8 +5,8 @@ as the mean over 0.5, 0.55 … 0.95 (Lin et al. 2014, https://cocodataset.org/#d
 VisDrone's toolkit (Zhu et al. 2021, VisDrone2018-DET-toolkit) and not as in COCO: up to 500 boxes of a class count in
 a frame instead of 100, because aerial frames hold more; and ignored regions (see `judged`).
 
-The issue asks for it *on base frames*: hand over the ticks that the ground has decoded and detected on
-(`FlightReport.detections`), not the list at every tick.
+The issue asks for it *on base frames*: hand over the frames that the ground has decoded and detected on
+(`FlightReport.detections`), not the list at every frame.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ import numpy.typing as npt
 from faster_coco_eval import COCO
 from faster_coco_eval.core.faster_eval_api import COCOeval_faster
 
-from hvt_study.metrics.contract import Ticks
-from hvt_study.metrics.judged import Judged, judged
-from hvt_study.metrics.sizes import LARGEST_PX2, LIMITS_PX2, SIZES, Size
+from hvt_study.metrics.frames import LabelledFrames
+from hvt_study.metrics.judged import LARGEST_PX2, LIMITS_PX2, SIZES, Judged, Size, judged
 
 __all__ = ["AveragePrecision", "DetectionScore", "detection_score"]
 
@@ -60,7 +59,7 @@ class DetectionScore:
 
 
 def detection_score(
-    ticks: Ticks,
+    labelled: LabelledFrames,
     *,
     word: Callable[[str], str] = str,
     classes: Collection[str] | None = None,
@@ -68,15 +67,15 @@ def detection_score(
 ) -> DetectionScore:
     """Average precision of the boxes and class names that are shown, ranked by confidence.
 
-    Refined names count as shown; for those of the base stream hand over ``view.before()``.
+    Refined names count as shown.
 
     Args:
-        ticks: the frames that were detected on.
+        labelled: the frames that were detected on.
         word: see `judged.judged`.
         classes: likewise.
         limits_px2: areas in source pixels between small and medium, and between medium and large.
     """
-    frames = judged(ticks, word=word, classes=classes)
+    frames = judged(labelled, word=word, classes=classes)
     names = sorted({name for one in frames for name in one.class_names})
     labels, boxes = sum(len(one.ids) for one in frames), sum(len(one.view) for one in frames)
     if not labels:

@@ -1,6 +1,6 @@
 """How long an object is there before the ground shows it with its right class.
 
-A true track is watched from the capture of its first judged tick until the list of its last one is shown. One that
+A true track is watched from the capture of its first judged frame until the list of its last one is shown. One that
 is never shown right is *censored*: it would have taken longer than it was watched. Quantiles are those of the
 Kaplan-Meier estimate (Kaplan and Meier 1958), which leaves out neither the censored ones (that would flatter every
 method that misses much) nor the time that they waited.
@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import CensoredData, ecdf
 
-from hvt_study.metrics.contract import NO_ID, Ticks
-from hvt_study.metrics.judged import Judged, judged
-from hvt_study.metrics.match import LEAST_IOU, matched_rows
+from hvt_study.metrics.frames import NO_ID, LabelledFrames
+from hvt_study.metrics.judged import LEAST_IOU, Judged, judged, matched_rows
 
 __all__ = ["FirstCorrect", "first_correct"]
 
@@ -27,7 +27,7 @@ class FirstCorrect:
     """Of the true tracks of one sequence."""
 
     waits_s: npt.NDArray[np.float64]
-    """(N,) from the first tick's capture until the first list with the right class is shown, or the last list where
+    """(N,) from the first frame's capture until the first list with the right class is shown, or the last list where
     there was none."""
     censored: npt.NDArray[np.bool_]
     """(N,) never shown right."""
@@ -49,12 +49,11 @@ class FirstCorrect:
         """
         if not self.tracks:
             return math.nan
-        waiting = 1.0
-        for wait_s in np.unique(self.waits_s[~self.censored]):
-            at_risk = (self.waits_s >= wait_s).sum()
-            waiting *= 1 - ((self.waits_s == wait_s) & ~self.censored).sum() / at_risk
-            if waiting <= 1 - share + 1e-12:
-                return float(wait_s)
+        seen, never = self.waits_s[~self.censored], self.waits_s[self.censored]
+        survival = ecdf(CensoredData(uncensored=seen, right=never)).sf
+        done = np.flatnonzero(survival.probabilities <= 1 - share + 1e-12)
+        if len(done):
+            return float(survival.quantiles[done[0]])
         return math.inf
 
     @property
@@ -69,7 +68,7 @@ class FirstCorrect:
 
 
 def first_correct(
-    ticks: Ticks,
+    labelled: LabelledFrames,
     *,
     fps: float,
     shown_s: Sequence[float] | None = None,
@@ -80,7 +79,7 @@ def first_correct(
 ) -> FirstCorrect:
     """Watch every true track.
 
-    ``fps`` is that of ticks; ``shown_s`` says of each when its list was shown, from the capture of the first: who
+    ``fps`` is that of frames; ``shown_s`` says of each when its list was shown, from the capture of the first: who
     waits for a second pass waits for its classes. None: with its capture. The rest is as in `classes.class_score`.
 
     Labels without ids are of no track and not watched.
@@ -88,20 +87,20 @@ def first_correct(
     first: dict[int, int] = {}
     last: dict[int, int] = {}
     right: dict[int, int] = {}
-    for tick, one in enumerate(judged(ticks, word=word, classes=classes)):
+    for frame_index, one in enumerate(judged(labelled, word=word, classes=classes)):
         there = [track for track in one.ids.tolist() if track != NO_ID]
-        first = dict.fromkeys(there, tick) | first
-        last |= dict.fromkeys(there, tick)
-        right = dict.fromkeys(_right_ids(one, refined=refined, least_iou=least_iou), tick) | right
+        first = dict.fromkeys(there, frame_index) | first
+        last |= dict.fromkeys(there, frame_index)
+        right = dict.fromkeys(_right_ids(one, refined=refined, least_iou=least_iou), frame_index) | right
     if shown_s is None:
-        shown_s = [tick / fps for tick in range(len(ticks))]
+        shown_s = [frame_index / fps for frame_index in range(len(labelled))]
     end_s = [shown_s[right.get(track, last[track])] for track in first]
     waits_s = np.array(end_s, np.float64) - np.array(list(first.values()), np.float64) / fps
     return FirstCorrect(waits_s, np.array([track not in right for track in first], np.bool_))
 
 
 def _right_ids(one: Judged, *, refined: bool, least_iou: float) -> list[int]:
-    """True tracks that this tick shows with their class."""
+    """True tracks that this frame shows with their class."""
     shown = one.view.class_names if refined else one.view.names_before
     pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px, least_iou=least_iou).tolist()
     hits = [row for row, column in pairs if shown[column] == one.class_names[row]]

@@ -1,34 +1,57 @@
-"""What is judged of a tick: nothing in ignored regions, in one vocabulary, and only classes that the labels know.
+"""What is judged of a frame: nothing in ignored regions, in one vocabulary, and only classes that the labels know.
 
 Ignored regions go by the rule of VisDrone's own toolkit (``dropObjectsInIgr.m`` of the VisDrone2018-DET and MOT
 toolkits): a label or a box with half of its area or more in the ignored regions, taken together, is dropped before
 anything is matched. It counts neither for nor against anyone. A single object that is not asked for takes out the
 boxes on it, but neither labels in front of it nor the boxes that are on those. Every metric here goes by it, so that
 detection, classes and tracks are judged on the same objects.
+
+Sizes are COCO's, 32 and 96 pixels squared (Lin et al. 2014, https://cocodataset.org/#detection-eval), in *source*
+pixels and not scaled: they mean the same object for every method, whatever its base size. The pilot's "small" is
+another one, a share of the frame: see `proxy`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
 
 from hvt_common.inference.class_names import MOVING
 from hvt_common.values import Boxes, iou
 from hvt_study.datasets.labels import FrameLabels, covered_share
-from hvt_study.metrics.contract import FrameView, Ticks, rows_of
-from hvt_study.metrics.match import LEAST_IOU
+from hvt_study.metrics.frames import FrameView, LabelledFrames, rows_of
 
-__all__ = ["Judged", "judged"]
+__all__ = [
+    "LARGEST_PX2",
+    "LEAST_IOU",
+    "LIMITS_PX2",
+    "SIZES",
+    "Judged",
+    "Size",
+    "judged",
+    "matched_rows",
+    "of_size",
+]
 
+LEAST_IOU = 0.5
+
+Floats = npt.NDArray[np.floating[Any]]
+Size: TypeAlias = Literal["small", "medium", "large"]
+
+SIZES: Final[tuple[Size, ...]] = ("small", "medium", "large")
+LIMITS_PX2: Final = (32.0**2, 96.0**2)
+LARGEST_PX2: Final = 1e10
 _IGNORED_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """The N labels of one tick that count, and what was shown beside them."""
+    """The N labels of one frame that count, and what was shown beside them."""
 
     boxes_xyxy_px: npt.NDArray[np.float64]
     """(N, 4), source pixels."""
@@ -44,19 +67,19 @@ class Judged:
 
 
 def judged(
-    ticks: Ticks, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
+    labelled: LabelledFrames, *, word: Callable[[str], str] = str, classes: Collection[str] | None = None
 ) -> list[Judged]:
-    """Take out of every tick what is not to be judged.
+    """Take out of every frame what is not to be judged.
 
     Args:
-        ticks: of one sequence.
+        labelled: of one sequence.
         word: brings the names of labels and boxes into one vocabulary, such as
             `hvt_common.inference.class_names.kind_of`; by default they are compared as they are.
         classes: names in that vocabulary; labels and boxes of others are left out. None keeps all.
             A box stays where its name before *or* after refinement is one of them, so that no still can take a false
             box out of the account. What merely moves (`MOVING`) may be of any class and stays.
     """
-    return [_judged(labels, view, word, classes) for labels, view in ticks]
+    return [_judged(labels, view, word, classes) for labels, view in labelled]
 
 
 def _judged(
@@ -67,35 +90,35 @@ def _judged(
     after = tuple(map(word, view.class_names))
     wanted = _outside(labels.boxes_xyxy_px, labels.ignored_xyxy_px) & _known(names, classes)
     known = _known(before, classes) | _known(after, classes)
-    asked = labels.boxes_xyxy_px[wanted]
-    shown = known & _judgeable(view.boxes_xyxy_px, labels, asked=asked)
+    there = labels.boxes_xyxy_px[wanted]
+    shown = known & _judgeable(view.boxes_xyxy_px, labels, there=there)
     in_words = FrameView(view.boxes_xyxy_px, view.ids, after, view.confidences, before)
     return Judged(
-        boxes_xyxy_px=np.asarray(asked, np.float64),
+        boxes_xyxy_px=np.asarray(there, np.float64),
         ids=np.asarray(labels.ids, np.int64)[wanted],
         class_names=rows_of(names, wanted),
         view=in_words.rows(shown),
     )
 
 
-def _judgeable(boxes: Boxes, labels: FrameLabels, *, asked: Boxes) -> npt.NDArray[np.bool_]:
+def _judgeable(boxes: Boxes, labels: FrameLabels, *, there: Boxes) -> npt.NDArray[np.bool_]:
     """(N,) boxes that are right or wrong."""
     outside = _outside(boxes, labels.ignored_xyxy_px)
     if not len(labels.beside_xyxy_px):
         return outside
     free = _outside(boxes, np.concatenate((labels.ignored_xyxy_px, labels.beside_xyxy_px)))
-    return outside & (free | _on(boxes, asked))
+    return outside & (free | _on(boxes, there))
 
 
 def _outside(boxes: Boxes, regions: Boxes) -> npt.NDArray[np.bool_]:
     return np.asarray(covered_share(boxes, regions) < _IGNORED_SHARE)
 
 
-def _on(boxes: Boxes, asked: Boxes) -> npt.NDArray[np.bool_]:
+def _on(boxes: Boxes, there: Boxes) -> npt.NDArray[np.bool_]:
     """(N,) whether each box is on one of the labels."""
-    if not len(asked):
+    if not len(there):
         return np.zeros(len(boxes), np.bool_)
-    return np.asarray(iou(boxes, asked).max(axis=1) >= LEAST_IOU)
+    return np.asarray(iou(boxes, there).max(axis=1) >= LEAST_IOU)
 
 
 def _known(names: Sequence[str], classes: Collection[str] | None) -> npt.NDArray[np.bool_]:
@@ -104,3 +127,30 @@ def _known(names: Sequence[str], classes: Collection[str] | None) -> npt.NDArray
 
 def _areas(boxes: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.asarray(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None).prod(axis=1))
+
+
+def matched_rows(
+    labels_xyxy_px: Floats, shown_xyxy_px: Floats, *, least_iou: float = LEAST_IOU
+) -> npt.NDArray[np.int64]:
+    """Match (N, 4) labels and (M, 4) boxes one to one, whatever their classes.
+
+    As many pairs as possible of an IoU of ``least_iou`` or more, and of those matchings the one with most overlap in
+    all (Kuhn 1955, by `scipy.optimize.linear_sum_assignment`). Returns (K, 2): row of the label, row of the box, by
+    row of the label.
+    """
+    if not len(labels_xyxy_px) or not len(shown_xyxy_px):
+        return np.empty((0, 2), np.int64)
+    overlap = iou(labels_xyxy_px, shown_xyxy_px)
+    enough = overlap >= least_iou
+    # A pair that counts is worth more than any sum of overlaps.
+    value = np.where(enough, overlap + min(overlap.shape), 0.0)
+    rows, columns = linear_sum_assignment(value, maximize=True)
+    pairs = np.stack((rows, columns), axis=1).astype(np.int64)
+    return pairs[enough[rows, columns]]
+
+
+def of_size(
+    size: Size, areas_px2: npt.NDArray[np.float64], *, limits_px2: tuple[float, float] = LIMITS_PX2
+) -> npt.NDArray[np.bool_]:
+    """Which of (N,) areas are of this size; a limit belongs to the larger one."""
+    return np.asarray(np.digitize(areas_px2, limits_px2) == SIZES.index(size))

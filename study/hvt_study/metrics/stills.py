@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["Opinion", "RefinedObject", "StillArrival"]
+import numpy as np
+
+__all__ = ["Opinion", "RefinedObject", "StillArrival", "still_delays_ms"]
 
 
 @dataclass(frozen=True, slots=True)
 class StillArrival:
-    """One still at the ground. Times are media time, from the first tick's capture."""
+    """One still at the ground. Times are media time, from the first frame's capture."""
 
     sequence: int
     """Of the edge; names the still."""
-    cut_s: float
+    capture_s: float
     """Capture of the frame that it was cut from."""
     sent_s: float
     """When it was handed to the link."""
@@ -56,3 +60,11 @@ class RefinedObject:
     """Of the object as the decoded base shows it; None where that was not asked or gave no answer."""
     still: Opinion | None = None
     """Of the object as the still shows it, by the same model."""
+
+
+def still_delays_ms(stills: Sequence[StillArrival]) -> tuple[float, float]:
+    """(median, 95th percentile) from the capture of a still's frame to its arrival; NaN without stills."""
+    if not stills:
+        return math.nan, math.nan
+    p50, p95 = np.percentile([1e3 * (one.arrived_s - one.capture_s) for one in stills], (50, 95)).tolist()
+    return p50, p95

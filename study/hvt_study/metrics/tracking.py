@@ -18,10 +18,9 @@ import motmetrics
 import numpy as np
 
 from hvt_common.values import iou
-from hvt_study.metrics.contract import NO_ID, Ticks
+from hvt_study.metrics.frames import NO_ID, LabelledFrames
 from hvt_study.metrics.hota import Hota, IdBoxes, hota
-from hvt_study.metrics.judged import judged
-from hvt_study.metrics.match import LEAST_IOU
+from hvt_study.metrics.judged import LEAST_IOU, judged
 
 __all__ = ["TrackingScore", "compare_tracks", "tracking_score"]
 
@@ -41,7 +40,7 @@ class TrackingScore:
     """Counts of one sequence, or, added up, of several."""
 
     objects: int = 0
-    """Labels that belong to a track, over all ticks."""
+    """Labels that belong to a track, over all frames."""
     misses: int = 0
     false_positives: int = 0
     switches: int = 0
@@ -85,18 +84,18 @@ class TrackingScore:
 
 
 def tracking_score(
-    ticks: Ticks,
+    labelled: LabelledFrames,
     *,
     word: Callable[[str], str] = str,
     classes: Collection[str] | None = None,
     least_iou: float = LEAST_IOU,
 ) -> TrackingScore:
-    """Compare what is shown at every tick with the labelled tracks; see `judged.judged` for ``word`` and ``classes``.
+    """Compare what is shown at every frame with the labelled tracks; ``word`` and ``classes`` as in `judged.judged`.
 
     Labels without ids say nothing of tracks: where none has one, every figure is NaN.
     """
     frames: list[tuple[IdBoxes, IdBoxes]] = []
-    for one in judged(ticks, word=word, classes=classes):
+    for one in judged(labelled, word=word, classes=classes):
         known, tracked = one.ids != NO_ID, one.view.ids != NO_ID
         true = one.ids[known], one.boxes_xyxy_px[known]
         frames.append((true, (one.view.ids[tracked], one.view.boxes_xyxy_px[tracked])))

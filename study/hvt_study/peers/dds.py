@@ -23,8 +23,8 @@ from hvt_common.inference.detect import Detector
 from hvt_common.values import Frame
 from hvt_edge.link.budget import RollingBudget
 from hvt_edge.source.resample import Resizer
-from hvt_study.compare_clip import NOMINAL_FPS, Clip, FrameSource
-from hvt_study.flight import FlightReport, coded_ticks
+from hvt_study.datasets.clip import NOMINAL_FPS, Clip, FrameSource
+from hvt_study.flights.flight import FlightReport, coded_frames
 from hvt_study.peers.dds_edge import DdsEdge, pass_rates
 from hvt_study.peers.dds_ground import DdsGround
 from hvt_study.peers.dds_line import Line
@@ -51,78 +51,82 @@ def fly_dds(
 ) -> FlightReport:
     """Fly the peer once; ``detector`` is the ground's, ``size`` (width, height) that of the base frames.
 
-    The list of a tick is the final one of that very frame, as an operator sees it when it is known, which is later
+    The list of a frame is the final one of that very frame, as an operator sees it when it is known, which is later
     than with a stream that is shown as it comes: the delays of ``FlightReport.link`` are, for each coded frame, from
     capture to the arrival of the pass that completes it (segment, question, second pass, and the frames before it).
-    ``picture_age_p95_ms`` is of the newest picture at the ground, that of a first pass, as in `hvt_study.flight.fly`.
+    ``picture_age_p95_ms`` is of the newest picture at the ground, that of a first pass, as in
+    `hvt_study.flights.flight.fly`.
 
     Raises:
         UserError: the budget is too small for two passes of this size and frame rate.
     """
-    settings = settings.settled(budget_bps, size=size)
+    settings = settings.resolved(budget_bps, size=size)
     rates = pass_rates(budget_bps, size=size, settings=settings, edge_id=edge_id)
     line = Line(
         link_bps=link_bps, budget=RollingBudget(rates.budget), window_ns=settings.window_ns, edge_id=edge_id
     )
-    coded = coded_ticks(clip.ticks, settings.rate)
-    segments = _segments(coded, settings.segment_ticks)
-    most_bytes = int(budget_bps * clip.ticks / NOMINAL_FPS / 8)
+    coded = coded_frames(clip.frame_count, settings.rate)
+    segments = _segments(coded, settings.segment_frames)
+    most_bytes = int(budget_bps * clip.frame_count / NOMINAL_FPS / 8)
     resizer = Resizer(clip.source_size, size, fit="letterbox")
     edge = DdsEdge(rates, size=size, settings=settings, segments=segments, line=line, most_bytes=most_bytes)
-    ground = DdsGround(detector, settings, resizer.view, segments, line, started_ns=_tick_ns(0))
-    with closing(_by_tick(FrameSource(clip, resizer, ticks=coded), clip.ticks)) as frames:
+    ground = DdsGround(detector, settings, resizer.view, segments, line, started_ns=_frame_ns(0))
+    with closing(_by_frame(FrameSource(clip, resizer, frames=coded), clip.frame_count)) as frames:
         for now_ns, frame in frames:
             ground.advance(now_ns)
             while ground.requests and ground.requests[0][0] <= now_ns:
-                edge.hear(ground.requests.popleft()[1])
+                edge.on_request(ground.requests.popleft()[1])
             if frame is not None:
                 edge.first_pass(frame)
             edge.second_pass(now_ns)
-            if now_ns > _tick_ns(clip.ticks) and edge.idle and line.empty and not ground.requests:
+            if now_ns > _frame_ns(clip.frame_count) and edge.idle and line.empty and not ground.requests:
                 break
-    ground.close(ticks=clip.ticks)
-    return _report(clip.ticks, edge=edge, ground=ground, line=line)
+    ground.close(frames=clip.frame_count)
+    return _report(clip.frame_count, edge=edge, ground=ground, line=line)
 
 
-def _segments(coded: frozenset[int], segment_ticks: int) -> tuple[tuple[int, ...], ...]:
-    """The coded ticks of each segment that has any."""
-    return tuple(tuple(ticks) for _, ticks in groupby(sorted(coded), key=lambda tick: tick // segment_ticks))
+def _segments(coded: frozenset[int], segment_frames: int) -> tuple[tuple[int, ...], ...]:
+    """The coded frames of each segment that has any."""
+    return tuple(
+        tuple(frames)
+        for _, frames in groupby(sorted(coded), key=lambda frame_index: frame_index // segment_frames)
+    )
 
 
-def _by_tick(source: FrameSource, ticks: int) -> Generator[tuple[int, Frame | None], None, None]:
-    """(time, frame to code) of every tick, and empty ones after the clip for what is still to come."""
-    tick = 0
+def _by_frame(source: FrameSource, frames: int) -> Generator[tuple[int, Frame | None], None, None]:
+    """(time, frame to code) of every frame, and empty ones after the clip for what is still to come."""
+    frame_index = 0
     for frame in source.frames(start_ns=_START_NS):
-        for between in range(tick, frame.index):
-            yield _tick_ns(between), None
+        for between in range(frame_index, frame.index):
+            yield _frame_ns(between), None
         yield frame.capture_ns, frame
-        tick = frame.index + 1
-    for after in range(tick, ticks + round(_LONGEST_TAIL_S * NOMINAL_FPS)):
-        yield _tick_ns(after), None
+        frame_index = frame.index + 1
+    for after in range(frame_index, frames + round(_LONGEST_TAIL_S * NOMINAL_FPS)):
+        yield _frame_ns(after), None
 
 
-def _tick_ns(tick: int) -> int:
-    return _START_NS + round(tick * _SECOND_NS / NOMINAL_FPS)
+def _frame_ns(frame_index: int) -> int:
+    return _START_NS + round(frame_index * _SECOND_NS / NOMINAL_FPS)
 
 
-def _report(ticks: int, *, edge: DdsEdge, ground: DdsGround, line: Line) -> FlightReport:
+def _report(frames: int, *, edge: DdsEdge, ground: DdsGround, line: Line) -> FlightReport:
     return FlightReport(
-        lists=tuple(ground.lists[tick] for tick in range(ticks)),
-        account=line.ledger.summary(ticks / NOMINAL_FPS),
+        lists=tuple(ground.lists[frame_index] for frame_index in range(frames)),
+        account=line.ledger.summary(frames / NOMINAL_FPS),
         line_bytes=dict(line.line_bytes),
         messages=dict(line.messages),
         max_frame_bytes=line.max_frame_bytes,
         link=LinkReport.of(ground.delays_ns, line.arrivals),
-        picture_age_p95_ms=_picture_age_p95_ms(ground.shown_ns, ticks),
-        edge_cpu_ms=1e3 * edge.cpu_s / ticks,
+        picture_age_p95_ms=_picture_age_p95_ms(ground.shown_ns, frames),
+        edge_cpu_ms=1e3 * edge.cpu_s / frames,
         digest=line.digest,
     )
 
 
-def _picture_age_p95_ms(shown_ns: list[tuple[int, int]], ticks: int) -> float:
-    """Over the ticks from the first picture on, as `hvt_study.flight` has it."""
+def _picture_age_p95_ms(shown_ns: list[tuple[int, int]], frames: int) -> float:
+    """Over the frames from the first picture on, as `hvt_study.flights.flight` has it."""
     shown = np.array(shown_ns, np.int64).reshape(-1, 2)
-    at_ns = np.array([_tick_ns(tick) for tick in range(ticks)], np.int64)
+    at_ns = np.array([_frame_ns(frame_index) for frame_index in range(frames)], np.int64)
     at_ns = at_ns[at_ns >= shown[0, 0]] if len(shown) else at_ns[:0]
     if not len(at_ns):
         return 0.0

@@ -16,20 +16,20 @@ from hvt_common.values import AccessUnit, Frame, Image
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.video.encoder_settings import VBV_S, EncoderSettings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_study.compare_clip import NOMINAL_FPS
+from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.peers.dds_line import Line, header_bps
 from hvt_study.peers.dds_regions import Blocks, block_grid, pasted
 from hvt_study.peers.dds_request import RegionRequest
 from hvt_study.peers.dds_settings import DdsSettings
 
-__all__ = ["DdsEdge", "PassRates", "most_kept", "pass_rates"]
+__all__ = ["DdsEdge", "PassRates", "most_stored", "pass_rates"]
 
 _KEYFRAME_DEBT_S = 10
 """x265 never takes back what the first keyframe costs beyond a frame's share: so much media time pays for it."""
 _BLACK_FRAME_BYTES = 100
 """What x265 takes for a frame with very little in it."""
-_KEPT_SEGMENTS = 4
-_KEPT_LEAST = 8
+_STORED_SEGMENTS = 4
+_STORED_LEAST = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ def pass_rates(budget_bps: int, *, size: tuple[int, int], settings: DdsSettings,
     first_line = settings.share * (budget_bps - request_bps)
     second_line = budget_bps - request_bps - first_line
     fps = settings.rate
-    questions = NOMINAL_FPS / settings.segment_ticks
+    questions = NOMINAL_FPS / settings.segment_frames
     bundles = min(fps, max(questions, second_line / 8 / settings.bundle_bytes))
     small = settings.first_size(size)
     first = first_line - _beside_bps(
@@ -86,9 +86,11 @@ def _beside_bps(
     return headers + 8 * keyframe_floor_bytes(size) / _KEYFRAME_DEBT_S
 
 
-def most_kept(settings: DdsSettings) -> int:
+def most_stored(settings: DdsSettings) -> int:
     """How many frames either end keeps at most while it waits for the other."""
-    return max(_KEPT_LEAST, round(_KEPT_SEGMENTS * settings.segment_ticks * settings.rate / NOMINAL_FPS) + 1)
+    return max(
+        _STORED_LEAST, round(_STORED_SEGMENTS * settings.segment_frames * settings.rate / NOMINAL_FPS) + 1
+    )
 
 
 class DdsEdge:
@@ -97,7 +99,7 @@ class DdsEdge:
     Args:
         rates: of `pass_rates`.
         size: (width, height) of the base frames.
-        segments: the coded ticks of each segment.
+        segments: the coded frames of each segment.
         line: takes the messages; ``line.budget`` was opened with ``rates.budget``.
         most_bytes: line bytes that the whole flight may take; a second pass beyond it is not sent.
     """
@@ -115,16 +117,16 @@ class DdsEdge:
         self._settings, self._size, self._line = settings, size, line
         self._most_bytes = most_bytes
         self._budget: RollingBudget = line.budget
-        self._segments = {ticks[0]: ticks for ticks in segments}
+        self._segments = {frames[0]: frames for frames in segments}
         self._first_size = settings.first_size(size)
         fps, preset, vbv_s = settings.rate, settings.preset, max(VBV_S, 1 / settings.rate)
         self._first, self._second = (
             BaseEncoder(EncoderSettings(coded, fps=fps, bitrate_bps=rate_bps, preset=preset, vbv_s=vbv_s))
             for coded, rate_bps in ((self._first_size, rates.first_bps), (size, rates.second_bps))
         )
-        self._most = most_kept(settings)
-        self._kept: dict[int, Frame] = {}
-        self._asked: deque[tuple[int, Blocks]] = deque()
+        self._most = most_stored(settings)
+        self._stored: dict[int, Frame] = {}
+        self._requested: deque[tuple[int, Blocks]] = deque()
         self._ready: list[AccessUnit] = []
         self._first_done = self._second_done = False
         self.cpu_s = 0.0
@@ -133,43 +135,47 @@ class DdsEdge:
     @property
     def idle(self) -> bool:
         """Nothing that was asked for waits."""
-        return not self._asked and not self._ready
+        return not self._requested and not self._ready
 
     def first_pass(self, frame: Frame) -> None:
         """Code and send a frame as it comes."""
         began_s = time.process_time()
-        self._keep(frame)
+        self._store(frame)
         small = replace(frame, base_bgr=self._shrunk(frame))
         unit = self._first.encode(small, keyframe=not self._first_done)
         self._first_done = True
-        size_bytes = self._line.weigh(Channel.BASE, (unit,), at_ns=frame.capture_ns)
+        size_bytes = self._line.message_bytes(Channel.BASE, (unit,), at_ns=frame.capture_ns)
         at_ns = self._budget.earliest_ns(size_bytes, now_ns=frame.capture_ns, base=True)
         sent = self._line.send(Channel.BASE, (unit,), at_ns=at_ns)
         self._budget.record_base(sent, now_ns=at_ns, keyframe=unit.keyframe)
         self.cpu_s += time.process_time() - began_s
 
-    def hear(self, payload: bytes) -> None:
+    def on_request(self, payload: bytes) -> None:
         """What the ground asks for."""
         grid = block_grid(self._size, align_px=self._settings.align_px)
         request = RegionRequest.parse(payload, grid=grid)
-        ticks = self._segments[request.first_tick]
-        for tick in [kept for kept in self._kept if kept < request.first_tick and not self._is_asked(kept)]:
-            del self._kept[tick]  # about these the ground had no question
-        for tick, blocks in zip(ticks, request.frames, strict=True):
+        frames = self._segments[request.first_frame]
+        for frame_index in [
+            stored
+            for stored in self._stored
+            if stored < request.first_frame and not self._is_requested(stored)
+        ]:
+            del self._stored[frame_index]  # about these the ground had no question
+        for frame_index, blocks in zip(frames, request.frames, strict=True):
             if not blocks.any():
-                self._kept.pop(tick, None)
-            elif tick in self._kept:
-                self._asked.append((tick, blocks))
+                self._stored.pop(frame_index, None)
+            elif frame_index in self._stored:
+                self._requested.append((frame_index, blocks))
 
     def second_pass(self, now_ns: int) -> None:
         """Code and send what was asked for, as far as the budget has room now."""
         began_s = time.process_time()
         while not self.idle:
             self._fill()
-            size_bytes = self._line.weigh(Channel.ROI, self._ready, at_ns=now_ns)
+            size_bytes = self._line.message_bytes(Channel.ROI, self._ready, at_ns=now_ns)
             if self._line.total_bytes + size_bytes > self._most_bytes:
                 self._ready.clear()
-                self._asked.clear()
+                self._requested.clear()
                 self._most_bytes = 0  # what comes later would build on what was left out
                 break
             if size_bytes > self._budget.still_allowance(now_ns):
@@ -181,27 +187,27 @@ class DdsEdge:
 
     def _fill(self) -> None:
         """Code what makes up the next message."""
-        while self._asked and sum(len(unit.data) for unit in self._ready) < self._settings.bundle_bytes:
+        while self._requested and sum(len(unit.data) for unit in self._ready) < self._settings.bundle_bytes:
             self._ready.append(self._code_next())
 
     def _code_next(self) -> AccessUnit:
-        tick, blocks = self._asked.popleft()
-        frame = self._kept.pop(tick)
+        frame_index, blocks = self._requested.popleft()
+        frame = self._stored.pop(frame_index)
         picture = pasted(None, frame.base_bgr, blocks, align_px=self._settings.align_px)
         unit = self._second.encode(replace(frame, base_bgr=picture), keyframe=not self._second_done)
         self._second_done = True
         return unit
 
-    def _keep(self, frame: Frame) -> None:
-        self._kept[frame.index] = frame
-        if len(self._kept) > self._most:
-            oldest = min(self._kept)
-            del self._kept[oldest]
-            if self._asked and self._asked[0][0] == oldest:
-                self._asked.popleft()
+    def _store(self, frame: Frame) -> None:
+        self._stored[frame.index] = frame
+        if len(self._stored) > self._most:
+            oldest = min(self._stored)
+            del self._stored[oldest]
+            if self._requested and self._requested[0][0] == oldest:
+                self._requested.popleft()
 
-    def _is_asked(self, tick: int) -> bool:
-        return any(tick == one for one, _ in self._asked)
+    def _is_requested(self, frame_index: int) -> bool:
+        return any(frame_index == one for one, _ in self._requested)
 
     def _shrunk(self, frame: Frame) -> Image:
         if self._first_size == self._size:

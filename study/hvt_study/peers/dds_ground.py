@@ -14,12 +14,12 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import AccessUnit, Detections, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
-from hvt_study.compare_clip import NOMINAL_FPS
-from hvt_study.metrics.contract import NO_ID, FrameView
-from hvt_study.metrics.seen import ObservedFrame
-from hvt_study.peers.dds_edge import most_kept
+from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.metrics.frames import NO_ID, FrameView
+from hvt_study.metrics.observed import ObservedFrame
+from hvt_study.peers.dds_edge import most_stored
 from hvt_study.peers.dds_line import Line
-from hvt_study.peers.dds_regions import Blocks, asked_blocks, asked_boxes, combined, pasted
+from hvt_study.peers.dds_regions import Blocks, combined, pasted, requested_blocks, requested_boxes
 from hvt_study.peers.dds_request import RegionRequest
 from hvt_study.peers.dds_settings import DdsSettings
 
@@ -30,7 +30,7 @@ __all__ = ["DdsGround"]
 class _Held:
     """A frame that is not finished."""
 
-    tick: int
+    frame_index: int
     capture_ns: int
     picture_bgr: Image
     """Base size."""
@@ -54,12 +54,12 @@ class DdsGround:
     settings: DdsSettings
     view: View
     segments: Sequence[tuple[int, ...]]
-    """The coded ticks of each segment."""
+    """The coded frames of each segment."""
     line: Line
     started_ns: int
-    """Capture of the first tick."""
+    """Capture of the first frame."""
     lists: dict[int, ObservedFrame] = field(default_factory=dict)
-    """By tick."""
+    """By frame."""
     delays_ns: list[int] = field(default_factory=list)
     """Of every coded frame, in order: capture to the arrival that finished it."""
     shown_ns: list[tuple[int, int]] = field(default_factory=list)
@@ -67,7 +67,7 @@ class DdsGround:
     requests: deque[tuple[int, bytes]] = field(default_factory=deque)
     """What the edge is to hear, with the time at which it does."""
     _held: dict[int, _Held] = field(default_factory=dict)
-    _last_ticks: dict[int, tuple[int, ...]] = field(init=False)
+    _last_frames: dict[int, tuple[int, ...]] = field(init=False)
     _first: BaseDecoder = field(init=False)
     _second: BaseDecoder = field(init=False)
     _tracker: ByteTracker = field(init=False)
@@ -76,7 +76,7 @@ class DdsGround:
 
     def __post_init__(self) -> None:
         size = self.view.base_size
-        self._last_ticks = {ticks[-1]: ticks for ticks in self.segments}
+        self._last_frames = {frames[-1]: frames for frames in self.segments}
         self._first, self._second = BaseDecoder(size=size), BaseDecoder(size=size)
         tracking = TrackerSettings.starting_at(
             self.settings.confidence, camera_motion=self.settings.camera_motion
@@ -94,44 +94,44 @@ class DdsGround:
                     self._second_pass(unit)
             self._finish()
 
-    def close(self, *, ticks: int) -> None:
-        """Nothing more comes: finish what is left, and list every tick up to the last."""
+    def close(self, *, frames: int) -> None:
+        """Nothing more comes: finish what is left, and list every frame up to the last."""
         for held in self._held.values():
             held.whole = True
         self._finish()
-        self._list_between(ticks)
+        self._list_between(frames)
 
     def _first_pass(self, unit: AccessUnit) -> None:
         self.shown_ns.append((self._at_ns, unit.capture_ns))
         picture = self._full(_decoded(self._first, unit))
         found = self.detector.detect(picture)
         size = self.view.base_size
-        regions = asked_boxes(found, size=size, settings=self.settings)
-        blocks = asked_blocks(regions, size=size, align_px=self.settings.align_px)
-        tick = unit.frame_index
-        self._held[tick] = _Held(tick, unit.capture_ns, picture, found, blocks)
-        if tick in self._last_ticks:
-            self._ask(self._last_ticks[tick])
-        if len(self._held) > most_kept(self.settings) + self.settings.segment_ticks:
+        regions = requested_boxes(found, size=size, settings=self.settings)
+        blocks = requested_blocks(regions, size=size, align_px=self.settings.align_px)
+        frame_index = unit.frame_index
+        self._held[frame_index] = _Held(frame_index, unit.capture_ns, picture, found, blocks)
+        if frame_index in self._last_frames:
+            self._request(self._last_frames[frame_index])
+        if len(self._held) > most_stored(self.settings) + self.settings.segment_frames:
             next(iter(self._held.values())).whole = True
 
-    def _ask(self, ticks: tuple[int, ...]) -> None:
+    def _request(self, frames: tuple[int, ...]) -> None:
         """Of a whole segment at once, as DDS does."""
-        frames = [self._held[tick] for tick in ticks]
+        segment = [self._held[frame_index] for frame_index in frames]
         if self.settings.steady:
-            every = np.logical_or.reduce([one.blocks for one in frames])
-            for one in frames:
+            every = np.logical_or.reduce([one.blocks for one in segment])
+            for one in segment:
                 one.blocks = every
-        for one in frames:
+        for one in segment:
             one.whole = not one.blocks.any()
-        if not all(one.whole for one in frames):
-            payload = RegionRequest(ticks[0], tuple(one.blocks for one in frames)).pack()
+        if not all(one.whole for one in segment):
+            payload = RegionRequest(frames[0], tuple(one.blocks for one in segment)).pack()
             self.requests.append((self.line.send_request(payload, now_ns=self._at_ns), payload))
 
     def _second_pass(self, unit: AccessUnit) -> None:
         over = _decoded(self._second, unit)
         for held in self._held.values():
-            if held.tick < unit.frame_index and not held.whole:
+            if held.frame_index < unit.frame_index and not held.whole:
                 held.whole = True  # the edge had to leave it out
         mine = self._held.get(unit.frame_index)
         if mine is None or mine.whole:
@@ -147,18 +147,18 @@ class DdsGround:
             one = next(iter(self._held.values()))
             if not one.whole:
                 return
-            del self._held[one.tick]
-            self._list_between(one.tick)
-            tracks = self._tracker.update(one.found, frame_index=one.tick, image_bgr=one.picture_bgr)
-            self.lists[one.tick] = self._seen(tracks, found=one.found)
+            del self._held[one.frame_index]
+            self._list_between(one.frame_index)
+            tracks = self._tracker.update(one.found, frame_index=one.frame_index, image_bgr=one.picture_bgr)
+            self.lists[one.frame_index] = self._seen(tracks, found=one.found)
             self.delays_ns.append(self._at_ns - one.capture_ns)
-            self._listed_to = one.tick + 1
+            self._listed_to = one.frame_index + 1
 
-    def _list_between(self, tick: int) -> None:
-        """Those before ``tick`` that were not coded."""
-        for between in range(self._listed_to, tick):
+    def _list_between(self, frame_index: int) -> None:
+        """Those before ``frame`` that were not coded."""
+        for between in range(self._listed_to, frame_index):
             self.lists[between] = self._seen(self._tracker.extrapolated(frame_index=between))
-        self._listed_to = max(self._listed_to, tick)
+        self._listed_to = max(self._listed_to, frame_index)
 
     def _seen(self, tracks: Tracks, *, found: Detections | None = None) -> ObservedFrame:
         names = self._names(tracks.class_ids)

@@ -26,7 +26,7 @@ _SECOND_NS = 1_000_000_000
 _CHANNELS = {Channel.BASE: Account.BASE, Channel.ROI: Account.ROI, Channel.CONTROL: Account.META}
 _VIDEO = DELIVERIES[Channel.BASE].encoding
 _FURTHER = struct.Struct(">II")
-"""Before each access unit but the first: its tick and its length."""
+"""Before each access unit but the first: its frame and its length."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Line:
         """Whether everything that was sent to the ground has been taken out."""
         return not self._under_way
 
-    def weigh(self, row: Channel, units: Sequence[AccessUnit], *, at_ns: int) -> int:
+    def message_bytes(self, row: Channel, units: Sequence[AccessUnit], *, at_ns: int) -> int:
         """Line bytes of a message with these access units, were it sent then."""
         payload = _payload(units)
         attachment = self._header(row, units[0], at_ns=at_ns).pack(payload)

@@ -16,13 +16,13 @@ from hvt_study.peers.dds_settings import DdsSettings
 
 __all__ = [
     "Blocks",
-    "asked_blocks",
-    "asked_boxes",
     "block_grid",
     "combined",
     "merged",
     "pasted",
     "pixel_mask",
+    "requested_blocks",
+    "requested_boxes",
 ]
 
 Blocks = npt.NDArray[np.bool_]
@@ -32,7 +32,7 @@ _TWIN_IOU = 0.8
 """Above it two boxes are one object whatever their classes, as in our detectors."""
 
 
-def asked_boxes(found: Detections, *, size: tuple[int, int], settings: DdsSettings) -> Boxes:
+def requested_boxes(found: Detections, *, size: tuple[int, int], settings: DdsSettings) -> Boxes:
     """The regions, (K, 4), of a first pass's results at one frame of ``size`` (width, height).
 
     Uncertain results (``low`` ≤ confidence < ``high``) that no confident one explains and that are not too large,
@@ -69,7 +69,7 @@ def block_grid(size: tuple[int, int], *, align_px: int) -> tuple[int, int]:
     return -(-size[1] // align_px), -(-size[0] // align_px)
 
 
-def asked_blocks(boxes_px: Boxes, *, size: tuple[int, int], align_px: int) -> Blocks:
+def requested_blocks(boxes_px: Boxes, *, size: tuple[int, int], align_px: int) -> Blocks:
     """Every block that a region touches."""
     rows, columns = block_grid(size, align_px=align_px)
     blocks = np.zeros((rows, columns), np.bool_)
@@ -102,5 +102,5 @@ def combined(first: Detections, second: Detections, *, settings: DdsSettings) ->
     boxes = np.concatenate((second.boxes_xyxy_px, first.boxes_xyxy_px[sure]))
     scores = np.concatenate((second.confidences, first.confidences[sure]))
     kinds = np.concatenate((second.class_ids, first.class_ids[sure]))
-    kept = suppress(boxes, scores, kinds, iou=settings.nms_iou, any_class_iou=_TWIN_IOU)
-    return Detections(boxes[kept], scores[kept], kinds[kept])
+    rows = suppress(boxes, scores, kinds, iou=settings.nms_iou, any_class_iou=_TWIN_IOU)
+    return Detections(boxes[rows], scores[rows], kinds[rows])

@@ -1,6 +1,6 @@
 """What the ground asks for, as bytes: the blocks of each frame of a segment.
 
-``>IB``: first tick of the segment and number of frames, then the masks one after the other as bits, each but the
+``>IB``: first frame of the segment and number of frames, then the masks one after the other as bits, each but the
 first as its difference (exclusive or) from the one before, deflated. Regions that stay cost next to nothing.
 """
 
@@ -24,7 +24,7 @@ _LEVEL = 9
 class RegionRequest:
     """One question of the ground."""
 
-    first_tick: int
+    first_frame: int
     """Of the segment."""
     frames: tuple[Blocks, ...]
     """Of every coded frame of the segment in order, 1 to 255; empty masks where nothing is asked."""
@@ -33,7 +33,7 @@ class RegionRequest:
         """The payload."""
         stack = np.stack(self.frames)
         stack[1:] ^= np.stack(self.frames)[:-1]
-        return _HEAD.pack(self.first_tick, len(stack)) + zlib.compress(np.packbits(stack).tobytes(), _LEVEL)
+        return _HEAD.pack(self.first_frame, len(stack)) + zlib.compress(np.packbits(stack).tobytes(), _LEVEL)
 
     @classmethod
     def parse(cls, payload: bytes, *, grid: tuple[int, int]) -> RegionRequest:
@@ -44,7 +44,7 @@ class RegionRequest:
         """
         if len(payload) < _HEAD.size:
             raise ValueError(f"a request of {len(payload)} bytes is cut off")
-        first_tick, count = _HEAD.unpack_from(payload)
+        first_frame, count = _HEAD.unpack_from(payload)
         cells = count * grid[0] * grid[1]
         expected = -(-cells // 8)
         try:
@@ -54,4 +54,4 @@ class RegionRequest:
         if len(bits) != expected or not count:
             raise ValueError(f"a request for {count} frames holds {len(bits)} bytes of masks, not {expected}")
         changes = np.unpackbits(np.frombuffer(bits, np.uint8), count=cells).reshape(count, *grid)
-        return cls(first_tick, tuple(np.bitwise_xor.accumulate(changes, axis=0).astype(np.bool_)))
+        return cls(first_frame, tuple(np.bitwise_xor.accumulate(changes, axis=0).astype(np.bool_)))

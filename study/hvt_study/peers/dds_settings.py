@@ -8,7 +8,7 @@ from typing import Literal
 
 from hvt_common.errors import UserError
 from hvt_edge.video.encoder_settings import PRESETS
-from hvt_study.compare_clip import NOMINAL_FPS
+from hvt_study.datasets.clip import NOMINAL_FPS
 
 __all__ = ["RATES", "DdsSettings"]
 
@@ -75,7 +75,7 @@ class DdsSettings:
         if self.preset not in PRESETS:
             raise UserError(f"DDS preset {self.preset!r} is not known: choose from {', '.join(PRESETS)}")
 
-    def settled(self, budget_bps: int, *, size: tuple[int, int]) -> DdsSettings:
+    def resolved(self, budget_bps: int, *, size: tuple[int, int]) -> DdsSettings:
         """The same with a frame rate, chosen by the budget where none was given."""
         if self.fps is not None:
             return self
@@ -84,12 +84,12 @@ class DdsSettings:
 
     @property
     def rate(self) -> float:
-        """``fps`` of settings that are `settled`."""
+        """``fps`` of settings that are `resolved`."""
         assert self.fps is not None, "settled() comes first"
         return self.fps
 
     @property
-    def segment_ticks(self) -> int:
+    def segment_frames(self) -> int:
         """At least one."""
         return max(1, round(self.segment_s * NOMINAL_FPS))
 
@@ -101,7 +101,7 @@ class DdsSettings:
     @property
     def request_bps(self) -> float:
         """What requests may take of the budget."""
-        return 8 * self.request_bytes * NOMINAL_FPS / self.segment_ticks
+        return 8 * self.request_bytes * NOMINAL_FPS / self.segment_frames
 
     def first_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """(width, height) of the first pass, even numbers."""

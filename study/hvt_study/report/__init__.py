@@ -1,1 +1,1 @@
-"""From the rows of a study to its tables, figures and pages."""
+"""From the rows of a study to its tables, figures and pages: `write_report`, `join_studies`."""

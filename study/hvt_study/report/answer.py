@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from hvt_study.report.document import Drawing
-from hvt_study.report.intervals import ENOUGH
-from hvt_study.report.metric_names import METRICS, written
-from hvt_study.report.pair_figures import difference_figures
-from hvt_study.report.pairs import Pair, pairs
-from hvt_study.report.runs import Setting
+from hvt_study.report.data.arms import Setting
+from hvt_study.report.data.document import Drawing
+from hvt_study.report.data.intervals import ENOUGH
+from hvt_study.report.data.metric_names import METRICS, written
+from hvt_study.report.data.pairs import Pair, pairs
+from hvt_study.report.figures.pair_figures import difference_figures
 
 __all__ = ["DECIDES", "REFERENCES", "answer", "forests"]
 
@@ -30,7 +30,7 @@ def answer(found: Sequence[Setting]) -> Iterator[str | Drawing]:
         ahead = " ".join(filter(None, written(best.interval(DECIDES), metric, sign=True)))
         yield (
             f"{setting.name}, labels: {setting.labels}. The method furthest ahead of video at the same bits is "
-            f"{best.arm.name} in the {best.arm.regime} regime, {ahead} {metric.name} "
+            f"{best.arm.name} in the {best.arm.regime} regime, {ahead} {metric.title} "
             f"(n = {len(best.gaps(DECIDES))}). {_tally(plain)}"
         )
     for setting in found[:1]:

@@ -13,9 +13,9 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.metrics.bits import Accounting
-from hvt_study.report.example_store import load_example, save_example
-from hvt_study.report.runs import settings
-from hvt_study.report.table_file import RESULTS, SWEEP, read_results, write_results
+from hvt_study.report.data.arms import settings
+from hvt_study.report.data.table_file import RESULTS, SWEEP, read_results, write_results
+from hvt_study.report.example.store import load_example, save_example
 
 __all__ = ["join_studies"]
 

@@ -7,20 +7,18 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.report.answer import DECIDES, REFERENCES, answer, forests
-from hvt_study.report.appendix_tables import failed_table, metrics_table
-from hvt_study.report.captions import time_of
-from hvt_study.report.curve_figures import codec_figure, utility_figure
-from hvt_study.report.document import Part, Report, Section, Table
-from hvt_study.report.equal_quality import equal_quality
-from hvt_study.report.example_figures import crop_pictures, timeline_figure
-from hvt_study.report.examples import Example
-from hvt_study.report.intervals import ENOUGH
-from hvt_study.report.matrix_table import matrix_table
-from hvt_study.report.pair_figures import equal_figures
-from hvt_study.report.pair_tables import differences_table, equal_table
-from hvt_study.report.pairs import pairs
-from hvt_study.report.runs import Row, Setting, counts, sequence_of, settings
-from hvt_study.report.tables import (
+from hvt_study.report.data.arms import RunRow, Setting, counts, sequence_of, settings
+from hvt_study.report.data.captions import time_of
+from hvt_study.report.data.document import Part, Report, Section, Table
+from hvt_study.report.data.equal_quality import equal_quality
+from hvt_study.report.data.intervals import ENOUGH
+from hvt_study.report.data.pairs import pairs
+from hvt_study.report.example.choice import Example
+from hvt_study.report.figures.curve_figures import codec_figure, utility_figure
+from hvt_study.report.figures.example_figures import crop_pictures, timeline_figure
+from hvt_study.report.figures.pair_figures import equal_figures
+from hvt_study.report.tables.appendix_tables import failed_table, metrics_table
+from hvt_study.report.tables.arm_tables import (
     named_table,
     pilot_table,
     proxy_table,
@@ -28,13 +26,17 @@ from hvt_study.report.tables import (
     size_table,
     spent_table,
 )
+from hvt_study.report.tables.matrix_table import matrix_table
+from hvt_study.report.tables.pair_tables import differences_table, equal_table
 
 __all__ = ["make_report"]
 
 _MATRICES = ("top1_all", "map_50", "hota")
 
 
-def make_report(rows: Sequence[Row], *, sweep: Table | None = None, example: Example | None = None) -> Report:
+def make_report(
+    rows: Sequence[RunRow], *, sweep: Table | None = None, example: Example | None = None
+) -> Report:
     """All of it, in order; nothing is read or written.
 
     Raises:
@@ -63,7 +65,7 @@ def make_report(rows: Sequence[Row], *, sweep: Table | None = None, example: Exa
     )
 
 
-def _lead(rows: Sequence[Row]) -> Iterator[str]:
+def _lead(rows: Sequence[RunRow]) -> Iterator[str]:
     good = sum(map(counts, rows))
     sequences = len({(row["dataset"], row["sequence"]) for row in rows})
     span_s = sum(row["duration_s"] or 0 for row in rows if counts(row))
@@ -87,7 +89,7 @@ def _lead(rows: Sequence[Row]) -> Iterator[str]:
     )
 
 
-def _strays(rows: Sequence[Row]) -> int:
+def _strays(rows: Sequence[RunRow]) -> int:
     """Followers that count and are in no pair, as in tables that were joined."""
     paired = {
         (name, row["key"])
@@ -95,8 +97,8 @@ def _strays(rows: Sequence[Row]) -> int:
         for pair in pairs(setting)
         for name, row in pair.matched.items()
     }
-    followers = [row for row in rows if counts(row) and row["matched_to"]]
-    return sum((sequence_of(row), row["key"]) not in paired for row in followers)
+    matching = [row for row in rows if counts(row) and row["matched_to"]]
+    return sum((sequence_of(row), row["key"]) not in paired for row in matching)
 
 
 def _many(count: int, what: str) -> str:
@@ -112,7 +114,7 @@ def _each(found: Iterable[Setting], *makers: object) -> Iterator[Part]:
                 yield table
 
 
-def _pilot(rows: Sequence[Row], found: Sequence[Setting]) -> Iterator[Part]:
+def _pilot(rows: Sequence[RunRow], found: Sequence[Setting]) -> Iterator[Part]:
     """Both accountings, whichever the other tables are in."""
     yield from _each(settings(in_accounting(rows, "span")), pilot_table)
     yield from _each(found, proxy_table)
@@ -140,7 +142,7 @@ def _against(found: Sequence[Setting]) -> Iterator[Part]:
             for reference in REFERENCES
             if reference in setting.references()
         ]
-        yield from equal_figures(setting, equal, name=f"equal-sight-{index + 1}", column=DECIDES)
+        yield from equal_figures(setting, equal, name=f"equal-quality-{index + 1}", column=DECIDES)
         yield from _there(equal_table(setting, equal, column=DECIDES))
 
 
@@ -154,7 +156,7 @@ def _codecs(found: Sequence[Setting]) -> Iterator[Part]:
         yield from _there(codec_figure(setting, name=f"codecs-{index + 1}"))
 
 
-def _flight(rows: Sequence[Row], example: Example | None) -> Iterator[Part]:
+def _flight(rows: Sequence[RunRow], example: Example | None) -> Iterator[Part]:
     """Only of a run that is in the table, and only if it is the very same flight."""
     digests = {row["key"]: row["digest"] for row in rows}
     if example is None or example.key not in digests:
@@ -168,11 +170,11 @@ def _flight(rows: Sequence[Row], example: Example | None) -> Iterator[Part]:
         yield crop_pictures(example)
 
 
-def _failed(rows: Sequence[Row]) -> Iterator[Part]:
+def _failed(rows: Sequence[RunRow]) -> Iterator[Part]:
     yield from _there(failed_table(rows))
 
 
-def _provenance(rows: Sequence[Row]) -> Iterator[Part]:
+def _provenance(rows: Sequence[RunRow]) -> Iterator[Part]:
     said: dict[str, list[str]] = {}
     for row in rows:
         for name, version in _versions(row["versions"]).items():

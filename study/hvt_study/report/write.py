@@ -9,18 +9,17 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_study.matrix.accounting import in_accounting
 from hvt_study.metrics.bits import Accounting
-from hvt_study.report.document import Drawing, Pictures, Report
-from hvt_study.report.example_store import load_example
-from hvt_study.report.html_page import html_page
+from hvt_study.report.data.document import Drawing, Pictures, Report
+from hvt_study.report.data.table_file import RESULTS, SWEEP, read_results
+from hvt_study.report.example.store import load_example
 from hvt_study.report.make import make_report
-from hvt_study.report.markdown_page import FIGURES, markdown_page
-from hvt_study.report.sweep_table import sweep_table
-from hvt_study.report.table_file import RESULTS, SWEEP, read_results
+from hvt_study.report.pages.render import FIGURES, html_page, markdown_page
+from hvt_study.report.tables.sweep_table import sweep_table
 
 __all__ = ["write_report"]
 
 _OURS = re.compile(
-    r"(?:(?:answer|timeline|(?:differences|equal-sight|utility|codecs)-\d+)(?:-[A-Za-z0-9.-]+)?\.(?:svg|pdf)"
+    r"(?:(?:answer|timeline|(?:differences|equal-quality|utility|codecs)-\d+)(?:-[A-Za-z0-9.-]+)?\.(?:svg|pdf)"
     r"|crop-\d+-(?:source|base|still)\.png)"
 )
 """Files that a report of ours may have written."""

@@ -10,7 +10,6 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import open_model
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, embedded_models
 from hvt_scene import Scene
-from hvt_train.crops import held_out_crops
 from hvt_train.evaluate import (
     CLEAN,
     clip_frames,
@@ -19,6 +18,7 @@ from hvt_train.evaluate import (
     evaluate_real,
     reference_vehicles,
 )
+from hvt_train.pictures.crops import held_out_crops
 
 
 def test_they_are_there_and_small_together():

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from hvt_common.values import View
-from hvt_scene import Look, Scene, write_truth
-from hvt_scene.project import turns
-from hvt_scene.vehicles import CLASS_NAMES, draw_vehicle
+from hvt_scene import Appearance, Scene, write_truth
+from hvt_scene.drawing.vehicles import CLASS_NAMES, draw_vehicle
+from hvt_scene.view.project import turns
 
 CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 
@@ -25,13 +25,15 @@ def scene():
 @pytest.fixture(scope="module")
 def bare():
     """Draw without shadows, so that a body alone makes the difference between two pictures; small, to be quick."""
-    return Scene(0, size=(960, 540), look=Look(shadow_strength=0.0))
+    return Scene(0, size=(960, 540), appearance=Appearance(shadow_strength=0.0))
 
 
 @pytest.fixture(scope="module")
 def tilted():
     """Look aslant at a scene that is turned."""
-    return Scene(4, size=(960, 540), look=Look(shadow_strength=0.0, tilt_deg=25.0, roll_deg=(40.0, 60.0)))
+    return Scene(
+        4, size=(960, 540), appearance=Appearance(shadow_strength=0.0, tilt_deg=25.0, roll_deg=(40.0, 60.0))
+    )
 
 
 def digest(image):
@@ -166,7 +168,7 @@ def test_visibility_is_the_share_of_pixels_that_show(bare):
 
 def test_traffic_does_not_drive_through_itself(scene):
     """A person would see at once that the demo is broken."""
-    cast = scene._cast
+    cast = scene.cast
     driving = np.nonzero(cast.class_ids != CLASSES.index("pedestrian"))[0]
     for t_s in range(0, 20, 2):
         places = cast.places(float(t_s))
@@ -217,9 +219,9 @@ def test_random_looks_differ_strongly(tmp_path):
     """A detector trained on the scene would learn its asphalt by heart."""
     means = []
     for seed in range(4):
-        scene = Scene(seed, size=(480, 270), look=Look.random(seed))
+        scene = Scene(seed, size=(480, 270), appearance=Appearance.random(seed))
         means.append(scene.image(5.0).mean((0, 1)))
-        assert Look.random(seed) == Look.random(seed)
+        assert Appearance.random(seed) == Appearance.random(seed)
     spread = np.ptp(np.array(means), axis=0)
     assert (spread > 20).all()
 

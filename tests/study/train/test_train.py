@@ -7,9 +7,9 @@ import pytest
 
 from hvt_common.values import Detections
 from hvt_train.evaluate import average_precision, evaluate_drawn, evaluate_real, overlaps
-from hvt_train.fleet import make_solid
-from hvt_train.places import Picture, draw_place
-from hvt_train.views import ViewSettings, ViewSource, degrade
+from hvt_train.pictures.fleet import make_solid
+from hvt_train.pictures.places import Picture, draw_place
+from hvt_train.pictures.views import ViewSettings, ViewSource, degrade
 
 CLASSES = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
 
@@ -175,7 +175,7 @@ def torch():
 @pytest.fixture
 def batch(torch, tmp_path, place):
     """Eight views of one place."""
-    from hvt_train.train_detector import batch_of
+    from hvt_train.learning.train_detector import batch_of
 
     source = ViewSource([save(tmp_path, place)], seed=2, settings=ViewSettings(side=128))
     return batch_of([source.next() for _ in range(8)])
@@ -183,8 +183,8 @@ def batch(torch, tmp_path, place):
 
 def test_training_lowers_the_loss(torch, batch):
     """The recipe would run for an hour and learn nothing."""
-    from hvt_train.detector import DetectorNet
-    from hvt_train.train_detector import loss_of
+    from hvt_train.learning.detector import DetectorNet
+    from hvt_train.learning.train_detector import loss_of
 
     net = DetectorNet(len(CLASSES)).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=2e-3)
@@ -200,7 +200,7 @@ def test_training_lowers_the_loss(torch, batch):
 
 def test_perfect_answers_cost_next_to_nothing(torch):
     """The loss would pull right answers away from where they belong."""
-    from hvt_train.loss import Targets, detector_loss
+    from hvt_train.learning.loss import Targets, detector_loss
 
     maps = [torch.full((1, 12, side, side), -12.0) for side in (16, 8, 4)]
     for level in maps:
@@ -226,8 +226,8 @@ def test_the_onnx_file_answers_as_the_network_does(torch, tmp_path):
     pytest.importorskip("onnx")
     from hvt_common.inference.detect import open_detector
     from hvt_common.inference.runtimes.model import open_model
-    from hvt_train.detector import DetectorNet, ExportedDetector
-    from hvt_train.train_detector import export_detector
+    from hvt_train.learning.detector import DetectorNet, ExportedDetector
+    from hvt_train.learning.train_detector import export_detector
 
     net = DetectorNet(len(CLASSES)).eval()
     for level in net.modules():
@@ -249,7 +249,7 @@ def test_the_classifier_file_answers_as_the_network_does(torch, tmp_path):
     """Crops would be prepared otherwise in the air than in training."""
     pytest.importorskip("onnx")
     from hvt_common.inference.classify import open_classifier
-    from hvt_train.classifier import MEAN, SCALE, ClassifierNet, export_classifier
+    from hvt_train.learning.classifier import MEAN, SCALE, ClassifierNet, export_classifier
 
     net = ClassifierNet(len(CLASSES)).eval()
     path = tmp_path / "cls.onnx"

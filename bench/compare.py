@@ -1,0 +1,250 @@
+"""``make bench-compare``: every method at every rate on a real clip and on small objects, judged against the goals.
+
+Writes build/compare/CLIP.json and CLIP.png; with ``--docs`` also plots and tables of docs/design-notes/compare.md.
+``python -m bench.compare [--docs] [CLIP …]``: carpark, highway (reference labels), street (exact labels), or all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from bench.material import ROOT, data
+from hvt_common.runtime.reporting import write_json
+from hvt_study.commands.compare import print_result
+from hvt_study.matrix.compare import ComparePlan, CompareResult, CompareRow, compare
+from hvt_study.matrix.pools import local_pool
+from hvt_study.report.figures.compare_plot import plot
+from hvt_study.runs.spec import ModelChoice
+
+_RATES = (150_000, 200_000, 300_000, 400_000, 800_000)
+_CLIPS = {
+    "carpark": "clips/drone_carpark.mp4",
+    "highway": "still:aerial_highway.jpg",
+    "street": "still:visdrone/0000001_02999_d_0000005.jpg@1.2",
+}
+_OUT = Path("build/compare")
+_DOC = ROOT / "docs" / "design-notes" / "compare.md"
+_BEGIN, _END = "<!-- results of make bench-compare -->", "<!-- end of results -->"
+
+Goal = tuple[str, str, bool | None]
+"""What was asked for, what was measured, and whether it holds; None where it cannot be judged."""
+
+
+def main(argv: list[str]) -> int:
+    parser = argparse.ArgumentParser(prog="python -m bench.compare", description=__doc__)
+    parser.add_argument("clips", nargs="*", metavar="CLIP", help=", ".join(_CLIPS))
+    parser.add_argument(
+        "--docs", action="store_true", help="also write docs/design-notes/compare.md's tables and plots"
+    )
+    arguments = parser.parse_args(argv)
+    unknown = [name for name in arguments.clips if name not in _CLIPS]
+    if unknown:
+        parser.error(f"clip {unknown[0]} is not known: choose from {', '.join(_CLIPS)}")
+    _OUT.mkdir(parents=True, exist_ok=True)
+    console = Console(highlight=False)
+    sections = []
+    for name in arguments.clips or _CLIPS:
+        result = _fly(name)
+        print_result(result)
+        goals = list(_goals(name, result))
+        for goal, measured, holds in goals:
+            console.print(f"{_WORDS[holds]:>15}  {goal}: {measured}", markup=False, soft_wrap=True)
+        sections.append((name, result, goals))
+    if arguments.docs:
+        _document(sections)
+    return 0
+
+
+_WORDS = {True: "holds", False: "does not hold", None: "not judged"}
+
+
+def _fly(name: str) -> CompareResult:
+    clip, models = _CLIPS[name], data() / "models"
+    scheme, _, path = clip.rpartition(":")
+    began_s = time.monotonic()
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(name, total=None)
+
+        def on_run(done: int, of: int) -> None:
+            progress.update(task, completed=done, total=of)
+
+        plan = ComparePlan(
+            clip=f"{scheme}:{data() / path}" if scheme else str(data() / path),
+            models=ModelChoice(
+                detector=str(models / "yolov5su_visdrone_736x1280.onnx"),
+                edge_detector=str(models / "yolov5su_visdrone_640.onnx"),
+            ),
+            rates_bps=_RATES,
+            cache=(_OUT / "cache").absolute(),
+        )
+        with local_pool(os.cpu_count() or 1) as pool:
+            result = compare(plan, pool=pool, on_run=on_run)
+    print(f"{name}: {time.monotonic() - began_s:.0f} s", file=sys.stderr)
+    write_json(_OUT / f"{name}.json", list(result.rows))
+    plot(result, _OUT / f"{name}.png")
+    return result
+
+
+# Goals
+
+
+def _goals(name: str, result: CompareResult) -> Iterator[Goal]:
+    """All are of the second half."""
+    rows = {(row["method"], row["rate_kbps"]): row for row in result.rows if row["half"] == 2}
+    if name == "carpark":
+        yield from _half_the_bits(rows)
+    else:
+        yield from _small_objects(rows)
+    yield _never_worse(rows)
+
+
+def _half_the_bits(rows: dict[tuple[str, float], CompareRow]) -> Iterator[Goal]:
+    for rate in (300.0, 400.0, 800.0):  # half of less lies below the lowest rate
+        goal = f"M6 needs at most 0.5 of the bits of M0-fps at {rate:g} kbps for its class agreement"
+        row = rows.get(("M0-fps", rate))
+        needed = None if row is None else _bits_for(row["class_agreement"], _curve(rows, "M6"))
+        if row is None or not _curve(rows, "M6"):
+            yield goal, "a method is missing", None
+        elif needed is None:
+            best = max(one["class_agreement"] for one in _curve(rows, "M6"))
+            yield goal, f"M6 never reaches {row['class_agreement']:.3f} (best {best:.3f})", False
+        else:
+            share = needed / row["total_bps"]
+            yield goal, f"{share:.2f} for {row['class_agreement']:.3f}", share <= 0.5
+
+
+def _small_objects(rows: dict[tuple[str, float], CompareRow]) -> Iterator[Goal]:
+    best = rows.get(("M6", 200.0))
+    for other, factor in (("M0", 5.0), ("M0-fps", 1.5)):
+        row = rows.get((other, 200.0))
+        goal = f"F1 of M6 at 200 kbps at least {factor:g} x that of {other}"
+        if best is None or row is None:
+            yield goal, "a method is missing", None
+            continue
+        yield (
+            goal,
+            f"{best['f1']:.3f} / {row['f1']:.3f} = {best['f1'] / max(row['f1'], 1e-9):.2f}",
+            best["f1"] >= factor * row["f1"],
+        )
+        goal = f"delay p95 of M6 at 200 kbps no worse than {other}'s"
+        yield (
+            goal,
+            f"{best['delay_p95_ms']:.0f} and {row['delay_p95_ms']:.0f} ms",
+            best["delay_p95_ms"] <= row["delay_p95_ms"],
+        )
+
+
+def _never_worse(rows: dict[tuple[str, float], CompareRow]) -> Goal:
+    """At the bits that R0 really spent, M6's curve in between its rates."""
+    goal = "M6 never worse than R0 at equal bits (F1 and class agreement)"
+    mine, theirs = _curve(rows, "M6"), _curve(rows, "R0")
+    if len(mine) < 2 or not theirs:
+        return goal, "a method is missing", None
+    gains: list[tuple[float, str, float]] = []
+    for row in theirs:
+        for measure in ("f1", "class_agreement"):
+            value = _value_at(row["total_bps"], mine, lambda one, of=measure: float(one[of]))
+            if value is not None:
+                gains.append((value - row[measure], measure, row["rate_kbps"]))
+    least, measure, rate = min(gains)
+    return goal, f"least gain {least:+.3f} ({measure} at {rate:g} kbps)", least >= 0
+
+
+def _curve(rows: dict[tuple[str, float], CompareRow], method: str) -> list[CompareRow]:
+    return sorted(
+        (row for (name, _), row in rows.items() if name == method), key=lambda row: row["total_bps"]
+    )
+
+
+def _bits_for(agreement: float, curve: list[CompareRow]) -> float | None:
+    """The fewest bits at which a curve reaches a class agreement, straight lines over the logarithm of the bits."""
+    for index, row in enumerate(curve):
+        if row["class_agreement"] < agreement:
+            continue
+        if index == 0:
+            return row["total_bps"]
+        before = curve[index - 1]
+        part = (agreement - before["class_agreement"]) / (row["class_agreement"] - before["class_agreement"])
+        low, high = math.log(before["total_bps"]), math.log(row["total_bps"])
+        return math.exp(low + part * (high - low))
+    return None
+
+
+def _value_at(bps: float, curve: list[CompareRow], value: Callable[[CompareRow], float]) -> float | None:
+    """What a curve says at so many bits; None below its beginning, its last value beyond its end."""
+    if bps < curve[0]["total_bps"]:
+        return value(curve[0]) if bps > 0.97 * curve[0]["total_bps"] else None
+    for low, high in pairwise(curve):
+        if low["total_bps"] <= bps <= high["total_bps"]:
+            span = math.log(high["total_bps"] / low["total_bps"])
+            part = math.log(bps / low["total_bps"]) / span if span else 0.0
+            return value(low) + part * (value(high) - value(low))
+    return value(curve[-1])
+
+
+# docs/design-notes/compare.md
+
+_HEADS = (
+    *(
+        "kbps",
+        "method",
+        "F1 1st, 2nd half",
+        "class 1st, 2nd half",
+        "in all",
+        "base",
+        "stills",
+        "tracks",
+        "fps",
+    ),
+    *("largest frame", "delay p95", "edge CPU"),
+)
+
+
+def _document(sections: list[tuple[str, CompareResult, list[Goal]]]) -> None:
+    images = ROOT / "docs" / "images"
+    parts = []
+    for name, result, goals in sections:
+        shutil.copyfile(_OUT / f"{name}.png", images / f"compare-{name}.png")
+        parts.append(_section(name, result, goals))
+    text = _DOC.read_text(encoding="utf-8")
+    before, _, rest = text.partition(_BEGIN)
+    _, _, after = rest.partition(_END)
+    _DOC.write_text(f"{before}{_BEGIN}\n\n" + "\n".join(parts) + f"\n{_END}{after}", encoding="utf-8")
+
+
+def _section(name: str, result: CompareResult, goals: list[Goal]) -> str:
+    lines = [
+        f"### {name} ({result.labels} labels)\n",
+        f"![F1 and class agreement over kbps](../images/compare-{name}.png)\n",
+        "| " + " | ".join(_HEADS) + " |",
+        "|" + "---|" * len(_HEADS),
+    ]
+    for first, second in zip(result.rows[::2], result.rows[1::2], strict=True):
+        lines.append(
+            f"| {first['rate_kbps']:g} | {first['method']} | {first['f1']:.3f}, {second['f1']:.3f} "
+            f"| {first['class_agreement']:.3f}, {second['class_agreement']:.3f} | {first['total_bps'] / 1e3:.0f} "
+            f"| {first['base_bps'] / 1e3:.0f} | {first['roi_bps'] / 1e3:.0f} | {first['track_bps'] / 1e3:.1f} "
+            f"| {first['fps']:.1f} | {first['max_frame_bytes'] / 1e3:.1f} kB | {first['delay_p95_ms']:.0f} ms "
+            f"| {first['edge_cpu_ms']:.0f} ms |"
+        )
+    lines += [
+        f"\nNot available: {one.method} at {one.rate_kbps:g} kbps ({one.reason})." for one in result.missing
+    ]
+    lines += ["", "| goal | measured | |", "|---|---|---|"]
+    lines += [f"| {goal} | {measured} | {_WORDS[holds]} |" for goal, measured, holds in goals]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

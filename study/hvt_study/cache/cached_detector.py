@@ -1,0 +1,140 @@
+"""A detector that remembers: flights of one comparison look at the same pixels again and again.
+
+What a detection cost is remembered with it, so that a flight can still say what it would have spent. An answer is
+named by all that decides it: the content of the model file, what runs it, the code and the versions of the libraries
+on the way, and the pixels. Each entry carries a checksum; one that was cut off or changed is thrown away, and the
+detector is asked again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import time
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import msgpack
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.inference.detect import OnnxDetector
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
+from hvt_common.inference.store import resolve_model
+from hvt_common.values import Detections, Image
+from hvt_study.cache.code_digest import code_digest
+from hvt_study.cache.results import CacheError, file_digest
+
+__all__ = ["CachedDetector"]
+
+_log = logging.getLogger(__name__)
+_PACKAGES = ("numpy", "opencv-python-headless", "onnxruntime", "onnxruntime-gpu", "openvino")
+"""Those that may have a say in an answer, as far as they are installed."""
+_CHECKSUM_BYTES = 16
+_digest_of_file = cache(file_digest)
+"""Once in a process: a model that is changed under a running study is not noticed by it."""
+
+
+class CachedDetector(OnnxDetector):
+    """The network that ``spec`` names, on one thread; its answers lie in ``folder``, which processes may share.
+
+    Raises:
+        UserError: as `hvt_common.inference.detect.open_detector`; or the folder cannot be made.
+        CacheError: from `detect`, it cannot be written any further.
+    """
+
+    def __init__(self, spec: str, *, confidence: float, provider: str, folder: Path) -> None:
+        path = resolve_model(spec, role="detector")
+        super().__init__(
+            open_model(path, settings=ModelSettings(threads=1, provider=provider)), confidence=confidence
+        )
+        said = (
+            _digest_of_file(path.resolve()),
+            self.model.provider.provider,
+            f"{confidence:g}",
+            *_versions(),
+        )
+        self._name = " ".join(said).encode()
+        self._folder = folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"detections {folder} cannot be made ({error.strerror}): name a folder") from None
+        self.saved_cpu_s = 0.0
+        """What the answers out of memory would have cost, less what it took to remember."""
+
+    def detect(self, image_bgr: Image) -> Detections:
+        """The network's answer for these pixels."""
+        began_s = time.process_time()
+        path = self._folder / self._key(image_bgr)
+        known = _read(path)
+        if known is None:
+            began_s = time.process_time()
+            found = super().detect(image_bgr)
+            cost_s = time.process_time() - began_s
+            _write(path, found, cost_s)
+        else:
+            found, cost_s = known
+        self.saved_cpu_s += cost_s - (time.process_time() - began_s)
+        return found
+
+    def _key(self, image_bgr: Image) -> str:
+        digest = hashlib.sha1(self._name + repr(image_bgr.shape).encode(), usedforsecurity=False)
+        digest.update(image_bgr.tobytes())
+        return digest.hexdigest()
+
+
+@cache
+def _versions() -> tuple[str, ...]:
+    found = [f"code {code_digest('hvt_common')}"]
+    for name in _PACKAGES:
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return tuple(found)
+
+
+def _read(path: Path) -> tuple[Detections, float] | None:
+    """What lies there; None where there is nothing, or nothing whole."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        _log.warning("%s cannot be read (%s): the detector is asked again", path, error.strerror)
+        return None
+    checksum, body = data[:_CHECKSUM_BYTES], data[_CHECKSUM_BYTES:]
+    if checksum != _checksum(body):
+        _log.warning("%s is damaged: the detector is asked again", path)
+        path.unlink(missing_ok=True)
+        return None
+    cost_s, boxes, confidences, class_ids = msgpack.unpackb(body)
+    found = Detections(
+        np.frombuffer(boxes, "<f4").reshape(-1, 4).astype(np.float32),
+        np.frombuffer(confidences, "<f4").astype(np.float32),
+        np.frombuffer(class_ids, "<i4").astype(np.int32),
+    )
+    return found, float(cost_s)
+
+
+def _write(path: Path, found: Detections, cost_s: float) -> None:
+    """Keep an answer; whole or not at all, for another process may be reading."""
+    arrays = (found.boxes_xyxy_px, "<f4"), (found.confidences, "<f4"), (found.class_ids, "<i4")
+    body: bytes = msgpack.packb([cost_s, *(one.astype(dtype).tobytes() for one, dtype in arrays)])
+    scratch = path.with_suffix(f".{os.getpid()}")
+    try:
+        scratch.write_bytes(_checksum(body) + body)
+        scratch.replace(path)
+    except OSError as error:
+        scratch.unlink(missing_ok=True)
+        raise CacheError(
+            f"detections {path.parent} cannot be written ({error.strerror}): what is in it stays; make room, or name "
+            "another with --cache"
+        ) from None
+
+
+def _checksum(body: bytes) -> bytes:
+    return hashlib.sha256(body).digest()[:_CHECKSUM_BYTES]

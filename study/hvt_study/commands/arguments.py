@@ -1,0 +1,274 @@
+"""The arguments that ``run``, ``plan`` and ``tune`` share, and what they ask for."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence as Many
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from hvt_common.errors import UserError
+from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.detect import MOTION, open_detector
+from hvt_common.inference.labels import first_synonym
+from hvt_common.inference.store import EMBEDDED_DETECTOR
+from hvt_common.runtime.reporting import check_writable
+from hvt_common.units import parse_size
+from hvt_common.video.still_codecs import still_codec
+from hvt_edge.source.contract import check_shape
+from hvt_ground.config import DETECTOR, NONE
+from hvt_study.datasets.layouts.uri import DATASETS, open_datasets
+from hvt_study.datasets.sequence import Sequence
+from hvt_study.matrix.accounting import ACCOUNTINGS
+from hvt_study.matrix.plan import StudyPlan, parse_regimes
+from hvt_study.matrix.pools import dask_pool, local_pool
+from hvt_study.matrix.tuning import tuned_methods
+from hvt_study.runs.joint_classes import joint_classes
+from hvt_study.runs.methods import METHODS, chosen_methods
+from hvt_study.runs.spec import ModelChoice
+
+__all__ = [
+    "add_accounting",
+    "add_plan_arguments",
+    "add_pool_arguments",
+    "jobs_of",
+    "make_out",
+    "open_pool",
+    "open_sequences",
+    "study_plan",
+]
+
+_LEAST_FRAMES = 30
+_MOST_JOBS = 256
+_ALL_AT_ONCE = 10_000
+"""A cluster has a queue of its own."""
+
+
+def add_pool_arguments(parser: argparse.ArgumentParser) -> None:
+    """Where it is done."""
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help="processes, each with one thread and one sequence's pictures at a time (default: the cores)",
+    )
+    parser.add_argument(
+        "--dask",
+        default=argparse.SUPPRESS,
+        metavar="tcp://…",
+        help="run on the workers of this Dask cluster instead, which see the same files (dask worker --nthreads 1)",
+    )
+
+
+def add_accounting(parser: argparse.ArgumentParser, *, default: str) -> None:
+    """What rates are divided by; matching is not touched by it."""
+    parser.add_argument(
+        "--accounting",
+        choices=ACCOUNTINGS,
+        default=default,
+        help="rates by the processed span, or by the length of the whole clip as in the pilot's notebooks, for "
+        "comparison with its tables",
+    )
+
+
+def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True, writes: bool = True) -> None:
+    """All that decides which runs there are; ``methods`` where several may be named, ``writes`` with ``--out``."""
+    parser.add_argument("datasets", nargs="+", metavar="DATASET", help=", ".join(DATASETS))
+    parser.add_argument(
+        "--detector",
+        action="append",
+        default=argparse.SUPPRESS,
+        metavar="FILE",
+        help="of the ground, and of reference labels: FILE.onnx or a model's name; may be given several times "
+        "(default: the embedded one)",
+    )
+    parser.add_argument(
+        "--edge-detector",
+        default=argparse.SUPPRESS,
+        metavar="FILE",
+        help="of the edge (default: the ground's)",
+    )
+    parser.add_argument(
+        "--classifier",
+        action="append",
+        default=argparse.SUPPRESS,
+        help="reads the stills: detector, none, FILE.onnx or a model's name; may be given several times "
+        "(default: detector)",
+    )
+    parser.add_argument("--refine", default="fuse", choices=("replace", "fuse"), help="as of hvt-ground")
+    every = ",".join(METHODS)
+    if methods:
+        parser.add_argument("--methods", default=every, metavar="NAME,…", help="which to fly")
+        parser.add_argument(
+            "--tune",
+            action="append",
+            default=[],
+            metavar="METHOD:KEY=VALUE,…|FILE",
+            help="parameters of a method other than its defaults, or the tune.json of a search",
+        )
+    else:
+        parser.set_defaults(methods=every, tune=[])
+    parser.add_argument(
+        "--regimes",
+        default="low,moderate",
+        metavar="NAME,…",
+        help="low, moderate, or budgets such as 300kbps",
+    )
+    parser.add_argument(
+        "--still-codecs", default="jpeg", metavar="NAME,…", help="for the methods with stills"
+    )
+    parser.add_argument(
+        "--labels",
+        default="annotations",
+        choices=("annotations", "reference"),
+        help="what is there: the dataset's word, or the ground's detector on untouched frames",
+    )
+    parser.add_argument(
+        "--detect-every",
+        type=int,
+        default=5,
+        metavar="N",
+        help="frames from one detection to the next at edge and ground; DDS looks at every frame that it codes, and "
+        "with 1 so does the rest",
+    )
+    parser.add_argument("--size", default="1280x720", metavar="WxH", help="size of the base stream")
+    parser.add_argument(
+        "--max-frames", type=int, default=argparse.SUPPRESS, metavar="N", help="frames of a sequence"
+    )
+    parser.add_argument(
+        "--limit", type=int, default=argparse.SUPPRESS, metavar="N", help="sequences of a dataset"
+    )
+    parser.add_argument(
+        "--only", action="append", default=[], metavar="NAME", help="sequences, or patterns of them"
+    )
+    parser.add_argument("--provider", default="auto", help="what runs the networks, as of hvt-edge")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=writes,
+        default=argparse.SUPPRESS,
+        metavar="DIR",
+        help="results.parquet, report.html, …" if writes else "not needed: nothing is written",
+    )
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        default=argparse.SUPPRESS,
+        metavar="DIR",
+        help="finished flights (default: DIR/cache)",
+    )
+
+
+def open_sequences(arguments: argparse.Namespace) -> tuple[tuple[str, Sequence], ...]:
+    """(URI, sequence) of all that the arguments name; `UserError` where labels are asked for that nobody made."""
+    limit = getattr(arguments, "limit", None)
+    found = tuple(open_datasets(arguments.datasets, limit=limit, only=arguments.only))
+    for uri, one in found:
+        if one.labels is None and arguments.labels == "annotations":
+            raise UserError(f"{uri} {one.name} has no annotations: add --labels reference, or leave it out")
+    return found
+
+
+def study_plan(arguments: argparse.Namespace, sequences: Many[tuple[str, Sequence]]) -> StudyPlan:
+    """What the arguments ask for, with these of `open_sequences`; `UserError` for what cannot be."""
+    size = parse_size(arguments.size, name="--size")
+    check_shape(size=size, fps=15)
+    frames = getattr(arguments, "max_frames", None)
+    if frames is not None and frames < _LEAST_FRAMES:
+        raise UserError(f"--max-frames {frames} is too few: give {_LEAST_FRAMES} or more")
+    if arguments.detect_every < 1:
+        raise UserError(
+            f"--detect-every {arguments.detect_every} is not accepted: give a whole number from 1"
+        )
+    codecs = tuple(dict.fromkeys(word.strip() for word in arguments.still_codecs.split(",")))
+    for codec in codecs:
+        still_codec(codec)
+    plan = StudyPlan(
+        sequences=tuple((uri, one.name) for uri, one in sequences),
+        methods=chosen_methods(arguments.methods),
+        regimes=parse_regimes(arguments.regimes),
+        still_codecs=codecs,
+        models=_models(arguments),
+        labels=arguments.labels,
+        cache=_cache(arguments).absolute(),
+        size=size,
+        max_frames=frames,
+        detect_every=arguments.detect_every,
+        tune=_tune(arguments),
+    )
+    _check_classes(plan, sequences)
+    return plan
+
+
+def open_pool(arguments: argparse.Namespace) -> tuple[AbstractContextManager[Any], int]:
+    """The pool that the arguments ask for, and how many runs to hand it at once."""
+    if hasattr(arguments, "dask") and not hasattr(arguments, "jobs"):
+        return dask_pool(arguments.dask), _ALL_AT_ONCE
+    jobs = jobs_of(arguments)
+    return local_pool(jobs), jobs
+
+
+def jobs_of(arguments: argparse.Namespace) -> int:
+    """How many processes on this machine; `UserError` for a number that cannot be, or has no say."""
+    jobs: int = getattr(arguments, "jobs", os.cpu_count() or 1)
+    if hasattr(arguments, "dask"):
+        raise UserError(f"--jobs {jobs} has no say with --dask: give one of them")
+    if not 1 <= jobs <= _MOST_JOBS:
+        raise UserError(f"--jobs {jobs} is not accepted: give a whole number from 1 to {_MOST_JOBS}")
+    return jobs
+
+
+def make_out(folder: Path, *, name: str) -> Path:
+    """The file of that name in ``--out``, which is made; `UserError` now where it could not be written later."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--out {folder} cannot be made ({error.strerror}): name a folder") from None
+    check_writable(folder / name, name="--out")
+    return folder / name
+
+
+def _cache(arguments: argparse.Namespace) -> Path:
+    out: Path = getattr(arguments, "out", Path())  # who plans writes nothing
+    return getattr(arguments, "cache", out / "cache")
+
+
+def _models(arguments: argparse.Namespace) -> tuple[ModelChoice, ...]:
+    detectors: list[str] = getattr(arguments, "detector", [EMBEDDED_DETECTOR])
+    models = tuple(
+        ModelChoice(
+            detector=detector,
+            edge_detector=getattr(arguments, "edge_detector", detector),
+            classifier=classifier,
+            refine=arguments.refine,
+            provider=arguments.provider,
+        )
+        for detector in dict.fromkeys(detectors)
+        for classifier in dict.fromkeys(getattr(arguments, "classifier", ["detector"]))
+    )
+    if any(MOTION in (one.detector, one.edge_detector) for one in models):
+        raise UserError(f"{MOTION!r} remembers pictures, and cannot serve a study: give a detection network")
+    return models
+
+
+def _tune(arguments: argparse.Namespace) -> dict[str, tuple[str, ...]]:
+    found = tuned_methods(arguments.tune)
+    flown = {one.name for one in chosen_methods(arguments.methods)}
+    for name in found:
+        if name not in flown:
+            raise UserError(f"--tune of {name} has no say: it is not among --methods {arguments.methods}")
+    return found
+
+
+def _check_classes(plan: StudyPlan, sequences: Many[tuple[str, Sequence]]) -> None:
+    """Before anything is flown, for the last sequence as for the first."""
+    for model, reader in dict.fromkeys((one.detector, one.classifier) for one in plan.models):
+        names = open_detector(model, threads=1).class_names
+        read = None if reader in (DETECTOR, NONE) else open_classifier(reader, threads=1).class_names
+        own = (tuple(map(first_synonym, read or names)),)
+        sets = own if plan.labels == "reference" else (one.class_set for _, one in sequences)
+        for class_set in dict.fromkeys(sets):
+            joint_classes(names, read, class_set)

@@ -1,0 +1,100 @@
+"""Which class of a detector or classifier speaks of which class of a dataset.
+
+Names are compared by kind (`hvt_common.inference.class_names`): COCO's ``person`` speaks of VisDrone's ``pedestrian``
+and ``people``, an ImageNet ``pickup`` of UAVDT's ``truck``. Within one kind names stay apart where model and dataset
+have the very same ones, else they become one word. Where a dataset has one class of a kind, that is the word.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import MOVING, kind_of
+from hvt_common.inference.labels import first_synonym
+
+__all__ = ["ClassMap", "map_classes"]
+
+_VEHICLE = "vehicle"
+_VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
+"""What a dataset means that calls all of them so."""
+_SHOWN = 12
+
+
+@dataclass(frozen=True, slots=True)
+class ClassMap:
+    """Which names of a model and of a dataset mean the same."""
+
+    spoken: Mapping[str, tuple[str, ...]]
+    """Model class to classes of the dataset that it speaks of; classes that speak of none are not in it."""
+    words: Mapping[str, str]
+    """Word in which a name is compared, for all names of model and dataset that have a partner."""
+
+    def word(self, name: str) -> str:
+        """The word in which a name of either side is compared; its own plain form where it has no partner."""
+        return self.words.get(name) or _plain(name)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Words that both sides have, sorted: what metrics are of."""
+        return tuple(sorted(set(self.words.values())))
+
+
+def map_classes(model_names: Iterable[str], dataset_classes: Iterable[str]) -> ClassMap:
+    """Find the partners.
+
+    Args:
+        model_names: class names of a detector or classifier (VisDrone's ten, COCO's 80, ImageNet's 1000 …).
+        dataset_classes: `Sequence.class_set`.
+
+    Raises:
+        UserError: the two share no kind at all.
+    """
+    models, classes = tuple(dict.fromkeys(model_names)), tuple(dict.fromkeys(dataset_classes))
+    ours, theirs = _by_kind(models, classes), _by_kind(classes, classes)
+    spoken: dict[str, tuple[str, ...]] = {}
+    words: dict[str, str] = {}
+    for kind in ours.keys() & theirs.keys():
+        found, words_of = _pair(ours[kind], theirs[kind], kind=kind)
+        spoken |= found
+        words |= words_of
+    if MOVING in models and len(models) == 1:  # the motion detector does not say what it is that moves
+        spoken, words = {MOVING: classes}, dict.fromkeys((MOVING, *classes), MOVING)
+    if not spoken or not classes:
+        raise UserError(
+            f"the model's classes ({_some(models)}) and those of the dataset ({_some(classes)}) have nothing in "
+            "common: give a model of one of these kinds, or labels=reference"
+        )
+    return ClassMap({name: spoken[name] for name in models if name in spoken}, words)
+
+
+def _pair(
+    models: list[str], classes: list[str], *, kind: str
+) -> tuple[dict[str, tuple[str, ...]], dict[str, str]]:
+    """Of one kind: what each model class speaks of, and the word of every name."""
+    if len(classes) > 1 and {_plain(name) for name in models} == {_plain(name) for name in classes}:
+        named = {_plain(name): name for name in classes}
+        spoken: dict[str, tuple[str, ...]] = {name: (named[_plain(name)],) for name in models}
+        return spoken, {name: _plain(name) for name in (*models, *classes)}
+    word = _plain(classes[0]) if len(classes) == 1 else kind
+    return dict.fromkeys(models, tuple(classes)), dict.fromkeys((*models, *classes), word)
+
+
+def _by_kind(names: Collection[str], classes: Collection[str]) -> dict[str, list[str]]:
+    all_one = any(_plain(name) == _VEHICLE for name in classes)
+    found: dict[str, list[str]] = defaultdict(list)
+    for name in names:
+        kind = kind_of(name)
+        found[_VEHICLE if all_one and kind in _VEHICLES else kind].append(name)
+    return found
+
+
+def _plain(name: str) -> str:
+    return first_synonym(name).casefold()
+
+
+def _some(names: Collection[str]) -> str:
+    shown = ", ".join(list(names)[:_SHOWN])
+    return f"{shown} … {len(names)} in all" if len(names) > _SHOWN else shown or "none"

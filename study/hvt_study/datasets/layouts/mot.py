@@ -1,0 +1,180 @@
+"""MOTChallenge's layout (https://motchallenge.net), which CVAT and others write, too.
+
+::
+
+    ROOT/MOT17-02-FRCNN/seqinfo.ini       name, imDir, frameRate, seqLength, imWidth, imHeight, imExt
+    ROOT/MOT17-02-FRCNN/img1/000001.jpg …
+    ROOT/MOT17-02-FRCNN/gt/gt.txt         frame,id,x,y,w,h,counts,class,visibility
+    ROOT/MOT17-02-FRCNN/gt/labels.txt     names of the classes from 1 on; MOT17's where the file is missing
+
+ROOT may be one sequence, or hold them below train/ and test/. CVAT's "MOT 1.1" has no seqinfo.ini; the frame rate is
+then given with ``?fps=``. Pixels count from 1.
+
+What counts goes by TrackEval (https://github.com/JonathonLuiten/TrackEval, ``mot_challenge_2d_box.py``): in the
+published sequences boxes on distractors, static persons, reflections and persons on vehicles (crowds, too, and on
+MOT20 other vehicles) count neither for nor against, and anything else that is marked as not counting is nothing at
+all. Where a file names its own classes, what is marked so is passed over. MOT15 has no classes: all are pedestrians,
+and in place of class and visibility there is a place in the world, or -1,-1,-1.
+"""
+
+from __future__ import annotations
+
+import configparser
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.errors import UserError
+from hvt_common.inference.labels import read_labels
+from hvt_study.datasets.annotation_rows import Rows, read_rows
+from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
+from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
+from hvt_study.datasets.layouts.options import Options
+from hvt_study.datasets.sequence import Sequence
+
+__all__ = ["mot_table", "open_mot"]
+
+_INFO = "seqinfo.ini"
+_TRUTH = "gt/gt.txt"
+_PICTURES = "img1"
+_LAYOUT = "NAME/seqinfo.ini, NAME/img1/000001.jpg and NAME/gt/gt.txt"
+_NAMES = ("pedestrian", "person on vehicle", "car", "bicycle", "motor", "non-motorised vehicle")
+"""MOT17's classes from 1 on that may be objects."""
+_BESIDE = (2, 7, 8, 12, 13)
+"""Person on vehicle, static person, distractor, reflection, crowd."""
+_BESIDE_ON_MOT20 = (*_BESIDE, 6)
+"""Its cyclists and the like are labelled as non-motorised vehicles."""
+_HIGHEST = 13
+_PEDESTRIAN = 1
+_MOT15_COLUMNS = 10
+
+
+def open_mot(root: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
+    """Every sequence by name, opened when called.
+
+    Raises:
+        UserError: ROOT is not laid out so, or annotations are missing.
+    """
+    folders = [folder for folder in find_folders(root, depth=2) if _is_sequence(folder)]
+    if not folders:
+        raise UserError(
+            f"MOTChallenge folder {root} has no sequence with a {_INFO} or gt/gt.txt: expected is {_LAYOUT}"
+        )
+    found: dict[str, Callable[[], Sequence]] = {}
+    for folder in folders:
+        short = folder.name or folder.resolve().name
+        name = short if short not in found else f"{folder.parent.name}/{short}"
+        found[name] = partial(_open, name, folder, options)
+    return found
+
+
+def mot_table(
+    truth: Path, names: Path, size: tuple[int, int], beside: tuple[int, ...] = _BESIDE
+) -> LabelTable:
+    """All labels of a sequence; ``names`` may be missing, and ``beside`` are then classes that are not asked for."""
+    rows = read_rows(truth, columns="frame,id,x,y,w,h,counts,class,visibility", least=7)
+    own = names.is_file()
+    class_names = read_labels(names) if own else _NAMES
+    kinds = _kinds(rows, len(class_names) if own else _HIGHEST, own=own)
+    judged = rows["counts"] != 0
+    passed = ~judged
+    if not own:
+        passed = np.isin(kinds, beside)
+        judged &= ~passed & (kinds <= len(class_names))
+        used = np.unique(kinds[judged])  # only pedestrians count in the published sequences
+        class_names = tuple(class_names[kind - 1] for kind in used.tolist())
+        kinds = np.searchsorted(used, kinds) + 1
+    boxes, frames = rows.boxes(origin=1.0), rows["frame"].astype(np.int64)
+    return LabelTable.of(
+        frames=frames[judged],
+        boxes=boxes[judged],
+        ids=rows["id"].astype(np.int64)[judged],
+        class_ids=kinds[judged] - 1,
+        class_names=class_names,
+        ignored=Regions(frames[passed], boxes[passed], np.zeros(int(passed.sum()), np.bool_)),
+        size=size,
+    )
+
+
+def _kinds(rows: Rows, highest: int, *, own: bool) -> npt.NDArray[np.int64]:
+    """Class from 1 on."""
+    if not own and _in_the_world(rows):
+        return np.full(len(rows), _PEDESTRIAN, np.int64)
+    kinds = np.where(rows["class"] == -1, _PEDESTRIAN, rows["class"])
+    rows.check(np.isin(kinds, np.arange(1, highest + 1)), accepted=f"a class from 1 to {highest} in column 8")
+    return kinds.astype(np.int64)
+
+
+def _in_the_world(rows: Rows) -> bool:
+    """Whether columns 8 to 10 are MOT15's ``x,y,z``; MOT16 and all after it have nine columns."""
+    return bool(rows.text) and len(rows.text[0].rstrip(",").split(",")) >= _MOT15_COLUMNS
+
+
+def _is_sequence(folder: Path) -> bool:
+    return (folder / _INFO).is_file() or (folder / _TRUTH).is_file() or (folder / _PICTURES).is_dir()
+
+
+def _open(name: str, folder: Path, options: Options) -> Sequence:
+    info = _info(folder / _INFO) if (folder / _INFO).is_file() else None
+    if info is None and options.fps is None:
+        raise UserError(
+            f"MOTChallenge sequence {folder} has no {_INFO}, which says the frame rate: "
+            "add the file, or say the rate, such as ?fps=25"
+        )
+    said = info or {}
+    images = _images(folder, said)
+    fps = options.fps or _rate(folder / _INFO, said)
+    labels = _labels(folder, said, images) if options.annotated else None
+    return images.sequence(name=name, dataset="mot", fps=fps, labels=labels)
+
+
+def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:
+    pictures = folder / info.get("imDir", _PICTURES)
+    if not pictures.is_dir():
+        raise UserError(f"MOTChallenge sequence {folder} has no folder {pictures.name} of images")
+    images = ImageSequence(pictures)
+    said = info.get("seqLength", "")
+    if said.isdecimal() and images.frame_count < int(said):
+        raise UserError(
+            f"MOTChallenge sequence {folder} says seqLength={said} and has {images.frame_count} images"
+        )
+    return images
+
+
+def _labels(folder: Path, info: Mapping[str, str], images: ImageSequence) -> TableLabels:
+    truth = folder / _TRUTH
+    if not truth.is_file():
+        raise UserError(
+            f"MOTChallenge sequence {folder} has no annotations {_TRUTH}: "
+            "add them, or ask for pictures alone with ?labels=none"
+        )
+    beside = _BESIDE_ON_MOT20 if info.get("name", folder.name).startswith("MOT20") else _BESIDE
+    return TableLabels(
+        mot_table, (truth, folder / "gt" / "labels.txt", images.size, beside), images.first_number
+    )
+
+
+def _info(path: Path) -> Mapping[str, str]:
+    parser = configparser.ConfigParser(interpolation=None)
+    parser.optionxform = str  # type: ignore[assignment, method-assign] # the documented way to keep case
+    try:
+        parser.read_string(path.read_text(encoding="utf-8-sig"))
+        return dict(parser["Sequence"])
+    except (configparser.Error, KeyError, OSError, UnicodeDecodeError):
+        raise UserError(f"{path} is not a sequence's description: expected is a section [Sequence]") from None
+
+
+def _rate(path: Path, info: Mapping[str, str]) -> float:
+    try:
+        fps = float(info["frameRate"])
+    except (KeyError, ValueError):
+        fps = math.nan
+    if not 0.1 <= fps <= 1000:
+        raise UserError(
+            f"{path} says frameRate={info.get('frameRate')}: accepted is a number from 0.1 to 1000"
+        )
+    return fps

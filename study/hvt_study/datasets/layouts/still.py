@@ -1,0 +1,121 @@
+"""Annotated aerial pictures, made into sequences by a virtual camera that flies over them.
+
+VisDrone-DET's layout (ROOT/images/NAME.jpg, ROOT/annotations/NAME.txt), a folder of pictures with NAME.txt beside
+NAME.jpg, or a single picture. Real pixels and real labels, and boxes that follow exactly; the way is drawn from a
+seed. See `hvt_study.datasets.virtual_camera`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import VISDRONE_NAMES
+from hvt_edge.source.folder import sequence_files
+from hvt_study.datasets.clip import NOMINAL_FPS, Clip
+from hvt_study.datasets.label_table import file_stamp
+from hvt_study.datasets.labels import FrameLabels
+from hvt_study.datasets.layouts.image_sequence import find_folders
+from hvt_study.datasets.layouts.options import Options
+from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.virtual_camera import SCHEME, USUAL_VIEW, VirtualCamera, annotation_file
+
+__all__ = ["StillLabels", "open_stills"]
+
+
+@dataclass(frozen=True, slots=True)
+class StillLabels:
+    """What the virtual camera sees."""
+
+    picture: Path
+    view: float
+    seed: int
+
+    def __call__(self, index: int) -> FrameLabels:
+        """Of frame ``index``, in the camera's pixels; each mirror image of an object is one of its own."""
+        labels = _camera(self.picture, self.view, self.seed, True, _stamps(self.picture)).labels(index)
+        assert labels is not None, "made for annotated pictures only"
+        return labels
+
+
+def open_stills(place: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
+    """A sequence for each picture and seed by name, opened when called.
+
+    Raises:
+        UserError: there are no pictures, or annotations are missing.
+    """
+    pictures = [place] if place.is_file() else _pictures(place)
+    if options.annotated and place.is_dir():
+        _check_annotated(place, pictures)
+    return {
+        name: partial(_open, name, picture, seed, options)
+        for label, picture in _labelled(pictures).items()
+        for seed in options.seeds
+        for name in [label if options.seeds == (0,) else f"{label}-{seed}"]
+    }
+
+
+def _pictures(place: Path) -> list[Path]:
+    folders = [folder / "images" for folder in find_folders(place, depth=1) if (folder / "images").is_dir()]
+    found = [file for folder in folders or [place] for file in sequence_files(folder)]
+    if not found:
+        raise UserError(
+            f"still folder {place} holds no pictures: expected are images/NAME.jpg and annotations/NAME.txt, "
+            "or NAME.jpg and NAME.txt beside it"
+        )
+    return found
+
+
+def _labelled(pictures: list[Path]) -> dict[str, Path]:
+    """Pictures by a name of their own."""
+    found: dict[str, Path] = {}
+    for picture in pictures:
+        words = (picture.stem, picture.name, f"{picture.parent.parent.name}/{picture.name}", str(picture))
+        found[next(word for word in words if word not in found)] = picture
+    return found
+
+
+def _check_annotated(place: Path, pictures: list[Path]) -> None:
+    missing = next((picture for picture in pictures if not annotation_file(picture).is_file()), None)
+    if missing is not None:
+        raise UserError(
+            f"still folder {place} has no annotations {annotation_file(missing)} of picture {missing.name}: "
+            "add them, or ask for pictures alone with ?labels=none"
+        )
+
+
+def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
+    view = float(f"{options.view or USUAL_VIEW:g}")  # as it is written in the clip's name
+    camera = _camera(picture, view, seed, options.annotated, _stamps(picture))
+    known = camera.annotations
+    return Sequence(
+        name=name,
+        dataset="still",
+        clip=Clip(f"{SCHEME}{picture}@{view:g}", camera.size, camera.frame_count, seed=seed),
+        frame_count=camera.frame_count,
+        fps=NOMINAL_FPS,
+        source_size=camera.size,
+        labels=None if known is None else StillLabels(picture, view, seed),
+        class_set=() if known is None else tuple(sorted(VISDRONE_NAMES)),
+        attributes={"view": f"{view:g}", "seed": str(seed)},
+        files=(picture,) if known is None else (picture, annotation_file(picture)),
+    )
+
+
+@lru_cache(maxsize=2)
+def _camera(
+    picture: Path,
+    view: float,
+    seed: int,
+    annotated: bool,  # noqa: FBT001 - part of the key
+    stamps: tuple[Hashable, ...],  # noqa: ARG001 - likewise
+) -> VirtualCamera:
+    return VirtualCamera(picture, view, NOMINAL_FPS, seed, annotated)
+
+
+def _stamps(picture: Path) -> tuple[Hashable, ...]:
+    """Other ones when picture or annotations have changed."""
+    return file_stamp(picture), file_stamp(annotation_file(picture))

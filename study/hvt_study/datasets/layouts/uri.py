@@ -1,0 +1,117 @@
+"""One function opens every dataset: ``open_dataset("visdrone:/data/VisDrone2019-VID-val")``; another several."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence as Words
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+from itertools import islice
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_study.datasets.layouts.clips import open_clips
+from hvt_study.datasets.layouts.demo import open_demo
+from hvt_study.datasets.layouts.mot import open_mot
+from hvt_study.datasets.layouts.options import Options, split_options
+from hvt_study.datasets.layouts.still import open_stills
+from hvt_study.datasets.layouts.uavdt import open_uavdt
+from hvt_study.datasets.layouts.visdrone import open_visdrone
+from hvt_study.datasets.sequence import Sequence
+
+__all__ = ["DATASETS", "open_dataset", "open_datasets"]
+
+_Found = Mapping[str, Callable[[], Sequence]]
+"""By name, each opened when called."""
+_Layout = Callable[[Path, Options], _Found]
+
+_LAYOUTS: Mapping[str, tuple[_Layout, frozenset[str]]] = {
+    "visdrone": (open_visdrone, frozenset({"fps", "labels"})),
+    "uavdt": (open_uavdt, frozenset({"fps", "labels"})),
+    "mot": (open_mot, frozenset({"fps", "labels"})),
+    "clips": (open_clips, frozenset({"fps"})),
+    "still": (open_stills, frozenset({"labels", "view", "seeds"})),
+}
+"""What each scheme is, and the options that it takes. Only sequences that are asked for are opened."""
+
+DATASETS = ("visdrone:ROOT", "uavdt:ROOT", "mot:ROOT", "clips:FOLDER", "demo:SEEDS", "still:FOLDER")
+"""What is accepted."""
+_SHOWN_NAMES = 5
+
+
+def open_dataset(uri: str, *, limit: int | None = None, only: Words[str] = ()) -> tuple[Sequence, ...]:
+    """The sequences of a dataset, in natural order.
+
+    Args:
+        uri: one of `DATASETS`; options follow a question mark: ``visdrone:ROOT?fps=24``.
+        limit: at most so many sequences.
+        only: names of sequences, or patterns such as ``uav00000*``; none: all.
+
+    Raises:
+        UserError: unknown scheme or option, nothing there, the layout lacks something, an annotation line is wrong,
+            or ``only`` names what is not there.
+    """
+    return tuple(one for _, one in open_datasets((uri,), limit=limit, only=only))
+
+
+def open_datasets(
+    uris: Words[str], *, limit: int | None = None, only: Words[str] = ()
+) -> Iterator[tuple[str, Sequence]]:
+    """The same of several, each with its URI; ``limit`` is of each.
+
+    Raises:
+        UserError: as `open_dataset`; what ``only`` names has to be in one of them, not in all.
+    """
+    uris = tuple(dict.fromkeys(uris))
+    found = {uri: _layout(uri, limit) for uri in uris}
+    _check_there(found, only)
+    for uri, sequences in found.items():
+        for name in islice(_chosen(sequences, only), limit):
+            with _readable(uri):
+                sequence = sequences[name]()
+            yield uri, sequence
+
+
+@contextmanager
+def _readable(uri: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"dataset {uri!r} cannot be read: {error}") from None
+
+
+def _layout(uri: str, limit: int | None) -> _Found:
+    if limit is not None and limit < 1:
+        raise UserError(f"dataset {uri!r} is limited to {limit} sequences: accepted is 1 or more")
+    with _readable(uri):
+        return _laid_out(uri)
+
+
+def _laid_out(uri: str) -> _Found:
+    scheme, colon, place = uri.partition(":")
+    if scheme == "demo" and colon:
+        return open_demo(uri, place)
+    if not colon or scheme not in _LAYOUTS:
+        raise UserError(f"dataset {uri!r} is unknown: accepted are {', '.join(DATASETS)}")
+    opener, accepted = _LAYOUTS[scheme]
+    text, options = split_options(uri, place, accepted=accepted)
+    path = Path(text).expanduser()
+    files_too = scheme in ("clips", "still")
+    if not text or not (path.is_dir() or (files_too and path.is_file())):
+        state = "is not a folder" if text and path.exists() else "does not exist"
+        raise UserError(f"dataset {uri!r}: folder {text!r} {state}")
+    return opener(path, options)
+
+
+def _check_there(found: Mapping[str, _Found], only: Words[str]) -> None:
+    names = tuple(name for sequences in found.values() for name in sequences)
+    for wanted in only:
+        if not any(fnmatchcase(name, wanted) for name in names):
+            where = " and ".join(map(repr, found))
+            which = f"dataset {where} has" if len(found) == 1 else f"datasets {where} have"
+            there = ", ".join(names[:_SHOWN_NAMES]) + (", …" if len(names) > _SHOWN_NAMES else "")
+            raise UserError(f"{which} no sequence {wanted!r}: there are {there}")
+
+
+def _chosen(found: _Found, only: Words[str]) -> Iterator[str]:
+    return (name for name in found if not only or any(fnmatchcase(name, wanted) for wanted in only))

@@ -1,0 +1,92 @@
+"""VisDrone's video layouts (VID and MOT, https://github.com/VisDrone/VisDrone-Dataset).
+
+::
+
+    ROOT/sequences/uav0000086_00000_v/0000001.jpg …
+    ROOT/annotations/uav0000086_00000_v.txt        frame,id,x,y,w,h,score,category,truncation,occlusion
+
+ROOT may also hold several such folders, as the downloads unpack (VisDrone2019-VID-train, …-val).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import VISDRONE_NAMES
+from hvt_study.datasets.label_table import LabelTable, Regions, TableLabels
+from hvt_study.datasets.layouts.image_sequence import ImageSequence, find_folders
+from hvt_study.datasets.layouts.options import Options
+from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.visdrone_rows import VisDroneRows, read_video_rows
+
+__all__ = ["open_visdrone", "table_of", "visdrone_table"]
+
+_FPS = 30.0
+"""The dataset does not say; its drones filmed at 24 to 30."""
+_COLUMNS = "frame,id,x,y,w,h,score,category,truncation,occlusion"
+_LAYOUT = "sequences/NAME/0000001.jpg and annotations/NAME.txt"
+
+
+def open_visdrone(root: Path, options: Options) -> Mapping[str, Callable[[], Sequence]]:
+    """Every sequence by name, opened when called.
+
+    Raises:
+        UserError: ROOT is not laid out so, or annotations are missing.
+    """
+    splits = [folder for folder in find_folders(root, depth=1) if (folder / "sequences").is_dir()]
+    if not splits:
+        hint = ": these are images, use still:" if (root / "images").is_dir() else f": expected is {_LAYOUT}"
+        raise UserError(f"VisDrone folder {root} has no folder sequences{hint}")
+    found: dict[str, Callable[[], Sequence]] = {}
+    for split in splits:
+        for folder in find_folders(split / "sequences", depth=1)[1:]:
+            name = folder.name if folder.name not in found else f"{split.name}/{folder.name}"
+            annotations = split / "annotations" / f"{folder.name}.txt"
+            found[name] = partial(_open, name, folder, annotations, options)
+    if not found:
+        raise UserError(f"VisDrone folder {splits[0] / 'sequences'} is empty: expected is {_LAYOUT}")
+    return found
+
+
+def visdrone_table(path: Path, size: tuple[int, int]) -> LabelTable:
+    """All labels of a sequence whose pictures have this (width, height)."""
+    return table_of(read_video_rows(path), size=size)
+
+
+def table_of(rows: VisDroneRows, *, size: tuple[int, int]) -> LabelTable:
+    """Objects that are asked for, and what is not: regions, and single objects ("others", and those of score 0)."""
+    judged, passed = rows.counts, ~rows.counts
+    return LabelTable.of(
+        frames=rows.frames[judged],
+        boxes=rows.boxes[judged],
+        ids=rows.ids[judged],
+        class_ids=rows.categories[judged] - 1,
+        class_names=VISDRONE_NAMES,
+        ignored=Regions(rows.frames[passed], rows.boxes[passed], rows.land[passed]),
+        size=size,
+    )
+
+
+def _open(name: str, folder: Path, annotations: Path, options: Options) -> Sequence:
+    images = ImageSequence(folder)
+    labels = None
+    if options.annotated:
+        if not annotations.is_file():
+            raise UserError(
+                f"VisDrone sequence {folder} has no annotations {annotations}: "
+                "add them, or ask for pictures alone with ?labels=none"
+            )
+        labels = TableLabels(visdrone_table, (annotations, images.size), images.first_number)
+        _check_frames(labels, annotations)
+    return images.sequence(name=name, dataset="visdrone", fps=options.fps or _FPS, labels=labels)
+
+
+def _check_frames(labels: TableLabels, annotations: Path) -> None:
+    last_frame = labels.table().last_frame
+    if last_frame < 0:
+        raise UserError(f"annotations {annotations} are empty: expected are lines of {_COLUMNS}")
+    if last_frame < labels.first_frame:
+        raise UserError(f"annotations {annotations} speak of no frame from {labels.first_frame} on")

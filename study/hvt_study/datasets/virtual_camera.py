@@ -1,0 +1,292 @@
+"""A clip from one aerial picture: a virtual camera pans and zooms over it, and the boxes follow exactly.
+
+The picture, mirrored at each of its edges, is the land; the camera flies along it, sways, and climbs and sinks: from
+the right to the left as seed 0, on a way of its own as any other. It never sees finer than the picture's own pixels,
+so that nothing is invented. Every frame has sensor noise of its own, without which a still picture would be cheaper
+to code than anything a camera delivers. Objects do not move by themselves; they enter and leave as the camera goes.
+The same file and seed give the same pixels, always.
+
+Annotations are those of VisDrone-DET, in a text file of the same name beside the picture, or in ``annotations``
+where the picture lies in ``images``: ``x,y,w,h,score,category,truncation,occlusion``; category 0 is an ignored region
+and 11 is "others", of both of which nothing is asked. Without such a file the clip has no exact labels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import VISDRONE_NAMES
+from hvt_common.values import Boxes, Image
+from hvt_study.datasets.labels import FrameLabels, covered_share
+from hvt_study.datasets.visdrone_rows import read_image_rows
+
+__all__ = [
+    "SCHEME",
+    "USUAL_VIEW",
+    "Annotations",
+    "VirtualCamera",
+    "annotation_file",
+    "open_camera",
+    "read_annotations",
+]
+
+SCHEME = "still:"
+"""``still:FILE`` is a virtual camera over that picture, ``still:FILE@1.5`` one that sees 1.5 times its height."""
+
+_DURATION_S = 14.0
+USUAL_VIEW = 0.87
+"""Height that the camera sees at its lowest, in heights of the picture."""
+_LEAST_VIEW, _MOST_VIEW = 0.1, 3.0
+_REACH = 0.35
+"""The way goes from so many widths of the window on one side of the picture's middle to as many on the other: at its
+fastest, half-way, seven pixels a frame of 1280 at 15 fps, a drone at 13 m/s that sees 160 m."""
+_NOISE_LEVELS = 2.0
+"""Standard deviation of the noise of a small camera's sensor by day, of 256 levels."""
+_LEAST_VISIBLE = 0.6
+"""An object of which the window shows less is not asked for."""
+_LEAST_SIDE_PX = 64
+_ACROSS, _DOWN = range(-3, 4), range(-2, 3)
+"""Mirror images on each axis: enough for the widest view on its whole way."""
+_COVERED = 0.5
+"""An object with so much of it in regions of which nothing is known is not asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """How a camera flies."""
+
+    heading: tuple[float, float] = (-1.0, 0.0)
+    """Of length 1, to the picture's right and towards its bottom."""
+    climb: float = 0.08
+    """By how much the window grows and shrinks again."""
+    climb_s: float = 8.0
+    climb_phase: float = 0.0
+    """Radians; at 0 it begins at its lowest."""
+    sway: float = 0.034
+    """To each side, in heights of the window: without a slant the usual one stays within the picture."""
+    sway_s: float = 5.0
+    sway_phase: float = 0.0
+
+    @classmethod
+    def of(cls, seed: int) -> _Way:
+        """Seed 0 is the plain way; any other draws one: either direction, a slant, deeper zooms, another rhythm."""
+        if seed == 0:
+            return cls()
+        rng = np.random.Generator(np.random.PCG64(seed))
+        turn, slant, climb, climb_s, climb_phase, sway, sway_s, sway_phase = rng.random(8).tolist()
+        angle = (math.pi if turn < 0.5 else 0.0) + math.radians(20 * slant - 10)
+        return cls(
+            heading=(math.cos(angle), math.sin(angle)),
+            climb=0.05 + 0.25 * climb,
+            climb_s=6 + 6 * climb_s,
+            climb_phase=2 * math.pi * climb_phase,
+            sway=0.02 + 0.03 * sway,
+            sway_s=4 + 4 * sway_s,
+            sway_phase=2 * math.pi * sway_phase,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Annotations:
+    """What is in a picture, as parallel arrays in the order of the file."""
+
+    boxes_px: Boxes
+    """(N, 4) x1 y1 x2 y2 in pixels of the picture."""
+    classes: tuple[str, ...]
+    ignored_px: Boxes
+    """(K, 4): regions of which nothing is known."""
+    beside_px: Boxes
+    """(P, 4): single objects that are not asked for."""
+
+
+def annotation_file(picture: Path) -> Path:
+    """Where the annotations of a picture are, or would be."""
+    beside = picture.with_suffix(".txt")
+    if picture.parent.name == "images" and not beside.is_file():
+        return picture.parent.parent / "annotations" / beside.name
+    return beside
+
+
+def read_annotations(path: Path) -> Annotations:
+    """Read a VisDrone-DET annotation file; `UserError` names the first line that is not one.
+
+    Objects that lie mostly in ignored regions are left out, as in VisDrone's toolkit; empty boxes, too.
+    """
+    rows = read_image_rows(path)
+    solid = (rows.boxes[:, 2:] > rows.boxes[:, :2]).all(axis=1)
+    hidden = covered_share(rows.boxes, rows.boxes[rows.land & solid]) >= _COVERED
+    judged = rows.counts & solid & ~hidden
+    return Annotations(
+        boxes_px=rows.boxes[judged],
+        classes=tuple(VISDRONE_NAMES[kind - 1] for kind in rows.categories[judged].tolist()),
+        ignored_px=rows.boxes[rows.land & solid],
+        beside_px=rows.boxes[~rows.counts & ~rows.land & solid],
+    )
+
+
+@dataclass(slots=True)
+class VirtualCamera:
+    """Opens the picture; frames are drawn when asked for.
+
+    Raises:
+        UserError: no such picture, one that cannot be decoded or is too small, or damaged annotations.
+    """
+
+    picture_path: Path
+    view_heights: float = USUAL_VIEW
+    """Height of what it sees at its lowest, in heights of the picture; beyond about 0.9 mirrored land is in view."""
+    fps: float = 15.0
+    seed: int = 0
+    """Of the way that it takes."""
+    annotated: bool = True
+    """False: the annotations are not looked at."""
+    annotations: Annotations | None = field(init=False)
+    """Of the picture and of all its mirror images that may come into view."""
+    size: tuple[int, int] = field(init=False)
+    """(width, height) of its frames in pixels: those of the window at its narrowest, and even."""
+    _picture: Image = field(init=False, repr=False)
+    _way: _Way = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.picture_path.is_file():
+            raise UserError(f"picture {self.picture_path} of {SCHEME} does not exist: give a picture file")
+        picture = cv2.imread(str(self.picture_path), cv2.IMREAD_COLOR)
+        if picture is None or min(picture.shape[:2]) < _LEAST_SIDE_PX:
+            raise UserError(
+                f"picture {self.picture_path} is not one of at least {_LEAST_SIDE_PX}x{_LEAST_SIDE_PX} pixels: "
+                "give a JPEG or PNG file"
+            )
+        self._picture = np.asarray(picture, np.uint8)
+        high, wide = picture.shape[:2]
+        # One aspect ratio for all pictures, that of the usual base stream.
+        across = min(wide, high * 16 / 9) * self.view_heights
+        self.size = (int(across) // 2 * 2, int(across * 9 / 16) // 2 * 2)
+        file = annotation_file(self.picture_path)
+        known = self.annotated and file.is_file()
+        self.annotations = _mirrored(read_annotations(file), size=(wide, high)) if known else None
+        self._way = _Way.of(self.seed)
+
+    @property
+    def frame_count(self) -> int:
+        """Of the whole clip."""
+        return math.ceil(_DURATION_S * Fraction(self.fps).limit_denominator(1001))
+
+    def images(self) -> Iterator[Image]:
+        """Every frame, (height, width, 3) uint8 BGR of `size`."""
+        sheet = self._noise()
+        rng = np.random.default_rng(1)
+        for index in range(self.frame_count):
+            seen = cv2.warpAffine(
+                self._picture,
+                self._to_frame(index),
+                self.size,
+                flags=cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REFLECT,
+            )
+            top, left = rng.integers(0, 64, 2).tolist()
+            noise = sheet[top : top + self.size[1], left : left + self.size[0]]
+            yield np.asarray(cv2.add(seen, noise, dtype=cv2.CV_8U), np.uint8)
+
+    def _noise(self) -> npt.NDArray[np.int8]:
+        """A sheet of it, larger than a frame: each frame takes another part."""
+        shape = (self.size[1] + 64, self.size[0] + 64, 3)
+        noise = np.random.default_rng(0).normal(0, _NOISE_LEVELS, shape)
+        return np.clip(noise.round(), -127, 127).astype(np.int8)
+
+    def labels(self, index: int) -> FrameLabels | None:
+        """What is in a frame, in its pixels, clipped to it; None without annotations.
+
+        Each mirror image of an object is one of its own, and keeps its id. Objects of which less than 0.6 is inside
+        the frame are not judged.
+        """
+        if self.annotations is None:
+            return None
+        boxes, visible = self._seen(self.annotations.boxes_px, index)
+        ignored, there = self._seen(self.annotations.ignored_px, index)
+        beside, near = self._seen(self.annotations.beside_px, index)
+        rows = np.flatnonzero(visible >= _LEAST_VISIBLE)
+        partly = boxes[(visible < _LEAST_VISIBLE) & (visible > 0)]
+        return FrameLabels(
+            boxes_xyxy_px=boxes[rows],
+            ids=rows.astype(np.int64) + 1,
+            class_names=tuple(self.annotations.classes[row] for row in rows.tolist()),
+            ignored_xyxy_px=ignored[there > 0],
+            beside_xyxy_px=np.concatenate([beside[near > 0], partly]),
+        )
+
+    def _to_frame(self, index: int) -> npt.NDArray[np.float64]:
+        """(2, 3): from pixels of the picture to those of the frame, pixel centres at whole numbers."""
+        t_s, way = index / self.fps, self._way
+        zoom = 1 / (1 + way.climb * (0.5 - 0.5 * math.cos(2 * math.pi * t_s / way.climb_s + way.climb_phase)))
+        high, wide = self._picture.shape[:2]
+        along = -_REACH * math.cos(math.pi * t_s / _DURATION_S)  # in widths of the window
+        across = -way.sway * math.sin(2 * math.pi * t_s / way.sway_s + way.sway_phase)  # in heights
+        ahead, aside = way.heading
+        aspect = self.size[0] / self.size[1]
+        x = wide / 2 + (along * ahead - across * aside / aspect - 0.5 / zoom) * self.size[0]
+        y = high / 2 + (along * aside * aspect + across * ahead - 0.5 / zoom) * self.size[1]
+        shift = 0.5 * zoom - 0.5
+        return np.array([[zoom, 0, shift - x * zoom], [0, zoom, shift - y * zoom]])
+
+    def _seen(self, boxes_px: Boxes, index: int) -> tuple[Boxes, npt.NDArray[np.float64]]:
+        """Boxes in frame pixels, clipped, and the share of each that is inside."""
+        matrix = self._to_frame(index)
+        zoom = matrix[0, 0]
+        # Edges of boxes lie between pixels: half a pixel before the centre that the matrix speaks of.
+        moved = (boxes_px.astype(np.float64) - 0.5) * zoom + np.tile(matrix[:, 2], 2) + 0.5
+        clipped = np.clip(moved, 0, [*self.size, *self.size])
+        area = (moved[:, 2:] - moved[:, :2]).prod(axis=1)
+        inside = (clipped[:, 2:] - clipped[:, :2]).prod(axis=1)
+        return clipped.astype(np.float32), inside / np.maximum(area, 1e-9)
+
+
+def open_camera(spec: str, *, fps: float, seed: int = 0, annotated: bool = True) -> VirtualCamera:
+    """The camera of ``still:PICTURE`` or ``still:PICTURE@HEIGHT``, on the way of a seed."""
+    text = spec.removeprefix(SCHEME)
+    name, separator, height = text.rpartition("@")
+    if not separator or Path(text).is_file():
+        return VirtualCamera(Path(text), fps=fps, seed=seed, annotated=annotated)
+    try:
+        heights = float(height)
+    except ValueError:
+        heights = math.nan
+    if not _LEAST_VIEW <= heights <= _MOST_VIEW:
+        raise UserError(
+            f"{spec!r} asks for a view of {height!r} heights of the picture: "
+            f"give a number from {_LEAST_VIEW:g} to {_MOST_VIEW:g}"
+        )
+    return VirtualCamera(Path(name), heights, fps, seed, annotated)
+
+
+def _mirrored(found: Annotations, *, size: tuple[int, int]) -> Annotations:
+    """Those of a picture of this (width, height), mirrored at each of its edges again and again."""
+    tiles = [(across, down) for down in _DOWN for across in _ACROSS]
+    boxes = [_in_tile(found.boxes_px, tile, size=size) for tile in tiles]
+    ignored = [_in_tile(found.ignored_px, tile, size=size) for tile in tiles]
+    beside = [_in_tile(found.beside_px, tile, size=size) for tile in tiles]
+    return Annotations(
+        boxes_px=np.concatenate(boxes),
+        classes=found.classes * len(tiles),
+        ignored_px=np.concatenate(ignored),
+        beside_px=np.concatenate(beside),
+    )
+
+
+def _in_tile(boxes: Boxes, tile: tuple[int, int], *, size: tuple[int, int]) -> Boxes:
+    """Where the boxes of the picture lie in one of its images, (0, 0) being itself."""
+    moved = boxes.copy()
+    for axis, (number, side) in enumerate(zip(tile, size, strict=True)):
+        ends = boxes[:, [axis, axis + 2]]
+        if number % 2:
+            ends = side - ends[:, ::-1]
+        moved[:, [axis, axis + 2]] = ends + number * side
+    return moved

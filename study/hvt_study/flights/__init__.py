@@ -1,0 +1,1 @@
+"""Flies edge and ground in one process, in lockstep over a simulated serial link: `fly`, `dry_run`, `FlightPlan`."""

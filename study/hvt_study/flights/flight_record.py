@@ -1,0 +1,260 @@
+"""What a flight's ground detects, lists and makes of stills, noted frame by frame for the metrics.
+
+`Watch` stands between the ground's pipeline and its detector and refiner, passes everything on and remembers the last
+answer. Nothing here changes what is shown or sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from hvt_common.inference.classify import Classifier
+from hvt_common.inference.detect import Detector
+from hvt_common.protocol.messages import RoiHeader, StillResult
+from hvt_common.transport.inbox import Received
+from hvt_common.values import Boxes, Detections, Image, Posterior, Tracks, View, iou
+from hvt_ground.events import Overlay, Refinement
+from hvt_ground.perception.pipeline import Pipeline
+from hvt_ground.perception.stills.classify import DecodedStill, object_crops
+from hvt_ground.perception.stills.refine import Refiner, ShownClasses
+from hvt_study.metrics.frames import NO_ID, FrameView
+from hvt_study.metrics.observed import ObservedFrame
+from hvt_study.metrics.proxy import score_entropy_nats
+from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival
+from hvt_study.serial_link import Arrival
+
+__all__ = ["FlightRecord", "Watch"]
+
+_SAME_OBJECT_IOU = 0.4
+"""As re-detection asks of a detection at an object's place."""
+
+
+class Watch:
+    """Between a ground's pipeline and two of its parts."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        parts = pipeline._parts  # noqa: SLF001 - events say neither raw detections nor confidences without refinement
+        self._detector = _WatchedDetector(parts.detector)
+        self._refiner = _WatchedRefiner(parts.refiner)
+        refiner = cast("Refiner", self._refiner)
+        pipeline._parts = replace(parts, detector=self._detector, refiner=refiner)  # noqa: SLF001
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Of the detections."""
+        return self._detector.class_names
+
+    @property
+    def listed(self) -> Tracks | None:
+        """The tracks of the last list, before refinement."""
+        return self._refiner.listed
+
+    def take_found(self) -> Detections | None:
+        """What was detected on the base stream since the last time; None where nothing was looked for."""
+        found, self._detector.found = self._detector.found, None
+        return found
+
+
+class _WatchedDetector:
+    """The ground's detector on the base stream; re-detection of stills has its own way to it."""
+
+    def __init__(self, detector: Detector) -> None:
+        self._detector = detector
+        self.found: Detections | None = None
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        return self._detector.class_names
+
+    def detect(self, image_bgr: Image) -> Detections:
+        self.found = self._detector.detect(image_bgr)
+        return self.found
+
+
+class _WatchedRefiner:
+    def __init__(self, refiner: Refiner) -> None:
+        self._refiner = refiner
+        self.listed: Tracks | None = None
+
+    def shown(self, tracks: Tracks) -> ShownClasses:
+        self.listed = tracks
+        return self._refiner.shown(tracks)
+
+    def preview(self, tracks: Tracks) -> ShownClasses:
+        self.listed = tracks
+        return self._refiner.preview(tracks)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._refiner, name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pending:
+    """Waits for the next list."""
+
+    done: RefinedObject
+    frame_index: int
+    """Of the still."""
+    edge_track_id: int
+    box_source_px: Boxes
+    """(1, 4)"""
+
+
+class FlightRecord:
+    """Gathers between two lists; `complete` makes of a list what the metrics are given.
+
+    Args:
+        view: between source and base pixels.
+        started_ns: capture of the first frame.
+        classes: how many the detector knows.
+        classifier: the ground's, which is asked of each still and of the base crop at its place; None takes what
+            re-detection said of the still, and what the list said of the object at the still's frame.
+    """
+
+    def __init__(self, view: View, *, started_ns: int, classes: int, classifier: Classifier | None) -> None:
+        self._view = view
+        self._started_ns = started_ns
+        self._classes = classes
+        self._classifier = classifier
+        self._headers: dict[int, RoiHeader] = {}
+        self._answers: dict[tuple[int, int], Opinion] = {}
+        self._stills: list[StillArrival] = []
+        self._pending: list[_Pending] = []
+
+    # What comes
+
+    def still(self, header: RoiHeader, arrival: Arrival[Received]) -> None:
+        """A still has arrived."""
+        self._headers[header.sequence] = header
+        self._stills.append(
+            StillArrival(
+                sequence=header.sequence,
+                capture_s=self._seconds(header.capture_ns),
+                sent_s=self._seconds(arrival.enter_ns),
+                arrived_s=self._seconds(arrival.arrival_ns),
+                size_bytes=len(arrival.message.payload),
+                line_bytes=arrival.size_bytes,
+                reason=header.reason,
+            )
+        )
+
+    def answers(self, results: Iterable[StillResult]) -> None:
+        """The ground has answered the edge: that is what it read in its stills."""
+        for one in results:
+            if one.class_name:
+                opinion = Opinion(one.class_name, one.confidence, one.entropy_nats)
+                self._answers[one.still_sequence, one.track_id] = opinion
+
+    def refinement(self, event: Refinement, *, at_ns: int) -> None:
+        """An object in a still has been named, or given up."""
+        header = self._headers[event.still_sequence]
+        box = np.array([event.box_base_px], np.float32)
+        width, height = self._view.base_size
+        base, still = self._opinions_on(event, header)
+        done = RefinedObject(
+            still_sequence=event.still_sequence,
+            track_id=NO_ID if event.track_id is None else event.track_id,
+            at_s=self._seconds(at_ns),
+            name_before=event.class_before,
+            name_after=event.class_after,
+            area_share=float((box[0, 2:] - box[0, :2]).prod()) / (width * height),
+            base=base,
+            still=still,
+        )
+        self._pending.append(
+            _Pending(done, header.frame_index, event.edge_track_id, self._view.to_source(box))
+        )
+
+    # What is listed
+
+    def listed(self, overlay: Overlay, tracks: Tracks) -> ObservedFrame:
+        """A list, with the same tracks before refinement."""
+        assert np.array_equal(overlay.track_ids, tracks.ids), "both are of the same list"
+        return ObservedFrame(
+            self._inside(overlay.boxes_base_px),
+            overlay.classes,
+            ids=overlay.track_ids,
+            confidences=overlay.confidences,
+            classes_before=overlay.base_classes,
+            confidences_before=tracks.confidences.astype(np.float32),
+            origins=overlay.origins or ("base",) * len(overlay.classes),
+        )
+
+    def detected(self, found: Detections, class_names: tuple[str, ...]) -> FrameView:
+        """Plain detections."""
+        names = tuple(class_names[kind] for kind in found.class_ids.tolist())
+        ids = np.full(len(names), NO_ID, np.int64)
+        return FrameView(self._inside(found.boxes_xyxy_px), ids, names, found.confidences, names)
+
+    def complete(
+        self,
+        seen: ObservedFrame,
+        *,
+        lists: Mapping[int, ObservedFrame],
+        at_ns: int | None = None,
+        detections: FrameView | None = None,
+    ) -> ObservedFrame:
+        """The list with everything that came since the last one was completed; ``lists`` are those before it.
+
+        ``at_ns`` is when somebody can look at it; None: as it was.
+        """
+        refined = tuple(self._with_opinions(one, lists) for one in self._pending)
+        stills = tuple(self._stills)
+        self._pending.clear()
+        self._stills.clear()
+        return replace(
+            seen,
+            shown_s=seen.shown_s if at_ns is None else self._seconds(at_ns),
+            detections=seen.detections if detections is None else detections,
+            stills=seen.stills + stills,
+            refined=seen.refined + refined,
+        )
+
+    def _opinions_on(self, event: Refinement, header: RoiHeader) -> tuple[Opinion | None, Opinion | None]:
+        """What the classifier says of the base crop and of the still."""
+        if self._classifier is None or event.base_crop_bgr is None or event.still_bgr is None:
+            return None, None
+        also = (event.box_base_px,) if header.also else ()  # one of several has to be cut out
+        crops = [
+            object_crops(
+                DecodedStill(image, header.crop_source_px, event.box_base_px, header.frame_index, also),
+                view=self._view,
+            )[0]
+            for image in (event.base_crop_bgr, event.still_bgr)
+        ]
+        base, still = self._classifier.classify(crops)
+        return _opinion(base), _opinion(still)
+
+    def _with_opinions(self, one: _Pending, lists: Mapping[int, ObservedFrame]) -> RefinedObject:
+        read = self._answers.pop((one.done.still_sequence, one.edge_track_id), None)
+        if self._classifier is not None:
+            return one.done
+        seen = lists.get(one.frame_index)
+        base = None if seen is None else self._in_list(seen.base_view(), one.box_source_px)
+        return replace(one.done, base=base, still=read)
+
+    def _in_list(self, view: FrameView, box_source_px: Boxes) -> Opinion | None:
+        """What a list said at an object's place."""
+        if not len(view):
+            return None
+        overlap = iou(box_source_px, view.boxes_xyxy_px)[0]
+        row = int(overlap.argmax())
+        if overlap[row] < _SAME_OBJECT_IOU:
+            return None
+        confidence = float(view.confidences[row])
+        return Opinion(view.class_names[row], confidence, score_entropy_nats(confidence, self._classes))
+
+    def _inside(self, boxes_base_px: Boxes) -> Boxes:
+        limits = np.array([*self._view.source_size, *self._view.source_size], np.float32)
+        return np.clip(self._view.to_source(boxes_base_px), 0, limits)
+
+    def _seconds(self, at_ns: int) -> float:
+        return (at_ns - self._started_ns) / 1e9
+
+
+def _opinion(posterior: Posterior) -> Opinion:
+    return Opinion(posterior.class_name, posterior.confidence, posterior.entropy_nats)

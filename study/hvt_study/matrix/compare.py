@@ -1,0 +1,182 @@
+"""What does the ground show at this budget on my clip? The methods at some rates over one clip, flown and scored.
+
+The runs are those of `hvt-study run`, without the matching of totals: same methods, same cache, same scores. *Labels*
+are exact where the source knows what it shows (the demo, an annotated picture under the virtual camera), else
+*reference* labels (`hvt_study.datasets.reference`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import as_completed
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+from hvt_common.errors import UserError
+from hvt_study.datasets.layouts.uri import open_dataset
+from hvt_study.datasets.sequence import Sequence
+from hvt_study.datasets.virtual_camera import SCHEME, open_camera
+from hvt_study.matrix.schedule import Pool
+from hvt_study.runs.execute import run_spec
+from hvt_study.runs.methods import METHODS
+from hvt_study.runs.spec import ModelChoice, RunSpec
+
+__all__ = ["COMPARED", "ComparePlan", "CompareResult", "CompareRow", "Missing", "compare"]
+
+COMPARED: Mapping[str, tuple[str, str]] = {
+    "M0": ("M0", ""),
+    "M0-fps": ("M0-fps", ""),
+    "R0": ("R0", ""),
+    "M5-jpeg": ("M5", "jpeg"),
+    "M5-residual": ("M5", "residual"),
+    "tracks": ("tracks", ""),
+    "M6": ("M6", "residual"),
+}
+"""(method, still codec) by the name in tables, in their order."""
+Labels = Literal["auto", "exact", "reference"]
+
+
+@dataclass(frozen=True, slots=True)
+class ComparePlan:
+    """What to compare."""
+
+    clip: str
+    """A video, a folder of images, ``demo``, or ``still:PICTURE``."""
+    models: ModelChoice
+    rates_bps: tuple[int, ...]
+    cache: Path
+    methods: tuple[str, ...] = tuple(COMPARED)
+    """Names of `COMPARED`."""
+    size: tuple[int, int] = (1280, 720)
+    max_frames: int | None = None
+    labels: Labels = "auto"
+
+
+CompareRow: TypeAlias = dict[str, Any]
+"""One half of one flight, by the names of `_FIGURES`; docs/compare.md says what they are. What is not of the list
+counts for the whole clip, in both halves alike."""
+
+_FIGURES = (
+    *(("f1", "f1_half_{half}", 4), ("class_agreement", "top1_half_{half}", 4)),
+    *((name, name, 0) for name in ("total_bps", "base_bps", "roi_bps", "track_bps", "max_frame_bytes")),
+    *(
+        ("delay_p95_ms", "delay_p95_ms", 1),
+        ("edge_cpu_ms", "edge_cpu_ms", 1),
+        ("labels", "", 0),
+        ("fps", "fps", 2),
+    ),
+    *(("precision", "precision_half_{half}", 4), ("recall", "recall_half_{half}", 4)),
+    *((name, name, 1) for name in ("delay_p50_ms", "picture_age_p95_ms")),
+    *((name, name, 0) for name in ("worst_queue_bytes", "stills")),
+)
+"""Name in compare.json, column of the study's table, digits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """A method that could not be flown at a rate."""
+
+    rate_kbps: float
+    method: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class CompareResult:
+    """All rows, by rate, then in the table's order of methods."""
+
+    rows: tuple[CompareRow, ...]
+    missing: tuple[Missing, ...]
+    labels: str
+    clip: str
+
+
+def compare(
+    plan: ComparePlan, *, pool: Pool, on_run: Callable[[int, int], None] = lambda *_: None
+) -> CompareResult:
+    """Fly everything; ``on_run(done, of)`` is called after each run.
+
+    Raises:
+        UserError: the clip, a detector or a rate cannot be used.
+    """
+    uri, sequence = _opened(plan.clip)
+    if plan.labels == "exact" and sequence.labels is None:
+        raise UserError(f"--labels exact: {plan.clip} does not say what it shows; leave --labels out")
+    labels = "reference" if sequence.labels is None or plan.labels == "reference" else "exact"
+    specs = {
+        (rate_bps, name): RunSpec(
+            dataset=uri,
+            sequence=sequence.name,
+            method=COMPARED[name][0],
+            regime=f"{rate_bps / 1e3:g}kbps",
+            budget_bps=rate_bps,
+            models=plan.models,
+            still_codec=COMPARED[name][1],
+            labels="reference" if labels == "reference" else "annotations",
+            size=plan.size,
+            max_frames=plan.max_frames,
+        )
+        for rate_bps in plan.rates_bps
+        for name in plan.methods
+    }
+    run = partial(run_spec, cache=plan.cache, folder=Path.cwd())
+    # Those of several flights first, so that no process is left with one at the end.
+    order = sorted(specs, key=lambda one: -len(METHODS[specs[one].method].fps_choices))
+    running = {pool.submit(run, specs[one]): one for one in order}
+    done: dict[tuple[int, str], dict[str, Any]] = {}
+    try:
+        for future in as_completed(running):
+            done[running[future]] = future.result()
+            on_run(len(done), len(specs))
+    finally:
+        for future in running:
+            future.cancel()
+    return _result(sequence.name, labels, [(one, done[one]) for one in specs])
+
+
+def _opened(clip: str) -> tuple[str, Sequence]:
+    """The clip as a dataset of one sequence."""
+    if clip == "demo":
+        uri = "demo:0"
+    elif clip.startswith(SCHEME):
+        camera = open_camera(clip, fps=1, annotated=False)  # says what is wrong with picture and height
+        uri = f"{SCHEME}{camera.picture_path}?view={camera.view_heights:g}"
+    elif Path(clip).exists():
+        uri = f"clips:{clip}"
+    else:
+        raise UserError(
+            f"clip {clip!r} does not exist: give a video, a folder of images, demo or {SCHEME}PICTURE"
+        )
+    found = open_dataset(uri, limit=2)
+    if len(found) > 1:
+        raise UserError(f"clip {clip} holds several videos: give one of them")
+    return uri, found[0]
+
+
+def _result(clip: str, labels: str, done: list[tuple[tuple[int, str], dict[str, Any]]]) -> CompareResult:
+    rows: list[CompareRow] = []
+    missing: list[Missing] = []
+    flown: dict[tuple[int, str], str] = {}
+    for (rate_bps, name), row in done:
+        same = flown.get((rate_bps, row["digest"])) if name != "M0-fps" else None
+        if row["failed"]:
+            missing.append(Missing(rate_bps / 1e3, name, row["failed"]))
+        elif same is not None:
+            missing.append(Missing(rate_bps / 1e3, name, f"its settings change nothing over {same}"))
+        else:
+            flown.setdefault((rate_bps, row["digest"]), name)
+            rows += [
+                _half(row, half, labels=labels, clip=clip, rate_kbps=rate_bps / 1e3, method=name)
+                for half in (1, 2)
+            ]
+    return CompareResult(tuple(rows), tuple(missing), labels, clip)
+
+
+def _half(row: Mapping[str, Any], half: int, *, labels: str, **place: Any) -> CompareRow:
+    found: CompareRow = {**place, "half": half}
+    for name, column, digits in _FIGURES:
+        value = row[column.format(half=half)] if column else labels
+        found[name] = round(value, digits) if isinstance(value, float) else value
+    return found

@@ -1,0 +1,102 @@
+"""What a flight records of the ground at every frame, and the views of it that metrics take."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Boxes
+from hvt_study.metrics.frames import NO_ID, FrameLabels, FrameView, LabelledFrame
+from hvt_study.metrics.stills import RefinedObject, StillArrival
+
+__all__ = [
+    "ObservedFrame",
+    "arrivals",
+    "detected_frames",
+    "refined_frames",
+    "refined_objects",
+    "shown_times_s",
+]
+
+
+def _no_boxes() -> Boxes:
+    return np.empty((0, 4), np.float32)
+
+
+def _none_32() -> npt.NDArray[np.float32]:
+    return np.empty(0, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedFrame:
+    """The ground's list at one source frame, with all that metrics need of it; N tracks."""
+
+    boxes_xyxy_px: Boxes = field(default_factory=_no_boxes)
+    """(N, 4) float32, source pixels."""
+    classes: tuple[str, ...] = ()
+    """N names as shown."""
+    ids: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    """(N,) of the ground."""
+    confidences: npt.NDArray[np.float32] = field(default_factory=_none_32)
+    """(N,) of the class that is shown."""
+    classes_before: tuple[str, ...] = ()
+    """N names without refinement."""
+    confidences_before: npt.NDArray[np.float32] = field(default_factory=_none_32)
+    """(N,) of the last detection that was matched."""
+    origins: tuple[str, ...] = ()
+    """N words of `hvt_ground.events.Origin`: who knows of the track."""
+    detections: FrameView | None = None
+    """What the ground's detector said of this decoded frame, from the tracker's weak confidence on, before any
+    tracking; None at frames that were not coded or not detected on."""
+    stills: tuple[StillArrival, ...] = ()
+    """Arrived since the frame before; those after the last frame stand with it."""
+    shown_s: float = math.nan
+    """When the list was there for somebody to look at, from the capture of the flight's first frame."""
+    refined: tuple[RefinedObject, ...] = ()
+    """Objects that were named since the frame before."""
+
+    def refined_view(self) -> FrameView:
+        """The whole list, as it was shown."""
+        return FrameView(self.boxes_xyxy_px, self.ids, self.classes, self.confidences, self.classes_before)
+
+    def base_view(self) -> FrameView:
+        """The tracks that the base stream knows of, with names and confidences as without stills.
+
+        Where the edge reports its tracks too, a box is what both say together. That no still was sent does not give
+        their bits back to the video: the fair video-only figure is that of M0 at equal bits.
+        """
+        known = np.array([origin in ("base", "edge+base") for origin in self.origins], np.bool_)
+        names, confidences = self.classes_before, self.confidences_before
+        return FrameView(self.boxes_xyxy_px, self.ids, names, confidences, names).rows(known)
+
+
+def refined_frames(lists: Sequence[ObservedFrame], labels: Iterable[FrameLabels]) -> list[LabelledFrame]:
+    """Every frame of a flight (``FlightReport.lists``) as it was shown, with its labels."""
+    return [(truth, one.refined_view()) for one, truth in zip(lists, labels, strict=True)]
+
+
+def detected_frames(lists: Sequence[ObservedFrame], labels: Iterable[FrameLabels]) -> list[LabelledFrame]:
+    """The base frames that the ground detected on, with plain detections: what mAP is of."""
+    pairs = [(truth, one.detections) for one, truth in zip(lists, labels, strict=True)]
+    return [(truth, found) for truth, found in pairs if found is not None]
+
+
+def shown_times_s(lists: Iterable[ObservedFrame]) -> list[float]:
+    """When each frame's list was there, from the capture of the first frame."""
+    return [one.shown_s for one in lists]
+
+
+def arrivals(lists: Iterable[ObservedFrame]) -> list[StillArrival]:
+    """All stills, in order of arrival."""
+    return [still for one in lists for still in one.stills]
+
+
+def refined_objects(lists: Iterable[ObservedFrame], *, track_id: int | None = None) -> list[RefinedObject]:
+    """All objects that stills named, in order; only those of one of the ground's tracks where it is given."""
+    every = [done for one in lists for done in one.refined]
+    assert track_id != NO_ID, "no track has many objects"
+    return [done for done in every if track_id in (None, done.track_id)]

@@ -1,0 +1,123 @@
+"""How well the ground knows what is there: classes of its tracks against ground truth, on every frame."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.errors import UserError
+from hvt_study.metrics.classes import class_score
+from hvt_study.metrics.frames import NO_ID, FrameLabels, FrameView, LabelledFrame
+
+__all__ = ["Labelled", "Score", "read_tracks", "read_truth", "score"]
+
+SMALL_SHARE = 0.0012
+"""Objects of less than this share of the frame count as small: about 33x33 pixels of 1280x720."""
+_LEAST_VISIBLE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Labelled:
+    """Boxes with class names, of one frame."""
+
+    boxes_xyxy_px: npt.NDArray[np.float64]
+    """(N, 4), base pixels."""
+    classes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Over all objects on all frames; an object without a track is neither right nor wrong but missed."""
+
+    objects: int
+    recall: float
+    """Share of objects that have a track (IoU at least 0.5)."""
+    top1: float
+    """Share of those whose class is right."""
+    macro_f1: float
+    """F1 of each class of the truth, averaged; missed objects count as false negatives."""
+    small_top1: float
+    """Top-1 of those that are small."""
+    seen_right: float
+    """Share of all objects, missed ones included, that are shown with their right class."""
+
+
+def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
+    """Read a tracks table of the ground by frame (from 1); ``column`` is ``class`` or ``base_class``."""
+    rows: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            for line in csv.DictReader(file):
+                x, y, w, h = (float(line[name]) for name in ("x", "y", "w", "h"))
+                rows[int(line["frame"])].append(([x, y, x + w, y + h], line[column]))
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise UserError(
+            f"{path} is not a table of tracks as hvt-ground --tracks writes it ({error})"
+        ) from None
+    return {frame: _labelled(found) for frame, found in rows.items()}
+
+
+def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, Labelled]:
+    """Read MOTChallenge ground truth (``frame,id,x,y,w,h,1,class,visibility``) by frame; hidden objects left out."""
+    rows: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
+    try:
+        with path.open(encoding="utf-8") as file:
+            for fields in csv.reader(file):
+                x, y, w, h = (float(value) for value in fields[2:6])
+                if float(fields[8]) >= _LEAST_VISIBLE:
+                    rows[int(fields[0])].append(([x, y, x + w, y + h], class_names[int(fields[7]) - 1]))
+    except (OSError, IndexError, ValueError) as error:
+        raise UserError(
+            f"{path} is not MOTChallenge ground truth of {len(class_names)} classes ({error})"
+        ) from None
+    return {frame: _labelled(found) for frame, found in rows.items()}
+
+
+def score(
+    tracks: Mapping[int, Labelled],
+    truth: Mapping[int, Labelled],
+    *,
+    frame_area_px: float,
+    frames: Sequence[int] = (),
+) -> Score:
+    """Match tracks to objects frame by frame and count; ``frames`` limits it to some (default: all of the truth)."""
+    nothing = _labelled([])
+    labelled = [
+        _frame(truth.get(frame, nothing), tracks.get(frame, nothing)) for frame in frames or sorted(truth)
+    ]
+    one = class_score(labelled, limits_px2=(SMALL_SHARE * frame_area_px, math.inf))
+    return Score(
+        objects=one.counts.labels,
+        recall=_or_zero(one.recall),
+        top1=_or_zero(one.counts.top1_found),
+        macro_f1=_or_zero(one.macro_f1_all),
+        small_top1=_or_zero(one.by_size["small"].top1_found),
+        seen_right=_or_zero(one.counts.top1_all),
+    )
+
+
+def _frame(wanted: Labelled, found: Labelled) -> LabelledFrame:
+    ids = np.full(len(found.classes), NO_ID, np.int64)
+    labels = FrameLabels(
+        wanted.boxes_xyxy_px.astype(np.float32),
+        np.full(len(wanted.classes), NO_ID, np.int64),
+        wanted.classes,
+    )
+    boxes, sure = found.boxes_xyxy_px.astype(np.float32), np.ones(len(ids), np.float32)
+    return labels, FrameView(boxes, ids, found.classes, sure, found.classes)
+
+
+def _or_zero(value: float) -> float:
+    return 0.0 if math.isnan(value) else value
+
+
+def _labelled(rows: Sequence[tuple[list[float], str]]) -> Labelled:
+    boxes = np.array([box for box, _ in rows], np.float64).reshape(-1, 4)
+    return Labelled(boxes, tuple(name for _, name in rows))

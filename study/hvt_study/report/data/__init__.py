@@ -1,0 +1,1 @@
+"""Values that tables and figures share: `Setting`, `Arm`, `pairs`, `interval_of`, `METRICS`, `Report`."""

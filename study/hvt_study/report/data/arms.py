@@ -1,0 +1,251 @@
+"""Which rows of a study are compared with which: settings, arms, and pairs at matched totals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from hvt_common.errors import UserError
+from hvt_study.report.data.conditions import USUAL, Conditions, conditions_of, how_they_differ, tune_of
+from hvt_study.runs.methods import METHODS, Kind
+
+__all__ = [
+    "Arm",
+    "BySequence",
+    "Models",
+    "RunRow",
+    "Setting",
+    "counts",
+    "is_video",
+    "place",
+    "sequence_of",
+    "settings",
+    "values",
+]
+
+RunRow: TypeAlias = Mapping[str, Any]
+"""Of ``results.parquet``."""
+BySequence: TypeAlias = Mapping[str, RunRow]
+"""One run of each sequence; the key is dataset and name."""
+_WHOSE = ("regime", "method", "still_codec", "matched_to", "matched_codec")
+_SAME_TOTAL = 1e-4
+"""Of a total: rates that come back from another accounting are rounded."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Models:
+    """The networks that runs have in common."""
+
+    detector: str
+    edge_detector: str
+    classifier: str
+
+    def __str__(self) -> str:
+        edge = "" if self.edge_detector == self.detector else f", at the edge {self.edge_detector}"
+        reader = "the detector again" if self.classifier == "detector" else self.classifier
+        return f"detector {self.detector}{edge}, stills read by {reader}"
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """A method in one regime, at its own budget; what averages are of."""
+
+    regime: str
+    method: str
+    still_codec: str
+
+    @property
+    def name(self) -> str:
+        """Without the regime."""
+        return f"{self.method} {self.still_codec}".strip()
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Runs that may be averaged: same labels, same networks, same conditions, over one dataset or several.
+
+    Raises:
+        UserError: two different runs count at one place, so that none of them is the one.
+    """
+
+    datasets: tuple[str, ...]
+    """URIs."""
+    labels: str
+    models: Models
+    rows: tuple[RunRow, ...]
+    """All, those that count nowhere too."""
+    conditions: Conditions = USUAL
+    _counted: Mapping[tuple[str, ...], Mapping[str, tuple[RunRow, ...]]] = field(
+        init=False, repr=False, compare=False
+    )
+    """By whose they are and by sequence; of followers one a target."""
+
+    def __post_init__(self) -> None:
+        counted: dict[tuple[str, ...], dict[str, tuple[RunRow, ...]]] = {}
+        places: dict[tuple[Any, ...], RunRow] = {}
+        for row in sorted(filter(counts, self.rows), key=sequence_of):
+            whose, name = tuple(row[column] for column in _WHOSE), sequence_of(row)
+            first = places.setdefault((whose, name, row["target_bps"]), row)
+            if first is row:
+                of = counted.setdefault(whose, {})
+                of[name] = (*of.get(name, ()), row)
+            elif first["key"] != row["key"]:
+                raise UserError(_conflict(first, row))
+        _one_tune_a_method(self.rows)
+        object.__setattr__(self, "_counted", counted)
+
+    @property
+    def name(self) -> str:
+        """Of the dataset, without the folders that lead to it."""
+        return place(self.datasets[0]) if len(self.datasets) == 1 else f"all {len(self.datasets)} datasets"
+
+    @property
+    def sequences(self) -> int:
+        """How many there are, whether or not their runs count."""
+        return len({sequence_of(row) for row in self.rows})
+
+    @property
+    def tunes(self) -> Mapping[str, tuple[str, ...]]:
+        """Parameters of methods other than their defaults, by method."""
+        return {row["method"]: said for row in self.rows if (said := tune_of(row))}
+
+    @property
+    def regimes(self) -> tuple[str, ...]:
+        """From the thinnest."""
+        budgets = {row["regime"]: row["budget_bps"] or 0 for row in self.rows}
+        return tuple(sorted(budgets, key=lambda name: (budgets[name], name)))
+
+    @property
+    def accounting(self) -> str:
+        """What rates are divided by."""
+        return str(self.rows[0]["accounting"])
+
+    def budget_bps(self, regime: str) -> int:
+        """B_tot of a regime."""
+        return max(row["budget_bps"] or 0 for row in self.rows if row["regime"] == regime)
+
+    def arms(self, regime: str) -> list[Arm]:
+        """All in a regime, in the order of tables; also those of which no run counts."""
+        found = {
+            Arm(regime, row["method"], row["still_codec"])
+            for row in self.rows
+            if row["regime"] == regime and not row["matched_to"]
+        }
+        return sorted(found, key=lambda arm: (_order(arm.method), arm.still_codec))
+
+    def hybrids(self, regime: str) -> list[Arm]:
+        """Those whose totals video is matched with."""
+        return [arm for arm in self.arms(regime) if not is_video(arm.method)]
+
+    def references(self) -> list[str]:
+        """Methods that were coded again to the totals of others, in the order of tables."""
+        return sorted({row["method"] for row in self.rows if row["matched_to"]}, key=_order)
+
+    def runs(self, arm: Arm) -> BySequence:
+        """Those of an arm that count."""
+        found = self._counted.get((arm.regime, arm.method, arm.still_codec, "", ""), {})
+        return {name: rows[0] for name, rows in found.items()}
+
+    def matched(self, arm: Arm, reference: str) -> BySequence:
+        """Runs of ``reference`` that were coded to the totals of the very runs of `runs`, within one per cent."""
+        matching = self._counted.get((arm.regime, reference, "", arm.method, arm.still_codec), {})
+        found = {name: _at_total(matching.get(name, ()), run) for name, run in self.runs(arm).items()}
+        return {name: row for name, row in found.items() if row is not None}
+
+    def video(self, reference: str) -> dict[str, list[RunRow]]:
+        """All that count of a video-only method, by sequence, at whatever total."""
+        found: dict[str, list[RunRow]] = {}
+        for row in self.rows:
+            if row["method"] == reference and counts(row):
+                found.setdefault(sequence_of(row), []).append(row)
+        return found
+
+
+def counts(row: RunRow) -> bool:
+    """Whether a run is in averages: it was flown, and it spends what it is to spend."""
+    return not row["failed"] and bool(row["matched"])
+
+
+def is_video(method: str) -> bool:
+    """Whether a method spends all on video."""
+    return method in METHODS and METHODS[method].kind is Kind.VIDEO
+
+
+def settings(rows: Sequence[RunRow]) -> list[Setting]:
+    """The settings of a study: where several datasets share all else, all of them first, then each.
+
+    Raises:
+        UserError: two different runs count at one place.
+    """
+    shared: dict[tuple[str, Models, Conditions], list[RunRow]] = {}
+    for row in rows:
+        models = Models(row["detector"], row["edge_detector"], row["classifier"])
+        shared.setdefault((row["labels"], models, conditions_of(row)), []).append(row)
+    found = []
+    for (labels, models, conditions), own in shared.items():
+        datasets = tuple(dict.fromkeys(row["dataset"] for row in own))
+        if len(datasets) > 1:
+            found.append(Setting(datasets, labels, models, tuple(own), conditions))
+        for dataset in datasets:
+            these = tuple(row for row in own if row["dataset"] == dataset)
+            found.append(Setting((dataset,), labels, models, these, conditions))
+    return found
+
+
+def values(runs: Mapping[str, RunRow], column: str) -> dict[str, float]:
+    """One figure of each run; NaN where it has none."""
+    return {name: math.nan if row[column] is None else float(row[column]) for name, row in runs.items()}
+
+
+def place(dataset: str) -> str:
+    """``visdrone:/data/VisDrone2019-VID-val?fps=24`` as ``visdrone VisDrone2019-VID-val``."""
+    scheme, _, rest = dataset.partition(":")
+    where, _, _ = rest.partition("?")
+    return f"{scheme} {where.rstrip('/').rpartition('/')[2]}".strip()
+
+
+def sequence_of(row: RunRow) -> str:
+    """Dataset and name: what runs are paired by."""
+    return f"{row['dataset']}#{row['sequence']}"
+
+
+def _order(method: str) -> tuple[int, str]:
+    names = list(METHODS)
+    return (names.index(method) if method in METHODS else len(names), method)
+
+
+def _at_total(matching: Sequence[RunRow], run: RunRow) -> RunRow | None:
+    """The follower whose target is this run's total: not that of another run of the same name."""
+    total = run["total_bps"]
+    known = [row for row in matching if row["target_bps"] is not None]
+    nearest = min(known, key=lambda row: abs(row["target_bps"] - total), default=None)
+    if nearest is None or abs(nearest["target_bps"] - total) > _SAME_TOTAL * total:
+        return None
+    return nearest
+
+
+def _conflict(one: RunRow, other: RunRow) -> str:
+    name = f"{one['method']} {one['still_codec']}".strip()
+    at = f" at the total of {one['matched_to']} {one['matched_codec']}".rstrip() if one["matched_to"] else ""
+    return (
+        f"two runs of {name}{at} on {one['sequence']}, {one['regime']} regime, count and are not the same "
+        f"({how_they_differ(one, other)}): join studies that agree in this, or report each by itself"
+    )
+
+
+def _one_tune_a_method(rows: Sequence[RunRow]) -> None:
+    first: dict[str, RunRow] = {}
+    for row in filter(counts, rows):
+        other = first.setdefault(row["method"], row)
+        if tune_of(other) != tune_of(row):
+            raise UserError(_mixed_tune(other, row))
+
+
+def _mixed_tune(one: RunRow, other: RunRow) -> str:
+    said = " and ".join(" ".join(tune_of(row)) or "its defaults" for row in (one, other))
+    return (
+        f"runs of {one['method']} with other parameters would be averaged together ({said}): join studies that agree "
+        "in this, or report each by itself"
+    )

@@ -1,0 +1,147 @@
+"""What a report is made of, before it is a page: sections of paragraphs, tables, drawings and pictures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeAlias
+
+__all__ = [
+    "Cell",
+    "Drawing",
+    "Head",
+    "Part",
+    "Picture",
+    "PictureRow",
+    "Pictures",
+    "Report",
+    "Section",
+    "Table",
+    "breaks_between",
+    "numbered",
+    "words",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """Of a column."""
+
+    text: str
+    number: bool = True
+    """Set flush right."""
+    says: str = ""
+    """What it is, for those who point at it."""
+
+
+def words(*texts: str) -> tuple[Head, ...]:
+    """Heads of columns of words."""
+    return tuple(Head(text, number=False) for text in texts)
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Of a table."""
+
+    text: str
+    under: str = ""
+    """A second, smaller line, such as an interval."""
+    strong: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table; its caption says which labels it is of and how many sequences."""
+
+    caption: str
+    heads: tuple[Head, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    breaks: frozenset[int] = frozenset()
+    """Rows before which a line is drawn."""
+
+
+def breaks_between(keys: Iterable[object]) -> frozenset[int]:
+    """Rows before which the key is another one than that of the row above: a line is drawn there."""
+    return frozenset(row for row, (one, other) in enumerate(pairwise(keys), start=1) if one != other)
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A figure in lines."""
+
+    name: str
+    """Of its files, unique in the report."""
+    caption: str
+    svg: str
+    """A standalone file."""
+    pdf: bytes
+    """The same for print."""
+    alternative: str
+    """What it shows, for those who do not see it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """Pixels."""
+
+    name: str
+    """Of its file, unique in the report."""
+    png: bytes
+    alternative: str
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRow:
+    """Pictures of one thing side by side."""
+
+    label: str
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """Rows of pictures under common heads."""
+
+    caption: str
+    heads: tuple[str, ...]
+    rows: tuple[PictureRow, ...]
+
+
+Part: TypeAlias = str | Table | Drawing | Pictures
+"""A text is a paragraph."""
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Under one heading."""
+
+    title: str
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """All of it."""
+
+    title: str
+    lead: tuple[str, ...]
+    """Paragraphs above the contents."""
+    sections: tuple[Section, ...]
+
+
+def numbered(section: Section, before: Counter[str]) -> list[tuple[str, Part]]:
+    """The parts of a section with what they are called, ``Table 3``, ``Figure 1``; paragraphs have no name.
+
+    ``before`` counts those of the sections before, and is added to.
+    """
+    named: list[tuple[str, Part]] = []
+    for part in section.parts:
+        if isinstance(part, str):
+            named.append(("", part))
+            continue
+        kind = "Table" if isinstance(part, Table) else "Figure"
+        before[kind] += 1
+        named.append((f"{kind} {before[kind]}", part))
+    return named

@@ -1,0 +1,187 @@
+"""One flight of a study from close by: which, by rule; what came of its stills; and how it went, second by second."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from hvt_study.report.data.arms import Arm, BySequence, RunRow, Setting, is_video, settings, values
+from hvt_study.report.data.pairs import Pair, pairs
+
+__all__ = [
+    "PERCENTILES",
+    "Choice",
+    "CropExample",
+    "Example",
+    "Lane",
+    "Timeline",
+    "Word",
+    "choose_run",
+    "percentile_rows",
+]
+
+PERCENTILES = (10, 50, 90)
+"""Of the gain in PSNR: the stills that are shown."""
+_GAIN = "top1_all"
+_PREFERRED = "M6"
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A run to be shown."""
+
+    key: str
+    """Of its row."""
+    rule: str
+    """Why this one; the end of a sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class CropExample:
+    """One still beside what it was cut from and what the base shows there; three pictures of one size, PNG."""
+
+    percentile: int
+    gain_db: float
+    """Y-PSNR of the still less that of the base, both against the source."""
+    base_db: float
+    at_s: float
+    """Capture of its frame, from the first frame."""
+    track_id: int
+    """Of the edge."""
+    class_before: str
+    class_after: str
+    size_bytes: int
+    source_png: bytes
+    base_png: bytes
+    still_png: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """What a still said of a track, and when."""
+
+    at_s: float
+    before: str
+    after: str
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """A track of the ground that stills have named."""
+
+    track_id: int
+    spans_s: tuple[tuple[float, float], ...]
+    """From and to, when it was listed."""
+    words: tuple[Word, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """A flight in steps of one second; lists are as long as it has seconds."""
+
+    budget_bps: int
+    base_kbps: tuple[float, ...]
+    roi_kbps: tuple[float, ...]
+    other_kbps: tuple[float, ...]
+    f1: tuple[float, ...]
+    """Of the list, whatever the classes."""
+    named_before: tuple[float, ...]
+    """Found & named, without the stills' word."""
+    named: tuple[float, ...]
+    """As shown."""
+    lanes: tuple[Lane, ...]
+    """Tracks whose class changed most often first, then those with the most words; not all of them."""
+    tracks_named: int
+    """How many there are in all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """A flight that was flown again to be looked at."""
+
+    key: str
+    """Of its row in the table."""
+    digest: str
+    """Of all payloads, as in its row: it is the same flight."""
+    rule: str
+    title: str
+    """Sequence, method, regime and labels, in words."""
+    stills: int
+    """Of which percentiles are shown."""
+    crops: tuple[CropExample, ...]
+    timeline: Timeline
+
+
+def choose_run(rows: Sequence[RunRow]) -> Choice | None:
+    """The run of the sequence with the median gain, of those that sent stills; None where no such method counts.
+
+    Of the methods that sent stills M6 is taken, or the last in the order of tables; in the thinnest regime; with the
+    codec that comes first. Gain is in found & named, against M0 at the same total; without M0, against the same run
+    without the stills' word. Where no run sent a still, the rule goes by all of them: there is a timeline still.
+
+    Raises:
+        UserError: two different runs count at one place.
+    """
+    found = settings(rows)
+    return _first(found, _that_sent) or _first(found, Setting.runs)
+
+
+def percentile_rows(gains_db: Sequence[float]) -> list[tuple[int, int]]:
+    """(percentile, index) of the stills nearest to `PERCENTILES` of the gain, each once; a lone one is the middle."""
+    order = sorted(range(len(gains_db)), key=lambda index: (gains_db[index], index))
+    if len(order) == 1:
+        return [(50, 0)]
+    found: dict[int, int] = {}
+    for percentile in PERCENTILES if order else ():
+        found.setdefault(order[round(percentile / 100 * (len(order) - 1))], percentile)
+    return [(percentile, index) for index, percentile in found.items()]
+
+
+def _preferred(arms: Sequence[Arm], setting: Setting) -> Arm:
+    method = _PREFERRED if any(arm.method == _PREFERRED for arm in arms) else arms[-1].method
+    codecs = list(dict.fromkeys(row["still_codec"] for row in setting.rows))
+    return min((arm for arm in arms if arm.method == method), key=lambda arm: codecs.index(arm.still_codec))
+
+
+def _first(found: Sequence[Setting], take: Callable[[Setting, Arm], BySequence]) -> Choice | None:
+    for setting in found:
+        for regime in setting.regimes:
+            arms = [arm for arm in setting.hybrids(regime) if arm.still_codec and take(setting, arm)]
+            if arms:
+                arm = _preferred(arms, setting)
+                return _median(setting, arm, take(setting, arm))
+    return None
+
+
+def _that_sent(setting: Setting, arm: Arm) -> BySequence:
+    return {name: row for name, row in setting.runs(arm).items() if row["stills"]}
+
+
+def _median(setting: Setting, arm: Arm, runs: BySequence) -> Choice:
+    assert not is_video(arm.method), "video sends no stills"
+    sent = "with stills" if any(row["stills"] for row in runs.values()) else "(no run sent a still)"
+    gains, over = _gains(setting, arm, runs)
+    ordered = sorted(gains, key=lambda name: (gains[name], name)) or sorted(runs)
+    name = ordered[(len(ordered) - 1) // 2]
+    how = f"with the median gain in found & named over {over}" if gains else "in the middle by name"
+    where = f"{arm.name} in the thinnest regime with such runs ({arm.regime})"
+    if len(ordered) == 1:
+        return Choice(str(runs[name]["key"]), f"{where}, which has one sequence {sent}")
+    rule = f"{where}, and of its {len(ordered)} sequences {sent} the one {how}"
+    return Choice(str(runs[name]["key"]), rule)
+
+
+def _gains(setting: Setting, arm: Arm, runs: BySequence) -> tuple[Mapping[str, float], str]:
+    """In found & named by sequence, and over what."""
+    for pair in _plain(setting, arm):
+        against = {name: gap for name, gap in pair.gaps(_GAIN).items() if name in runs}
+        if against:
+            return against, "M0 at the same total"
+    after, before = values(runs, _GAIN), values(runs, "top1_all_before")
+    own = {name: after[name] - before[name] for name in runs}
+    return {name: gap for name, gap in own.items() if not math.isnan(gap)}, "itself without stills"
+
+
+def _plain(setting: Setting, arm: Arm) -> list[Pair]:
+    return [pair for pair in pairs(setting, references=("M0",)) if pair.arm == arm]

@@ -1,0 +1,1 @@
+"""Figures of the report in Matplotlib, each a function of a `Setting`, and the plot of ``hvt-study compare``."""

@@ -1,0 +1,157 @@
+"""How figures look: for print, for every kind of colour vision, and legible in grey."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hvt_study.report.data.arms import Arm
+from hvt_study.report.data.document import Drawing
+
+__all__ = [
+    "GREY",
+    "INK",
+    "PALETTE",
+    "WIDTH_IN",
+    "Style",
+    "drawn",
+    "fill_of",
+    "mark_of",
+    "plain_axes",
+    "rate_axis",
+    "style_of",
+]
+
+WIDTH_IN = 7.2
+"""Of a page of two columns."""
+INK = "#000000"
+"""Becomes the page's own colour of text in HTML."""
+GREY = "#808080"
+
+PALETTE: Mapping[str, str] = MappingProxyType(
+    {
+        "black": "#000000",
+        "orange": "#E69F00",
+        "sky": "#56B4E9",
+        "green": "#009E73",
+        "blue": "#0072B2",
+        "vermillion": "#D55E00",
+        "purple": "#CC79A7",
+    }
+)
+"""Okabe and Ito 2008, without yellow, which paper hides."""
+
+_RC: Mapping[str, Any] = MappingProxyType(
+    {
+        "font.family": ["DejaVu Sans"],
+        "font.size": 8,
+        "axes.titlesize": 8,
+        "axes.labelsize": 8,
+        "legend.fontsize": 7.5,
+        "xtick.labelsize": 7,
+        "ytick.labelsize": 7,
+        "axes.linewidth": 0.6,
+        "xtick.major.width": 0.6,
+        "ytick.major.width": 0.6,
+        "lines.linewidth": 1.3,
+        "lines.markersize": 5,
+        "pdf.fonttype": 42,
+        "svg.fonttype": "none",
+        "figure.facecolor": "none",
+        "axes.facecolor": "none",
+        "savefig.facecolor": "none",
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """Of a method: any of the three tells it from its neighbours."""
+
+    colour: str
+    marker: str
+    dashes: str
+
+
+_STYLES: Mapping[str, Style] = MappingProxyType(
+    {
+        "M0": Style(PALETTE["black"], "o", "--"),
+        "M0-fps": Style(PALETTE["black"], "s", "-"),
+        "R0": Style(PALETTE["sky"], "^", "-"),
+        "M1": Style(PALETTE["blue"], "o", ":"),
+        "M2": Style(PALETTE["blue"], "v", "--"),
+        "M3": Style(PALETTE["blue"], "D", "-."),
+        "M4": Style(PALETTE["orange"], "^", ":"),
+        "M5": Style(PALETTE["orange"], "D", "-"),
+        "M6": Style(PALETTE["vermillion"], "*", "-"),
+        # No triangle to the left or right: in figures of bits arrows say where a curve ends.
+        "tracks": Style(PALETTE["purple"], "p", "-"),
+        "permissive": Style(PALETTE["purple"], "s", ":"),
+        "conf_size_top1": Style(PALETTE["purple"], "8", "--"),
+        "strict_small_only": Style(PALETTE["purple"], "d", "-."),
+        "balanced_top2": Style(PALETTE["purple"], "h", ":"),
+        "DDS": Style(PALETTE["sky"], "H", "-."),
+    }
+)
+_OTHER = Style(GREY, "x", "-")
+_FILLS = ("full", "none", "left", "top", "right", "bottom")
+
+
+def style_of(method: str) -> Style:
+    """The same in every figure."""
+    return _STYLES.get(method, _OTHER)
+
+
+def fill_of(arm: Arm, codecs: tuple[str, ...]) -> Any:
+    """How a marker is filled: by its codec, full for the first."""
+    return _FILLS[codecs.index(arm.still_codec) % len(_FILLS)] if arm.still_codec in codecs else _FILLS[0]
+
+
+def mark_of(style: Style) -> float:
+    """Size of a marker: a star has little area."""
+    return 6.5 if style.marker == "*" else 4.5
+
+
+def plain_axes(axes: Axes, *, grid: str = "both") -> None:
+    """Two spines and a faint grid."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=True, axis=grid, color=INK, alpha=0.22, linewidth=0.4)  # type: ignore[arg-type]
+    axes.set_axisbelow(True)
+
+
+def rate_axis(axes: Axes, kbps: list[float]) -> None:
+    """A logarithmic axis of bitrates with marks at these, as far as they do not touch each other."""
+    axes.set_xscale("log")
+    marks: list[float] = []
+    for value in sorted(set(kbps)):
+        if not marks or value > 1.25 * marks[-1]:
+            marks.append(value)
+    axes.set_xticks(marks, [f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in marks])
+    axes.minorticks_off()
+
+
+def drawn(
+    name: str,
+    paint: Callable[[Figure], None],
+    *,
+    height_in: float,
+    caption: str,
+    alternative: str,
+    width_in: float = WIDTH_IN,
+) -> Drawing:
+    """Let ``paint`` fill a figure and write it as SVG and PDF; the same figure gives the same bytes."""
+    own: Any = {**_RC, "svg.hashsalt": name}
+    with mpl.rc_context(own):
+        figure = Figure(figsize=(width_in, height_in), layout="constrained")
+        paint(figure)
+        svg, pdf = io.BytesIO(), io.BytesIO()
+        figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
+        figure.savefig(svg, format="svg", metadata={"Date": None})
+    return Drawing(name, caption, svg.getvalue().decode(), pdf.getvalue(), alternative)

@@ -1,0 +1,1 @@
+"""Tables of the report, each a function of a `Setting` or of rows."""

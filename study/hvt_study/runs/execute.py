@@ -1,0 +1,202 @@
+"""One run, from its specification to its row, in whatever process the pool gives; all they share is the cache."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TypeVar
+
+from hvt_common.errors import UserError
+from hvt_study.cache.results import CacheError, ResultCache, content_key
+from hvt_study.runs.columns import COLUMNS
+from hvt_study.runs.match_total import match, within
+from hvt_study.runs.materials import Materials, open_materials
+from hvt_study.runs.methods import METHODS
+from hvt_study.runs.paths import located
+from hvt_study.runs.run_context import RunContext, open_run_context
+from hvt_study.runs.run_settings import dry_run_bps, edge_flags, flown, settings
+from hvt_study.runs.scoring import figures
+from hvt_study.runs.spec import RunSpec
+
+__all__ = ["run_spec"]
+
+RunRow = dict[str, Any]
+_T = TypeVar("_T")
+_log = logging.getLogger(__name__)
+_in_flight = threading.Lock()
+"""Flights of one process take turns with its detectors; a Dask worker may have several threads."""
+
+
+def run_spec(spec: RunSpec, *, cache: Path, folder: Path = Path()) -> RunRow:
+    """Do one run; what the edge refuses, or no one has foreseen, is a row that says so.
+
+    Args:
+        spec: what to do.
+        cache: folder of what was computed before.
+        folder: what paths that are not absolute begin at, such as the folder in which the study was started.
+
+    Raises:
+        UserError: dataset or models cannot be used, or the cache not be written: that ends the study.
+    """
+    with _in_flight:
+        here = located(spec, folder=folder)
+        found = open_materials(here, cache=cache)
+        flights = _Flights(spec, cache, found, here)
+        try:
+            row = flights.best()
+            failed = "" if _matches(spec, row) else _missed(spec, row)
+        except (_RefusedError, _BrokenError) as error:
+            row, failed = {}, str(error)
+    row = {**row, **_identity(spec), "failed": failed, "matched": not failed, "wall_s": flights.wall_s}
+    row["config"] = json.dumps({"run": asdict(spec), **row.pop("settings", {})})
+    row |= {"versions": json.dumps(found.software), "content": json.dumps(found.content)}
+    return {column.name: row.get(column.name) for column in COLUMNS}
+
+
+class _RefusedError(Exception):
+    """The edge does not take these settings; the run is a failed one, the study goes on."""
+
+
+class _BrokenError(Exception):
+    """A flight ended in an error that nobody has foreseen: the run has failed at whatever rate, the study goes on."""
+
+
+class _Flights:
+    """The flights of one run, each done once in the life of the cache; ``here`` has the paths that are opened."""
+
+    def __init__(self, spec: RunSpec, cache: Path, found: Materials, here: RunSpec) -> None:
+        self._spec, self._folder, self._found, self._here = spec, cache, found, here
+        self._cache = ResultCache(cache / "flights")
+        self.wall_s = 0.0
+        """What all of them took, whenever that was."""
+
+    def best(self) -> RunRow:
+        """The flight that counts; of several frame rates the one that shows most."""
+        choices: tuple[float | None, ...] = METHODS[self._spec.method].fps_choices or (None,)
+        done: list[RunRow] = []
+        refused: list[_RefusedError] = []
+        for fps in choices:
+            try:
+                done.append(self._at_rate(fps))
+            except _RefusedError as error:  # at this frame rate; others may do
+                refused.append(error)
+        matching = [row for row in done if _matches(self._spec, row)] or done
+        if not matching:
+            raise refused[-1]  # of the slowest, for which there was most hope
+        return max(matching, key=_worth)
+
+    def _at_rate(self, fps: float | None) -> RunRow:
+        spec = self._spec
+        if spec.target is None:
+            return self._flight(spec.budget_bps, fps)
+        refused: list[_RefusedError] = []
+
+        def spends(budget_bps: int) -> float | None:
+            try:
+                return self._weight(budget_bps, fps)
+            except _RefusedError as error:
+                refused.append(error)
+                return None
+
+        found = match(spends, target_bps=spec.target.total_bps)
+        if found is None:
+            raise refused[0]
+        return self._flight(found.budget_bps, fps)
+
+    def _flight(self, budget_bps: int, fps: float | None) -> RunRow:
+        def fly(context: RunContext) -> RunRow:
+            report = _or_refused(lambda: flown(self._spec, context, budget_bps=budget_bps, fps=fps))
+            used = settings(self._spec, context, budget_bps=budget_bps, fps=fps)
+            return {**figures(report, context), "settings": used}
+
+        spec, words = self._spec, dict(self._found.classes.words)
+        return self._known(self._key("flight", budget_bps, fps, spec.budget_bps, spec.labels, words), fly)
+
+    def _weight(self, budget_bps: int, fps: float | None) -> float:
+        """What a flight at this budget spends; without a ground, which has no say in it."""
+
+        def dry_run(context: RunContext) -> RunRow:
+            return {
+                "bps": _or_refused(lambda: dry_run_bps(self._spec, context, budget_bps=budget_bps, fps=fps))
+            }
+
+        return float(self._known(self._key("weight", budget_bps, fps), dry_run)["bps"])
+
+    def _known(self, key: str, make: Callable[[RunContext], RunRow]) -> RunRow:
+        """Out of the cache; else it is made, which alone needs pictures."""
+        row = self._cache.get(key)
+        if row is None:
+            began_s = time.monotonic()
+            row = self._made(make)
+            row["wall_s"] = time.monotonic() - began_s
+            self._cache.put(key, row)
+        self.wall_s += row["wall_s"]
+        return row
+
+    def _made(self, make: Callable[[RunContext], RunRow]) -> RunRow:
+        try:
+            return make(open_run_context(self._here, cache=self._folder))
+        except (UserError, _RefusedError, MemoryError):
+            raise
+        except Exception as error:  # noqa: BLE001 - one bad flight of thousands must not end them all
+            _log.exception("%s on %s ended in an error", self._spec.method, self._spec.sequence)
+            said = str(error).strip().partition("\n")[0]
+            raise _BrokenError(f"{type(error).__name__}: {said}".rstrip(": ")) from None
+
+    def _key(self, what: str, budget_bps: int, fps: float | None, *more: Any) -> str:
+        spec, found = self._spec, self._found
+        flags = edge_flags(spec, budget_bps=budget_bps, fps=fps)
+        frames = found.sequence.clip_frames
+        said = (asdict(spec.models), spec.detect_every, found.content, found.software)
+        return content_key(what, flags, frames, *said, *more)
+
+
+def _or_refused(fly: Callable[[], _T]) -> _T:
+    """A cache that cannot be written is no refusal: it ends the study."""
+    try:
+        return fly()
+    except CacheError:
+        raise
+    except UserError as error:
+        raise _RefusedError(str(error)) from None
+
+
+def _worth(row: RunRow) -> tuple[float, float]:
+    """By this the best frame rate is chosen: objects found and named, and of equal ones the boxes."""
+    return row["top1_all"] or 0.0, row["f1"] or 0.0
+
+
+def _matches(spec: RunSpec, row: RunRow) -> bool:
+    return spec.target is None or within(row["total_bps"], spec.target.total_bps)
+
+
+def _missed(spec: RunSpec, row: RunRow) -> str:
+    assert spec.target is not None, "without a target nothing is missed"
+    off_pct = 100 * (row["total_bps"] / spec.target.total_bps - 1)
+    return f"spends {row['total_bps']} bps, {off_pct:+.1f} % off the {spec.target.total_bps} of {spec.target.method}"
+
+
+def _identity(spec: RunSpec) -> RunRow:
+    target = spec.target
+    return {
+        "key": spec.key,
+        "accounting": "span",
+        "dataset": spec.dataset,
+        "sequence": spec.sequence,
+        "labels": spec.labels,
+        "method": spec.method,
+        "regime": spec.regime,
+        "budget_bps": spec.budget_bps,
+        "still_codec": spec.still_codec,
+        "detector": spec.models.detector,
+        "edge_detector": spec.models.edge_detector,
+        "classifier": spec.models.classifier,
+        "matched_to": "" if target is None else target.method,
+        "matched_codec": "" if target is None else target.still_codec,
+        "target_bps": None if target is None else target.total_bps,
+    }

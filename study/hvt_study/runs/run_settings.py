@@ -1,0 +1,114 @@
+"""A run's settings as users of ``hvt-edge`` and ``hvt-ground`` would give them, and its flight."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from typing import Any
+
+from hvt_common.config import load
+from hvt_edge.config import REGIMES, EdgeConfig
+from hvt_edge.config import check as check_edge
+from hvt_ground.config import GroundConfig
+from hvt_ground.config import check as check_ground
+from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.flights.flight import FlightPlan, FlightReport, dry_run, fly
+from hvt_study.flights.flight_ground import SharedModels
+from hvt_study.peers.dds import fly_dds
+from hvt_study.peers.dds_settings import DdsSettings
+from hvt_study.runs.materials import CONFIDENCE
+from hvt_study.runs.methods import METHODS, Kind
+from hvt_study.runs.run_context import RunContext
+from hvt_study.runs.spec import RunSpec
+
+__all__ = ["dry_run_bps", "edge_flags", "flight_plan", "flown", "settings"]
+
+
+def edge_flags(spec: RunSpec, *, budget_bps: int, fps: float | None) -> tuple[str, ...]:
+    """What ``hvt-edge`` is started with, but for the source; a peer's settings in words of its own."""
+    method = METHODS[spec.method]
+    if method.kind is Kind.PEER:
+        return (spec.method, f"{spec.size[0]}x{spec.size[1]}", f"{budget_bps}bps", str(_dds_settings(fps)))
+    width, height = spec.size
+    flags = ["--pace", "lockstep", "--detector", spec.models.edge_detector, "--size", f"{width}x{height}"]
+    flags += ["--budget", f"{budget_bps}bps", "--threads", "1", "--confidence", f"{CONFIDENCE:g}"]
+    flags += ["--provider", spec.models.provider, "--detect-every", f"{spec.detect_every}", *method.flags]
+    if method.sends_stills:
+        flags += ["--still-codec", spec.still_codec]
+        if "--video-share" not in method.flags and spec.regime in REGIMES:
+            flags += ["--video-share", f"{REGIMES[spec.regime].video_share:.6f}"]
+    for parameter in spec.tune:
+        flags += ["--tune", parameter]
+    if fps is not None and fps != NOMINAL_FPS:
+        # The budget's window has to hold two frames.
+        flags += ["--fps", f"{fps:g}", "--window", f"{max(1.0, 2 / fps):g}s"]
+    return tuple(flags)
+
+
+def flight_plan(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> FlightPlan:
+    """The flight of this run at a budget; its link carries what the regime allows, whatever the budget.
+
+    Raises:
+        UserError: the edge does not take these settings.
+    """
+    flags = ["--source", context.sequence.clip.spec, *edge_flags(spec, budget_bps=budget_bps, fps=fps)]
+    config, _ = load(EdgeConfig, flags, program="hvt-edge", description="")
+    return FlightPlan(
+        clip=context.sequence.clip,
+        edge=check_edge(config),
+        ground=_ground_config(spec),
+        link_bps=spec.budget_bps,
+    )
+
+
+def flown(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> FlightReport:
+    """Fly it."""
+    if METHODS[spec.method].kind is Kind.PEER:
+        return fly_dds(
+            context.sequence.clip,
+            budget_bps=budget_bps,
+            link_bps=spec.budget_bps,
+            size=spec.size,
+            detector=context.detector,
+            settings=_dds_settings(fps),
+        )
+    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
+    return fly(
+        plan, detector=context.edge_detector, models=SharedModels(context.detector, context.classifier)
+    )
+
+
+def dry_run_bps(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> float:
+    """Line bits a second of a method that no ground's answer changes."""
+    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
+    return dry_run(plan, detector=context.edge_detector)
+
+
+def settings(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> dict[str, Any]:
+    """All settings of a flight, as JSON holds them."""
+    if METHODS[spec.method].kind is Kind.PEER:
+        peer = {**asdict(_dds_settings(fps)), "budget_bps": budget_bps, "size": list(spec.size)}
+        return {spec.method: peer}
+    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
+    sides = {"edge": asdict(plan.edge), "ground": asdict(plan.ground)}
+    known: dict[str, Any] = json.loads(json.dumps(sides, default=str))
+    return known
+
+
+def _dds_settings(fps: float | None) -> DdsSettings:
+    return DdsSettings(fps=fps)
+
+
+def _ground_config(spec: RunSpec) -> GroundConfig:
+    return check_ground(
+        replace(
+            GroundConfig(),
+            detector=spec.models.detector,
+            classifier=spec.models.classifier,
+            refine=spec.models.refine,
+            confidence=CONFIDENCE,
+            detect_every=spec.detect_every,
+            threads=1,
+            provider=spec.models.provider,
+        )
+    )

@@ -1,0 +1,169 @@
+"""From a flight and its labels to the figures of a row."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from hvt_common.protocol.channels import Channel
+from hvt_study.datasets.clip import NOMINAL_FPS
+from hvt_study.flights.flight import FlightReport
+from hvt_study.metrics.bits import Accounting, bit_split, still_counts
+from hvt_study.metrics.classes import class_score
+from hvt_study.metrics.detection import detection_score
+from hvt_study.metrics.first_correct import first_correct
+from hvt_study.metrics.frames import LabelledFrames
+from hvt_study.metrics.observed import (
+    arrivals,
+    detected_frames,
+    refined_frames,
+    refined_objects,
+    shown_times_s,
+)
+from hvt_study.metrics.proxy import proxies
+from hvt_study.metrics.stills import still_delays_ms
+from hvt_study.metrics.tracking import tracking_score
+from hvt_study.runs.run_context import RunContext
+
+__all__ = ["figures"]
+
+_DIGITS = 6
+
+
+def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
+    """Every metric column of `hvt_study.runs.columns.COLUMNS`; None where a run has none."""
+    found = {**_bits(report, context), **_labelled(report, context), **_delays(report), **_proxies(report)}
+    found |= {"digest": report.digest, "edge_cpu_ms": report.edge_cpu_ms}
+    return {name: _plain(value) for name, value in found.items()}
+
+
+def _bits(report: FlightReport, context: RunContext) -> dict[str, Any]:
+    stills, refined = arrivals(report.lists), refined_objects(report.lists)
+
+    def split(accounting: Accounting) -> tuple[float, ...]:
+        one = bit_split(
+            report.line_bytes,
+            processed_s=report.duration_s,
+            clip_s=context.sequence.duration_s,
+            accounting=accounting,
+        )
+        return one.total_bps, one.base_bps, one.roi_bps, one.track_bps, one.other_bps
+
+    counts = still_counts(stills, refined, processed_s=report.duration_s)
+    total, base, roi, tracks, other = map(round, split("span"))
+    pilot = tuple(map(round, split("pilot")))
+    return {
+        "duration_s": report.duration_s,
+        "clip_s": context.sequence.duration_s,
+        "total_bps": total,
+        "base_bps": base,
+        "roi_bps": roi,
+        "track_bps": tracks,
+        "other_bps": other,
+        "back_bps": round(8 * _back_bytes(report) / report.duration_s),
+        "total_bps_pilot": pilot[0],
+        "base_bps_pilot": pilot[1],
+        "roi_bps_pilot": pilot[2],
+        "fps": report.messages.get("base", 0) / report.duration_s,
+        "stills": counts.stills,
+        "stills_per_min": counts.stills_per_min,
+        "mean_still_bytes": counts.mean_bytes,
+        "tracks_refined": counts.tracks_refined,
+    }
+
+
+def _back_bytes(report: FlightReport) -> int:
+    """Of a server its questions, which are a row of what crossed the line."""
+    return report.back_bytes + report.line_bytes.get(Channel.CONTROL, 0)
+
+
+def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
+    words: dict[str, Any] = {"word": context.classes.word, "classes": context.classes.classes}
+    labelled = refined_frames(report.lists, context.labels)
+    detection = detection_score(detected_frames(report.lists, context.labels), **words)
+    after = class_score(labelled, **words)
+    before = class_score(labelled, refined=False, **words)
+    tracking = tracking_score(labelled, **words)
+    first = first_correct(labelled, fps=NOMINAL_FPS, shown_s=shown_times_s(report.lists), **words)
+    return {
+        "map_50": detection.mean.at_50,
+        "map_50_95": detection.mean.at_50_95,
+        **{f"map_50_{size}": one.at_50 for size, one in detection.by_size.items()},
+        "recall": after.recall,
+        "precision": after.precision,
+        "f1": after.f1,
+        "top1_before": before.counts.top1_found,
+        "top1": after.counts.top1_found,
+        "top1_all_before": before.counts.top1_all,
+        "top1_all": after.counts.top1_all,
+        **_halves(labelled, words),
+        "macro_f1_before": before.macro_f1_found,
+        "macro_f1": after.macro_f1_found,
+        "macro_f1_all_before": before.macro_f1_all,
+        "macro_f1_all": after.macro_f1_all,
+        **{f"top1_{size}": one.top1_found for size, one in after.by_size.items()},
+        **{f"top1_all_{size}": one.top1_all for size, one in after.by_size.items()},
+        "mota": tracking.mota,
+        "idf1": tracking.idf1,
+        "hota": tracking.hota,
+        "id_switches": tracking.switches if tracking.objects else None,
+        "first_correct_p50_s": first.median_s,
+        "first_correct_p90_s": first.p90_s,
+        "first_correct_never": first.never / first.tracks if first.tracks else None,
+    }
+
+
+def _halves(labelled: LabelledFrames, words: dict[str, Any]) -> dict[str, float]:
+    """Of the list in each half of the clip: what is tuned on one half must hold in the other."""
+    middle = len(labelled) // 2
+    found: dict[str, float] = {}
+    for half, part in enumerate((labelled[:middle], labelled[middle:]), start=1):
+        one = class_score(part, **words)
+        figures = {
+            "recall": one.recall,
+            "precision": one.precision,
+            "f1": one.f1,
+            "top1": one.counts.top1_found,
+        }
+        found |= {f"{name}_half_{half}": value for name, value in figures.items()}
+    return found
+
+
+def _delays(report: FlightReport) -> dict[str, Any]:
+    still_p50_ms, still_p95_ms = still_delays_ms(arrivals(report.lists))
+    return {
+        "delay_p50_ms": report.link.delay_p50_ms,
+        "delay_p95_ms": report.link.delay_p95_ms,
+        "still_delay_p50_ms": still_p50_ms,
+        "still_delay_p95_ms": still_p95_ms,
+        "picture_age_p95_ms": report.picture_age_p95_ms,
+        "worst_queue_bytes": report.link.worst_queue_bytes,
+        "max_frame_bytes": report.max_frame_bytes,
+    }
+
+
+def _proxies(report: FlightReport) -> dict[str, Any]:
+    said = proxies(refined_objects(report.lists))
+    return {
+        "confidence_base": said.every.confidence_base,
+        "confidence_refined": said.every.confidence_still,
+        "confidence_gain": said.every.gain,
+        "positive_rate": said.every.positive_rate,
+        "change_rate": said.every.change_rate,
+        "entropy_gain_nats": said.every.entropy_gain_nats,
+        "proxy_pairs": said.every.pairs,
+        "small_confidence_base": said.small.confidence_base,
+        "small_confidence_refined": said.small.confidence_still,
+        "small_confidence_gain": said.small.gain,
+        "small_positive_rate": said.small.positive_rate,
+        "small_change_rate": said.small.change_rate,
+        "small_entropy_gain_nats": said.small.entropy_gain_nats,
+        "small_pairs": said.small.pairs,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """No NaN, no digits that nobody can repeat; a wait that never ended stays infinite, or means would flatter."""
+    if isinstance(value, float):
+        return None if math.isnan(value) else round(value, _DIGITS)
+    return value

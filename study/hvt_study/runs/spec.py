@@ -1,0 +1,73 @@
+"""What one run of the matrix is: everything that decides its result, and nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Literal
+
+__all__ = ["MATCH_TOLERANCE", "ModelChoice", "RunSpec", "Target"]
+
+MATCH_TOLERANCE = 0.01
+"""A run that is to match another's total may miss it by so much, and is marked failed beyond."""
+
+LabelKind = Literal["annotations", "reference"]
+
+
+@dataclass(frozen=True, slots=True)
+class ModelChoice:
+    """The networks of a run: what ``--detector`` and ``--classifier`` take."""
+
+    detector: str
+    """The ground's, and that of reference labels."""
+    edge_detector: str
+    classifier: str = "detector"
+    """``detector`` (it looks at the still again), ``none``, or a classifier."""
+    refine: str = "fuse"
+    provider: str = "auto"
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """The run whose total this one has to spend, within `MATCH_TOLERANCE`."""
+
+    method: str
+    still_codec: str
+    total_bps: int
+    """What that run really spent over the processed span."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunSpec:
+    """One flight of one method. Two equal ones have the same result to the bit."""
+
+    dataset: str
+    """URI, such as ``visdrone:/data/VisDrone2019-VID-val``."""
+    sequence: str
+    """Its name within the dataset."""
+    method: str
+    """A name of `hvt_study.runs.methods.METHODS`."""
+    regime: str
+    """``low``, ``moderate``, or the budget in words, such as ``300kbps``."""
+    budget_bps: int
+    """B_tot of the regime."""
+    models: ModelChoice
+    still_codec: str = "jpeg"
+    labels: LabelKind = "reference"
+    size: tuple[int, int] = (1280, 720)
+    """(width, height) of the base stream in pixels."""
+    max_frames: int | None = None
+    """At 15 a second."""
+    detect_every: int = 5
+    """Frames from one detection to the next, at the edge and at the ground. The peer looks at all that it codes."""
+    target: Target | None = None
+    """For video-only methods: spend what this run spent; None: the budget itself."""
+    tune: tuple[str, ...] = field(default=())
+    """``KEY=VALUE`` of the method's parameters other than their defaults."""
+
+    @property
+    def key(self) -> str:
+        """Names the spec: hexadecimal, the same on every machine. Contents of clips and models are not in it."""
+        text = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:32]

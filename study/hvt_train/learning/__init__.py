@@ -1,0 +1,1 @@
+"""Networks, losses, training loops of detector and classifier, and `export_onnx`."""

@@ -1,0 +1,158 @@
+"""The pool of drawn pictures that training cuts its views from, one file each, made by seeds alone.
+
+Three kinds: ``demo`` (the demo's scene, clean), ``base`` (the same after x265 as the base stream carries it) and
+``place`` (`draw_place`). Seeds of training lie from `TRAIN_SEED` on; those of `held_out` and the demo's own seed 0
+never occur among them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hvt_common.values import Frame, Image, View
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.x265 import BaseEncoder
+from hvt_scene import Appearance, Scene
+from hvt_train.pictures.places import Picture, draw_place
+
+__all__ = [
+    "BASE_SIZE",
+    "HELD_OUT_SEED",
+    "SOURCE_SIZE",
+    "TRAIN_SEED",
+    "PoolPlan",
+    "Shot",
+    "coded",
+    "fill_pool",
+    "shoot",
+]
+
+TRAIN_SEED = 1000
+HELD_OUT_SEED = 900_000
+SOURCE_SIZE = (1920, 1080)
+BASE_SIZE = (1280, 720)
+_FPS = 15.0
+_CODED_FRAMES = 6
+
+
+@dataclass(frozen=True, slots=True)
+class PoolPlan:
+    """How many pictures: ``scenes`` worlds with ``moments`` each (clean and coded), and ``places``."""
+
+    scenes: int = 220
+    moments: int = 3
+    places: int = 700
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One moment of a demo scene: the source frame and the truth in its pixels."""
+
+    scene: Scene
+    t_s: float
+
+    def picture(self, size: tuple[int, int]) -> Picture:
+        """The moment at ``size``, shrunk from the source as the edge shrinks it."""
+        truth = self.scene.truth(self.t_s)
+        scale = size[0] / self.scene.size[0]
+        boxes = (truth.boxes_source_px * scale).astype(np.float32)
+        image = _shrunk(self.scene.image(self.t_s), size)
+        return Picture(image, boxes, truth.class_ids.astype(np.int32), truth.visible.astype(np.float32))
+
+
+def shoot(seed: int, *, demo_appearance: bool) -> Scene:
+    """The demo's scene of a seed, in the demo's look or in a random one."""
+    return Scene(seed, size=SOURCE_SIZE, appearance=None if demo_appearance else Appearance.random(seed))
+
+
+def coded(shot: Shot, *, bitrates_bps: Sequence[int], frames: int = _CODED_FRAMES) -> list[Image]:
+    """The base picture of a moment as the ground decodes it, ``frames`` after a keyframe, at each bitrate."""
+    images = [
+        _shrunk(shot.scene.image(max(0.0, shot.t_s - (frames - 1 - index) / _FPS)), BASE_SIZE)
+        for index in range(frames)
+    ]
+    return [_through_x265(images, bitrate_bps) for bitrate_bps in bitrates_bps]
+
+
+def _through_x265(images: Sequence[Image], bitrate_bps: int) -> Image:
+    """The last of the pictures, decoded."""
+    encoder = BaseEncoder(EncoderSettings(size=BASE_SIZE, fps=_FPS, bitrate_bps=bitrate_bps))
+    decoder, picture = BaseDecoder(), None
+    for index, image in enumerate(images):
+        frame = Frame(index=index, capture_ns=0, source_bgr=image, base_bgr=image)
+        picture = decoder.decode(encoder.encode(frame).data)
+    assert picture is not None
+    return picture
+
+
+def fill_pool(folder: Path, plan: PoolPlan, *, workers: int = 1) -> list[Path]:
+    """Draw what is missing in ``folder`` and return all files of the plan, in the order of their names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = [("demo", number, plan.moments) for number in range(plan.scenes)]
+    jobs += [("place", number, 1) for number in range(plan.places)]
+    # Kinds are spread evenly, so that a pool that is cut short is a smaller pool of the same mixture.
+    jobs.sort(key=lambda job: (job[1] / (plan.scenes if job[0] == "demo" else plan.places), job[0]))
+    with ProcessPoolExecutor(workers) as executor:
+        names = executor.map(_draw, [(folder, *job) for job in jobs], chunksize=1)
+        return sorted(path for group in names for path in group)
+
+
+def _draw(job: tuple[Path, str, int, int]) -> list[Path]:
+    cv2.setNumThreads(1)
+    folder, kind, number, moments = job
+    if kind == "place":
+        path = folder / f"place-{number:05d}.npz"
+        if not path.exists():
+            _save(path, draw_place(np.random.default_rng([TRAIN_SEED, number])))
+        return [path]
+    paths = [folder / f"{name}-{number:05d}-{m}.npz" for name in ("demo", "base") for m in range(moments)]
+    if not all(path.exists() for path in paths):
+        for path, picture in zip(paths, _pictures(number, moments), strict=True):
+            _save(path, picture)
+    return paths
+
+
+def _pictures(number: int, moments: int) -> Iterator[Picture]:
+    """First the clean pictures of all moments, then the coded ones."""
+    rng = np.random.default_rng([TRAIN_SEED, 1, number])
+    scene = shoot(TRAIN_SEED + number, demo_appearance=number % 4 == 0)
+    clean = [
+        Shot(scene, float(t_s)).picture(BASE_SIZE) for t_s in rng.uniform(0.4, scene.duration_s, moments)
+    ]
+    yield from clean
+    for t_s in rng.uniform(0.4, scene.duration_s, moments):
+        shot = Shot(scene, float(t_s))
+        bitrate = round(math.exp(rng.uniform(math.log(300_000), math.log(2_500_000))))
+        truth = shot.picture(BASE_SIZE)
+        picture = coded(shot, bitrates_bps=[bitrate])[0]
+        yield Picture(picture, truth.boxes_px, truth.class_ids, truth.visible)
+
+
+def _save(path: Path, picture: Picture) -> None:
+    """Write whole or not at all: a run that is stopped leaves no half file."""
+    partial = path.with_suffix(".part")
+    with partial.open("wb") as file:
+        np.savez(
+            file,
+            image=picture.image_bgr,
+            boxes=picture.boxes_px,
+            classes=picture.class_ids,
+            visible=picture.visible,
+        )
+    partial.replace(path)
+
+
+def _shrunk(image: Image, size: tuple[int, int]) -> Image:
+    if (image.shape[1], image.shape[0]) == size:
+        return image
+    view = View.fitted((image.shape[1], image.shape[0]), size, fit="letterbox")
+    assert view.offset_px == (0.0, 0.0), "the drawn frame has the shape of the base"
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

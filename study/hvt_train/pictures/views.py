@@ -1,0 +1,228 @@
+"""Training views: a random window of a pool picture at a random scale, damaged as cameras and codecs do it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Boxes, Image
+from hvt_train.pictures.places import Picture
+
+__all__ = ["View", "ViewSettings", "ViewSource", "degrade", "read_picture"]
+
+_Rng = np.random.Generator
+_FILL = 114
+_CLASSES = 7
+_DAMAGE = {"demo": (0.6, 0.3), "base": (0.4, 0.1), "place": (1.0, 0.6)}
+"""Strength and how often the codec is bad. Base pictures have been through x265 already."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One training example."""
+
+    image_bgr: Image
+    boxes_px: Boxes
+    class_ids: npt.NDArray[np.int32]
+    """-1 where something is there that is too hidden or too small to be asked for: neither object nor background."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewSettings:
+    """How views are cut."""
+
+    side: int = 416
+    shares: tuple[tuple[str, float], ...] = (("demo", 0.4), ("base", 0.35), ("place", 0.25))
+    """How often each kind of picture is taken."""
+    least_visible: float = 0.3
+    least_side_px: float = 4.0
+    """Of the longer side of a box, in pixels of the view."""
+
+
+class ViewSource:
+    """Draws views from a pool, without end.
+
+    Args:
+        pool: The files of `hvt_train.pictures.pool.fill_pool`.
+        seed: of everything that is random here.
+        settings: how to cut.
+    """
+
+    def __init__(self, pool: list[Path], *, seed: int, settings: ViewSettings) -> None:
+        self._kinds = [name for name, _ in settings.shares]
+        self._files = {kind: [p for p in pool if p.name.startswith(kind)] for kind in self._kinds}
+        shares = np.array([share if self._files[kind] else 0.0 for kind, share in settings.shares])
+        self._shares = shares / shares.sum()
+        self._rng = np.random.default_rng(seed)
+        self._settings = settings
+
+    def next(self) -> View:
+        """The next view."""
+        rng = self._rng
+        kind = str(rng.choice(self._kinds, p=self._shares))
+        files = self._files[kind]
+        picture = read_picture(files[int(rng.integers(len(files)))])
+        scale = _scale(kind, rng)
+        view = self._cropped(picture, scale)
+        view = _turned(view, rng)
+        strength, compress = _DAMAGE[kind]
+        image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
+        return View(image, view.boxes_px, view.class_ids)
+
+    def _cropped(self, picture: Picture, scale: float) -> View:
+        """A square window, usually around an object, every class that is there as often."""
+        side, rng = self._settings.side, self._rng
+        high, wide = picture.image_bgr.shape[:2]
+        window = side / scale
+        if len(picture.boxes_px) and rng.random() < 0.75:
+            counts = np.bincount(picture.class_ids, minlength=_CLASSES)
+            weights = 1.0 / counts[picture.class_ids]
+            box = picture.boxes_px[rng.choice(len(weights), p=weights / weights.sum())]
+            middle = (box[:2] + box[2:]) / 2 + rng.uniform(-0.4, 0.4, 2) * window
+        else:
+            middle = rng.uniform(0, (wide, high))
+        slack = np.array([wide, high]) - window  # negative where the picture is smaller than the window
+        margin = rng.uniform(0, 0.06, 2) * window
+        low = np.clip(middle - window / 2, np.minimum(slack, 0) - margin, np.maximum(slack, 0) + margin)
+        return self._window(picture, low, scale)
+
+    def _window(self, picture: Picture, low: npt.NDArray[np.float64], scale: float) -> View:
+        side, settings = self._settings.side, self._settings
+        x0, y0 = (round(float(v)) for v in low)
+        reach = max(1, round(side / scale))
+        image = np.full((reach, reach, 3), _FILL, np.uint8)
+        high, wide = picture.image_bgr.shape[:2]
+        left, top, right, bottom = max(x0, 0), max(y0, 0), min(x0 + reach, wide), min(y0 + reach, high)
+        if right > left and bottom > top:
+            image[top - y0 : bottom - y0, left - x0 : right - x0] = picture.image_bgr[top:bottom, left:right]
+        exact = side / reach
+        how = cv2.INTER_AREA if exact < 0.6 else cv2.INTER_LINEAR
+        small = cv2.resize(image, (side, side), interpolation=how)
+        whole = (picture.boxes_px - np.array([x0, y0, x0, y0])) * exact
+        boxes = whole.clip(0, side).astype(np.float32)
+        sides = boxes[:, 2:] - boxes[:, :2]
+        area = np.maximum((whole[:, 2:] - whole[:, :2]).prod(1), 1e-6)
+        seen = picture.visible * sides.prod(1) / area
+        valid = (sides > 1).all(1)
+        ignored = (seen < settings.least_visible) | (sides.max(1) < settings.least_side_px)
+        kinds = np.where(ignored, -1, picture.class_ids).astype(np.int32)
+        return View(np.asarray(small, np.uint8), boxes[valid], kinds[valid])
+
+
+def read_picture(path: Path) -> Picture:
+    """Read one file of the pool."""
+    with np.load(path) as file:
+        return Picture(file["image"], file["boxes"], file["classes"], file["visible"])
+
+
+def _scale(kind: str, rng: _Rng) -> float:
+    """Pixels of the view per pixel of the picture; a car is 35…85 px long in a demo picture, 36…135 in a place."""
+    draw = rng.random()
+    if kind == "base" and draw < 0.65:  # as the pipeline shows it: whole, or halved to 640 pixels
+        return 1.0 if draw < 0.4 else 0.5
+    if kind == "demo" and draw < 0.45:
+        return float(rng.uniform(0.8, 1.25))
+    low, high = {"demo": (0.3, 1.6), "base": (0.35, 1.3), "place": (0.26, 1.2)}[kind]
+    return float(math.exp(rng.uniform(math.log(low), math.log(high))))
+
+
+def _turned(view: View, rng: _Rng) -> View:
+    """One of the eight ways to lay a square."""
+    image, boxes, side = view.image_bgr, view.boxes_px, len(view.image_bgr)
+    if rng.random() < 0.5:
+        image, boxes = image[:, ::-1], boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (side, 0, side, 0)
+    if rng.random() < 0.5:
+        image, boxes = image[::-1], boxes[:, [0, 3, 2, 1]] * (1, -1, 1, -1) + (0, side, 0, side)
+    if rng.random() < 0.5:
+        image, boxes = image.transpose(1, 0, 2), boxes[:, [1, 0, 3, 2]]
+    return View(np.ascontiguousarray(image), boxes.astype(np.float32), view.class_ids)
+
+
+def degrade(image_bgr: Image, rng: _Rng, *, strength: float, compress: float) -> Image:
+    """Light, lens, sensor and codec; ``compress`` is how often the codec is bad."""
+    image = image_bgr
+    if rng.random() < 0.5 * strength:
+        image = _blurred(image, rng)
+    image = _lit(image, rng, strength)
+    if rng.random() < 0.2 * strength:
+        soft = cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.8, 2)))
+        gain = float(rng.uniform(0.3, 1.5))
+        image = np.asarray(cv2.addWeighted(image, 1 + gain, soft, -gain, 0), np.uint8)
+    if rng.random() < 0.4 * strength:
+        image = _noisy(image, rng)
+    if rng.random() < 0.06 * strength:
+        image = _lettered(image, rng)
+    if rng.random() < compress:
+        quality = int(np.exp(rng.uniform(np.log(12), np.log(90))))
+        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+    return np.ascontiguousarray(image)
+
+
+def _blurred(image: Image, rng: _Rng) -> Image:
+    kind = rng.integers(3)
+    if kind == 0:
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.3, 1.5))), np.uint8)
+    if kind == 1:  # motion
+        length, angle = int(rng.integers(2, 8)), rng.uniform(0, math.pi)
+        kernel = np.zeros((9, 9), np.float32)
+        reach = np.array([math.cos(angle), math.sin(angle)]) * length / 2
+        ends = [tuple(round(float(v)) for v in 4 + sign * reach) for sign in (-1, 1)]
+        cv2.line(kernel, ends[0], ends[1], 1.0)
+        return np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()), np.uint8)
+    shrink, side = float(rng.uniform(0.4, 0.9)), len(image)  # a camera of fewer pixels
+    small = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    how = cv2.INTER_LINEAR if rng.random() < 0.5 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(small, (side, side), interpolation=how), np.uint8)
+
+
+def _lit(image: Image, rng: _Rng, strength: float) -> Image:
+    """One table a channel: gain, contrast, gamma, white balance; then saturation; sometimes grey or negative haze."""
+    levels = np.arange(256, dtype=np.float64) / 255
+    gamma, gain = math.exp(rng.normal(0, 0.28 * strength)), math.exp(rng.normal(0, 0.15 * strength))
+    pivot = rng.uniform(0.3, 0.7)
+    contrast = math.exp(rng.normal(0, 0.22 * strength))
+    haze, air = (
+        (rng.uniform(0, 0.45), rng.uniform(0.5, 0.95)) if rng.random() < 0.2 * strength else (0.0, 1.0)
+    )
+    tables = []
+    for _ in range(3):
+        curve = (levels**gamma * gain * math.exp(rng.normal(0, 0.05 * strength)) - pivot) * contrast + pivot
+        tables.append((curve * (1 - haze) + haze * air).clip(0, 1) * 255)
+    table = np.stack(tables, axis=1).astype(np.uint8)[None]
+    image = np.asarray(cv2.LUT(image, table), np.uint8)
+    if rng.random() < 0.5:
+        grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+        colour = 0.0 if rng.random() < 0.08 else float(rng.uniform(0.3, 1.5))
+        image = np.asarray(cv2.addWeighted(image, colour, grey, 1 - colour, 0), np.uint8)
+    if rng.random() < 0.2 * strength:  # light that falls off across the picture
+        side = len(image)
+        slope = np.linspace(rng.uniform(0.6, 1.3), rng.uniform(0.6, 1.3), side, dtype=np.float32)
+        ramp = slope[:, None] if rng.random() < 0.5 else slope[None]
+        image = np.asarray((image * ramp[..., None]).clip(0, 255), np.uint8)
+    return image
+
+
+def _noisy(image: Image, rng: _Rng) -> Image:
+    sigma = float(rng.uniform(1, 12))
+    side = len(image)
+    grain = rng.standard_normal((side, side, 1 if rng.random() < 0.5 else 3), np.float32) * sigma
+    if rng.random() < 0.3:
+        grain = np.asarray(cv2.GaussianBlur(grain, (0, 0), 0.8), np.float32).reshape(side, side, -1) * 2
+    return np.asarray((image + grain).clip(0, 255), np.uint8)
+
+
+def _lettered(image: Image, rng: _Rng) -> Image:
+    """Text laid over the picture, as telemetry and watermarks are."""
+    image = image.copy()
+    word = "".join(rng.choice(list("abcdefghiklmnoprstuvwxyz0123456789.:"), int(rng.integers(4, 14))))
+    place = (int(rng.integers(-50, len(image))), int(rng.integers(0, len(image))))
+    tone = float(rng.choice([255, 250, 20]))
+    size, thick = float(rng.uniform(0.4, 2.0)), int(rng.integers(1, 4))
+    cv2.putText(image, word, place, int(rng.integers(0, 5)), size, (tone, tone, tone), thick, cv2.LINE_AA)
+    return image

@@ -1,0 +1,78 @@
+"""What a detector said of a picture, kept between flights."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.inference.store import resolve_model
+from hvt_study.cache.cached_detector import CachedDetector
+
+PICTURE = np.random.default_rng(3).integers(0, 255, (96, 128, 3), np.uint8)
+
+
+def opened(folder, spec="aerial-nano", confidence=1e-6):
+    return CachedDetector(str(spec), confidence=confidence, provider="cpu", folder=folder)
+
+
+def entries(folder):
+    return sorted(folder.iterdir())
+
+
+def same(one, other):
+    names = ("boxes_xyxy_px", "confidences", "class_ids")
+    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
+    return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
+
+
+def test_an_answer_comes_back_as_it_was_and_its_cost_is_known(tmp_path):
+    """A table would change with what was in the cache, and the edge's CPU with it."""
+    first = opened(tmp_path / "deep" / "memory").detect(PICTURE)
+    again = opened(tmp_path / "deep" / "memory")
+    before_s = again.saved_cpu_s
+    assert same(again.detect(PICTURE), first)
+    assert len(first) > 0
+    assert again.saved_cpu_s > before_s
+    assert len(entries(tmp_path / "deep" / "memory")) == 1
+
+
+def test_a_model_goes_by_its_content(tmp_path):
+    """A model that was trained again under its old name would give the old one's answers."""
+    model, memory = tmp_path / "mine.onnx", tmp_path / "memory"
+    shutil.copy(resolve_model("aerial-nano"), model)
+    shutil.copy(model, tmp_path / "copy.onnx")
+    for spec in ("aerial-nano", model, tmp_path / "copy.onnx"):
+        opened(memory, spec).detect(PICTURE)
+    assert len(entries(memory)) == 1  # one content, one answer, wherever it lies
+    opened(memory, model, confidence=0.02).detect(PICTURE)
+    assert len(entries(memory)) == 2
+    other = tmp_path / "other.onnx"
+    other.write_bytes(model.read_bytes() + b"\x72\x07\x0a\x01a\x12\x02bc")  # one entry of metadata more
+    opened(memory, other).detect(PICTURE)
+    assert len(entries(memory)) == 3
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:-3], lambda data: data[:20] + b"\x80\x04." + data[23:], lambda _: b""]
+)
+def test_a_damaged_answer_is_asked_for_again(tmp_path, damage, caplog):
+    """A file that a full disk cut off would end the study with a traceback, or worse, count."""
+    first = opened(tmp_path).detect(PICTURE)
+    (path,) = entries(tmp_path)
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    assert same(opened(tmp_path).detect(PICTURE), first)
+    assert "is damaged" in caplog.text
+    assert entries(tmp_path) == [path]
+    assert same(opened(tmp_path).detect(PICTURE), first)
+    assert caplog.text.count("is damaged") == 1
+
+
+def test_a_folder_that_cannot_be_is_told_in_a_sentence(tmp_path):
+    """A traceback in place of the path that is wrong."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be made"):
+        opened(tmp_path / "file" / "memory")

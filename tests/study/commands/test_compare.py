@@ -1,0 +1,104 @@
+"""``hvt-study compare`` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import pytest
+
+from hvt_common.config import load
+from hvt_edge.config import EdgeConfig
+from hvt_edge.config import check as check_edge
+from hvt_scene import Scene
+from hvt_study.cli import main
+from hvt_study.matrix.compare import COMPARED, CompareResult, Missing
+from hvt_study.report.figures.compare_plot import STYLES, plot
+from hvt_study.runs.methods import DDS, METHODS
+
+FIRST_COLUMNS = [
+    *("clip", "rate_kbps", "method", "half", "f1", "class_agreement", "total_bps", "base_bps", "roi_bps"),
+    *("track_bps", "max_frame_bytes", "delay_p95_ms", "edge_cpu_ms"),
+]
+CHEAP = ("--size", "640x360", "--max-frames", "30", "--jobs", "1")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("no-such.mp4",), "no-such.mp4"),
+        (("still:no-such.jpg",), "no-such.jpg"),
+        (("demo", "--rates", "200,fast"), "'fast'"),
+        (("demo", "--rates", "-5"), "-5"),
+        (("demo", "--rates", "1"), "'1'"),
+        (("demo", "--rates", "nan"), "'nan'"),
+        (("demo", "--methods", "M0,M9"), "'M9'"),
+        (("demo", "--methods", ""), "--methods"),
+        (("demo", "--jobs", "0"), "--jobs 0"),
+        (("demo", "--max-frames", "3"), "--max-frames 3"),
+        (("demo", "--size", "13x7"), "13x7"),
+        (("demo", "--detector", "no-such.onnx"), "no-such.onnx"),
+    ],
+)
+def test_what_cannot_be_flown_is_one_sentence(tmp_path, capsys, arguments, said):
+    """Nobody waits for minutes to learn of a slip of the pen."""
+    given = ["compare", arguments[0], "--detector", "aerial-nano", "--out", str(tmp_path), *CHEAP]
+    assert main([*given, *(word.replace("--rates=", "") for word in arguments[1:])]) == 2
+    text = capsys.readouterr().err
+    assert said in text
+    assert "Traceback" not in text
+    assert len(text.strip().splitlines()) == 1
+
+
+def test_a_comparison_end_to_end(tmp_path, capsys):
+    """The question that a user brings: what do I see at this budget?"""
+    cv2.imwrite(str(tmp_path / "scene.png"), cv2.resize(Scene(0).image(0.0), (720, 404)))
+    arguments = ["compare", f"still:{tmp_path / 'scene.png'}", "--detector", "aerial-nano"]
+    arguments += ["--rates", "300", "--methods", "M0,M5-jpeg"]
+    assert main([*arguments, "--out", str(tmp_path), *CHEAP]) == 0
+    rows = json.loads((tmp_path / "compare.json").read_text())
+    assert [(row["method"], row["half"]) for row in rows] == [
+        *(("M0", 1), ("M0", 2)),
+        *(("M5-jpeg", 1), ("M5-jpeg", 2)),
+    ]
+    for row in rows:
+        assert list(row)[: len(FIRST_COLUMNS)] == FIRST_COLUMNS
+        assert row["labels"] == "reference"
+        assert 0 < row["f1"] <= 1
+        assert 0.3 * 300_000 < row["total_bps"] < 1.1 * 300_000
+        assert row["total_bps"] > row["base_bps"] + row["roi_bps"]
+        assert row["edge_cpu_ms"] > 0
+    assert rows[0]["roi_bps"] == 0 < rows[2]["roi_bps"]
+    assert (tmp_path / "compare.png").read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr().out
+    assert "reference labels" in said
+    assert "M5-jpeg" in said
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS if name != DDS])
+def test_every_method_is_settings_that_the_edge_takes(name):
+    """A method that the edge refuses would be missing from every table."""
+    flags = ["--source", "demo", "--budget", "400kbps", *METHODS[name].flags]
+    config, _ = load(EdgeConfig, flags, program="hvt-edge", description="")
+    assert check_edge(config).budget_bps == 400_000
+
+
+def test_names_of_methods():
+    """A row of the comparison is a method of the study, and the plot knows how to draw it."""
+    assert all(
+        method in METHODS and METHODS[method].sends_stills == bool(codec)
+        for method, codec in COMPARED.values()
+    )
+    assert set(COMPARED) == set(STYLES)
+
+
+def test_a_plot_of_what_there_is(tmp_path):
+    """A method that is missing at some rates must not take the plot with it."""
+    shown = {"f1": 0.9, "class_agreement": None}
+    rows = [
+        {"clip": "clip", "rate_kbps": rate, "method": method, "half": half, "total_bps": rate * 990, **shown}
+        for rate, method in ((150.0, "M0"), (800.0, "M0"), (800.0, "M6"))
+        for half in (1, 2)
+    ]
+    plot(CompareResult(tuple(rows), (Missing(150.0, "M6", "why"),), "exact", "clip"), tmp_path / "plot.png")
+    assert (tmp_path / "plot.png").stat().st_size > 20_000

@@ -1,0 +1,306 @@
+"""``hvt-study run`` from its arguments to its table: real flights of a small scene, and wrong input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from hvt_study.cli import main
+from hvt_study.commands import run as command
+from hvt_study.matrix.plan import StudyPlan, first_runs, parse_regimes
+from hvt_study.runs import execute
+from hvt_study.runs.columns import COLUMNS
+from hvt_study.runs.match_total import within
+from hvt_study.runs.materials import open_materials
+from hvt_study.runs.methods import chosen_methods
+from hvt_study.runs.run_context import open_run_context
+from hvt_study.runs.run_settings import flown
+from hvt_study.runs.spec import ModelChoice
+from layouts import write_images, write_visdrone
+from onnx_models import colour_classifier, colour_detector
+from small_study import PATIENT_S, SIZE, arguments, entries, flights, said, study, table
+
+METHODS = ("--methods", "M0,R0,M5,DDS", "--regimes", "150kbps")
+
+
+@pytest.fixture(scope="module")
+def done(scene, tmp_path_factory):
+    """A finished study with two budgets, of which nothing can be flown at the second."""
+    out = tmp_path_factory.mktemp("done") / "new" / "folder"
+    regimes = ("--methods", "M0,R0,M5,DDS", "--regimes", "150kbps,9kbps")
+    assert main(["run", *arguments(scene, out, *regimes, "--jobs", "2")]) == 0
+    return out
+
+
+def good(rows):
+    return [row for row in rows if row["regime"] == "150kbps"]
+
+
+def test_a_row_for_every_run(done):
+    """A table with holes, or without what its figures were measured with, could not be believed."""
+    rows = good(table(done))
+    order = [(row["method"], row["matched_to"]) for row in rows]
+    alone = [("M0", ""), ("R0", "")]
+    matched = [step for to in ("M5", "DDS") for step in ((to, ""), ("M0", to), ("R0", to))]
+    assert order == alone + matched
+    assert {row["labels"] for row in rows} == {"annotations"}
+    everywhere = {
+        "duration_s",
+        "total_bps",
+        "base_bps",
+        "roi_bps",
+        "track_bps",
+        "fps",
+        "stills",
+        "map_50",
+        "mota",
+    }
+    everywhere |= {
+        "hota",
+        "idf1",
+        "top1",
+        "top1_all",
+        "macro_f1",
+        "recall",
+        "f1",
+        "delay_p95_ms",
+        "id_switches",
+    }
+    for row in rows:
+        assert not {name for name in everywhere if row[name] is None}, row["method"]
+        config = json.loads(row["config"])
+        assert config["run"]["method"] == row["method"]
+        assert config["run"]["max_frames"] is None
+        assert {"numpy", "av", "motmetrics", "hvt", "code", "provider"} <= json.loads(row["versions"]).keys()
+        assert json.loads(row["content"]).keys() == {"clip", "detector", "edge_detector"}
+    m5 = next(row for row in rows if row["method"] == "M5")
+    stills = {column.name for column in COLUMNS if "still" in column.name}
+    assert m5["stills"] > 0
+    assert not {name for name in stills if m5[name] is None}
+    assert {row["stills"] for row in rows if row["method"] in ("M0", "R0")} == {0}
+    # What a ground says of stills is beside the total; what a server asks is in it.
+    assert {row["back_bps"] for row in rows if row["method"] in ("M0", "R0")} == {0}
+    assert 0 < 8 * 85 / 2 < m5["back_bps"] < 15 * 8 * 400
+    dds = next(row for row in rows if row["method"] == "DDS")
+    assert 0 < dds["back_bps"] == dds["other_bps"]
+
+
+def test_video_spends_what_the_others_really_spent(done):
+    """Compared at other bits, either side could win."""
+    rows = good(table(done))
+    spent = {row["method"]: row["total_bps"] for row in rows if not row["matched_to"]}
+    matching = [row for row in rows if row["matched_to"]]
+    assert len(matching) == 4
+    for row in matching:
+        assert row["matched"], row["failed"]
+        assert row["target_bps"] == spent[row["matched_to"]]
+        assert within(row["total_bps"], row["target_bps"])
+    for row in rows:
+        parts = row["base_bps"] + row["roi_bps"] + row["track_bps"]
+        assert (
+            0 <= row["total_bps"] - parts < 0.05 * row["total_bps"]
+        )  # the rest is status, and what DDS asks
+        # Thirty of thirty images at 15 a second: the clip is as long as the processed span.
+        assert row["total_bps_pilot"] == row["total_bps"]
+
+
+def test_totals_are_of_the_bytes_that_were_sent(scene, done, tmp_path):
+    """A total that forgot headers, tracks or status would give the hybrid bits for nothing."""
+    from hvt_study.cli import _Parser
+    from hvt_study.commands.arguments import add_plan_arguments, open_sequences, study_plan
+
+    parser = _Parser()
+    add_plan_arguments(parser)
+    asked = parser.parse_args(arguments(scene, tmp_path, *METHODS, "--max-frames", "30"))
+    plan = study_plan(asked, open_sequences(asked))
+    spec = next(one for one in first_runs(plan) if one.method == "M5")
+    report = flown(spec, open_run_context(spec, cache=done / "cache"), budget_bps=spec.budget_bps, fps=None)
+    row = next(row for row in table(done) if row["method"] == "M5")
+    assert row["digest"] == report.digest
+    assert row["total_bps"] == round(sum(report.line_bytes.values()) * 8 / 2)
+    assert row["roi_bps"] == round(report.line_bytes["roi"] * 8 / 2) > 0
+    assert row["total_bps"] == report.account.total_bps
+
+
+def test_a_run_that_cannot_be_flown_is_in_no_average(done):
+    """One budget too many would end the study, or count as a bad result."""
+    rows = [row for row in table(done) if row["regime"] == "9kbps"]
+    assert [row["method"] for row in rows] == ["M0", "R0", "M5", "DDS"]
+    for row in rows:
+        assert not row["matched"]
+        assert "budget" in row["failed"]
+        assert row["total_bps"] is row["f1"] is None
+        assert json.loads(row["config"])["run"]["budget_bps"] == 9000
+    report = (done / "report.md").read_text()
+    assert "9kbps" in report.partition("Runs that do not count")[2]
+
+
+def test_a_second_run_does_nothing_anew(scene, done):
+    """A study of days would begin from nothing after every change of its report; a damaged entry would end it."""
+    cache = done / "cache"
+    clocks = (done / "results.parquet").read_bytes()
+    before = entries(cache)
+    again = ["run", *arguments(scene, done, "--methods", "M0,R0,M5,DDS", "--regimes", "150kbps,9kbps")]
+    assert main([*again, "--jobs", "1"]) == 0
+    assert entries(cache) == before
+    assert (done / "results.parquet").read_bytes() == clocks  # to the byte: what was timed is remembered too
+
+
+def test_damaged_entries_are_made_again(scene, done, tmp_path):
+    """What a full disk or a bad sector left of an entry would count as a result."""
+    cache, first = done / "cache", table(done)
+    before = entries(cache)
+    broken = [flights(cache)[0], flights(cache)[1], next((cache / "detections").iterdir())]
+    broken[0].write_bytes(broken[0].read_bytes()[:-20])
+    broken[1].write_bytes(b"")
+    broken[2].write_bytes(b"\0" * 40)
+    again = arguments(scene, done, "--methods", "M0,R0,M5,DDS", "--regimes", "150kbps,9kbps", "--jobs", "1")
+    process = study("run", *again, folder=tmp_path)
+    assert process.wait(PATIENT_S) == 0, said(tmp_path)
+    words = said(tmp_path)
+    assert f"{broken[0]} is damaged and is made again" in words
+    assert f"{broken[1]} is damaged and is made again" in words
+    assert table(done) == first
+    after = entries(cache)
+    assert after.keys() == before.keys()
+    assert {path for path in after if after[path] != before[path]} <= set(broken)
+    assert all(path.read_bytes().partition(b"\n")[2] for path in broken[:2])
+
+
+def test_an_interrupted_study_keeps_what_was_there(scene, done, tmp_path, monkeypatch):
+    """Started again and stopped after a minute, a study of a thousand rows would be a study of three."""
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copy(done / "results.parquet", out)
+    before = table(out)
+
+    def interrupted(*_, on_row, **__):
+        on_row(before[0], 1, len(before))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "run_all", interrupted)
+    words = arguments(scene, out, "--methods", "M0,R0,M5,DDS", "--regimes", "150kbps,9kbps", "--jobs", "1")
+    assert main(["run", *words]) == 130
+    assert {row["key"] for row in table(out)} == {row["key"] for row in before}
+    assert len(table(out)) == len(before)
+
+
+def test_a_method_that_is_added_stands_beside_the_others(scene, done, tmp_path, capsys):
+    """The table of a finished study would be gone without a word."""
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copy(done / "results.parquet", out)
+    words = ("--methods", "tracks", "--regimes", "9kbps", "--jobs", "1", "--cache", str(done / "cache"))
+    assert main(["run", *arguments(scene, out, *words)]) == 2  # nothing can be flown at so little
+    assert "every run failed" in capsys.readouterr().err
+    new, *earlier = table(out)
+    assert (new["method"], new["regime"]) == ("tracks", "9kbps")
+    assert earlier == table(done)
+    (out / "results.parquet").write_bytes(b"something else")
+    assert main(["run", *arguments(scene, out, *words)]) == 2
+    assert "cannot be read as Parquet" in capsys.readouterr().out
+    assert (out / "earlier-results.parquet").read_bytes() == b"something else"
+    assert table(out) == [new]
+
+
+def plan_of(scene, cache, *, labels="annotations", classifier="detector"):
+    return StudyPlan(
+        sequences=((scene, "street"),),
+        methods=chosen_methods("M0"),
+        regimes=parse_regimes("150kbps"),
+        still_codecs=("jpeg",),
+        models=(ModelChoice("aerial-nano", "aerial-nano", classifier=str(classifier)),),
+        labels=labels,
+        cache=cache,
+        size=SIZE,
+    )
+
+
+def test_an_error_in_one_flight_is_one_row(scene, tmp_path, monkeypatch, caplog):
+    """One picture in a thousand that a library stumbles over would end the study, each time it is started."""
+    plan = plan_of(scene, tmp_path / "cache")
+    (spec,) = first_runs(plan)
+
+    def stumbles(*_, **__):
+        raise AssertionError("the base frame 3 cannot be decoded\nand more")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(execute, "flown", stumbles)
+        row = execute.run_spec(spec, cache=plan.cache)
+    assert row["failed"] == "AssertionError: the base frame 3 cannot be decoded"
+    assert (row["matched"], row["total_bps"], row["method"]) == (False, None, "M0")
+    assert "Traceback" in caplog.text
+    assert not flights(plan.cache)  # the next start tries again
+    with monkeypatch.context() as full:
+        full.setattr(execute, "flown", lambda *_, **__: (_ for _ in ()).throw(MemoryError))
+        with pytest.raises(MemoryError):
+            execute.run_spec(spec, cache=plan.cache)
+
+
+def test_a_classifier_names_the_reference_labels(scene, tmp_path):
+    """Labels would be the detector's word where the study says that they are the classifier's."""
+    names = ("minivan", "beach wagon", "pickup")
+    metadata = {"names": str(dict(enumerate(names)))}
+    reader = colour_classifier(tmp_path / "reader.onnx", metadata=metadata)
+    plan = plan_of(scene, tmp_path / "cache", labels="reference", classifier=reader)
+    (spec,) = first_runs(plan)
+    found = open_materials(spec, cache=plan.cache)
+    assert found.classes.word("minivan") == found.classes.word("car") == "car"
+    assert found.classes.word("pickup") == found.classes.word("truck") != "car"
+    first = open_run_context(spec, cache=plan.cache)
+    assert first.classifier is found.classifier
+    said = {name for one in first.labels for name in one.class_names}
+    assert said
+    assert said <= set(names)
+    shutil.rmtree(plan.cache / "detections")  # labels are remembered as they are
+    other = plan_of(scene, tmp_path / "other")  # the last context alone stays open
+    open_run_context(*first_runs(other), cache=other.cache)
+    again = open_run_context(spec, cache=plan.cache)
+    assert not (plan.cache / "detections").exists()
+    for one, other in zip(first.labels, again.labels, strict=True):
+        assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)
+        assert one.class_names == other.class_names
+    plain = plan_of(scene, plan.cache, labels="annotations", classifier=reader)
+    assert open_materials(*first_runs(plain), cache=plan.cache).classes.word("minivan") == "car"
+
+
+def spoken(capsys, *words):
+    assert main(["run", *words]) == 2
+    return capsys.readouterr().err
+
+
+def test_wrong_input_is_one_sentence(scene, tmp_path, capsys):
+    """A traceback after an hour, in place of what is wrong before the first flight."""
+    (tmp_path / "none").mkdir()
+    (tmp_path / "empty" / "sequences").mkdir(parents=True)
+    write_visdrone(tmp_path / "bare", "one")
+    (tmp_path / "bare" / "annotations" / "one.txt").unlink()
+    write_visdrone(tmp_path / "blank", "one", rows="")
+    write_images(tmp_path / "pictures", 3)
+    other = colour_detector(
+        tmp_path / "other.onnx", "yolox", metadata={"names": "{0: 'cat', 1: 'dog', 2: 'cow'}"}
+    )
+    out = tmp_path / "out"
+    for words, wanted in (
+        ((f"visdrone:{tmp_path}/none",), "no folder sequences"),
+        ((f"visdrone:{tmp_path}/empty",), "is empty"),
+        ((f"visdrone:{tmp_path}/bare",), "has no annotations"),
+        ((f"visdrone:{tmp_path}/bare?labels=none",), "add --labels reference"),
+        ((f"visdrone:{tmp_path}/blank",), "are empty: expected are lines"),
+        ((scene, "--detector", str(other)), "nothing in common"),
+        ((scene, "--detector", "motion"), "give a detection network"),
+        ((scene, "--jobs", "0"), "--jobs 0 is not accepted"),
+        ((scene, "--jobs", "2", "--dask", "tcp://127.0.0.1:1"), "has no say with --dask"),
+        ((scene, "--regimes", "lots"), "--regimes 'lots'"),
+        ((scene, "--regimes", "9kbps", "--methods", "M0", "--jobs", "1"), "every run failed"),
+        ((scene, "--max-frames", "3"), "--max-frames 3 is too few"),
+        ((scene, "--detect-every", "0"), "--detect-every 0"),
+    ):
+        sentence = spoken(capsys, *arguments(words[0], out, *words[1:]))
+        assert wanted in sentence, sentence
+        assert sentence.rstrip("\n").splitlines()[-1].startswith("hvt-study: ")
+    (tmp_path / "file").write_text("")
+    assert "--out" in spoken(capsys, *arguments(scene, tmp_path / "file", *METHODS))

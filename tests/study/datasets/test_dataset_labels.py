@@ -1,0 +1,287 @@
+"""Labels that are made: by a virtual camera over annotated pictures, and by a detector; which class means which."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from itertools import islice, pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from flight import RedSquares
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, MOVING, VISDRONE_NAMES
+from hvt_common.values import Posterior
+from hvt_study.cache.cached_detector import CachedDetector
+from hvt_study.datasets.class_map import map_classes
+from hvt_study.datasets.labels import covered_share
+from hvt_study.datasets.layouts.uri import open_dataset
+from hvt_study.datasets.reference import reference_labels, with_labels
+from hvt_study.datasets.virtual_camera import VirtualCamera
+from layouts import SIZE, square_xywh, write_visdrone
+
+BLOCKS = [(300, 200, 40, 24), (620, 330, 30, 40), (480, 260, 24, 24)]
+"""x, y, w, h of white blocks on dark ground."""
+
+
+@pytest.fixture
+def root(tmp_path):
+    """VisDrone-DET: a picture with a car, a bus, and a pedestrian in a region that nobody has labelled."""
+    pixels = np.full((540, 960, 3), 40, np.uint8)
+    for x, y, w, h in BLOCKS:
+        pixels[y : y + h, x : x + w] = 250
+    lines = [
+        f"{x},{y},{w},{h},1,{kind},0,{kind % 3}" for (x, y, w, h), kind in zip(BLOCKS, (4, 9, 1), strict=True)
+    ]
+    lines += ["470,250,60,60,0,0,0,0", "10,10,50,50,1,11,0,0"]
+    for name in ("images", "annotations"):
+        (tmp_path / name).mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "street.png"), pixels)
+    (tmp_path / "annotations" / "street.txt").write_text("\n".join(lines))
+    return tmp_path
+
+
+def test_boxes_follow_the_camera_on_every_way(root):
+    """Derived sequences are the only real labels here: a pixel of drift is a wrong label for a 10-pixel object."""
+    sequences = open_dataset(f"still:{root}?seeds=0,1-3&view=0.6")
+    assert [one.name for one in sequences] == [f"street-{seed}" for seed in range(4)]
+    checked = 0
+    for sequence in sequences:
+        assert sequence.attributes == {"view": "0.6", "seed": sequence.name[-1]}
+        for index, image in enumerate(sequence.clip.images()):
+            if index % 35:
+                continue
+            labels = sequence.labels(index)
+            ys, xs = np.nonzero(image[:, :, 0] > 145)
+            for box in labels.boxes_xyxy_px:
+                near = (xs > box[0] - 6) & (xs < box[2] + 6) & (ys > box[1] - 6) & (ys < box[3] + 6)
+                found = xs[near].min(), ys[near].min(), xs[near].max() + 1, ys[near].max() + 1
+                assert np.allclose(found, box, atol=1.01)
+                checked += bool((box > 0).all() and (box[2:] < sequence.source_size).all())  # wholly inside
+    assert checked > 20
+
+
+def test_objects_enter_and_leave_and_keep_their_ids(root):
+    """Tracks are judged by identity: an id that jumps to another object would count as the tracker's mistake."""
+    (sequence,) = open_dataset(f"still:{root}?view=0.6")
+    seen: dict[int, list[tuple[int, np.ndarray, str]]] = {}
+    for index in range(sequence.frame_count):
+        labels = sequence.labels(index)
+        for number, box, name in zip(
+            labels.ids.tolist(), labels.boxes_xyxy_px, labels.class_names, strict=True
+        ):
+            seen.setdefault(number, []).append((index, box, name))
+    assert len(seen) >= 2
+    for track in seen.values():
+        assert len({name for _, _, name in track}) == 1
+        for (before, one, _), (after, other, _) in pairwise(track):
+            assert after > before + 1 or np.abs(one - other).max() < 12
+    spans = [(track[0][0], track[-1][0]) for track in seen.values()]
+    assert any(first > 0 for first, _ in spans)
+    assert any(last < sequence.frame_count - 1 for _, last in spans)
+
+
+def test_what_nobody_labelled_is_ignored(root):
+    """The pedestrian lies in an ignored region: VisDrone's own toolkit does not ask for it."""
+    (sequence,) = open_dataset(f"still:{root}")
+    names = {name for index in range(0, 210, 10) for name in sequence.labels(index).class_names}
+    assert names == {"car", "bus"}
+    assert sequence.class_set == tuple(sorted(VISDRONE_NAMES))
+    assert sum(len(sequence.labels(index).ignored_xyxy_px) for index in range(0, 210, 10)) > 10
+
+
+def test_a_seed_is_a_way(root):
+    """The same seed flies the same pixels anywhere; another sees the picture anew."""
+    again = VirtualCamera(root / "images" / "street.png", seed=2)
+    (sequence,) = open_dataset(f"still:{root}?seeds=2")
+    sequence = pickle.loads(pickle.dumps(sequence))
+    assert all(
+        np.array_equal(one, other)
+        for one, other in zip(islice(sequence.clip.images(), 3), again.images(), strict=False)
+    )
+    plain = VirtualCamera(root / "images" / "street.png")
+    assert not np.array_equal(next(plain.images()), next(again.images()))
+
+
+def test_a_folder_of_pictures_with_annotations_beside(root):
+    """Whoever annotates a handful of pictures needs no layout; but one that is forgotten is told."""
+    flat = root / "flat"
+    flat.mkdir()
+    shutil.copy(root / "images" / "street.png", flat)
+    shutil.copy(root / "annotations" / "street.txt", flat)
+    (sequence,) = open_dataset(f"still:{flat}")
+    assert sequence.labels(100).class_names
+    (alone,) = open_dataset(f"still:{flat / 'street.png'}")
+    assert alone.name == "street"
+    shutil.copy(flat / "street.png", flat / "second.png")
+    with pytest.raises(UserError, match=r"second\.txt of picture second\.png"):
+        open_dataset(f"still:{flat}")
+    assert [one.labels for one in open_dataset(f"still:{flat}?labels=none")] == [None, None]
+    (flat / "street.txt").write_text("1,2,3,4,1,4,0,0\n\n4 0.5 0.5 0.1 0.1\n")
+    with pytest.raises(UserError, match=r"street\.txt, line 3"):
+        open_dataset(f"still:{flat / 'street.png'}")
+
+
+@pytest.mark.realdata
+def test_a_real_picture_with_its_annotations(tmp_path, data):
+    """VisDrone's own files as they are published."""
+    name = "0000001_02999_d_0000005"
+    for folder, ending in (("images", "jpg"), ("annotations", "txt")):
+        (tmp_path / folder).mkdir()
+        shutil.copy(data / "visdrone" / f"{name}.{ending}", tmp_path / folder)
+    (sequence,) = open_dataset(f"still:{tmp_path}")
+    assert (sequence.name, sequence.source_size, sequence.frame_count) == (name, (1670, 938), 210)
+    rows = np.loadtxt(data / "visdrone" / f"{name}.txt", delimiter=",")
+    middle = sequence.labels(105)
+    # Half-way the camera sees the middle of the picture, which is nearly all of it, and little of its images.
+    assert 0.8 * (rows[:, 5] > 0).sum() < len(middle) <= (rows[:, 5] > 0).sum()
+    assert {"car", "pedestrian", "motor"} <= set(middle.class_names)
+
+
+@pytest.mark.realdata
+def test_two_hundred_real_annotations(data):
+    """Categories, scores and commas as the annotators left them."""
+    files = sorted((data / "visdrone" / "annotations").glob("*.txt"))
+    from hvt_study.datasets.virtual_camera import read_annotations
+
+    found = [read_annotations(file) for file in files]
+    assert len(files) == 200
+    # 12330 objects by their categories, of which a few lie in ignored regions or are empty.
+    assert 12_000 < sum(len(one.classes) for one in found) <= 12_330
+    assert sum(len(one.ignored_px) for one in found) == 550  # category 0
+    assert sum(len(one.beside_px) for one in found) == 12  # category 11, "others"
+
+
+def test_covered_share_counts_nothing_twice():
+    """Overlapping regions must not hide an object between them that they do not cover."""
+    boxes = np.array([[0, 0, 10, 10], [5, 5, 15, 15], [100, 100, 110, 110]], np.float32)
+    regions = np.array([[0, 0, 6, 10], [4, 0, 8, 10], [14, 14, 40, 40]], np.float32)
+    assert covered_share(boxes, regions) == pytest.approx([0.8, (3 * 5 + 1) / 100, 0])
+    assert covered_share(boxes, regions[:0]).tolist() == [0, 0, 0]
+    rng = np.random.default_rng(0)
+    corners = rng.integers(0, 40, (40, 2, 2)).astype(np.float32)
+    many = np.concatenate([corners.min(axis=1), corners.max(axis=1) + 1], axis=1)
+    grid = np.zeros((41, 41), bool)
+    for x1, y1, x2, y2 in many[:9].astype(int):
+        grid[y1:y2, x1:x2] = True
+    wanted = [grid[y1:y2, x1:x2].mean() for x1, y1, x2, y2 in many[9:].astype(int)]
+    assert covered_share(many[9:], many[:9]) == pytest.approx(wanted)
+
+
+def test_classes_of_visdrone_and_uavdt():
+    """A van that the detector names is a car where the dataset knows no vans."""
+    found = map_classes(VISDRONE_NAMES, ("bus", "car", "truck"))
+    assert found.spoken == {"car": ("car",), "van": ("car",), "truck": ("truck",), "bus": ("bus",)}
+    assert (found.word("van"), found.word("bus"), found.classes) == ("car", "bus", ("bus", "car", "truck"))
+    assert "pedestrian" not in found.words
+    assert found.word("pedestrian") == "pedestrian"  # nobody's partner, and nobody else's word
+
+
+def test_classes_of_coco_and_visdrone():
+    """COCO cannot tell pedestrians from people, nor vans from cars: it must not be judged as if it could."""
+    found = map_classes(COCO_NAMES, VISDRONE_NAMES)
+    assert found.spoken["person"] == ("pedestrian", "people")
+    assert {found.word(name) for name in ("person", "pedestrian", "people")} == {"person"}
+    assert {found.word(name) for name in ("car", "van")} == {"car"}
+    assert found.word("motorcycle") == found.word("motor") == "motor"
+    assert {name for name in VISDRONE_NAMES if name not in found.words} == {"awning-tricycle", "tricycle"}
+
+
+def test_the_same_classes_stay_apart():
+    """The VisDrone detector on VisDrone is judged by all ten names."""
+    found = map_classes(VISDRONE_NAMES, sorted(VISDRONE_NAMES))
+    assert all(found.spoken[name] == (name,) for name in VISDRONE_NAMES)
+    assert found.classes == tuple(sorted(VISDRONE_NAMES))
+
+
+def test_classes_of_imagenet():
+    """A classifier speaks of vehicles in hundreds of words."""
+    found = map_classes(IMAGENET_NAMES, ("bus", "car", "truck"))
+    assert found.spoken["minivan"] == found.spoken["sports car"] == ("car",)
+    assert found.spoken["pickup"] == ("truck",)
+    assert found.word("minivan") == "car"
+    assert len(found.spoken) < 100
+
+
+def test_classes_that_say_little():
+    """A dataset of vehicles and a detector of what moves are compared in the one word that they have."""
+    found = map_classes(COCO_NAMES, ("vehicle",))
+    assert set(found.spoken) == {"car", "bus", "truck"}
+    assert found.word("bus") == found.word("vehicle") == "vehicle"
+    moving = map_classes((MOVING,), VISDRONE_NAMES)
+    assert moving.spoken[MOVING] == VISDRONE_NAMES
+    assert moving.word("bus") == moving.word(MOVING)
+
+
+@pytest.mark.parametrize(
+    ("models", "classes"), [(("cat", "dog"), VISDRONE_NAMES), (COCO_NAMES, ()), ((), ("car",))]
+)
+def test_label_sets_that_do_not_map(models, classes):
+    """Hours of flights with a score of nothing would be the answer to a wrong model."""
+    with pytest.raises(UserError, match="have nothing in common") as caught:
+        map_classes(models, classes)
+    assert "\n" not in str(caught.value)
+
+
+class Namer:
+    """A classifier that tells by the size of the crop."""
+
+    class_names = ("small", "large, big")
+
+    def classify(self, crops):
+        """Certain of itself."""
+        kinds = [int(crop.shape[0] > 40) for crop in crops]
+        certain = np.eye(2, dtype=np.float32)
+        return [Posterior(self.class_names[kind], 1.0, 0.0, certain[kind]) for kind in kinds]
+
+
+def test_reference_labels_are_in_source_pixels(tmp_path):
+    """Labels in another space than the ground's list would score nothing."""
+    write_visdrone(tmp_path, "a", count=12)
+    (sequence,) = open_dataset(f"visdrone:{tmp_path}?labels=none&fps=10")
+    made = reference_labels(sequence, detector=RedSquares())
+    assert sorted(made.frames) == list(range(12))
+    labelled = pickle.loads(pickle.dumps(with_labels(sequence, made)))
+    for frame_index in (0, 1, 9):
+        labels = labelled.labels_at(frame_index)
+        x, y, w, h = square_xywh(sequence.source_frame(frame_index))
+        assert np.abs(labels.boxes_xyxy_px - [x, y, x + w, y + h]).max() <= 1
+        assert labels.ids.tolist() == [-1]
+    assert set(labels.class_names) <= set(labelled.class_set) == set(RedSquares().class_names)
+    # The same at the size of the base, and in chunks.
+    halves = [
+        reference_labels(sequence, detector=RedSquares(), size=(2 * SIZE[0], 2 * SIZE[1]), frames=frames)
+        for frames in (range(7), range(7, 18))
+    ]
+    joined = halves[0] | halves[1]
+    assert sorted(joined.frames) == sorted(made.frames)
+    assert np.abs(joined(5).boxes_xyxy_px - made(5).boxes_xyxy_px).max() <= 1
+
+
+def test_a_classifier_names_the_boxes(tmp_path):
+    """Refinement by a classifier is judged by that classifier's word on the untouched crop."""
+    write_visdrone(tmp_path, "a")
+    (sequence,) = open_dataset(f"visdrone:{tmp_path}?labels=none")
+    made = reference_labels(sequence, detector=RedSquares(), classifier=Namer())
+    assert made(0).class_names == ("large",)  # 32 pixels and the margin of a still
+    assert made.class_set == ("large", "small")
+
+
+def test_a_detection_is_never_done_twice(tmp_path, monkeypatch):
+    """A study that was killed goes on where it was."""
+    from hvt_common.inference.detect import OnnxDetector
+
+    write_visdrone(tmp_path / "root", "a")
+    (sequence,) = open_dataset(f"visdrone:{tmp_path / 'root'}?labels=none")
+    (tmp_path / "memory").mkdir()
+    settings = {"confidence": 0.1, "provider": "cpu", "folder": tmp_path / "memory"}
+    detector = CachedDetector("aerial-nano", **settings)
+    first = reference_labels(sequence, detector=detector)
+    assert len(list((tmp_path / "memory").iterdir())) == len(first.frames) == 3
+    again = CachedDetector("aerial-nano", **settings)
+    monkeypatch.setattr(OnnxDetector, "detect", lambda *_: pytest.fail("asked again"))
+    second = reference_labels(sequence, detector=again)
+    for index, labels in first.frames.items():
+        assert np.array_equal(labels.boxes_xyxy_px, second(index).boxes_xyxy_px)

@@ -1,0 +1,485 @@
+"""Datasets by URI, in small copies of their real layouts."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from dataclasses import replace
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from clips import smooth_pictures
+from flight import RedSquares
+from hvt_common.config import load
+from hvt_common.errors import UserError
+from hvt_edge.config import EdgeConfig
+from hvt_edge.config import check as check_edge
+from hvt_ground.config import GroundConfig
+from hvt_ground.config import check as check_ground
+from hvt_scene import Scene
+from hvt_study.datasets.annotation_rows import read_rows
+from hvt_study.datasets.clip import stage_clip
+from hvt_study.datasets.content import content_hash
+from hvt_study.datasets.layouts.mot import mot_table
+from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
+from hvt_study.flights.flight import FlightPlan, fly
+from hvt_study.flights.flight_ground import SharedModels
+from layouts import SIZE, square_xywh, write_images, write_mot, write_uavdt, write_visdrone
+
+
+def xyxy(x, y, w, h):
+    return [x, y, x + w, y + h]
+
+
+def test_visdrone_labels(tmp_path):
+    """A box shifted by a frame, or an ignored region taken for an object, would spoil every table of the paper."""
+    write_visdrone(tmp_path, "uav0000086_00000_v", "uav0000117_02622_v")
+    first, second = open_dataset(f"visdrone:{tmp_path}")
+    assert (first.name, second.name) == ("uav0000086_00000_v", "uav0000117_02622_v")
+    assert (first.dataset, first.frame_count, first.fps, first.source_size) == ("visdrone", 6, 30, SIZE)
+    assert {"car", "van", "awning-tricycle"} <= set(first.class_set)
+    for index in (0, 5):
+        labels = first.labels(index)
+        assert labels.boxes_xyxy_px.tolist() == [xyxy(*square_xywh(index)), [140, 10, 160, 20]]
+        assert labels.boxes_xyxy_px.dtype == np.float32
+        assert labels.class_names == ("van", "car")
+        assert labels.ids.tolist() == [7, 8]
+        assert labels.ignored_xyxy_px.shape == labels.beside_xyxy_px.shape == (0, 4)
+    labels = first.labels(1)
+    assert labels.ids.tolist() == [7, 8]  # the pedestrian lies where nobody has labelled anything
+    assert labels.ignored_xyxy_px.tolist() == [[100, 60, 120, 80]]
+    assert labels.beside_xyxy_px.tolist() == [[5, 80, 13, 88], [20, 80, 28, 88]]  # others, and a score of 0
+
+
+def test_a_frame_of_the_clip_shows_the_source_frame_of_its_labels(tmp_path):
+    """At 15 frames a second, every second frame of 30: labels a frame off are wrong for all that moves."""
+    write_visdrone(tmp_path, "a", count=7)
+    drawn = smooth_pictures(7, size=SIZE)
+    for fps, shown in ((30, [0, 2, 4, 6]), (24, [0, 1, 3, 4, 6]), (10, [0, 0, 1, 2, 2, 3, 4, 4, 5, 6, 6])):
+        (sequence,) = open_dataset(f"visdrone:{tmp_path}?fps={fps}")
+        assert sequence.clip_frames == len(shown)
+        assert [sequence.source_frame(frame_index) for frame_index in range(sequence.clip_frames)] == shown
+        pictures = list(sequence.clip.images())
+        assert len(pictures) == len(shown)
+        assert all(np.array_equal(one, drawn[index]) for one, index in zip(pictures, shown, strict=True))
+        box = sequence.labels_at(2).boxes_xyxy_px[0]
+        assert box.tolist() == xyxy(*square_xywh(shown[2]))
+        limited = sequence.limited(2)
+        assert (limited.clip_frames, len(list(limited.clip.images())), limited.duration_s) == (
+            2,
+            2,
+            pytest.approx(7 / fps),
+        )
+
+
+def test_several_splits_below_one_root(tmp_path):
+    """The 79 clips come in downloads of their own; a name that two of them have must stay unique."""
+    for split in ("train", "val"):
+        write_visdrone(tmp_path / split, "uav1", f"uav-{split}")
+    names = [sequence.name for sequence in open_dataset(f"visdrone:{tmp_path}")]
+    assert sorted(names) == ["uav-train", "uav-val", "uav1", "val/uav1"]
+
+
+def test_only_some_are_opened(tmp_path):
+    """A study of one clip must not fail for another's damage, nor read it."""
+    write_visdrone(tmp_path, "good", "other")
+    write_visdrone(tmp_path, "bad", rows="1;2;3\n")
+    assert [one.name for one in open_dataset(f"visdrone:{tmp_path}", only=["good", "oth*"])] == [
+        "good",
+        "other",
+    ]
+    (one,) = open_dataset(f"visdrone:{tmp_path}", only=["[go]*"], limit=1)
+    assert one.name == "good"
+    with pytest.raises(UserError, match=r"no sequence 'uav9': there are bad, good, other"):
+        open_dataset(f"visdrone:{tmp_path}", only=["uav9"])
+
+
+def test_a_name_has_to_be_in_one_of_several_datasets(tmp_path):
+    """A study over two datasets could not be cut down to sequences of both."""
+    write_visdrone(tmp_path / "one", "a", "b")
+    write_visdrone(tmp_path / "two", "c")
+    uris = [f"visdrone:{tmp_path / name}" for name in ("one", "two", "one")]
+    found = [(uri, one.name) for uri, one in open_datasets(uris, only=["a", "c*"])]
+    assert found == [(uris[0], "a"), (uris[1], "c")]
+    assert [one.name for _, one in open_datasets(uris, only=["b"])] == ["b"]
+    assert [one.name for _, one in open_datasets(uris, limit=1)] == ["a", "c"]
+    with pytest.raises(
+        UserError, match=r"datasets .*one' and .*two' have no sequence 'd': there are a, b, c"
+    ):
+        list(open_datasets(uris, only=["a", "d"]))
+
+
+def test_a_sequence_travels_to_other_processes(tmp_path):
+    """Runs are flown in processes of their own; what they are sent must be small and whole."""
+    write_visdrone(tmp_path, "a")
+    (sequence,) = open_dataset(f"visdrone:{tmp_path}")
+    sent = pickle.dumps(sequence)
+    assert len(sent) < 2000
+    again = pickle.loads(sent)
+    assert np.array_equal(again.labels(3).boxes_xyxy_px, sequence.labels(3).boxes_xyxy_px)
+    assert np.array_equal(next(again.clip.images()), next(sequence.clip.images()))
+
+
+@pytest.mark.parametrize(
+    ("row", "line"),
+    [
+        ("1;2;3", 2),
+        ("1,7,0,0,ten,9,1,4,0,0", 2),
+        ("1,7,0,0", 2),
+        ("1,7,9,9,1,4,0,0", 2),  # as in the layout for single images
+        ("1,7,0,0,9,9,1,12,0,0", 2),
+        ("1,7,0,0,9,9,1,4.5,0,0", 2),
+        ("1,7,0,0,nan,9,1,4,0,0", 2),
+        ("1,7,0,0,1e300,9,1,4,0,0", 2),
+        ("1.5,7,0,0,9,9,1,4,0,0", 2),
+        ("-1,7,0,0,9,9,1,4,0,0", 2),
+        ("\n\n1,7,0,0,9,9,1,x,0,0", 4),
+    ],
+)
+def test_a_bad_annotation_is_named_with_file_and_line(tmp_path, row, line):
+    """In forty thousand lines nobody finds it otherwise."""
+    write_visdrone(tmp_path, "a", rows=f"1,1,0,0,9,9,1,4,0,0\n{row}\n")
+    with pytest.raises(UserError) as caught:
+        open_dataset(f"visdrone:{tmp_path}")
+    assert f"{tmp_path / 'annotations' / 'a.txt'}, line {line} is" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda root: shutil.rmtree(root / "sequences"), "has no folder sequences: expected is"),
+        (lambda root: shutil.rmtree(root / "annotations"), "has no annotations"),
+        (lambda root: shutil.rmtree(root / "sequences" / "a"), "is empty"),
+        (lambda root: (root / "sequences" / "a" / "0000003.png").unlink(), "lacks image 3"),
+        (lambda root: (root / "sequences" / "a" / "3.png").write_bytes(b""), "has two images of number 3"),
+        (lambda root: (root / "sequences" / "a" / "x.png").write_bytes(b""), "has no number"),
+        (
+            lambda root: (root / "sequences" / "a" / "0000001.png").write_bytes(b"no"),
+            "cannot be read as an image",
+        ),
+        (lambda root: (root / "annotations" / "a.txt").write_text(""), "are empty"),
+        (lambda root: (root / "annotations" / "a.txt").write_bytes(b"\xff\xfe\x00"), "are not text"),
+        (lambda root: [file.unlink() for file in (root / "sequences" / "a").iterdir()], "holds no images"),
+        (lambda root: (root / "sequences").rename(root / "images"), "use still:"),
+        (shutil.rmtree, "does not exist"),
+    ],
+)
+def test_what_a_layout_lacks_is_one_sentence(tmp_path, spoil, said):
+    """The user is told what to add, before hours of flights."""
+    root = tmp_path / "root"
+    write_visdrone(root, "a")
+    spoil(root)
+    with pytest.raises(UserError, match=said) as caught:
+        open_dataset(f"visdrone:{root}")
+    assert "\n" not in str(caught.value)
+    assert str(root) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("uri", "said"),
+    [
+        ("visdrone", "is unknown: accepted are visdrone:ROOT"),
+        ("coco:/data", "is unknown"),
+        ("visdrone:", "does not exist"),
+        ("mot:{}/a.txt", "is not a folder"),
+        ("visdrone:{}?fsp=3", "unknown option 'fsp'"),
+        ("visdrone:{}?fps=0", "says fps=0"),
+        ("visdrone:{}?fps=fast", "says fps=fast"),
+        ("still:{}?labels=some", "says labels=some"),
+        ("still:{}?view=9", "says view=9"),
+        ("still:{}", "holds no pictures"),
+        ("clips:{}", "holds neither videos nor images"),
+        ("uavdt:{}", "has no sequences"),
+        ("mot:{}", "seqinfo.ini"),
+        ("demo:", "asks for the seeds ''"),
+        ("demo:5-1", "asks for the seeds '5-1'"),
+        ("demo:0-99999999", "at most 10000"),
+        ("demo:-1", "asks for the seeds"),
+    ],
+)
+def test_a_wrong_uri_is_one_sentence(tmp_path, uri, said):
+    """A slip of the pen is told with what is accepted."""
+    (tmp_path / "a.txt").write_text("")
+    with pytest.raises(UserError, match=said.replace("?", r"\?")):
+        open_dataset(uri.format(tmp_path))
+
+
+def test_pictures_alone(tmp_path):
+    """Test sets are published without annotations; reference labels need none."""
+    write_visdrone(tmp_path, "a")
+    shutil.rmtree(tmp_path / "annotations")
+    (sequence,) = open_dataset(f"visdrone:{tmp_path}?labels=none")
+    assert sequence.labels is None
+    assert sequence.labels_at(0) is None
+    assert len(list(sequence.clip.images())) == 3
+
+
+def test_uavdt_labels(tmp_path):
+    """Classes come from _gt_whole, regions from _gt_ignore, attributes from M_attr, wherever they were unpacked."""
+    write_uavdt(tmp_path)
+    (sequence,) = open_dataset(f"uavdt:{tmp_path}")
+    assert (sequence.name, sequence.frame_count, sequence.fps) == ("M0203", 6, 30)
+    assert sequence.class_set == ("bus", "car", "truck")
+    assert sequence.attributes == {"weather": "fog", "altitude": "low", "view": "side, bird"}
+    labels = sequence.labels(2)
+    assert labels.boxes_xyxy_px.tolist() == [xyxy(*square_xywh(2))]
+    assert (labels.class_names, labels.ids.tolist()) == (("bus",), [1])
+    assert labels.ignored_xyxy_px.tolist() == [[100, 0, 160, 20]]
+
+
+def test_uavdt_without_classes_or_regions(tmp_path):
+    """The tracking truth alone says where vehicles are, not which."""
+    write_uavdt(tmp_path, whole=False)
+    (tmp_path / "UAV-benchmark-MOTD_v1.0" / "GT" / "M0203_gt_ignore.txt").unlink()
+    (sequence,) = open_dataset(f"uavdt:{tmp_path}")
+    assert sequence.class_set == ("vehicle",)
+    assert sequence.labels(0).class_names == ("vehicle",)
+    shutil.rmtree(tmp_path / "UAV-benchmark-MOTD_v1.0")
+    with pytest.raises(UserError, match=r"M0203_gt_whole\.txt"):
+        open_dataset(f"uavdt:{tmp_path}")
+
+
+@pytest.mark.realdata
+def test_uavdt_real_annotations(tmp_path, data):
+    """The published files, to the last line."""
+    write_images(tmp_path / "M0402", 30, name="img{:06d}.png")
+    picture = np.zeros((540, 1024, 3), np.uint8)
+    for file in (tmp_path / "M0402").iterdir():
+        cv2.imwrite(str(file), picture)
+    for file in (data / "uavdt").glob("M0402_*.txt"):
+        shutil.copy(file, tmp_path)
+    (sequence,) = open_dataset(f"uavdt:{tmp_path}")
+    assert sequence.attributes == {"annotated beyond": "frame 410 of 30"}
+    whole = np.loadtxt(data / "uavdt" / "M0402_gt_whole.txt", delimiter=",")
+    for index in range(30):
+        rows = whole[whole[:, 0] == index + 1]
+        labels = sequence.labels(index)
+        assert labels.ids.tolist() == rows[:, 1].tolist()
+        assert set(labels.class_names) == {"car"}
+        assert np.allclose(labels.boxes_xyxy_px[:, :2], rows[:, 2:4])
+    table = sequence.labels.table()
+    assert (len(table.frames), len(table.ignored.frames)) == (10210, 754)
+
+
+def test_mot_labels(tmp_path):
+    """Pixels count from 1 there; MOTA, IDF1 and HOTA are the published ones only if the same things count."""
+    write_mot(tmp_path / "train" / "MOT17-02")
+    (sequence,) = open_dataset(f"mot:{tmp_path}")
+    assert (sequence.name, sequence.fps, sequence.frame_count) == ("MOT17-02", 25, 6)
+    assert sequence.class_set == ("pedestrian",)
+    labels = sequence.labels(1)
+    assert labels.boxes_xyxy_px.tolist() == [xyxy(*square_xywh(1))]
+    assert labels.ids.tolist() == [4]
+    assert labels.ignored_xyxy_px.shape == (0, 4)
+    assert labels.beside_xyxy_px.tolist() == [
+        [30, 10, 39, 19]
+    ]  # a distractor; neither the car nor the occluder
+    assert [sequence.source_frame(frame_index) for frame_index in range(sequence.clip_frames)] == [0, 1, 3, 5]
+    (alone,) = open_dataset(f"mot:{tmp_path / 'train' / 'MOT17-02'}")
+    assert alone.name == "MOT17-02"
+
+
+@pytest.mark.parametrize(
+    ("name", "beside"), [("MOT17-02", (2, 7, 8, 12, 13)), ("MOT20-01", (2, 6, 7, 8, 12, 13))]
+)
+def test_mot_goes_by_trackeval(tmp_path, name, beside):
+    """A pedestrian before a car, and what is marked as not counting, would be judged otherwise than by others."""
+    every = [f"1,{kind},{10 * kind + 1},11,9,9,{int(kind == 1)},{kind},1\n" for kind in range(1, 14)]
+    write_mot(tmp_path / name, rows="".join([*every, "1,99,1,51,9,9,0,1,1\n"]))
+    (sequence,) = open_dataset(f"mot:{tmp_path}")
+    labels = sequence.labels(0)
+    assert (labels.ids.tolist(), sequence.class_set) == ([1], ("pedestrian",))
+    assert labels.beside_xyxy_px[:, 0].tolist() == [10 * kind for kind in beside if 10 * kind < SIZE[0]]
+    assert labels.ignored_xyxy_px.shape == (0, 4)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "-1,-1,-1",
+        "4.4852,5.5016,0",
+        "12,3.3,0",
+    ],  # nobody knows, a place in the world, and one that looks like a class
+)
+def test_mot15_has_no_classes(tmp_path, place):
+    """TUD-Stadtmitte and PETS09-S2L1 say where everyone stands, where later sequences have class and visibility."""
+    write_mot(tmp_path / "a", rows=f"1,1,11,11,9,9,1,{place}\n1,2,31,11,9,9,0,{place}\n")
+    (sequence,) = open_dataset(f"mot:{tmp_path}")
+    labels = sequence.labels(0)
+    assert labels.class_names == sequence.class_set == ("pedestrian",)
+    assert labels.ids.tolist() == [1]
+    assert len(labels.beside_xyxy_px) == 0
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(("name", "count"), [("TUD-Campus", 359), ("TUD-Stadtmitte", 1156)])
+def test_real_mot15_annotations(data, name, count):
+    """The very files whose MOTA and IDF1 are published."""
+    truth = data / "tracking" / "motmetrics_tud" / name / "gt.txt"
+    table = mot_table(truth, truth.with_name("labels.txt"), (640, 480))
+    assert table.class_set == ("pedestrian",)
+    assert len(table.frames) == len(truth.read_text().splitlines()) == count
+    assert len(table.ignored.frames) == 0
+
+
+def test_mot_of_others(tmp_path):
+    """CVAT writes names of its own, and says nothing of the frame rate."""
+    write_mot(tmp_path / "a", rows="1,1,11,11,9,9,1,2,1,\n1,2,31,11,9,9,0,1,1\n")
+    (tmp_path / "a" / "gt" / "labels.txt").write_text("tractor\nlorry\n")
+    (tmp_path / "a" / "seqinfo.ini").unlink()
+    with pytest.raises(UserError, match=r"a has no seqinfo\.ini, which says the frame rate: .*\?fps=25"):
+        open_dataset(f"mot:{tmp_path}")
+    (sequence,) = open_dataset(f"mot:{tmp_path}?fps=10")
+    labels = sequence.labels(0)
+    assert (sequence.name, sequence.fps, labels.class_names) == ("a", 10, ("lorry",))
+    assert labels.beside_xyxy_px.tolist() == [[30, 10, 39, 19]]
+    assert sequence.class_set == ("lorry", "tractor")
+    shutil.rmtree(tmp_path / "a" / "gt")
+    assert open_dataset(f"mot:{tmp_path}?fps=10&labels=none")[0].labels is None
+    shutil.rmtree(tmp_path / "a" / "img1")
+    with pytest.raises(UserError, match=r"has no sequence with a seqinfo\.ini or gt/gt\.txt"):
+        open_dataset(f"mot:{tmp_path}?fps=10")
+
+
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        ({"info": "[Sequence]\nframeRate=0\n"}, "frameRate=0"),
+        ({"info": "frameRate=25\n"}, r"expected is a section \[Sequence\]"),
+        ({"info": "[Sequence]\nframeRate=25\nseqLength=9\n"}, "says seqLength=9 and has 6 images"),
+        ({"info": "[Sequence]\nframeRate=25\nimDir=frames\n"}, "no folder frames"),
+        ({"rows": "1,1,1,1,9,9,1,99,1\n"}, "line 1 is '1,1,1,1,9,9,1,99,1'"),
+        ({"rows": "1,1,1,1,9,9,1,1,1\n1,2,1,1,9,9,1,4.5,1\n"}, "line 2 is .* a class from 1 to 13"),
+    ],
+)
+def test_a_bad_mot_sequence_is_one_sentence(tmp_path, named, said):
+    """File and value are named."""
+    write_mot(tmp_path / "a", **named)
+    with pytest.raises(UserError, match=said):
+        open_dataset(f"mot:{tmp_path}")
+
+
+def _write_video(path, count, *, fps):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=fps)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "bgr0"
+        for picture in smooth_pictures(count, size=SIZE):
+            frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+@pytest.mark.parametrize(("ending", "fps"), [("mkv", 25), ("avi", 10), ("mkv", 30)])
+def test_clips_say_what_a_frame_shows(tmp_path, ending, fps):
+    """Reference labels are kept by source frame; those of another frame would be of another picture."""
+    _write_video(tmp_path / f"road.{ending}", 24, fps=fps)
+    (tmp_path / "notes.txt").write_text("no video")
+    (sequence,) = open_dataset(f"clips:{tmp_path}")
+    assert (sequence.name, sequence.frame_count, sequence.fps) == ("road", 24, fps)
+    assert (sequence.labels, sequence.class_set) == (None, ())
+    drawn = smooth_pictures(24, size=SIZE)
+    pictures = list(sequence.clip.images())
+    assert len(pictures) == sequence.clip_frames == -(-24 * 15 // fps)
+    for frame_index, picture in enumerate(pictures):
+        assert np.array_equal(picture, drawn[sequence.source_frame(frame_index)])
+
+
+def test_a_broken_clip_is_named(tmp_path):
+    """One of fifty videos is always damaged."""
+    (tmp_path / "road.mp4").write_bytes(b"not a video at all")
+    with pytest.raises(UserError, match=r"road\.mp4"):
+        open_dataset(f"clips:{tmp_path}")
+
+
+@pytest.mark.realdata
+def test_real_clips_play_as_many_pictures_as_promised(data):
+    """A clip that ends early leaves frames without a picture in every table."""
+    for sequence in open_dataset(f"clips:{data / 'clips'}", only=["intel*"]):
+        assert (sequence.frame_count, sequence.fps, sequence.clip_frames) == (377, 12.5, 453)
+        assert sum(1 for _ in sequence.clip.images()) == 453
+
+
+def test_demo_seeds():
+    """Exact labels of the drawn scene: of the same picture that is flown."""
+    sequences = open_dataset("demo:0-1,7")
+    assert [one.name for one in sequences] == ["demo-0", "demo-1", "demo-7"]
+    last = sequences[2]
+    scene = Scene(7)
+    labels, truth = last.labels(3), scene.truth(3 / 15)
+    asked = truth.visible >= 0.5
+    assert np.array_equal(labels.boxes_xyxy_px, truth.boxes_source_px[asked])
+    assert np.array_equal(labels.ids, truth.ids[asked])
+    assert len(labels.ignored_xyxy_px) == 0
+    assert len(labels.beside_xyxy_px) == (~asked).sum() > 0
+    assert set(labels.class_names) <= set(last.class_set)
+    assert (last.clip_frames, last.frame_count, last.source_frame(299)) == (300, 300, 299)
+    assert np.array_equal(next(last.clip.images()), scene.image(0.0))
+
+
+def test_a_clip_is_staged_once(tmp_path):
+    """Flights map the pixels in place of decoding them again; a full disk costs time, not the study."""
+    write_visdrone(tmp_path / "root", "a")
+    (sequence,) = open_dataset(f"visdrone:{tmp_path / 'root'}")
+    (tmp_path / "stage").mkdir()
+    staged = stage_clip(sequence.clip, folder=tmp_path / "stage")
+    assert staged.pixels == tmp_path / "stage" / "clip.bgr"
+    for one, other in zip(staged.images(), sequence.clip.images(), strict=True):
+        assert np.array_equal(one, other)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "clip.bgr").symlink_to("/dev/full")
+    assert stage_clip(sequence.clip, folder=tmp_path / "full") == sequence.clip
+    assert list((tmp_path / "full").iterdir()) == []
+
+
+def test_a_dataset_flies(tmp_path):
+    """A sequence is for flying; labels and the ground's lists must be of one picture and in one space."""
+    write_visdrone(tmp_path, "a", count=60)
+    (sequence,) = open_dataset(f"visdrone:{tmp_path}")
+    flags = ["--source", str(tmp_path), "--pace", "lockstep", "--size", "160x96", "--detector", "motion"]
+    flags += ["--budget", "300kbps", "--preset", "ultrafast", "--method", "M0"]
+    edge, _ = load(EdgeConfig, flags, program="hvt-edge", description="")
+    ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
+    plan = FlightPlan(sequence.clip, check_edge(edge), ground, 300_000)
+    report = fly(plan, detector=RedSquares(), models=SharedModels(RedSquares()))
+    assert len(report.lists) == sequence.clip_frames == 30
+    frame_index = 20  # no jump in the last frames before it
+    shown, known = (
+        report.lists[frame_index].boxes_xyxy_px[0],
+        sequence.labels_at(frame_index).boxes_xyxy_px[0],
+    )
+    assert np.abs(shown - known).max() < 8
+
+
+def test_the_content_of_a_sequence(tmp_path):
+    """A result names what it was measured on: the same wherever it lies, another for another label."""
+    for name in ("one", "two"):
+        write_visdrone(tmp_path / name, "a")
+    first, second = (open_dataset(f"visdrone:{tmp_path / name}")[0] for name in ("one", "two"))
+    assert content_hash(first) == content_hash(second)
+    with (tmp_path / "two" / "annotations" / "a.txt").open("a") as file:
+        file.write("6,7,0,0,9,9,1,4,0,0\n")
+    assert content_hash(first) != content_hash(second)
+
+
+def test_labels_follow_their_file(tmp_path):
+    """Mended annotations are read anew, not remembered."""
+    write_visdrone(tmp_path, "a", rows="1,1,0,0,9,9,1,4,0,0\n")
+    (sequence,) = open_dataset(f"visdrone:{tmp_path}")
+    assert sequence.labels(0).class_names == ("car",)
+    (tmp_path / "annotations" / "a.txt").write_text("1,1,0,0,9,9,1,6,0,0\n1,2,0,0,9,9,1,6,0,0\n")
+    assert sequence.labels(0).class_names == ("truck", "truck")
+
+
+def test_lines_of_any_length_are_read_alike(tmp_path):
+    """Columns beyond the known ones, and a comma at the end of some lines, are no matter."""
+    path = tmp_path / "a.txt"
+    path.write_text("1,2,3\n4,5,6,\n7,8,9,10\n\n")
+    rows = read_rows(path, columns="frame,id,x", least=2)
+    assert rows.table.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+    assert rows["y"].tolist() == [-1, -1, -1]
+    path.write_text("")
+    assert len(read_rows(path, columns="frame,id,x", least=2)) == 0

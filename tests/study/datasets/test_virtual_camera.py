@@ -1,0 +1,111 @@
+"""The virtual camera over a still: its boxes must lie where the objects are."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_study.datasets.clip import stage_clip
+from hvt_study.datasets.layouts.uri import open_dataset
+from hvt_study.datasets.virtual_camera import VirtualCamera, open_camera, read_annotations
+
+BOX = (300, 200, 40, 24)  # x, y, w, h of a white block
+
+
+@pytest.fixture
+def picture(tmp_path):
+    """A dark picture with one white block, annotated as a car, one ignored region, and one of class "others"."""
+    pixels = np.full((540, 960, 3), 40, np.uint8)
+    x, y, w, h = BOX
+    pixels[y : y + h, x : x + w] = 250
+    path = tmp_path / "street.png"
+    cv2.imwrite(str(path), pixels)
+    path.with_suffix(".txt").write_text(
+        f"{x},{y},{w},{h},1,4,0,0\n10,10,50,50,0,0,0,0\n500,300,20,20,1,11,0,0\n"
+    )
+    return path
+
+
+@pytest.mark.parametrize("height", ["", "@0.5", "@2"])
+def test_boxes_follow_exactly(picture, height):
+    """F1 at IoU 0.5 of small objects is lost by a pixel or two, in the mirrored land as in the picture."""
+    camera = open_camera(f"still:{picture}{height}", fps=3)
+    seen = 0
+    for index, image in enumerate(camera.images()):
+        labels = camera.labels(index)
+        boxes, names = labels.boxes_xyxy_px, labels.class_names
+        assert image.shape[1::-1] == camera.size
+        if index % 6 or not len(boxes):
+            continue
+        ys, xs = np.nonzero(image[:, :, 0] > 145)
+        assert set(names) == {"car"}
+        for x1, y1, x2, y2 in boxes:
+            near = (xs > x1 - 6) & (xs < x2 + 6) & (ys > y1 - 6) & (ys < y2 + 6)
+            found = xs[near].min(), ys[near].min(), xs[near].max() + 1, ys[near].max() + 1
+            assert np.allclose(found, (x1, y1, x2, y2), atol=1.01)
+            seen += 1
+    assert seen >= (1 if height == "@0.5" else 6)
+
+
+def test_it_moves_and_every_frame_has_noise_of_its_own(picture):
+    """A picture that stands still would be coded for nothing, and every method would look good."""
+    images = VirtualCamera(picture).images()
+    first, second = next(images), next(images)
+    differences = cv2.absdiff(first, second)
+    assert (differences > 0).mean() > 0.5
+    assert next(VirtualCamera(picture).images()).tobytes() == first.tobytes()
+
+
+def test_regions_without_labels_are_known(picture):
+    """What VisDrone says nothing about must not count as a false alarm."""
+    found = read_annotations(picture.with_suffix(".txt"))
+    assert found.classes == ("car",)
+    assert found.ignored_px.tolist() == [[10, 10, 60, 60]]
+    assert found.beside_px.tolist() == [[500, 300, 520, 320]]  # a single object: boxes on it alone
+    camera = VirtualCamera(picture)
+    seen = [camera.labels(index) for index in range(0, 200, 20)]
+    assert sum(len(one.ignored_xyxy_px) for one in seen) > 0
+    assert sum(len(one.beside_xyxy_px) for one in seen) > 0
+
+
+def test_shared_once_for_all(picture, tmp_path):
+    """Processes must fly over the very same pixels."""
+    (sequence,) = open_dataset(f"still:{picture}")
+    clip = stage_clip(sequence.limited(4).clip, folder=tmp_path)
+    assert clip.pixels is not None
+    images = list(clip.images())
+    again = VirtualCamera(picture).images()
+    assert all(np.array_equal(image, next(again)) for image in images)
+    assert (sequence.name, len(images)) == ("street", 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("no.png", None, "does not exist"),
+        ("text.png", b"not a picture", "not one of at least"),
+    ],
+)
+def test_a_bad_picture_is_one_sentence(tmp_path, name, content, said):
+    """The file is named, and what is accepted."""
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match=said):
+        VirtualCamera(path)
+
+
+@pytest.mark.parametrize("height", ["@0", "@-1", "@99", "@nan", "@high", "@"])
+def test_a_height_that_makes_no_sense_is_one_sentence(picture, height):
+    """The value is named, and what is accepted."""
+    with pytest.raises(UserError, match="give a number from"):
+        open_camera(f"still:{picture}{height}", fps=15)
+
+
+def test_a_bad_annotation_is_named_with_its_line(picture):
+    """A table of another layout would give nonsense."""
+    picture.with_suffix(".txt").write_text("1,2,3,4,1,4,0,0\n1;2;3\n")
+    with pytest.raises(UserError, match="line 2"):
+        VirtualCamera(picture)

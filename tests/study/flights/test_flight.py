@@ -1,0 +1,108 @@
+"""A whole flight in one process, on small drawn pictures with a detector of red things."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clips import smooth_pictures
+from flight import SIZE, RedSquares, square_box
+from hvt_common.config import load
+from hvt_edge.config import EdgeConfig
+from hvt_edge.config import check as check_edge
+from hvt_ground.config import GroundConfig
+from hvt_ground.config import check as check_ground
+from hvt_study.datasets.clip import Clip
+from hvt_study.flights.flight import FlightPlan, coded_frames, fly
+from hvt_study.flights.flight_ground import SharedModels
+from metric_frames import list_f1
+
+FRAMES = 46
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """A red square that moves seven pixels a frame over a smooth ground, and jumps back once."""
+    pictures = np.stack(smooth_pictures(FRAMES, size=SIZE))
+    path = tmp_path_factory.mktemp("clip") / "clip.bgr"
+    path.write_bytes(pictures.tobytes())
+    return Clip("drawn", SIZE, FRAMES, path)
+
+
+def flown(clip, *flags, link_bps=200_000):
+    width, height = SIZE
+    base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}", "--detector", "motion"]
+    base += ["--budget", "200kbps", "--preset", "ultrafast"]
+    edge, _ = load(EdgeConfig, [*base, *flags], program="hvt-edge", description="")
+    ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
+    plan = FlightPlan(clip, check_edge(edge), ground, link_bps)
+    return fly(plan, detector=RedSquares(), models=SharedModels(RedSquares()))
+
+
+def f1_of(report, frames):
+    return list_f1(report, frames, lambda frame_index: ([square_box(frame_index)], ("car",)))
+
+
+def test_video_alone_shows_the_square_at_every_frame(clip):
+    """The list at the ground, its bits and its delay are what every table of the comparison is made of."""
+    report = flown(clip, "--method", "M0")
+    assert len(report.lists) == FRAMES
+    assert f1_of(report, range(FRAMES)) > 0.9
+    assert report.messages["base"] == FRAMES
+    assert report.messages.get("roi", 0) == 0
+    # What was put on the link is what the edge's own ledger says.
+    assert report.bps() == report.account.total_bps
+    assert report.bps("base") == report.account.base_bps
+    assert 0 < report.link.delay_p50_ms <= report.link.delay_p95_ms < 1000
+    assert 0 < report.max_frame_bytes < report.line_bytes["base"]
+    assert report.edge_cpu_ms > 0
+
+
+def test_the_same_flight_twice(clip):
+    """A table that changes from run to run proves nothing."""
+    first, second = flown(clip, "--method", "M5"), flown(clip, "--method", "M5")
+    assert first.digest == second.digest
+    assert first.messages == second.messages
+    assert first.link == second.link
+    for one, other in zip(first.lists, second.lists, strict=True):
+        assert one.classes == other.classes
+        assert np.array_equal(one.boxes_xyxy_px, other.boxes_xyxy_px)
+
+
+def test_frames_between_coded_ones_are_predicted(clip):
+    """Judged on coded frames only, a slow base stream would look as good as a fast one."""
+    report = flown(clip, "--method", "M0", "--fps", "5")
+    coded = coded_frames(FRAMES, 5)
+    assert report.messages["base"] == len(coded) == 16
+    between = [frame_index for frame_index in range(9, 40) if frame_index not in coded]  # at 40 it jumps back
+    boxes = [report.lists[frame_index].boxes_xyxy_px for frame_index in between]
+    assert all(len(one) for one in boxes)
+    # The square moves on between them: a list that was merely repeated would be 7 and 14 pixels behind.
+    assert f1_of(report, between) > 0.8
+
+
+def test_a_thin_link_delivers_late(clip):
+    """Delay is what a smaller budget costs the operator first."""
+    wide, thin = (flown(clip, "--method", "M0", link_bps=rate) for rate in (400_000, 100_000))
+    assert wide.digest == thin.digest  # nothing at the edge hangs on the link here
+    assert thin.link.delay_p95_ms > 2 * wide.link.delay_p95_ms
+    assert thin.picture_age_p95_ms > wide.picture_age_p95_ms
+    assert thin.link.worst_queue_bytes > wide.link.worst_queue_bytes
+
+
+def test_stills_cross_and_are_counted(clip):
+    """Without them the comparison would be of video with video."""
+    report = flown(clip, "--method", "M5", "--cooldown", "0s")
+    assert report.messages["roi"] > 0
+    assert sum(report.account.outcomes["sent"].values()) == report.messages["roi"]
+    assert report.bps("roi") == report.account.roi_bps
+
+
+def test_coded_frames():
+    """Two frames a second of fifteen frames: every seventh or eighth, never two for one instant."""
+    assert sorted(coded_frames(31, 2)) == [0, 8, 15, 23, 30]
+    assert coded_frames(10, 15) == frozenset(range(10))
+    assert sorted(coded_frames(10, 7.5)) == [0, 2, 4, 6, 8]
+    assert coded_frames(1, 1) == {0}

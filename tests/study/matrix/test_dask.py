@@ -1,0 +1,107 @@
+"""``hvt-study run --dask``: a scheduler and two workers as processes of their own on loopback."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
+
+import pytest
+
+from hvt_common.inference.store import resolve_model
+from processes import eventually, free_ports
+from small_study import PATIENT_S, arguments, flights, said, study, table, until
+
+pytest.importorskip("distributed")
+WORDS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
+
+
+class Cluster:
+    """Two workers of one thread, without anybody who would start them again."""
+
+    def __init__(self, folder):
+        (port,) = free_ports(1)
+        self.address = f"tcp://127.0.0.1:{port}"
+        self._folder, self._stack = folder, ExitStack()
+        self.scheduler = self._start(
+            "scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"
+        )
+        self.workers = [self._start("worker", self.address, *_WORKER) for _ in range(2)]
+
+    def _start(self, what, *words):
+        log = self._stack.enter_context((self._folder / f"{what}.log").open("a"))
+        code = f"from distributed.cli.dask_{what} import main; main()"
+        command = [sys.executable, "-c", code, *words]
+        process = subprocess.Popen(
+            command, cwd=self._folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+        )
+        self._stack.callback(process.wait, 30)
+        self._stack.callback(process.kill)
+        return process
+
+    def ready(self):
+        """Both have registered."""
+        return (self._folder / "worker.log").read_text().count("Registered to") == 2
+
+    def __enter__(self):
+        eventually(self.ready, within_s=PATIENT_S, what="two workers have found their scheduler")
+        return self
+
+    def __exit__(self, *_):
+        self._stack.close()
+
+
+_WORKER = ("--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--memory-limit", "0")
+
+
+def test_a_worker_is_lost_in_mid_run(scene, tmp_path):
+    """One machine of a cluster that goes away would take a night's work with it, or change the table.
+
+    Paths that are not absolute begin where the study was started: workers were started somewhere else.
+    """
+    out, alone = tmp_path / "out", tmp_path / "alone"
+    home = tmp_path / "home"
+    home.mkdir()
+    shutil.copy(resolve_model("aerial-nano"), home / "nano.onnx")
+    (home / "flights").symlink_to(scene.removeprefix("visdrone:").removesuffix("?fps=15"))
+    scene, words = "visdrone:flights?fps=15", (*WORDS, "--detector", "nano.onnx")
+    with Cluster(tmp_path) as cluster:
+        asked = arguments(scene, out, *words, "--dask", cluster.address)
+        process = study("run", *asked, folder=tmp_path, cwd=home)
+        until(process, lambda: flights(out / "cache"))
+        cluster.workers[0].kill()
+        assert process.wait(PATIENT_S) == 0, said(tmp_path)
+        assert cluster.workers[0].poll() is not None
+        assert cluster.workers[1].poll() is None
+        assert "5 runs, 0 failed" in (tmp_path / "study.out").read_text()
+        assert "Traceback" not in said(tmp_path)
+    process = study("run", *arguments(scene, alone, *words, "--jobs", "1"), folder=tmp_path, cwd=home)
+    assert process.wait(PATIENT_S) == 0, said(tmp_path)
+    assert table(out) == table(alone)
+    assert len(table(out)) == 5
+    assert {(row["dataset"], row["detector"]) for row in table(out)} == {(scene, "nano.onnx")}
+
+
+def test_a_cluster_that_is_lost_is_told_in_a_sentence(scene, tmp_path):
+    """It would wait for ever for a scheduler that is gone, or end in a traceback of somebody else's code."""
+    out = tmp_path / "out"
+    with Cluster(tmp_path) as cluster:
+        process = study("run", *arguments(scene, out, *WORDS, "--dask", cluster.address), folder=tmp_path)
+        until(process, lambda: flights(out / "cache"))
+        cluster.scheduler.kill()
+        assert process.wait(PATIENT_S) == 2, said(tmp_path)
+    assert "the scheduler was lost" in said(tmp_path).splitlines()[-1]
+    assert "finished runs are kept" in said(tmp_path).splitlines()[-1]
+    assert "Traceback" not in said(tmp_path)
+    assert flights(out / "cache")
+
+
+def test_no_scheduler_is_told_in_a_sentence(scene, tmp_path):
+    """A wrong address would be a page of asyncio."""
+    (port,) = free_ports(1)
+    address = f"tcp://127.0.0.1:{port}"
+    process = study("run", *arguments(scene, tmp_path / "out", *WORDS, "--dask", address), folder=tmp_path)
+    assert process.wait(PATIENT_S) == 2
+    (sentence,) = said(tmp_path).splitlines()
+    assert sentence.startswith(f"hvt-study: --dask {address}: no scheduler answers (")

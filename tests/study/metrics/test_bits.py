@@ -1,0 +1,106 @@
+"""Bits, stills, delay and the pilot's proxies, against counts done by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from hvt_study.metrics.bits import StillCounts, bit_split, still_counts
+from hvt_study.metrics.frames import NO_ID
+from hvt_study.metrics.proxy import proxies, score_entropy_nats
+from hvt_study.metrics.stills import Opinion, RefinedObject, StillArrival, still_delays_ms
+
+SECOND = 1_000_000_000
+
+
+def still(number, *, size=1000, capture_s=1.0, arrived_s=1.5):
+    return StillArrival(number, capture_s, capture_s + 0.1, arrived_s, size, size + 180, "due")
+
+
+def named(number, track, *, share=0.01, base=None, seen=None):
+    return RefinedObject(number, track, 2.0, "car", "bus", share, base, seen)
+
+
+def test_the_parts_add_up_to_the_whole():
+    """A channel that is forgotten would give its method free bits."""
+    rows = {"base": 150_000, "roi": 30_000, "tracks": 2_000, "status": 500, "backlog": 300}
+    split = bit_split(rows, processed_s=2.0)
+    assert (split.base_bps, split.roi_bps, split.track_bps, split.other_bps) == (
+        600_000,
+        120_000,
+        8_000,
+        3_200,
+    )
+    assert split.total_bps == 8 * sum(rows.values()) / 2
+    assert bit_split({}, processed_s=1.0).total_bps == 0
+
+
+def test_the_pilots_accounting():
+    """59 stills of 300 frames at 15 fps; the pilot printed 1.123 a second, which is by a clip of 52.5 s."""
+    stills = [still(number, size=1500) for number in range(59)]
+    span = {"processed_s": 300 / 15}
+    pilot = {**span, "clip_s": 52.5, "accounting": "pilot"}
+    assert still_counts(stills, [], **pilot).stills_per_min / 60 == pytest.approx(1.124, abs=0.001)
+    assert still_counts(stills, [], **span).stills_per_min / 60 == pytest.approx(2.95)
+    rates = [bit_split({"roi": 59 * 1500}, **way).roi_bps for way in (span, pilot)]
+    assert rates[0] / rates[1] == pytest.approx(2.625)
+
+
+def test_no_time_to_divide_by():
+    """A rate of nothing by nothing must not stand in a table."""
+    with pytest.raises(ValueError, match="pilot accounting divides by None s"):
+        bit_split({"base": 1}, processed_s=1.0, accounting="pilot")
+    with pytest.raises(ValueError, match="must be above 0"):
+        still_counts([], [], processed_s=0.0)
+
+
+def test_stills_and_the_tracks_that_they_named():
+    """Two stills of one track refine one track; one that matched none refines none."""
+    counts = still_counts(
+        [still(1, size=800), still(2, size=1200), still(3, size=1000)],
+        [named(1, 7), named(2, 7), named(2, 8), named(3, NO_ID)],
+        processed_s=30.0,
+    )
+    assert counts == StillCounts(stills=3, stills_per_min=6.0, mean_bytes=1000.0, tracks_refined=2)
+    nothing = still_counts([], [], processed_s=30.0)
+    assert (nothing.stills, nothing.stills_per_min, nothing.tracks_refined) == (0, 0.0, 0)
+    assert math.isnan(nothing.mean_bytes)
+
+
+def test_delay_of_a_flight():
+    """Stills count from the capture of their frame, as base frames do."""
+    assert still_delays_ms([still(1), still(2, arrived_s=1.7)]) == (pytest.approx(600), pytest.approx(690))
+    assert math.isnan(still_delays_ms([])[0])
+
+
+def test_proxies():
+    """They stand beside the pilot's table: gain, its sign, changes of class, entropy and the small ones alone."""
+    objects = [
+        named(1, 7, share=0.001, base=Opinion("car", 0.4, 1.0), seen=Opinion("bus", 0.7, 0.4)),
+        named(2, 8, share=0.1, base=Opinion("car", 0.8, 0.5), seen=Opinion("car", 0.6, 0.8)),
+        named(3, 9, share=0.001, base=Opinion("van", 0.5, 0.9), seen=Opinion("van", 0.5, 0.9)),
+        named(4, 9, share=0.001, seen=Opinion("van", 0.9, 0.1)),
+    ]
+    score = proxies(objects)
+    assert (score.every.pairs, score.small.pairs, score.unpaired) == (3, 2, 1)
+    assert score.every.confidence_base == pytest.approx(1.7 / 3)
+    assert score.every.confidence_still == pytest.approx(1.8 / 3)
+    assert score.every.gain == pytest.approx(0.1 / 3)
+    assert score.every.positive_rate == pytest.approx(1 / 3)
+    assert score.every.change_rate == pytest.approx(1 / 3)
+    assert score.every.entropy_gain_nats == pytest.approx(0.1)
+    assert score.small.gain == pytest.approx(0.15)
+    assert score.small.entropy_gain_nats == pytest.approx(0.3)
+    nothing = proxies([])
+    assert (nothing.every.pairs, nothing.unpaired) == (0, 0)
+    assert math.isnan(nothing.small.gain)
+
+
+def test_entropy_of_a_detectors_score():
+    """Certain is 0 nats, and as likely as any other of four classes is ln 4."""
+    assert score_entropy_nats(1.0, 4) == 0.0
+    assert score_entropy_nats(0.25, 4) == pytest.approx(math.log(4))
+    assert score_entropy_nats(0.0, 4) == pytest.approx(math.log(3))
+    assert score_entropy_nats(0.5, 2) == pytest.approx(math.log(2))
+    assert score_entropy_nats(0.5, 1) == pytest.approx(-0.5 * math.log(0.5))

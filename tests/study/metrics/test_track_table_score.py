@@ -1,0 +1,115 @@
+"""Scores of tracks against ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_ground.events import Notice, Overlay
+from hvt_ground.sinks.tracks_table import TrackTable
+from hvt_scene import Scene
+from hvt_study.cli import main
+from hvt_study.metrics.track_table_score import Labelled, read_tracks, read_truth, score
+
+AREA_PX = 1280 * 720
+
+
+def labelled(*rows: tuple[float, float, float, float, str]) -> Labelled:
+    return Labelled(np.array([row[:4] for row in rows], float).reshape(-1, 4), tuple(row[4] for row in rows))
+
+
+def test_known_answer() -> None:
+    """A wrong formula here would make every comparison of methods worthless."""
+    truth = {1: labelled((0, 0, 10, 10, "car"), (100, 0, 200, 100, "van"), (300, 0, 310, 10, "car"))}
+    tracks = {1: labelled((1, 0, 11, 10, "car"), (100, 0, 200, 100, "car"), (600, 0, 610, 10, "bus"))}
+    result = score(tracks, truth, frame_area_px=AREA_PX)
+    assert result.objects == 3
+    assert result.recall == pytest.approx(2 / 3)
+    assert result.top1 == pytest.approx(1 / 2)
+    assert result.small_top1 == 1.0
+    assert result.seen_right == pytest.approx(1 / 3)
+    # car: 1 hit of 2 objects and 2 claims; van: no hit.
+    assert result.macro_f1 == pytest.approx((2 * 1 / (2 + 2) + 0) / 2)
+
+
+def test_a_track_counts_for_one_object_only() -> None:
+    """One large box over two neighbours must not find both."""
+    truth = {1: labelled((0, 0, 10, 10, "car"), (0, 1, 10, 11, "car"))}
+    tracks = {1: labelled((0, 0, 10, 10, "car"))}
+    assert score(tracks, truth, frame_area_px=AREA_PX).recall == 0.5
+
+
+def test_frames_without_tracks_count_as_missed() -> None:
+    """A ground that shows nothing for a while must lose points for it."""
+    truth = {frame: labelled((0, 0, 10, 10, "car")) for frame in (1, 2, 3, 4)}
+    tracks = {1: labelled((0, 0, 10, 10, "car"))}
+    assert score(tracks, truth, frame_area_px=AREA_PX).recall == 0.25
+
+
+def overlay(
+    frame_index: int, boxes: list[tuple[float, float, float, float]], classes: tuple[str, ...]
+) -> Overlay:
+    count = len(boxes)
+    return Overlay(
+        frame_index=frame_index,
+        capture_ns=frame_index * 10**9,
+        track_ids=np.arange(1, count + 1),
+        boxes_base_px=np.array(boxes, np.float32).reshape(-1, 4),
+        base_classes=("moving",) * count,
+        classes=classes,
+        confidences=np.full(count, 0.5, np.float32),
+        refined=np.ones(count, bool),
+    )
+
+
+def test_the_table_of_the_ground_reads_back(tmp_path: Path) -> None:
+    """What hvt-ground --tracks writes is what hvt-study score reads."""
+    path = tmp_path / "tracks.csv"
+    table = TrackTable(path)
+    table.log(overlay(0, [(1, 2, 11, 22), (5, 5, 9, 9)], ("car", "van")))
+    table.log(Notice(0, 0, "info", "not a track"))
+    table.log(overlay(3, [], ()))
+    table.log(overlay(4, [(0, 0, 4, 4)], ("bus",)))
+    table.close()
+    read = read_tracks(path)
+    assert set(read) == {1, 5}
+    assert read[1].classes == ("car", "van")
+    np.testing.assert_allclose(read[1].boxes_xyxy_px[0], (1, 2, 11, 22))
+    assert read_tracks(path, column="base_class")[5].classes == ("moving",)
+
+
+def test_perfect_tracks_of_the_demo_score_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The whole way, from the scene's truth file to the printed table."""
+    truth_path, tracks_path = tmp_path / "gt.txt", tmp_path / "perfect.csv"
+    lines = [
+        "1,1,10,10,50,30,1,1,1.000",
+        "1,2,100,10,50,30,1,2,1.000",
+        "2,1,12,10,50,30,1,1,0.900",
+        "2,2,9,9,9,9,1,3,0.1",
+    ]
+    truth_path.write_text("\n".join(lines) + "\n")
+    names = Scene.class_names
+    table = TrackTable(tracks_path)
+    table.log(overlay(0, [(10, 10, 60, 40), (100, 10, 150, 40)], (names[0], names[1])))
+    table.log(overlay(1, [(12, 10, 62, 40)], (names[0],)))
+    table.close()
+    assert main(["score", f"ours={tracks_path}", "--truth", str(truth_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "ours" in printed
+    assert printed.count("1.000") >= 4
+    assert "│ objects on all frames               │     3 │" in printed
+
+
+def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A table of something else is named, not counted as no tracks."""
+    junk = tmp_path / "junk.csv"
+    junk.write_text("a,b\n1,2\n")
+    with pytest.raises(UserError, match=r"junk\.csv"):
+        read_tracks(junk)
+    with pytest.raises(UserError, match="ground truth"):
+        read_truth(junk, class_names=("car",))
+    assert main(["score", str(junk), "--truth", str(junk)]) == 2
+    assert "Traceback" not in capsys.readouterr().err

@@ -1,0 +1,71 @@
+"""Programs in an install without the extra that they need: one sentence that says what to install."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+STUDY = ("faster_coco_eval", "jinja2", "matplotlib", "motmetrics", "optuna", "pandas", "pyarrow", "sklearn")
+GROUND = ("cryptography", "rerun")
+BLOCK = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {names!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Refuse())
+"""
+
+
+def done(tmp_path, module, words, without):
+    """The program in a Python that finds none of these packages."""
+    (tmp_path / "sitecustomize.py").write_text(BLOCK.format(names=without))
+    paths = [str(tmp_path), os.environ.get("PYTHONPATH", "")]
+    return subprocess.run(
+        [sys.executable, "-m", module, *words],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "without", "install"),
+    [
+        ("hvt_study.cli", ("run", "demo:0", "--out", "out"), (*STUDY, *GROUND), "hvt[study]"),
+        (
+            "hvt_study.cli",
+            ("compare", "demo", "--detector", "aerial-nano", "--out", "o"),
+            GROUND,
+            "hvt[study]",
+        ),
+        ("hvt_study.cli", ("plan", "demo:0"), ("rerun",), "hvt[study]"),
+        ("hvt_study.cli", ("tune", "demo:0-1", "--method", "M5", "--out", "out"), ("optuna",), "hvt[study]"),
+        ("hvt_study.cli", ("report", "out"), ("jinja2",), "hvt[study]"),
+        ("hvt_study.cli", ("score", "a.csv", "--truth", "gt.txt"), ("sklearn",), "hvt[study]"),
+        ("hvt_ground.cli", ("--help",), ("rerun",), "hvt[ground]"),
+        ("hvt_ground.cli", ("keys", "list"), ("cryptography",), "hvt[ground]"),
+        ("hvt_train", ("detector", "--out", "out"), ("torch",), "torch onnx"),
+    ],
+)
+def test_a_missing_package_is_one_sentence(tmp_path, module, words, without, install):
+    """Who installed hvt[edge] would get a traceback that names a package of somebody else."""
+    found = done(tmp_path, module, words, without)
+    assert found.returncode == 2, found.stderr
+    assert f"pip install {install}".replace("hvt[", "'hvt[").replace("]", "]'") in found.stderr
+    assert found.stderr.count("\n") == 1
+
+
+def test_what_needs_no_extra_works_without_one(tmp_path):
+    """The tracker alone and the selector sweep run where only the edge is installed."""
+    for command in ("track", "sweep"):
+        found = done(tmp_path, "hvt_study.cli", (command, "--help"), (*STUDY, *GROUND))
+        assert found.returncode == 0, found.stderr

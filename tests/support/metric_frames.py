@@ -1,0 +1,46 @@
+"""Labels and views written as rows, for tests of metrics."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hvt_study.datasets.labels import NO_ID, FrameLabels
+from hvt_study.metrics.classes import class_score
+from hvt_study.metrics.frames import FrameView
+
+__all__ = ["labels", "list_f1", "square", "view"]
+
+
+def square(x, y=0, side=10):
+    """x1 y1 x2 y2 of a square."""
+    return (x, y, x + side, y + side)
+
+
+def labels(*rows, ignored=()):
+    """Rows of (box, class) or (box, class, id)."""
+    return FrameLabels(
+        np.array([row[0] for row in rows], np.float32).reshape(-1, 4),
+        np.array([row[2] if len(row) > 2 else NO_ID for row in rows], np.int64),
+        tuple(row[1] for row in rows),
+        np.array(ignored, np.float32).reshape(-1, 4),
+    )
+
+
+def view(*rows):
+    """Rows of (box, class), with id, confidence and the class before refinement after it, each as far as given."""
+    return FrameView(
+        np.array([row[0] for row in rows], np.float32).reshape(-1, 4),
+        np.array([row[2] if len(row) > 2 else place for place, row in enumerate(rows)], np.int64),
+        tuple(row[1] for row in rows),
+        np.array([row[3] if len(row) > 3 else 0.5 for row in rows], np.float32),
+        tuple(row[4] if len(row) > 4 else row[1] for row in rows),
+    )
+
+
+def list_f1(report, frames, there):
+    """F1 of a flight's list at some frames, where ``there(frame)`` gives (boxes, classes) that are really there."""
+    pairs = []
+    for frame in frames:
+        boxes, names = there(frame)
+        pairs.append((labels(*zip(boxes, names, strict=True)), report.lists[frame].refined_view()))
+    return class_score(pairs).f1
