@@ -28,7 +28,7 @@ def flown(folder: Path, scene: Path, *arguments: str) -> dict[str, Any]:
     with Link(folder) as link, Relay(THIN, target_port=link.port) as relay:
         link.ground("--once", "--detector", "motion", "--classifier", "none")
         where = ["--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene)]
-        return link._start("hvt_edge.cli", [*where, *EDGE, *arguments], name="edge").finish(within_s=90)
+        return link.start("hvt_edge.cli", [*where, *EDGE, *arguments], name="edge").finish(within_s=90)
 
 
 def test_the_base_follows_a_link_thinner_than_the_budget(tmp_path, scene):
@@ -53,7 +53,7 @@ def test_stills_find_their_moment_between_few_frames(tmp_path, scene):
     with Link(tmp_path) as link:
         link.ground("--once", "--detector", "motion", "--classifier", "none")
         where = ["--connect", f"tcp/127.0.0.1:{link.port}", "--source", str(scene)]
-        summary = link._start("hvt_edge.cli", [*where, *EDGE, *few], name="edge").finish(within_s=90)
+        summary = link.start("hvt_edge.cli", [*where, *EDGE, *few], name="edge").finish(within_s=90)
     assert summary["stills"]["sent"] >= 10
 
 

@@ -177,7 +177,7 @@ def router(endpoint: str) -> Iterator[subprocess.Popen[str]]:
 def test_both_sides_come_back_to_a_router_that_was_killed(link: Link):
     """After a power cut at the relay station somebody would have to start everything again, in the right order."""
     with router(link.ground_endpoint):
-        ground = link._start(
+        ground = link.start(
             "hvt_ground.cli",
             ["--connect", link.ground_endpoint, *SEES, "--record", "flights", "--timing", "timing.csv"],
             name="ground",
@@ -255,14 +255,14 @@ def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
     lossy = Script(
         (Phase(0.0, LinkState(4_000_000, delay_s=0.01, loss=0.12)),), lasts_s=60.0, queue_bytes=100_000
     )
-    ground = link._start(
+    ground = link.start(
         "hvt_ground.cli",
         ["--listen", f"udp/127.0.0.1:{link.port}", *SEES, "--record", "flight.rrd", "--timing", "timing.csv"],
         name="ground",
     )
     ground.until("listening on")
     with Relay(lossy, protocol="udp", target_port=link.port, seed=3) as relay:
-        edge = link._start(
+        edge = link.start(
             "hvt_edge.cli",
             [
                 *("--connect", f"udp/127.0.0.1:{relay.port}", *PLAYS),
@@ -318,9 +318,9 @@ def test_a_clock_that_is_set_leaves_no_trace(
     monkeypatch.setenv("HVT_STEPPED", f"hvt_{side}.cli {step_s}")
     modules = {"ground": "hvt_ground.cli", "edge": "hvt_edge.cli"} | {side: "stepped"}
     heard = ["--listen", link.ground_endpoint, *SEES, "--record", "flight.rrd", "--timing", "timing.csv"]
-    ground: Running = link._start(modules["ground"], heard, name="ground")
+    ground: Running = link.start(modules["ground"], heard, name="ground")
     ground.until("listening on")
-    edge = link._start(modules["edge"], ["--connect", link.ground_endpoint, *PLAYS], name="edge")
+    edge = link.start(modules["edge"], ["--connect", link.ground_endpoint, *PLAYS], name="edge")
     with joined(link.ground_endpoint) as third:
         tap = Tap(third, "hvt/uav-1/feedback")
         more_is_shown(link.folder, than=0)

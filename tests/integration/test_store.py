@@ -80,7 +80,7 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
             "--detector", "motion", "--classifier", "none",
             "--record", str(tmp_path / "run.rrd"), "--timing", str(timing),
         )  # fmt: skip
-        edge = link._start(
+        edge = link.start(
             "hvt_edge.cli",
             ["--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene), *EDGE,
              "--max-frames", str(frames), "--store-folder", str(tmp_path / "store"), "--record-base", str(own)],
