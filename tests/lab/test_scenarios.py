@@ -1,7 +1,7 @@
 """The short scenarios, with hvt-edge and hvt-ground as real processes: cheap settings, so no bar of speed is asked.
 
-`make link` measures; here it is only asked that both survive, keep their account, and show a picture again. Two of the
-scenarios are flown by `make test`, all of them by `make nightly`.
+`make link` measures; here it is only asked that both survive, keep their account, and show a picture again. Two of
+the scenarios are flown by `make test`, all of them by `make nightly`.
 """
 
 from __future__ import annotations
