@@ -316,8 +316,8 @@ def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
 def test_clocks_that_are_set_leave_no_trace(link: Link, monkeypatch: pytest.MonkeyPatch):
     """For hours the picture would be an hour old by the ground's account, or reports and keyframes cease.
 
-    The ground's clock is set back by an hour and the edge's forward, in one flight. The other cases need no flight: see
-    tests/common/protocol/test_clock_offset.py.
+    The ground's clock is set back by an hour and the edge's forward, in one flight. The other cases need no flight:
+    see tests/common/protocol/test_clock_offset.py.
     """
     (link.folder / "stepped.py").write_text((TESTS / "stepped.py").read_text())
 
