@@ -92,6 +92,7 @@ def test_the_image_holds_what_the_commands_name(compose: dict[str, Any]) -> None
 
 
 @pytest.mark.integration
+@pytest.mark.realtime  # a flight of two seconds, which a ground that starts slowly would miss
 def test_the_commands_do_what_the_file_promises(
     compose: dict[str, Any], tmp_path: Path, free_port: int
 ) -> None:

@@ -17,7 +17,7 @@ from typing import Any, Self
 
 __all__ = ["Link", "Running", "eventually", "free_ports"]
 
-START_S = 30.0
+START_S = 60.0
 """How long a process may take to get going on a busy machine."""
 _POLL_S = 0.01
 
