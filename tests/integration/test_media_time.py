@@ -10,8 +10,8 @@ import pytest
 
 from clips import START_NS
 from keeping import FRAMES, Ground, Rig
-from lab.link.pipe import SEGMENT_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
-from lab.link.script import LinkState, Piece, Script
+from lab.link.carriers.pipe import SEGMENT_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
+from lab.link.script import LinkState, Phase, Script
 
 FRAME_S = 1 / 15
 LIGHT = LinkState(rate_bps=1_000_000, delay_s=0.02)
@@ -69,8 +69,8 @@ class DistantGround(Ground):
 def test_every_frame_and_still_arrives_whatever_the_outage_swallowed(tmp_path, dark_s, loss):
     """The operator would never see what the drone saw while the link was away."""
     light = replace(LIGHT, loss=loss)
-    dark = (Piece(2.0, replace(LIGHT, dark=True)), Piece(2.0 + dark_s, light))
-    script = Script(pieces=(Piece(0.0, light), *dark), lasts_s=60.0, queue_bytes=64_000)
+    dark = (Phase(2.0, replace(LIGHT, dark=True)), Phase(2.0 + dark_s, light))
+    script = Script(phases=(Phase(0.0, light), *dark), lasts_s=60.0, queue_bytes=64_000)
     rig = Rig(tmp_path)
     ground = rig.out.ground = DistantGround(script, now_ns=lambda: rig.now_ns, seed=3)
     stills = set()
