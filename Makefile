@@ -5,7 +5,9 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test nightly nightly-tests check lint type format bench bench-stills bench-sight bench-peers link soak kills fuzz clean help
+.PHONY: setup demo test check lint type format bench bench-stills bench-sight bench-peers link soak kills fuzz clean help
+
+.PHONY: nightly nightly-tests
 
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'

@@ -66,7 +66,7 @@ class DistantGround(Ground):
 
 @pytest.mark.parametrize("loss", [0.0, 0.05])
 @pytest.mark.parametrize("dark_s", [1.0, 2.7])
-def test_every_frame_and_still_arrives_whatever_the_outage_swallowed(tmp_path, dark_s, loss):
+def test_every_frame_and_still_arrives_whatever_the_outage_took(tmp_path, dark_s, loss):
     """The operator would never see what the drone saw while the link was away."""
     light = replace(LIGHT, loss=loss)
     dark = (Phase(2.0, replace(LIGHT, dark=True)), Phase(2.0 + dark_s, light))
