@@ -27,9 +27,9 @@ endif
 demo: setup      ## edge and ground as two processes on the drawn scene: demo.rrd and a summary
 	@$(BIN)/python deploy/demo.py
 
-# Most tests wait for other processes, so twice as many run at once as there are processors. Flights that a busy machine
+# Many tests wait for other processes, so that more run at once than there are processors. Flights that a busy machine
 # would spoil run alone afterwards. Nothing has a second chance.
-JOBS ?= $(shell echo $$((2 * $$(getconf _NPROCESSORS_ONLN))))
+JOBS ?= $(shell echo $$((2 + $$(getconf _NPROCESSORS_ONLN))))
 
 test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS=
 	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder; \

@@ -25,11 +25,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Tests of one file run in one process, in order, those that wait for other processes first.
+    """Tests of one file run in one process, in order; those that wait for other processes first, then the long ones.
 
     A file's fixtures are made once that way. A test marked ``apart`` shares none, and may run beside its neighbours.
     """
-    items.sort(key=lambda item: item.get_closest_marker("integration") is None)
+    items.sort(
+        key=lambda item: (item.get_closest_marker("integration") is None, "study" not in item.path.parts)
+    )
     for item in items:
         if item.get_closest_marker("nightly") and not config.getoption("nightly"):
             item.add_marker(pytest.mark.skip(reason="takes minutes: `make nightly` runs it"))

@@ -17,15 +17,15 @@ from processes import free_ports
 
 pytestmark = [pytest.mark.integration, pytest.mark.apart, pytest.mark.realdata, pytest.mark.timeout(120)]
 
-FRAMES = 75
-"""Five seconds."""
+FRAMES = 90
+"""Six seconds."""
 
 Run = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture
 def run(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Play five seconds of drone_carpark with more settings, keyframes among them, without a ground."""
+    """Play six seconds of drone_carpark with more settings, keyframes among them, without a ground."""
     handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
 
     def run(*settings: str) -> dict[str, Any]:

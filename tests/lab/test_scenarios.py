@@ -19,7 +19,7 @@ from lab.link.measures.outcome import Outcome, measures
 from lab.link.script import load_scenario, scenario_names
 from pictures import write_scene
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.integration, pytest.mark.realtime, pytest.mark.timeout(900)]
 
 EDGE = (
     "--source-fps",
