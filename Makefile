@@ -7,6 +7,8 @@ UV     := $(shell command -v uv 2>/dev/null)
 
 .PHONY: setup demo test check lint type format bench bench-stills bench-sight bench-peers link soak kills fuzz clean help
 
+.PHONY: nightly nightly-tests
+
 help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
@@ -25,12 +27,22 @@ endif
 demo: setup      ## edge and ground as two processes on the drawn scene: demo.rrd and a summary
 	@$(BIN)/python deploy/demo.py
 
-# A busy machine can stop a process for a second, and a flight in real time with it: what failed there flies once more,
-# alone. Nothing else has a second chance, and no run that ended otherwise than with failed tests (1) has one.
-test: setup      ## all tests, on real x265, Zenoh, ONNX models and recordings
-	@$(BIN)/python -m pytest -m 'not integration'
-	@$(BIN)/python -m pytest -m integration || { code=$$?; test $$code = 1 || exit $$code; \
-		echo 'The flights that failed fly once more:'; $(BIN)/python -m pytest -m integration --last-failed; }
+# Many tests wait for other processes, so that more run at once than there are processors. Flights that a busy machine
+# would spoil run alone afterwards. Nothing has a second chance.
+JOBS ?= $(shell echo $$((2 + $$(getconf _NPROCESSORS_ONLN))))
+
+test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS=
+	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder; \
+		together=$$?; $(BIN)/python -m pytest -m realtime && exit $$together
+
+nightly: setup   ## hours: the nightly tests, every scenario at full length, kills, fuzzers, soak; COUNT= RUNS= LASTS=
+	@failed=; for part in nightly-tests link 'kills COUNT=$(or $(COUNT),50)' 'fuzz RUNS=$(or $(RUNS),15000)' \
+		'soak LASTS=$(or $(LASTS),20min)'; do \
+		$(MAKE) --no-print-directory COUNT= RUNS= LASTS= $$part || failed="$$failed, $${part%% *}"; done; \
+		test -z "$$failed" || { echo "failed$$failed"; exit 1; }
+
+nightly-tests: setup ## the tests that `make test` leaves out, and nothing else
+	@$(BIN)/python -m pytest --nightly -m nightly
 
 lint: setup
 	@$(BIN)/ruff check
@@ -39,8 +51,9 @@ lint: setup
 
 type: setup
 	@$(BIN)/mypy
+	@$(BIN)/mypy --config-file tests/mypy.ini tests lab bench
 
-check: lint type ## lint, format, import arrows, types
+check: lint type ## lint, format, import arrows, types; of the tests whether they call what is there
 
 format: setup    ## write what `make check` wants to see
 	@$(BIN)/ruff format

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-import socket
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from processes import free_ports
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -15,6 +16,27 @@ ROOT = Path(__file__).resolve().parent.parent
 # break a property that holds. Here and not in a fixture: `@settings` takes what is loaded when its module is read.
 settings.register_profile("hvt", deadline=None)
 settings.load_profile("hvt")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--nightly``."""
+    parser.addoption("--nightly", action="store_true", help="run the tests marked nightly, too")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Tests of one file run in one process, in order; those that wait for other processes first, then the long ones.
+
+    A file's fixtures are made once that way. A test marked ``apart`` shares none, and may run beside its neighbours.
+    """
+    items.sort(
+        key=lambda item: (item.get_closest_marker("integration") is None, "study" not in item.path.parts)
+    )
+    for item in items:
+        if item.get_closest_marker("nightly") and not config.getoption("nightly"):
+            item.add_marker(pytest.mark.skip(reason="takes minutes: `make nightly` runs it"))
+        group = item.nodeid if item.get_closest_marker("apart") else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -34,7 +56,5 @@ def data() -> Path:
 
 @pytest.fixture
 def free_port() -> int:
-    """A TCP port of loopback that nobody listens on at this moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A TCP port that nobody listens on at this moment, and that no other test process picks."""
+    return free_ports(1)[0]

@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -90,17 +92,23 @@ def test_the_image_holds_what_the_commands_name(compose: dict[str, Any]) -> None
 
 
 @pytest.mark.integration
+@pytest.mark.realtime  # a flight of two seconds, which a ground that starts slowly would miss
 def test_the_commands_do_what_the_file_promises(
     compose: dict[str, Any], tmp_path: Path, free_port: int
 ) -> None:
     """Router, ground and edge with the very commands of the file: at the end there must be a recording."""
 
-    def start(name: str, *more: str) -> subprocess.Popen[str]:
+    @contextmanager
+    def start(name: str, *more: str) -> Iterator[subprocess.Popen[bytes]]:
         words = [
             _here(word, port=free_port, recordings=tmp_path) for word in compose["services"][name]["command"]
         ]
         program = [sys.executable, "-m", MODULES[words[0]]] if words[0] in MODULES else [sys.executable]
-        return subprocess.Popen([*program, *words[1:], *more], text=True, stdout=subprocess.DEVNULL)
+        with subprocess.Popen([*program, *words[1:], *more], stdout=subprocess.DEVNULL) as process:
+            try:
+                yield process
+            finally:
+                process.kill()
 
     check = [_here(word, port=free_port, recordings=tmp_path) for word in _health(compose)]
     with start("router") as router:

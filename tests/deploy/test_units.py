@@ -77,7 +77,7 @@ def test_router_unit_runs_the_script_that_is_in_the_checkout() -> None:
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
 def test_unit_stops_like_ctrl_c_and_does_not_retry_a_wrong_configuration(unit: Path) -> None:
-    """Another signal would cost the summary; retrying code 2 would fill the journal with one sentence for ever."""
+    """Another signal would cost the summary; retrying code 2 would fill the system log with one sentence for ever."""
     service = _read(unit)["Service"]
     assert service["KillSignal"] == "SIGINT"
     assert service["Restart"] == "on-failure"
@@ -114,7 +114,7 @@ def installed(tmp_path: Path) -> list[str]:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 def test_systemd_accepts_the_units(installed: list[str]) -> None:
-    """A misspelt hardening option is ignored by systemd with a line in the journal: the service runs without it."""
+    """A misspelt hardening option is ignored by systemd with a line in its log: the service runs without it."""
     found = subprocess.run(
         ["systemd-analyze", "verify", "--man=no", *installed], capture_output=True, text=True, check=False
     )

@@ -28,22 +28,19 @@ def flown(folder: Path, scene: Path, *arguments: str) -> dict[str, Any]:
     with Link(folder) as link, Relay(THIN, target_port=link.port) as relay:
         link.ground("--once", "--detector", "motion", "--classifier", "none")
         where = ["--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene)]
-        return link._start("hvt_edge.cli", [*where, *EDGE, *arguments], name="edge").finish(within_s=90)
+        return link.start("hvt_edge.cli", [*where, *EDGE, *arguments], name="edge").finish(within_s=90)
 
 
-def test_the_base_follows_a_link_thinner_than_the_budget(tmp_path, scene):
+@pytest.mark.realtime
+def test_the_base_stream_adapts_to_a_link_thinner_than_the_budget(tmp_path, scene):
     """The picture would be seconds late, and move in jerks."""
-    adapted, fixed = (
-        flown(tmp_path / "adapted", scene, "--adapt", "--max-frames", "240"),
-        flown(tmp_path / "fixed", scene, "--no-adapt", "--max-frames", "240"),
-    )
-    assert fixed["budget_base_bps"] == 650_000
-    assert fixed["total_bps"] > 1.2 * 250_000  # the rest stands in queues
-    assert adapted["budget_base_bps"] < 300_000  # x265 was opened anew
-    assert adapted["total_bps"] < 1.2 * 250_000
-    assert adapted["frames"] > fixed["frames"]  # more of them, and smaller ones
+    summary = flown(tmp_path / "adapted", scene, "--adapt", "--max-frames", "240")
+    assert summary["budget_base_bps"] < 300_000  # x265 was opened anew
+    assert summary["total_bps"] < 1.2 * 250_000  # of 800,000: nothing more stands in queues
+    assert summary["frames"] > 0.6 * 240  # of the rest each would have been late
 
 
+@pytest.mark.nightly
 def test_stills_find_their_moment_between_few_frames(tmp_path, scene):
     """Right behind a base frame the link is busy: at five a second no still would ever go, on the best of links."""
     few = (
@@ -53,10 +50,11 @@ def test_stills_find_their_moment_between_few_frames(tmp_path, scene):
     with Link(tmp_path) as link:
         link.ground("--once", "--detector", "motion", "--classifier", "none")
         where = ["--connect", f"tcp/127.0.0.1:{link.port}", "--source", str(scene)]
-        summary = link._start("hvt_edge.cli", [*where, *EDGE, *few], name="edge").finish(within_s=90)
+        summary = link.start("hvt_edge.cli", [*where, *EDGE, *few], name="edge").finish(within_s=90)
     assert summary["stills"]["sent"] >= 10
 
 
+@pytest.mark.apart
 def test_lockstep_never_adapts(tmp_path, scene):
     """The same input would not give the same bytes."""
     summary = flown(tmp_path / "lockstep", scene, "--pace", "lockstep", "--adapt", "--max-frames", "45")

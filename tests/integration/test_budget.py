@@ -15,7 +15,7 @@ from hvt_edge.cli import main
 from hvt_edge.stills.policy.registry import METHODS
 from processes import free_ports
 
-pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.integration, pytest.mark.apart, pytest.mark.realdata, pytest.mark.timeout(120)]
 
 FRAMES = 90
 """Six seconds."""
@@ -73,10 +73,10 @@ def test_every_method_holds_the_budget(run, method):
 @pytest.mark.parametrize(
     ("method", "regime", "budget_bps", "base_bps"),
     [
-        ("M0", "low", 800_000, 800_000),
+        pytest.param("M0", "low", 800_000, 800_000, marks=pytest.mark.nightly),
         ("M0", "moderate", 1_400_000, 1_400_000),
         ("M5", "low", 800_000, 650_000),
-        ("M5", "moderate", 1_400_000, 1_200_000),
+        pytest.param("M5", "moderate", 1_400_000, 1_200_000, marks=pytest.mark.nightly),
     ],
 )
 def test_the_regimes_of_the_paper_are_held_at_full_size(run, method, regime, budget_bps, base_bps):

@@ -22,7 +22,7 @@ from outsider import Message, Tap, answer, joined
 from processes import Link, eventually
 from rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(300)]
 
 FRAMES = 220
 """351 frames at 24 fps are 14.625 s: instants 0 … 219 at 15 fps."""
@@ -64,7 +64,7 @@ def flight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
                 *("--classifier", str(data / "models/mobilenet_v2_imagenet.onnx")),
                 *("--labels", str(data / "models/imagenet_labels_1001.txt")),
             )
-            summaries = edge.finish(within_s=120), ground.finish(within_s=30)
+            summaries = edge.finish(within_s=240), ground.finish(within_s=30)
             stills = tap.messages
     file = folder / "flight.rrd"
     return Flight(

@@ -23,7 +23,7 @@ from hvt_edge.operating.keyframes import KeyframeSettings
 from outsider import Tap, answer, joined
 from processes import Link, Running, eventually
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(280)]
+pytestmark = [pytest.mark.integration, pytest.mark.nightly, pytest.mark.timeout(280)]
 
 _FLOODER = Path(__file__).with_name("flooder.py")
 _SECONDS = 2.5

@@ -23,7 +23,7 @@ from outsider import Message, Tap, answer, joined
 from processes import Link, eventually
 from rrd import Recording
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.integration, pytest.mark.realtime, pytest.mark.timeout(120)]
 
 ROUNDS = 25
 """How often each kind of bad message is sent, a tenth of a second apart."""

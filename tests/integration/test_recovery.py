@@ -174,10 +174,11 @@ def router(endpoint: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
+@pytest.mark.apart
 def test_both_sides_come_back_to_a_router_that_was_killed(link: Link):
     """After a power cut at the relay station somebody would have to start everything again, in the right order."""
     with router(link.ground_endpoint):
-        ground = link._start(
+        ground = link.start(
             "hvt_ground.cli",
             ["--connect", link.ground_endpoint, *SEES, "--record", "flights", "--timing", "timing.csv"],
             name="ground",
@@ -205,6 +206,7 @@ def as_list(summaries: Any) -> list[dict[str, Any]]:
 # Two edges of one id
 
 
+@pytest.mark.apart
 def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
     """Two drones would fight for one screen; a fleet's copy-and-paste mistake would be found out in the air."""
     ground = link.ground(*SEES, "--record", "flights", "--timing", "timing.csv")
@@ -227,6 +229,7 @@ def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
     }
 
 
+@pytest.mark.apart
 def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(link: Link):
     """The picture would jump between two drones, or be another's, without a word."""
     edges = {name: link.edge(*PLAYS, "--wait", "0s", name=name) for name in ("one", "two")}
@@ -250,19 +253,20 @@ def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(lin
 # Stills that are lost
 
 
+@pytest.mark.apart
 def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
     """On a radio that loses datagrams the sharp pictures would have holes; or the gallery show some twice."""
     lossy = Script(
         (Phase(0.0, LinkState(4_000_000, delay_s=0.01, loss=0.12)),), lasts_s=60.0, queue_bytes=100_000
     )
-    ground = link._start(
+    ground = link.start(
         "hvt_ground.cli",
         ["--listen", f"udp/127.0.0.1:{link.port}", *SEES, "--record", "flight.rrd", "--timing", "timing.csv"],
         name="ground",
     )
     ground.until("listening on")
     with Relay(lossy, protocol="udp", target_port=link.port, seed=3) as relay:
-        edge = link._start(
+        edge = link.start(
             "hvt_edge.cli",
             [
                 *("--connect", f"udp/127.0.0.1:{relay.port}", *PLAYS),
@@ -308,19 +312,26 @@ def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
 # Clocks that are set
 
 
-@pytest.mark.parametrize("step_s", [3600, -3600])
-@pytest.mark.parametrize("side", ["ground", "edge"])
-def test_a_clock_that_is_set_leaves_no_trace(
-    link: Link, monkeypatch: pytest.MonkeyPatch, side: str, step_s: int
-):
-    """For hours the picture would be an hour old by the ground's account, or reports and keyframes cease."""
+@pytest.mark.apart
+def test_clocks_that_are_set_leave_no_trace(link: Link, monkeypatch: pytest.MonkeyPatch):
+    """For hours the picture would be an hour old by the ground's account, or reports and keyframes cease.
+
+    The ground's clock is set back by an hour and the edge's forward, in one flight. The other cases need no flight:
+    see tests/common/protocol/test_clock_offset.py.
+    """
     (link.folder / "stepped.py").write_text((TESTS / "stepped.py").read_text())
-    monkeypatch.setenv("HVT_STEPPED", f"hvt_{side}.cli {step_s}")
-    modules = {"ground": "hvt_ground.cli", "edge": "hvt_edge.cli"} | {side: "stepped"}
-    heard = ["--listen", link.ground_endpoint, *SEES, "--record", "flight.rrd", "--timing", "timing.csv"]
-    ground: Running = link._start(modules["ground"], heard, name="ground")
+
+    def stepped(program: str, step_s: int, *arguments: str, name: str) -> Running:
+        monkeypatch.setenv("HVT_STEPPED", f"{program} {step_s}")
+        return link.start("stepped", [*arguments], name=name)
+
+    ground = stepped(
+        *("hvt_ground.cli", -3600, "--listen", link.ground_endpoint, *SEES),
+        *("--record", "flight.rrd", "--timing", "timing.csv"),
+        name="ground",
+    )
     ground.until("listening on")
-    edge = link._start(modules["edge"], ["--connect", link.ground_endpoint, *PLAYS], name="edge")
+    edge = stepped("hvt_edge.cli", 3600, "--connect", link.ground_endpoint, *PLAYS, name="edge")
     with joined(link.ground_endpoint) as third:
         tap = Tap(third, "hvt/uav-1/feedback")
         more_is_shown(link.folder, than=0)

@@ -30,30 +30,6 @@ PATIENCE_S = 0.3
 """Nothing here is merely slow to come."""
 
 
-@pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
-    """Two edges; a ground that commands, one that watches; and one that the edges have not been told of."""
-    fleet = Fleet(tmp_path_factory.mktemp("keys") / "own")
-    fleet.keys("add-edge", "uav-1", "--host", "127.0.0.1")
-    fleet.keys("add-edge", "uav-2")
-    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
-    fleet.keys("add-ground", "guest", "--watch-only")
-    old = fleet.file("uav-1").read_text()
-    fleet.keys("add-ground", "stranger")
-    fleet.file("uav-1").write_text(old)
-    return fleet
-
-
-@pytest.fixture
-def started() -> Iterator[list[Running]]:
-    """Processes that a test appends, killed at its end."""
-    running: list[Running] = []
-    yield running
-    for one in running:
-        if one.alive:
-            one.kill()
-
-
 @contextmanager
 def _unchecked(settings: LinkSettings) -> Iterator[zenoh.Session]:
     """A session of somebody who does not look at keys before the start."""
@@ -273,30 +249,6 @@ def _hvt_edge(scene: Path, folder: Path, *arguments: str, name: str = "edge") ->
 def _hvt_ground(fleet: Fleet, who: str, folder: Path, *arguments: str) -> Running:
     common = ["--zenoh-config", str(fleet.file(who)), "--detector", "motion", "--classifier", "none"]
     return Running("hvt_ground.cli", [*common, *arguments], folder=folder, name=who)
-
-
-def test_a_flight_with_keys_keeps_the_account(
-    fleet: Fleet, scene: Path, tmp_path: Path, free_port: int, started: list[Running]
-) -> None:
-    """A rule too strict for one row of the key table would lose that row only, and nobody would know."""
-    endpoint = f"tls/127.0.0.1:{free_port}"
-    ground = _hvt_ground(fleet, "base", tmp_path, "--listen", endpoint, "--once", "--record", "flight.rrd")
-    started.append(ground)
-    ground.until("listening on")
-    keys = ("--zenoh-config", str(fleet.file("uav-1")), "--send-tracks")
-    edge = _hvt_edge(
-        scene, tmp_path, "--connect", endpoint, *keys, "--pace", "lockstep", "--max-frames", "45"
-    )
-    started.append(edge)
-    sent, received = edge.finish(), ground.finish()
-    for count in ("frames", "base_bytes", "roi_bytes", "meta_bytes", "overhead_bytes"):
-        assert sent[count] == received[count] > 0, count
-    assert sent["frames"] == 45
-    assert sent["stills"]["sent"] == received["stills"]["received"] > 0
-    assert sent["unusable_messages"] == received["unusable_messages"] == 0
-    for one in (edge, ground):
-        assert "is linked, but" not in one.said
-        assert "does not answer on control" not in one.said
 
 
 TOLD = {

@@ -64,10 +64,11 @@ def admitted(sent: dict[str, Any]) -> set[int]:
     return set(range(sum(live.values()))) | {FIRST_STORED + number for number in range(kept)}
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize(
     ("dark_s", "frames"),
     [
-        pytest.param(2.7, 150, id="shorter-than-zenoh-notices"),
+        pytest.param(2.7, 150, id="shorter-than-zenoh-notices", marks=pytest.mark.nightly),
         pytest.param(8.0, 220, id="session-of-zenoh-gone"),
     ],
 )
@@ -80,7 +81,7 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
             "--detector", "motion", "--classifier", "none",
             "--record", str(tmp_path / "run.rrd"), "--timing", str(timing),
         )  # fmt: skip
-        edge = link._start(
+        edge = link.start(
             "hvt_edge.cli",
             ["--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene), *EDGE,
              "--max-frames", str(frames), "--store-folder", str(tmp_path / "store"), "--record-base", str(own)],
@@ -111,6 +112,7 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
     assert said["backlog_bytes"] == sent["backlog_bytes"] > 0
 
 
+@pytest.mark.apart
 def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, scene):
     """What a drone saw before its computer was started again would stay on it for ever."""
     store = tmp_path / "store"

@@ -1,6 +1,7 @@
 """The short scenarios, with hvt-edge and hvt-ground as real processes: cheap settings, so no bar of speed is asked.
 
-`make link` measures; here it is only asked that both survive, keep their account, and show a picture again.
+`make link` measures; here it is only asked that both survive, keep their account, and show a picture again. Two of
+the scenarios are flown by `make test`, all of them by `make nightly`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from lab.link.measures.outcome import Outcome, measures
 from lab.link.script import load_scenario, scenario_names
 from pictures import write_scene
 
-pytestmark = [pytest.mark.integration, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.integration, pytest.mark.realtime, pytest.mark.timeout(900)]
 
 EDGE = (
     "--source-fps",
@@ -37,6 +38,10 @@ AT_ONCE = min(5, os.cpu_count() or 1)
 """Flights in real time: so many as the machine has time for."""
 PICTURE_WITHIN_S = 3.0
 SOAK_S = 60
+EACH_TIME = ("steady-300k", "outage-8s")
+"""Scenarios that `make test` flies."""
+nightly = pytest.mark.nightly
+NAMES = [pytest.param(name, marks=() if name in EACH_TIME else nightly) for name in scenario_names()]
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +68,14 @@ def short(name: str, scene: Path, folder: Path, **more: str) -> Outcome:
 
 
 @pytest.fixture(scope="module")
-def outcomes(scene, tmp_path_factory) -> dict[str, Outcome | str]:
-    """All scenarios over the relay, a few at a time."""
+def outcomes(scene, tmp_path_factory, request) -> dict[str, Outcome | str]:
+    """The scenarios over the relay, a few at a time."""
     folder = tmp_path_factory.mktemp("link")
+    if not request.config.getoption("nightly"):
+        with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
+            return dict(
+                zip(EACH_TIME, pool.map(lambda name: short(name, scene, folder), EACH_TIME), strict=True)
+            )
     with concurrent.futures.ThreadPoolExecutor(AT_ONCE) as pool:
         soak = pool.submit(short, "drone-fade", scene, folder / "soak", lasts=f"{SOAK_S}s")
         names = sorted(scenario_names(), key=lambda name: -load_scenario(name).script("short").lasts_s)
@@ -82,7 +92,7 @@ def _result(running: concurrent.futures.Future[Outcome]) -> Outcome | str:
         return str(error)
 
 
-@pytest.mark.parametrize("name", scenario_names())
+@pytest.mark.parametrize("name", NAMES)
 def test_both_sides_survive(outcomes, name):
     """A bad link would end the flight's video for good."""
     outcome = outcomes[name]
@@ -90,7 +100,7 @@ def test_both_sides_survive(outcomes, name):
     assert not [text for text in outcome.said.values() if "Traceback" in text]
 
 
-@pytest.mark.parametrize("name", scenario_names())
+@pytest.mark.parametrize("name", NAMES)
 def test_there_is_a_picture_at_the_end(outcomes, name):
     """After a fade the operator would look at the last frame before it."""
     outcome = outcomes[name]
@@ -101,7 +111,10 @@ def test_there_is_a_picture_at_the_end(outcomes, name):
     assert measures(outcome)["decodable frames, %"] > 0
 
 
-@pytest.mark.parametrize("name", ["steady-1M", "steady-300k", "satellite-600ms"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("steady-1M", marks=nightly), "steady-300k", pytest.param("satellite-600ms", marks=nightly)],
+)
 def test_a_steady_link_loses_nothing(outcomes, name):
     """The two accounts would differ, and with them what the budget means."""
     found = measures(outcomes[name])
@@ -110,12 +123,16 @@ def test_a_steady_link_loses_nothing(outcomes, name):
     assert found["decodable frames, %"] == 100
 
 
-@pytest.mark.parametrize("name", ["outage-8s", "outage-60s", "flapping", "drone-fade"])
+@pytest.mark.parametrize(
+    "name",
+    ["outage-8s", *(pytest.param(name, marks=nightly) for name in ("outage-60s", "flapping", "drone-fade"))],
+)
 def test_darkness_is_dark(outcomes, name):
     """The lab would be testing nothing."""
     assert measures(outcomes[name])["received in darkness, bytes"] == 0
 
 
+@nightly
 @pytest.mark.parametrize("side", ["edge", "ground"])
 def test_a_minute_of_fading_costs_neither_descriptors_nor_threads(outcomes, side):
     """An hour of it would cost sixty times as many (`make soak` flies that hour)."""
@@ -124,6 +141,7 @@ def test_a_minute_of_fading_costs_neither_descriptors_nor_threads(outcomes, side
     assert found[f"{side}, threads more at the end"] <= 0
 
 
+@nightly
 def test_a_minute_of_fading_keeps_its_account(outcomes):
     """What a bad link costs would be told wrongly by one of the two."""
     outcome = outcomes["soak"]
@@ -134,6 +152,7 @@ def test_a_minute_of_fading_keeps_its_account(outcomes):
     assert found["base messages lost"] == 0
 
 
+@nightly
 def test_a_satellite_is_far_away(outcomes):
     """As above."""
     assert measures(outcomes["satellite-600ms"])["frame delay p50, ms"] >= 300
@@ -145,6 +164,7 @@ def test_no_process_is_left(outcomes):
     assert not psutil.Process().children(recursive=True)
 
 
+@nightly
 def test_the_same_on_the_kernels_own_tcp(outcomes):
     """The model would be kind where the real thing is not."""
     outcome = outcomes["kernel"]

@@ -299,6 +299,7 @@ def test_what_is_on_its_way_comes_by_time_and_is_bounded():
     assert list(flight.due(3.0)) == [(1, b"late")]
 
 
+@pytest.mark.realtime
 @pytest.mark.timeout(240)
 def test_edge_and_ground_fly_over_datagrams(tmp_path):
     """With the kernel's packets only TCP would be flown."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import json
 import os
 import signal
@@ -15,21 +17,54 @@ from typing import Any, Self
 
 __all__ = ["Link", "Running", "eventually", "free_ports"]
 
-START_S = 30.0
+START_S = 60.0
 """How long a process may take to get going on a busy machine."""
 _POLL_S = 0.01
 
 
-def free_ports(number: int) -> list[int]:
-    """TCP ports of loopback that nobody listens on at this moment, all different."""
-    probes = [socket.socket() for _ in range(number)]
+class _Ports:
+    """Ports that belong to this process alone, so that tests in several processes never pick the same one.
+
+    A process owns a block of ports for as long as it holds the block's first one. The blocks end below 32768, where
+    Linux and macOS begin to number outgoing connections.
+    """
+
+    FIRST, LAST, BLOCK = 18_000, 32_000, 200
+
+    def __init__(self) -> None:
+        for base in range(self.FIRST, self.LAST, self.BLOCK):
+            if (held := _bound(base)) is not None:
+                self._held = held
+                self._ports = itertools.cycle(range(base + 1, base + self.BLOCK))
+                return
+        raise RuntimeError(f"every block of ports from {self.FIRST} to {self.LAST} is in use")
+
+    def free(self) -> int:
+        """The next port of the block on which nobody listens."""
+        for port in itertools.islice(self._ports, self.BLOCK):
+            if (probe := _bound(port)) is not None:
+                probe.close()
+                return port
+        raise RuntimeError("every port of this process is in use")
+
+
+def _bound(port: int) -> socket.socket | None:
+    """A socket bound to the port on all addresses; None where somebody else has it."""
+    bound = socket.socket()
     try:
-        for probe in probes:
-            probe.bind(("127.0.0.1", 0))
-        return [int(probe.getsockname()[1]) for probe in probes]
-    finally:
-        for probe in probes:
-            probe.close()
+        bound.bind(("", port))
+    except OSError:
+        bound.close()
+        return None
+    return bound
+
+
+_ports = functools.cache(_Ports)
+
+
+def free_ports(number: int) -> list[int]:
+    """TCP ports that nobody listens on at this moment, all different, and that no other test process picks."""
+    return [_ports().free() for _ in range(number)]
 
 
 def eventually(true: Callable[[], object], *, within_s: float, what: str) -> None:
@@ -138,7 +173,7 @@ class Link:
     ) -> Running:
         """Start a ground; with ``up`` return when it says where it listens."""
         where = ["--connect", self.edge_endpoint] if connects else ["--listen", self.ground_endpoint]
-        running = self._start("hvt_ground.cli", [*where, *arguments], name=name)
+        running = self.start("hvt_ground.cli", [*where, *arguments], name=name)
         if up:
             running.until("connecting to" if connects else "listening on")
         return running
@@ -147,9 +182,10 @@ class Link:
         """Start an edge that connects to the ground's port; with ``listens`` others can connect to it."""
         where = ["--connect", self.ground_endpoint]
         where += ["--listen", self.edge_endpoint] if listens else []
-        return self._start("hvt_edge.cli", [*where, *arguments], name=name)
+        return self.start("hvt_edge.cli", [*where, *arguments], name=name)
 
-    def _start(self, module: str, arguments: list[str], *, name: str) -> Running:
+    def start(self, module: str, arguments: list[str], *, name: str) -> Running:
+        """Start a program with these arguments and no others."""
         running = Running(module, arguments, folder=self.folder, name=name)
         self._started.append(running)
         return running

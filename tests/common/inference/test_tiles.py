@@ -147,7 +147,9 @@ def test_the_three_words_of_the_setting():
     network, motion = Blobs(), open_detector("motion")
     assert parse_tiles("4x3") == (4, 3)
     assert tiled(network, "off") is network
-    assert tiled(network, "2x1").grid((99, 99)) == (2, 1)
+    two = tiled(network, "2x1")
+    assert isinstance(two, TiledDetector)
+    assert two.grid((99, 99)) == (2, 1)
     assert tiled(network, "auto").class_names == ("car", "truck")
     assert tiled(motion, "auto") is motion, "it compares a picture with the one before"
     with pytest.raises(UserError, match="'motion' compares whole pictures"):

@@ -14,6 +14,7 @@ from processes import eventually, free_ports
 from small_study import PATIENT_S, arguments, flights, said, study, table, until
 
 pytest.importorskip("distributed")
+pytestmark = pytest.mark.nightly
 WORDS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
 
 

@@ -14,7 +14,7 @@ import pytest
 from onnx import helper
 
 from hvt_common.errors import UserError
-from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.cli import main
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
@@ -191,6 +191,7 @@ def test_a_classifier_takes_every_batch_with_openvino(tmp_path: Path, dtype: typ
         for one, other in zip(ours.classify(crops[:count]), theirs.classify(crops[:count]), strict=True):
             np.testing.assert_allclose(other.probabilities, one.probabilities, atol=0.02)
     runner = OpenVinoRunner(path, threads=1, bf16=False)
+    assert isinstance(theirs, OnnxClassifier)
     for count in (1, 5, 40):
         runner.run(np.zeros((count, *theirs.model.inputs[0].shape[1:]), dtype))
     assert len(runner.compiled_shapes) == 1

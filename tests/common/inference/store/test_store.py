@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
-from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.cli import main
 from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.inspect import inspect_model
@@ -463,7 +463,9 @@ def test_the_manifest_pins_the_files_that_are_known() -> None:
 def test_the_manifest_and_the_adapters_prepare_pixels_alike(tmp_path: Path) -> None:
     """Whoever follows the manifest elsewhere would feed the network other pixels than HVT does."""
     head = OnnxDetector(open_model(colour_detector(tmp_path / "d.onnx", "yolox"))).head
-    preparation = open_classifier(str(colour_classifier(tmp_path / "c.onnx", classes=1000))).preparation
+    classifier = open_classifier(str(colour_classifier(tmp_path / "c.onnx", classes=1000)))
+    assert isinstance(classifier, OnnxClassifier)
+    preparation = classifier.preparation
     for entry in builtin_manifest().values():
         said = entry.preprocessing
         assert said is not None
