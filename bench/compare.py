@@ -1,7 +1,7 @@
-"""``make bench-sight``: every method at every rate on a real clip and on small objects, judged against the goals.
+"""``make bench-compare``: every method at every rate on a real clip and on small objects, judged against the goals.
 
-Writes build/sight/CLIP.json and CLIP.png. With ``--docs`` also the plots and the tables of docs/sight.md.
-``python -m bench.sight [--docs] [CLIP …]``: carpark, highway (reference labels), street (exact labels), or all.
+Writes build/compare/CLIP.json and CLIP.png. With ``--docs`` also the plots and the tables of docs/design-notes/compare.md.
+``python -m bench.compare [--docs] [CLIP …]``: carpark, highway (reference labels), street (exact labels), or all.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ _CLIPS = {
     "highway": "still:aerial_highway.jpg",
     "street": "still:visdrone/0000001_02999_d_0000005.jpg@1.2",
 }
-_OUT = Path("build/sight")
-_DOC = ROOT / "docs" / "sight.md"
-_BEGIN, _END = "<!-- results of make bench-sight -->", "<!-- end of results -->"
+_OUT = Path("build/compare")
+_DOC = ROOT / "docs" / "design-notes" / "compare.md"
+_BEGIN, _END = "<!-- results of make bench-compare -->", "<!-- end of results -->"
 
 Goal = tuple[str, str, bool | None]
 """What was asked for, what was measured, and whether it holds; None where it cannot be judged."""
 
 
 def main(argv: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m bench.sight", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m bench.compare", description=__doc__)
     parser.add_argument("clips", nargs="*", metavar="CLIP", help=", ".join(_CLIPS))
-    parser.add_argument("--docs", action="store_true", help="also write docs/sight.md's tables and plots")
+    parser.add_argument("--docs", action="store_true", help="also write docs/design-notes/compare.md's tables and plots")
     arguments = parser.parse_args(argv)
     unknown = [name for name in arguments.clips if name not in _CLIPS]
     if unknown:
@@ -187,7 +187,7 @@ def _value_at(bps: float, curve: list[CompareRow], value: Callable[[CompareRow],
     return value(curve[-1])
 
 
-# docs/sight.md
+# docs/design-notes/compare.md
 
 _HEADS = (
     *(
@@ -209,7 +209,7 @@ def _document(sections: list[tuple[str, CompareResult, list[Goal]]]) -> None:
     images = ROOT / "docs" / "images"
     parts = []
     for name, result, goals in sections:
-        shutil.copyfile(_OUT / f"{name}.png", images / f"sight-{name}.png")
+        shutil.copyfile(_OUT / f"{name}.png", images / f"compare-{name}.png")
         parts.append(_section(name, result, goals))
     text = _DOC.read_text(encoding="utf-8")
     before, _, rest = text.partition(_BEGIN)
@@ -220,7 +220,7 @@ def _document(sections: list[tuple[str, CompareResult, list[Goal]]]) -> None:
 def _section(name: str, result: CompareResult, goals: list[Goal]) -> str:
     lines = [
         f"### {name} ({result.labels} labels)\n",
-        f"![F1 and class agreement over kbps](images/sight-{name}.png)\n",
+        f"![F1 and class agreement over kbps](../images/compare-{name}.png)\n",
         "| " + " | ".join(_HEADS) + " |",
         "|" + "---|" * len(_HEADS),
     ]
