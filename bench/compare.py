@@ -44,7 +44,9 @@ Goal = tuple[str, str, bool | None]
 def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.compare", description=__doc__)
     parser.add_argument("clips", nargs="*", metavar="CLIP", help=", ".join(_CLIPS))
-    parser.add_argument("--docs", action="store_true", help="also write docs/design-notes/compare.md's tables and plots")
+    parser.add_argument(
+        "--docs", action="store_true", help="also write docs/design-notes/compare.md's tables and plots"
+    )
     arguments = parser.parse_args(argv)
     unknown = [name for name in arguments.clips if name not in _CLIPS]
     if unknown:

@@ -98,6 +98,23 @@ def _anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
+def test_pages_named_in_the_code_exist() -> None:
+    """A message or a docstring sends its reader to a page that is gone."""
+    files = (
+        path
+        for room in ("common", "edge", "ground", "study", "lab", "bench", "deploy")
+        for path in (ROOT / room).rglob("*")
+        if path.suffix in {".py", ".toml", ".service", ".yaml", ".json5"}
+    )
+    named = {
+        (str(path.relative_to(ROOT)), page)
+        for path in files
+        for page in re.findall(r"docs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+    }
+    assert named, "the pattern finds nothing any more"
+    assert {(path, page) for path, page in named if not (ROOT / page).exists()} == set()
+
+
 def test_every_page_can_be_found() -> None:
     """A page that no other page links to does not exist for its reader."""
     reached, waiting = set(), ["README.md"]

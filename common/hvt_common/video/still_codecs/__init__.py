@@ -1,4 +1,4 @@
-"""Still codecs behind one small contract; see `contract`, and docs/still-codecs.md for the table of them."""
+"""Still codecs behind one small contract; see `contract`, and docs/stills.md for the table of them."""
 
 from __future__ import annotations
 
