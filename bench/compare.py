@@ -1,6 +1,6 @@
 """``make bench-compare``: every method at every rate on a real clip and on small objects, judged against the goals.
 
-Writes build/compare/CLIP.json and CLIP.png. With ``--docs`` also the plots and the tables of docs/design-notes/compare.md.
+Writes build/compare/CLIP.json and CLIP.png; with ``--docs`` also plots and tables of docs/design-notes/compare.md.
 ``python -m bench.compare [--docs] [CLIP …]``: carpark, highway (reference labels), street (exact labels), or all.
 """
 
