@@ -31,6 +31,7 @@ You can set every option below as a flag or as a TOML key of `--config FILE`; a 
 | list | the flag may be repeated; in TOML `["…", "…"]` |
 | yes/no | `--name`, `--no-name`; in TOML `true` or `false` |
 
+`hvt-edge --help` leaves out what is marked with a star; `--help-all` lists everything.
 A wrong value ends the program before the first frame with one sentence and exit code 2.
 """
 
@@ -56,11 +57,12 @@ def _program(name: str, config: type) -> Iterator[str]:
 
 def _row(field: dataclasses.Field[Any]) -> str:
     key, meaning = field.name.replace("_", "-"), field.metadata["help"].replace("|", r"\|")
+    star = " *" if field.metadata.get("rare") else ""
     if field.metadata.get("switch"):
-        return f"| `--{key}`, `--no-{key}` | `{key}` | {'yes' if field.default else 'no'} | {meaning} |"
+        return f"| `--{key}`, `--no-{key}`{star} | `{key}` | {'yes' if field.default else 'no'} | {meaning} |"
     kind, many = field.metadata["kind"], field.metadata["many"]
     value = kind.metavar.replace("|", r"\|")
-    return f"| `--{key} {value}`{', list' if many else ''} | `{key}` | {_default(field)} | {meaning} |"
+    return f"| `--{key} {value}`{', list' if many else ''}{star} | `{key}` | {_default(field)} | {meaning} |"
 
 
 def _default(field: dataclasses.Field[Any]) -> str:
