@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test check lint type format bench bench-stills bench-sight bench-peers link soak kills fuzz clean help
+.PHONY: setup demo test check lint type format docs bench bench-stills bench-compare bench-peers link soak kills fuzz clean help
 
 .PHONY: nightly nightly-tests
 
@@ -65,8 +65,8 @@ bench: setup     ## speed and memory as ratios against a peer or a floor, measur
 bench-stills: setup ## still codecs on real crops: bytes at equal quality, time to encode and decode
 	@$(BIN)/python -m bench.stills
 
-bench-sight: setup ## what the ground sees at each bitrate, method by method, on a car park and on small objects
-	@$(BIN)/python -m bench.sight
+bench-compare: setup ## what the ground sees at each bitrate, method by method, on a car park and on small objects
+	@$(BIN)/python -m bench.compare
 
 link: setup      ## edge and ground over bad links; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns|tun SEED=
 	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
@@ -85,6 +85,9 @@ bench-peers: setup ## the tracker beside roboflow trackers, which get an environ
 	@test -x build/peers/bin/python || $(PYTHON) -m venv build/peers
 	@build/peers/bin/python -m pip install --quiet numpy scipy trackers
 	@PYTHONPATH=common build/peers/bin/python bench/tracker.py
+
+docs: setup      ## write docs/options.md from the settings
+	@$(BIN)/python docs/options.py
 
 clean:
 	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

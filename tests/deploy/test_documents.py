@@ -1,8 +1,9 @@
-"""What the documents name exists: files, flags, make targets."""
+"""What the documents name exists: files, flags, options, make targets; and a page is short enough to be read."""
 
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import re
 from pathlib import Path
 
@@ -12,44 +13,135 @@ from hvt_edge.config import EdgeConfig
 from hvt_ground.config import GroundConfig
 
 ROOT = Path(__file__).resolve().parents[2]
-DOCUMENTS = ("docs/deployment.md", "CONTRIBUTING.md", "CHANGELOG.md")
-# Of other programs, or of every command.
-OTHER_FLAGS = {"--help", "--config", "--print-config", "--build", "--now", "--accounting", "--out"}
+PAGES = sorted(str(page.relative_to(ROOT)) for page in ROOT.glob("docs/**/*.md"))
+DOCUMENTS = ("README.md", "CONTRIBUTING.md", *PAGES)
+MOST_WORDS = 1200
+# Of other programs, of every command, or of the makers of the settings themselves.
+OTHER_FLAGS = {
+    "--help",
+    "--help-all",
+    "--version",
+    "--config",
+    "--print-config",
+    "--name",
+    "--no-name",
+    "--build",
+    "--now",
+}
 
 
 def _text(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
 
 
+def _prose_words(text: str) -> int:
+    """Words outside tables, code and pictures."""
+    text = re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines = (line for line in text.splitlines() if not line.startswith(("|", "    ", "<!--", "![")))
+    return sum(len(line.split()) for line in lines)
+
+
+def _known_flags() -> set[str]:
+    settings = {
+        "--" + no + field.name.replace("_", "-")
+        for config in (EdgeConfig, GroundConfig)
+        for field in dataclasses.fields(config)
+        for no in ("", "no-")
+    }
+    sources = (
+        path
+        for room in ("common", "ground", "study", "lab", "bench", "deploy")
+        for path in (ROOT / room).rglob("*.py")
+    )
+    declared = (re.findall(r'"(--[a-z][a-z0-9-]+)"', path.read_text(encoding="utf-8")) for path in sources)
+    return settings.union(*declared)
+
+
+@pytest.mark.parametrize("name", [*PAGES, "README.md", "CONTRIBUTING.md"])
+def test_a_page_is_short(name: str) -> None:
+    """Nobody reads to the end of what has no end."""
+    assert _prose_words(_text(name)) <= MOST_WORDS
+
+
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_flags_exist(name: str) -> None:
     """A flag that is only in a document costs its reader a wrong start, and trust."""
-    known = {
-        "--" + field.name.replace("_", "-")
-        for config in (EdgeConfig, GroundConfig)
-        for field in dataclasses.fields(config)
-    }
-    named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", _text(name)))
-    assert named - known - OTHER_FLAGS == set()
+    named = set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]+", _text(name)))
+    assert named - _known_flags() - OTHER_FLAGS == set()
 
 
-@pytest.mark.parametrize("name", DOCUMENTS)
+@pytest.mark.parametrize("name", [*DOCUMENTS, "CHANGELOG.md"])
 def test_files_exist(name: str) -> None:
-    """The table of where a change belongs is useless from the first renamed file on."""
+    """A path that leads nowhere ends the search of who followed it."""
     text = _text(name)
-    pattern = r"\b(?:common|edge|ground|study|deploy|docs|tests)/(?!\s)[\w./@*-]*\w/?"
+    pattern = r"\b(?:common|edge|ground|study|lab|deploy|docs|tests)/(?!\s)[\w./@*-]*\w/?"
     named = {found.rstrip("/") for found in re.findall(pattern, text.replace("/opt/hvt/src/", ""))}
-    assert named, "the pattern finds nothing any more"
-    missing = {path for path in named if not any(ROOT.glob(path))}
+    missing = {path for path in named if "/" in path and not any(ROOT.glob(path))}
     assert missing == set()
-    links = {link.partition("#")[0] for link in re.findall(r"\]\((?!https?:)([^)]+)\)", text)}
-    assert {link for link in links if not ((ROOT / name).parent / link).exists()} == set()
+
+
+@pytest.mark.parametrize("name", [*DOCUMENTS, "CHANGELOG.md"])
+def test_links_hold(name: str) -> None:
+    """The reader of a manual page would not find the figures behind it."""
+    broken = set()
+    for link in re.findall(r"\]\((?!https?:)([^)]+)\)", _text(name)):
+        file, _, anchor = link.partition("#")
+        page = (ROOT / name).parent / file if file else ROOT / name
+        if not page.exists() or (anchor and anchor not in _anchors(page)):
+            broken.add(link)
+    assert broken == set()
+
+
+def _anchors(page: Path) -> set[str]:
+    """Of all headings, as GitHub makes them."""
+    heads = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+def test_pages_named_in_the_code_exist() -> None:
+    """A message or a docstring sends its reader to a page that is gone."""
+    files = (
+        path
+        for room in ("common", "edge", "ground", "study", "lab", "bench", "deploy")
+        for path in (ROOT / room).rglob("*")
+        if path.suffix in {".py", ".toml", ".service", ".yaml", ".json5"}
+    )
+    named = {
+        (str(path.relative_to(ROOT)), page)
+        for path in files
+        for page in re.findall(r"docs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+    }
+    assert named, "the pattern finds nothing any more"
+    assert {(path, page) for path, page in named if not (ROOT / page).exists()} == set()
+
+
+def test_every_page_can_be_found() -> None:
+    """A page that no other page links to does not exist for its reader."""
+    reached, waiting = set(), ["README.md"]
+    while waiting:
+        name = waiting.pop()
+        if name in reached:
+            continue
+        reached.add(name)
+        links = re.findall(r"\]\((?!https?:)([^)#]+\.md)", _text(name))
+        waiting += [str(((ROOT / name).parent / link).resolve().relative_to(ROOT)) for link in links]
+    assert set(PAGES) - reached == set()
+
+
+def test_every_option_is_documented() -> None:
+    """An option would be known to those alone who read the code; `make docs` writes the page."""
+    spec = importlib.util.spec_from_file_location("options", ROOT / "docs" / "options.py")
+    assert spec is not None
+    assert spec.loader is not None
+    options = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(options)
+    assert _text("docs/options.md") == options.page(), "the settings have changed: run `make docs`"
 
 
 def test_make_targets_exist() -> None:
     """The first thing a contributor types."""
-    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    named = set(re.findall(r"`make ([a-z]+)`", _text("CONTRIBUTING.md")))
+    targets = set(re.findall(r"^([a-z-]+):", _text("Makefile"), re.MULTILINE))
+    named = {target for name in DOCUMENTS for target in re.findall(r"`make ([a-z-]+)\b", _text(name))}
     assert len(named) >= 5
     assert named <= targets
 

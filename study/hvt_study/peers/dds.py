@@ -3,8 +3,8 @@
 Du et al., "Server-Driven Video Streaming for Deep Learning Inference", SIGCOMM 2020. The edge sends every frame at a
 low quality; the ground looks at a segment of them, keeps what it is sure of and asks for the regions that it is not
 sure of; the edge codes the same frames again with these regions alone, the rest black; the ground pastes them into
-the first pass, looks again, and merges both into the final results, over which a tracker runs. docs/study-dds.md says
-what is as in DDS and what differs.
+the first pass, looks again, and merges both into the final results, over which a tracker runs. What is as in
+DDS and what differs: docs/design-notes/dds.md.
 
 Every byte counts, once: the first pass as ``base``, the second as ``roi``, what the ground asks as ``control``. All
 of it stays within the budget in every rolling window, and over the clip: the last second pass, which comes after the

@@ -1,4 +1,4 @@
-"""What the two-pass peer may be told; the defaults are those of a small sweep (docs/study-dds.md)."""
+"""What the two-pass peer may be told; the defaults are those of a small sweep (docs/design-notes/dds.md)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["RATES", "DdsSettings"]
 RATES = (NOMINAL_FPS, 7.5, 5.0, 3.0, 2.0)
 """Those that the study's video-only methods choose from too."""
 _LEAST_BITS_PER_PX = 0.1
-"""Of the whole budget, for each frame: with less, both passes are too coarse to tell objects (docs/study-dds.md)."""
+"""Of the whole budget, for each frame: with less, both passes are too coarse (docs/design-notes/dds.md)."""
 
 
 @dataclass(frozen=True, slots=True)

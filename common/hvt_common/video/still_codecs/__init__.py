@@ -1,4 +1,4 @@
-"""Still codecs behind one small contract (`contract.py`); docs/still-codecs.md has the table of them."""
+"""Still codecs behind one small contract (`contract.py`); docs/stills.md has the table of them."""
 
 from hvt_common.video.still_codecs.contract import (
     NO_PARAMETERS,

@@ -66,7 +66,7 @@ from hvt_common.protocol.messages.fields import (
 from hvt_common.values import View
 from messages import BASE, EXAMPLES, FEEDBACK, INFO, REQUEST, ROI, STATUS, STEP
 
-DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "wire.md"
+DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "wire-messages.md"
 MESSAGES: tuple[type[Message], ...] = (
     BaseHeader,
     RoiHeader,

@@ -1,0 +1,77 @@
+"""Writes docs/options.md from the configuration of both programs: ``make docs``."""  # noqa: INP001 - a script
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hvt_edge.config import EdgeConfig
+from hvt_ground.config import GroundConfig
+
+PAGE = Path(__file__).with_name("options.md")
+
+_HEAD = """\
+# All options
+
+You can set every option below as a flag or as a TOML key of `--config FILE`; a flag overrides the file.
+`make docs` writes this page from the code.
+
+    hvt-edge --help                              # the common options
+    hvt-edge --config edge.toml --print-config   # all settings, with the defaults filled in, as TOML
+
+| kind | written as |
+|---|---|
+| RATE | `800kbps`, `0.8Mbps` or `800000` (bits a second) |
+| SIZE | `200MB`, `64kB`, `1GB` or bytes |
+| TIME | `2s`, `500ms`, `1min`, `1h` or seconds |
+| SHARE | `0.8` or `80%` |
+| WxH | `1280x720`, pixels |
+| list | the flag may be repeated; in TOML `["…", "…"]` |
+| yes/no | `--name`, `--no-name`; in TOML `true` or `false` |
+
+`hvt-edge --help` leaves out what is marked with a star; `--help-all` lists everything.
+A wrong value ends the program before the first frame with one sentence and exit code 2.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    lines = [_HEAD, *_program("hvt-edge", EdgeConfig), *_program("hvt-ground", GroundConfig)]
+    return "\n".join(lines)
+
+
+def _program(name: str, config: type) -> Iterator[str]:
+    yield f"## {name}\n"
+    groups: dict[str, list[dataclasses.Field[Any]]] = {}
+    for field in dataclasses.fields(config):
+        groups.setdefault(str(field.metadata.get("group", "")), []).append(field)
+    for group, fields in groups.items():
+        if group:
+            yield f"### {group[0].upper()}{group[1:]}\n"
+        yield "| option | TOML key | default | meaning |\n|---|---|---|---|"
+        yield from map(_row, fields)
+        yield ""
+
+
+def _row(field: dataclasses.Field[Any]) -> str:
+    key, meaning = field.name.replace("_", "-"), field.metadata["help"].replace("|", r"\|")
+    star = " *" if field.metadata.get("rare") else ""
+    if field.metadata.get("switch"):
+        return f"| `--{key}`, `--no-{key}`{star} | `{key}` | {'yes' if field.default else 'no'} | {meaning} |"
+    kind, many = field.metadata["kind"], field.metadata["many"]
+    value = kind.metavar.replace("|", r"\|")
+    return f"| `--{key} {value}`{', list' if many else ''}{star} | `{key}` | {_default(field)} | {meaning} |"
+
+
+def _default(field: dataclasses.Field[Any]) -> str:
+    if shown := field.metadata["shown_default"]:
+        return str(shown).replace("<", "&lt;")
+    if field.default is None or field.default == ():
+        return ""
+    return f"`{field.metadata['kind'].show(field.default)}`"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
