@@ -152,9 +152,9 @@ class _Inbox(FeedbackInbox):
         self.due: deque[tuple[int, StillResult]] = deque()
 
     def take(self) -> list[StillResult]:
-        heard = [one for at_ns, one in self.due if at_ns <= self.now_ns]
+        due = [one for at_ns, one in self.due if at_ns <= self.now_ns]
         self.due = deque((at_ns, one) for at_ns, one in self.due if at_ns > self.now_ns)
-        return heard
+        return due
 
     def take_up_to(self, sequence: int) -> list[StillResult]:  # noqa: ARG002 - time decides here
         return self.take()
