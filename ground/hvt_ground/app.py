@@ -171,10 +171,11 @@ class Ground:
 
     def _all_ended(self) -> bool:
         edges = [one.sessions for one in self._edges.values()]
-        if not any(one.done for one in edges):
+        gone = all(one.idle and not one.port.present.is_set() for one in edges)
+        if not any(one.done for one in edges):  # nobody came, or who came left without a picture
             waited_s = time.monotonic() - self._began_s
-            return self._config.wait > 0 and not edges and waited_s > self._config.wait
-        return all(one.idle and not one.port.present.is_set() for one in edges)
+            return gone and 0 < self._config.wait < waited_s
+        return gone
 
     def _refresh_clocks(self) -> None:
         for one in self._edges.values():

@@ -26,7 +26,7 @@ from rrd import Recording
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
 TESTS = Path(__file__).resolve().parents[2] / "tests" / "support"
-ROUTER = TESTS.parent / "deploy" / "router.py"
+ROUTER = Path(__file__).resolve().parents[2] / "deploy" / "router.py"
 SOON_S = 60.0
 """Generous: the machine may be busy with other tests."""
 PLAYS = (
