@@ -22,7 +22,6 @@ _BEHIND_FRAMES = 3
 _LEAST_FRAMES = 2
 MAX_QUEUE_BYTES = 160 * 2**20
 """Of frames that are queued: 16 of 1280x720 and 1920x1080, 5 of 3840x2160."""
-_FINISH_S = 1.0
 _RETRY_S = 0.025
 
 
@@ -42,6 +41,7 @@ class StillWorker:
         clock: Callable[[], int],
         length: int = 16,
         max_bytes: int = MAX_QUEUE_BYTES,
+        finish_s: float = 1.0,
     ) -> None:
         self._stage = stage
         self._results = results
@@ -51,6 +51,7 @@ class StillWorker:
         )
         self._most_frames = length
         self._max_bytes = max_bytes
+        self._finish_s = finish_s
         self._error: BaseException | None = None
         self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-stills", daemon=True)
@@ -76,13 +77,13 @@ class StillWorker:
         self._frames.put((frame, unit, skipped))
 
     def close(self) -> None:
-        """Let the thread finish what it has, at most for a second, then leave the rest; join it."""
-        until_s = time.monotonic() + _FINISH_S
+        """Let the thread finish what it has, at most for ``finish_s``, then leave the rest; join it."""
+        until_s = time.monotonic() + self._finish_s
         with contextlib.suppress(queue.Full):
-            self._frames.put(None, timeout=_FINISH_S)
+            self._frames.put(None, timeout=self._finish_s)
         self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
         self._given_up.set()
-        self._thread.join(timeout=_FINISH_S)
+        self._thread.join(timeout=self._finish_s)
         self._raise_error()
 
     def __enter__(self) -> Self:

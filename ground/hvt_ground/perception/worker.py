@@ -35,8 +35,6 @@ _JOB_STEP_S = 0.1
 _STEP_LAG = 2
 """In lockstep a step counts from so many frames on. It is sent right before the next access unit, which may overtake
 it by microseconds: this is what makes the order the same in every run."""
-_FINISH_S = 1.5
-_LEAVE_S = 1.0
 _AHEAD = 2
 
 Analyze = Callable[[DecodedFrame, bool], None]
@@ -113,10 +111,24 @@ class PerceptionWorker(ABC):
 
 
 class RealtimeWorker(PerceptionWorker):
-    """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still."""
+    """A thread with two bounded queues. Pictures first: a still's frame has to be known before the still.
 
-    def __init__(self, analyze: Analyze, step: Step, read: Read, *, name: str) -> None:
+    `close` gives it ``finish_s`` for what waits, then ``leave_s`` for what is in hand.
+    """
+
+    def __init__(
+        self,
+        analyze: Analyze,
+        step: Step,
+        read: Read,
+        *,
+        name: str,
+        finish_s: float = 1.5,
+        leave_s: float = 1.0,
+    ) -> None:
         super().__init__(analyze, step, read)
+        self._finish_s = finish_s
+        self._leave_s = leave_s
         self._lock = threading.Lock()
         self._pictures: deque[DecodedFrame] = deque(maxlen=_MOST_PICTURES)
         self._stills: deque[ReceivedStill] = deque()
@@ -182,9 +194,9 @@ class RealtimeWorker(PerceptionWorker):
         """Finish what waits, for a second or two."""
         self._ending.set()
         self._wake.set()
-        self._thread.join(_FINISH_S)
+        self._thread.join(self._finish_s)
         self._given_up.set()
-        self._thread.join(_LEAVE_S)
+        self._thread.join(self._leave_s)
         self.dropped["ended"] += len(self._stills)
         self.untracked += len(self._pictures)
         return not self._thread.is_alive()

@@ -34,13 +34,9 @@ __all__ = ["EdgeSessions", "EdgeThread"]
 _log = logging.getLogger(__name__)
 
 _SECOND_NS = 1_000_000_000
-_ENDED_PATIENCE_NS = 2 * _SECOND_NS
-"""How long the rest of a session may take to arrive after its edge has said that it ended."""
 _INFO_TRIES = 3
 _BACKLOG_PAUSE_NS = 3 * _SECOND_NS
 """After so long without another chunk the recording says how much of the backlog came."""
-_DRAIN_NS = _SECOND_NS
-"""How long what has already arrived is still taken in when the ground stops."""
 
 
 class EdgeSessions:
@@ -54,6 +50,7 @@ class EdgeSessions:
         clock: the port's, Unix nanoseconds without steps; one of its own by default.
         recordings: of sessions that are over, closed with this; without it nothing of one is taken.
         patience_s: an edge whose token is gone and that sends nothing for so long has ended without saying so.
+        ended_patience_s: how long the rest of a session may take to arrive after its edge has said that it ended.
     """
 
     def __init__(
@@ -64,10 +61,12 @@ class EdgeSessions:
         clock: Callable[[], int] | None = None,
         recordings: BacklogRecordings | None = None,
         patience_s: float = 5.0,
+        ended_patience_s: float = 2.0,
     ) -> None:
         self.port = port
         self._open_session = open_session
         self._patience_ns = round(patience_s * _SECOND_NS)
+        self._ended_patience_ns = round(ended_patience_s * _SECOND_NS)
         clock = clock or SteadyClock()
         self.backlog = EdgeBacklog(port.edge, recordings=recordings)
         """What was stored while the link was down."""
@@ -267,14 +266,18 @@ class EdgeSessions:
         if self._ended_ns is None:
             return not self.port.present.is_set() and self._receiver.silent_ns > self._patience_ns
         whole = session.is_whole and not self.backlog.working
-        return whole or now_ns - self._ended_ns > _ENDED_PATIENCE_NS
+        return whole or now_ns - self._ended_ns > self._ended_patience_ns
 
 
 class EdgeThread:
-    """The thread of one edge, which no callback of the link waits for."""
+    """The thread of one edge, which no callback of the link waits for.
 
-    def __init__(self, sessions: EdgeSessions) -> None:
+    When it stops, what has already arrived is still taken in, for ``drain_s`` at the most.
+    """
+
+    def __init__(self, sessions: EdgeSessions, *, drain_s: float = 1.0) -> None:
         self.sessions = sessions
+        self._drain_ns = round(drain_s * _SECOND_NS)
         self.error: BaseException | None = None
         """What ended the thread."""
         self._inbox = sessions.port.inbox
@@ -312,4 +315,4 @@ class EdgeThread:
     def _finished(self) -> bool:
         if not self._stop.is_set():
             return False
-        return len(self._inbox) == 0 or time.monotonic_ns() - self._stop_ns > _DRAIN_NS
+        return len(self._inbox) == 0 or time.monotonic_ns() - self._stop_ns > self._drain_ns

@@ -7,6 +7,7 @@ import itertools
 import threading
 import time
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -58,7 +59,7 @@ class Models:
         yield RedSquares(), None
 
 
-def settings(info: Info, path: Path) -> RecorderSettings:
+def settings(info: Info, path: Path, **changes) -> RecorderSettings:
     """As `hvt_ground.app` makes them."""
     return RecorderSettings(
         path=path,
@@ -67,6 +68,7 @@ def settings(info: Info, path: Path) -> RecorderSettings:
         base_size=info.base_size,
         fps=info.fps,
         budget_bps=info.budget_bps,
+        **changes,
     )
 
 
@@ -85,12 +87,25 @@ class Rig:
     """A receiver with a port; sessions and former sessions with recordings in a folder."""
 
     def __init__(
-        self, folder: Path, flight: Flight, *, pipeline=pipeline_of, models=None, timing=None, most_files=32
+        self,
+        folder: Path,
+        flight: Flight,
+        *,
+        pipeline=pipeline_of,
+        models=None,
+        timing=None,
+        most_files=32,
+        ended_patience_s=2.0,
+        drain_s=1.0,
+        worker_of=None,
+        **recorder,
     ):
         self.folder = folder
         self._models = models or Models()
         self._pipeline = pipeline
         self._timing = timing
+        self._worker_of = worker_of
+        self._recorder = recorder
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
         self.port.flight = flight
@@ -99,12 +114,14 @@ class Rig:
         self._backlog_numbers = itertools.count()
         self.live: list[Received] = []
         self.recordings = BacklogRecordings(self._open_backlog, most_files=most_files)
-        self.receiver = EdgeSessions(self.port, open_session=self._open, recordings=self.recordings)
-        self.thread = EdgeThread(self.receiver)
+        self.receiver = EdgeSessions(
+            self.port, open_session=self._open, recordings=self.recordings, ended_patience_s=ended_patience_s
+        )
+        self.thread = EdgeThread(self.receiver, drain_s=drain_s)
 
     def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         path = self.folder / f"{len(self.opened)}.rrd"
-        sinks: list[Sink] = [Recorder(settings(info, path))]
+        sinks: list[Sink] = [Recorder(settings(info, path, **self._recorder))]
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=info.edge, session_id=info.session_id))
         session = GroundSession(
@@ -115,6 +132,7 @@ class Rig:
             clock=time.time_ns,
             reports=reports,
             backlog_perception=look_of(info, self._models),
+            worker_of=self._worker_of,
         )
         self.opened.append(session)
         return session
@@ -122,7 +140,7 @@ class Rig:
     def _open_backlog(self, info: Info) -> BacklogRecording:
         path = self.folder / f"backlog-{next(self._backlog_numbers)}.rrd"
         return BacklogRecording(
-            info, path=path, sink=Recorder(settings(info, path)), perception=look_of(info)
+            info, path=path, sink=Recorder(settings(info, path, **self._recorder)), perception=look_of(info)
         )
 
     def put(self, *items: Received) -> None:
@@ -255,11 +273,9 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 
 
 @pytest.mark.parametrize("compact_bytes", [6_000, 1 << 30])
-def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, monkeypatch, compact_bytes):
+def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, compact_bytes):
     """Rows that come late would be lost or doubled where the append log is compacted, or when the file is closed."""
-    monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.COMPACT_BYTES", compact_bytes)
-    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd_file._MOST_GROWTH", 10)
-    with Rig(tmp_path, flight) as rig:
+    with Rig(tmp_path, flight, compact_bytes=compact_bytes, footer_growth=10) as rig:
         rig.base(*range(25))
         rig.base(*range(65, 90))
         rig.put(*backlog(flight, "base", 40, video_object(flight, range(40, 65))))
@@ -354,10 +370,9 @@ def test_pieces_are_in_the_account_to_the_byte(flight, tmp_path):
         assert pressed == sum(len(one.payload) for one in rig.live if one.key.endswith("/backlog"))
 
 
-def test_the_end_waits_for_the_last_piece(flight, tmp_path, monkeypatch):
+def test_the_end_waits_for_the_last_piece(flight, tmp_path):
     """The last still of an outage would be cut off, though it is on the line."""
-    monkeypatch.setattr("hvt_ground.session.edge_sessions._ENDED_PATIENCE_NS", 3_600_000_000_000)
-    with Rig(tmp_path, flight) as rig:
+    with Rig(tmp_path, flight, ended_patience_s=3600) as rig:
         rig.base(*range(5))
         data = still_object(flight, 2, 0)
         one, two = backlog(flight, "still", 0, data, chunk_bytes=(len(data) + 1) // 2)
@@ -774,13 +789,11 @@ def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
     assert not any(at_rest), "it was busy"
 
 
-def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path, monkeypatch):
+def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path):
     """Ctrl-C would throw away an acknowledged stretch."""
     # What a second or two are enough for is the machine's affair.
-    monkeypatch.setattr("hvt_ground.session.edge_sessions._DRAIN_NS", 20_000_000_000)
-    monkeypatch.setattr("hvt_ground.perception.worker._LEAVE_S", 20.0)
-    monkeypatch.setattr("hvt_ground.perception.worker._FINISH_S", 20.0)
-    rig = Rig(tmp_path, flight)
+    patient = partial(RealtimeWorker, name="uav-1", finish_s=20, leave_s=20)
+    rig = Rig(tmp_path, flight, drain_s=20, worker_of=patient)
     rig.base(*range(25))
     rig.base(*range(65, 70))
     for item in backlog(flight, "base", 40, video_object(flight, range(40, 65))):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import replace
+from functools import partial
 from typing import Self
 
 import pytest
@@ -14,6 +15,7 @@ from handled import WatchedInbox, end
 from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Inbox, Received
+from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
@@ -28,22 +30,20 @@ def wait_for(condition, *, timeout_s: float = 30) -> None:
         time.sleep(0.005)
 
 
-def never_gives_up(monkeypatch) -> None:
-    """A session ends because all of it has come, and for no other reason."""
-    monkeypatch.setattr("hvt_ground.session.edge_sessions._ENDED_PATIENCE_NS", 3_600_000_000_000)
-
-
 class Rig:
     """A receiver with a port; sessions without a recording."""
 
-    def __init__(self, *, detector=None, reader=None, patience_s=5.0, clock=None) -> None:
+    def __init__(
+        self, *, detector=None, reader=None, clock=None, drain_s=1.0, worker_of=None, **patience
+    ) -> None:
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
         self.reader = reader or SameAnswer()
         self.detector = detector
         self.opened: list[GroundSession] = []
-        self.receiver = EdgeSessions(self.port, open_session=self._open, patience_s=patience_s, clock=clock)
-        self.thread = EdgeThread(self.receiver)
+        self.worker_of = worker_of
+        self.receiver = EdgeSessions(self.port, open_session=self._open, clock=clock, **patience)
+        self.thread = EdgeThread(self.receiver, drain_s=drain_s)
 
     def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         session = GroundSession(
@@ -51,6 +51,7 @@ class Rig:
             pipeline_of=lambda emit: pipeline_of(emit, detector=self.detector, reader=self.reader),
             clock=time.time_ns,
             reports=reports,
+            worker_of=self.worker_of,
         )
         self.opened.append(session)
         return session
@@ -166,11 +167,10 @@ def test_tracks_that_make_no_sense_are_counted_and_skipped():
         assert session.last_frame_index == 9
 
 
-def test_the_end_waits_for_the_last_tracks(monkeypatch):
+def test_the_end_waits_for_the_last_tracks():
     """The ground's account would lack the last tracks: the report of the end overtakes them."""
-    never_gives_up(monkeypatch)
     flight = Flight(3)
-    with Rig() as rig:
+    with Rig(ended_patience_s=3600) as rig:
         rig.port.flight = flight
         rig.put(*bases(flight, 0, 1, 2), flight.status(base=3, meta=1, state="ended"))
         rig.settle()
@@ -336,10 +336,9 @@ def test_an_edge_that_restarts_gets_a_session_of_its_own(flight):
     assert (last["frames"], last["gaps"], last["lost"], last["stills"]["received"]) == (8, 0, 0, 1)
 
 
-def test_a_session_ends_when_all_of_it_has_arrived(flight, monkeypatch):
+def test_a_session_ends_when_all_of_it_has_arrived(flight):
     """``--once`` would cut the last pictures off, or never end."""
-    never_gives_up(monkeypatch)
-    with Rig() as rig:
+    with Rig(ended_patience_s=3600) as rig:
         rig.port.flight = flight
         rig.put(*bases(flight, *range(5)))
         rig.put(flight.status(base=6, roi=1, state="ended"))
@@ -391,7 +390,7 @@ def test_a_lost_answer_does_not_lose_the_flight(flight):
         rig.put(*bases(flight, 0, 1, 2))  # nobody answers yet
         wait_for(lambda: rig.port.requested >= 3)
         rig.settle()
-        assert rig.receiver.session is None
+        assert rig.receiver.idle
         rig.port.flight = flight
         rig.put(*bases(flight, 3, 4))
         wait_for(lambda: rig.port.keyframe_requests >= 1)
@@ -517,12 +516,11 @@ def test_a_crash_of_the_eyes_ends_the_process_and_not_in_silence(flight):
     rig.thread.close()
 
 
-def test_closing_keeps_what_has_arrived_and_ends(flight, monkeypatch):
+def test_closing_keeps_what_has_arrived_and_ends(flight):
     """Ctrl-C would throw away the last second, or hang."""
     # What a second or two are enough for is the machine's affair.
-    monkeypatch.setattr("hvt_ground.session.edge_sessions._DRAIN_NS", 20_000_000_000)
-    monkeypatch.setattr("hvt_ground.perception.worker._FINISH_S", 20.0)
-    rig = Rig(detector=RedSquares(takes_s=0.05))
+    patient = partial(RealtimeWorker, name="uav-1", finish_s=20)
+    rig = Rig(detector=RedSquares(takes_s=0.05), drain_s=20, worker_of=patient)
     rig.port.flight = flight
     rig.put(flight.base(0))
     wait_for(lambda: bool(rig.opened))

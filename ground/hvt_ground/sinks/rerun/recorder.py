@@ -30,17 +30,14 @@ from hvt_ground.sinks.rerun.overlays import (
     OverlayEncoder,
 )
 from hvt_ground.sinks.rerun.palette import AMBER, GREY, VERMILLION, Rgb
-from hvt_ground.sinks.rerun.rrd_file import RrdFile
+from hvt_ground.sinks.rerun.rrd_file import FOOTER_GROWTH, RrdFile
 from hvt_ground.sinks.rerun.static_data import class_chunk, static_chunks
 from hvt_ground.sinks.rerun.stills import StillRows
 from hvt_ground.sinks.rerun.tables import TABLE_BYTES, CodedIdentity, LogText, SizeLimit, Table, TableRow
 
-__all__ = ["COMPACT_BYTES", "Recorder", "RecorderSettings"]
+__all__ = ["Recorder", "RecorderSettings"]
 
 log = logging.getLogger(__name__)
-
-COMPACT_BYTES = 3 << 19
-"""Payload of the append log at which it is compacted: a compaction costs some 50 kB, and this much is in memory."""
 
 DIMMED = 0.75
 """Brightness of the boxes that no still has spoken on, beside those one has."""
@@ -75,6 +72,10 @@ class RecorderSettings:
     """Whether latencies will be known; False leaves their plot out."""
     live_url: str | None = None
     """Where a viewer listens (`LiveView.url`) that shows it in place of a file."""
+    compact_bytes: int = 3 << 19
+    """Payload of the append log at which it is compacted: that costs some 50 kB, and this much is in memory."""
+    footer_growth: float = FOOTER_GROWTH
+    """How large the file may become by a footer, over what it is; where it takes more there is none."""
 
 
 class Recorder:
@@ -97,6 +98,7 @@ class Recorder:
         self._classes_written: dict[Layer, int] = dict.fromkeys(LAYERS, 0)
         self._contexts: dict[Layer, Chunk] = {}
         self._tables: dict[tuple[str, str], Table] = {}
+        self._compact_bytes = settings.compact_bytes
         self._pending_bytes = 0
         self._last_sample: int | None = None
         self._closed = False
@@ -127,7 +129,7 @@ class Recorder:
             chunks = [one if isinstance(one, Chunk) else self._add(one, event) for one in self._rows(event)]
             if chunks:
                 self._output.write(chunks)
-            if self._pending_bytes >= COMPACT_BYTES:
+            if self._pending_bytes >= self._compact_bytes:
                 self._compact(self._output)
 
     def close(self, *, quickly: bool = False) -> None:
@@ -263,7 +265,12 @@ class Recorder:
 def _output(settings: RecorderSettings) -> RrdFile | LiveRecording | None:
     recording_id = f"{settings.edge_id}-{settings.session}"
     if settings.path is not None:
-        return RrdFile(settings.path, recording_id=recording_id, name=settings.edge_id)
+        return RrdFile(
+            settings.path,
+            recording_id=recording_id,
+            name=settings.edge_id,
+            footer_growth=settings.footer_growth,
+        )
     if settings.live_url is not None:
         return LiveRecording(settings.live_url, recording_id=recording_id, name=settings.edge_id)
     return None

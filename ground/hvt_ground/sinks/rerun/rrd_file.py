@@ -4,7 +4,7 @@ Rerun stores chunks: a table of rows of one entity. A chunk costs about 1.3 kB b
 of a kB for each further column, as much as half an access unit at 300 kbps; so rows must be gathered. A recording
 that gathers in memory loses what it gathered when the process is killed. `RrdFile` does both: each row is
 appended at once as a chunk of its own (the *append log*, at the end of the file), and when the append log's rows have
-become `COMPACT_BYTES`, the same rows are written again as one chunk a table, over the append log (*compaction*).
+become ``compact_bytes``, the same rows are written again as one chunk a table, over the append log (*compaction*).
 
 What is on disk is a plain RRD stream without a footer: the SDK keeps a footer's manifest in memory for as long as
 it records (a footer costs 1.6 kB a chunk, too). `add_footer` adds one at the end.
@@ -32,7 +32,7 @@ from hvt_ground.sinks.rerun.sdk import (
     viewer_program,
 )
 
-__all__ = ["RrdFile", "add_footer"]
+__all__ = ["FOOTER_GROWTH", "RrdFile", "add_footer"]
 
 _log = logging.getLogger(__name__)
 
@@ -43,8 +43,9 @@ _LARGEST_BYTES = 64 * 2**20
 """About ten minutes at 800 kbps. The tool holds the file in memory, and Ctrl-C is answered within three seconds; a
 larger recording opens without a footer just as well."""
 _PATIENCE_S = 2.0
-_MOST_GROWTH = 1.12
-"""A footer takes some 70 kB, whatever the length of the flight: too much for one of a few seconds."""
+FOOTER_GROWTH = 1.12
+"""How large a file with a footer may be over the one without: some 70 kB, whatever the length of the flight, are too
+much for one of a few seconds."""
 
 
 class RrdFile:
@@ -56,8 +57,11 @@ class RrdFile:
 
     live = False
 
-    def __init__(self, path: Path, *, recording_id: str, name: str) -> None:
+    def __init__(
+        self, path: Path, *, recording_id: str, name: str, footer_growth: float = FOOTER_GROWTH
+    ) -> None:
         self._path = path
+        self._footer_growth = footer_growth
         self._file = _created(path)
         self._recording = new_recording(recording_id)
         self._stream = rr.binary_stream(self._recording)
@@ -92,7 +96,7 @@ class RrdFile:
         os.close(self._file)
         self._file = -1
         if not quickly:
-            add_footer(self._path)
+            add_footer(self._path, growth=self._footer_growth)
         self._recording.disconnect()
         self._stream.read()  # its own farewell, or the SDK warns that it was dropped
         del self._stream, self._recording
@@ -145,8 +149,10 @@ def _created(path: Path) -> int:
         raise UserError(f"recording {path} cannot be created: {error.strerror}") from error
 
 
-def add_footer(path: Path) -> bool:
+def add_footer(path: Path, *, growth: float = FOOTER_GROWTH) -> bool:
     """Rewrite the file with a footer, whole or not at all; False where that was not done.
+
+    It is not done where the file would become larger than ``growth`` times what it is.
 
     The SDK's own program does it (60 ms for 1.3 MB); it also gathers the video's chunks by keyframe.
     """
@@ -158,7 +164,7 @@ def add_footer(path: Path) -> bool:
         subprocess.run(  # noqa: S603 - the SDK's own program, no shell
             command, env=viewer_environment(), capture_output=True, check=True, timeout=_PATIENCE_S
         )
-        if scratch.stat().st_size > _MOST_GROWTH * path.stat().st_size:
+        if scratch.stat().st_size > growth * path.stat().st_size:
             scratch.unlink()
             return False
         scratch.replace(path)

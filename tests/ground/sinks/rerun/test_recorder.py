@@ -213,15 +213,12 @@ def test_a_keyframe_without_parameter_sets_does_not_begin_a_recording(
     assert [frame for frame, _, _ in Recording(path).video()] == [20]
 
 
-def test_folding_changes_nothing_but_the_size(
-    events: list[Event], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folding_changes_nothing_but_the_size(events: list[Event], tmp_path: Path) -> None:
     """The append log is rewritten while recording; a row lost or doubled there would be lost for good."""
     plain, compacted = tmp_path / "plain.rrd", tmp_path / "folded.rrd"
     sizes: list[int] = []
     for path, limit in ((plain, 1 << 40), (compacted, 20_000)):
-        monkeypatch.setattr("hvt_ground.sinks.rerun.recorder.COMPACT_BYTES", limit)
-        with Recorder(settings(path)) as recorder:
+        with Recorder(settings(path, compact_bytes=limit)) as recorder:
             for event in events:
                 recorder.log(event)
             assert recorder.size_bytes == path.stat().st_size
@@ -324,9 +321,7 @@ def test_a_killed_process_leaves_all_that_was_logged(events: list[Event], tmp_pa
     assert len(read.boxes(last)) == TRACKS
 
 
-def test_a_footer_makes_a_recording_that_verifies(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_footer_makes_a_recording_that_verifies(recording: Recording, tmp_path: Path) -> None:
     """Tools that index recordings refuse a file without a footer; a short flight must not grow by one."""
     from hvt_ground.sinks.rerun.live_view import viewer_program
     from hvt_ground.sinks.rerun.rrd_file import add_footer
@@ -336,8 +331,7 @@ def test_a_footer_makes_a_recording_that_verifies(
     plain_bytes = path.stat().st_size
     assert not add_footer(path)
     assert path.stat().st_size == plain_bytes
-    monkeypatch.setattr("hvt_ground.sinks.rerun.rrd_file._MOST_GROWTH", 10)
-    assert add_footer(path)
+    assert add_footer(path, growth=10)
     subprocess.run([viewer_program(), "rrd", "verify", path], check=True, capture_output=True)
     assert Recording(path).video() == recording.video()
     assert list(tmp_path.iterdir()) == [path]
