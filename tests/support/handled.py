@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_ground.session.edge_sessions import EdgeThread
 
@@ -14,6 +16,7 @@ class WatchedInbox(Inbox):
     def __init__(self) -> None:
         super().__init__(capacity=1024, overflow="newest")
         self._handled = True
+        self._watch = threading.Lock()
 
     @property
     def handled(self) -> bool:
@@ -22,15 +25,15 @@ class WatchedInbox(Inbox):
 
     def put(self, item: Received) -> None:
         """As any inbox does."""
-        with self._changed:
+        with self._watch:
             super().put(item)
             self._handled = False
 
     def get(self, *, timeout_s: float) -> Received | None:
         """As any inbox does."""
-        with self._changed:
-            self._handled |= not self._items
-            return super().get(timeout_s=timeout_s)
+        with self._watch:
+            self._handled |= len(self) == 0
+        return super().get(timeout_s=timeout_s)
 
 
 def end(thread: EdgeThread, *, failing: bool) -> None:

@@ -52,7 +52,7 @@ from messages import feedback
 __all__ = ["FRAMES", "SIZE", "STILL", "Ground", "Out", "Rig", "link_of"]
 
 SIZE = (320, 192)
-FRAMES = framed(smooth_pictures(150, size=SIZE))
+FRAMES = framed(smooth_pictures(210, size=SIZE))
 STILL = Still(
     sequence=2**31,
     frame_index=3,

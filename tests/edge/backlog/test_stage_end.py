@@ -150,17 +150,19 @@ def test_a_segment_that_begins_while_the_link_returns_does_not_put_the_picture_o
     """The link would be back, and the picture not, until the next keyframe of the plan a minute later."""
     rig = Rig(tmp_path / "store")
     rig.play(0, 21, reports=True)
-    rig.play(21, 30, linked=False)
+    rig.play(21, 169, linked=False)
     rig.admits = lambda _now_ns: False
-    rig.play(30, 32, linked=True)
-    rig.backlog._segment_ns = None  # as after ten seconds, or after a frame that the disk refused
-    rig.play(32, 40, linked=True)
+    assert not rig.backlog.segment_due(rig.now_ns)
+    rig.play(169, 171, linked=True)  # the link returns, and is full
+    assert not rig.backlog.offline
+    rig.play(171, 179, linked=True)  # ten seconds after the segment began, the next begins
     rig.admits = lambda _now_ns: True
-    rig.play(40, 60, linked=True)
-    after = [header.frame_index for header in rig.out.base if header.frame_index >= 30]
-    assert after == list(range(after[0], 60))
-    assert after[0] <= 50, "within the patience of a keyframe that is due"
-    rig.backlog.close()
+    rig.play(179, 199, linked=True)
+    after = [header.frame_index for header in rig.out.base if header.frame_index >= 169]
+    assert after == list(range(after[0], 199))
+    assert after[0] <= 189, "within the patience of a keyframe that is due"
+    keyframes = [unit.frame_index for unit in rig.kept() if unit.keyframe and unit.frame_index < 179]
+    assert keyframes == [21, 171], "a segment began while the link returned"
 
 
 def test_only_to_who_reports_is_anything_sent_that_was_kept(tmp_path):

@@ -19,10 +19,12 @@ from av.video.reformatter import Interpolation
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.clock import SteadyClock
+from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.folder import sequence_files
 from hvt_edge.source.live import LiveSource
 from hvt_edge.source.opening import open_source
 from hvt_edge.source.stream import StreamGrabber
+from hvt_scene import Scene
 
 BASE = {"size": (320, 180), "fps": 15.0}
 
@@ -295,6 +297,8 @@ def test_hidden_files_are_not_frames(tmp_path):
 def test_the_demo_is_a_source_with_truth():
     """The command `make demo` would have nothing to show, or nothing to measure against."""
     with open_source("demo", size=(640, 360), fps=15, seed=2, max_frames=2) as source:
+        assert isinstance(source, DemoSource)
+        assert isinstance(source.scene, Scene)
         assert not source.live
         assert source.frame_count == 2
         assert source.class_names[:2] == ("car", "van")
@@ -390,6 +394,7 @@ def test_a_clock_that_is_set_neither_stops_a_camera_nor_dates_it_anew(http_strea
 def test_a_slow_consumer_gets_fresh_frames_and_no_queue(http_stream):
     """The operator would see the past, later and later."""
     with open_source(http_stream, size=(320, 180), fps=200) as source:
+        assert isinstance(source, LiveSource)
         stale = []
         for frame in source.frames(start_ns=0):
             stale.append(time.time_ns() - frame.capture_ns)

@@ -190,7 +190,8 @@ def test_between_coded_ticks_tracks_go_on_and_stills_wait_for_a_coded_one():
 def test_the_tracks_of_a_step_go_before_its_stills():
     """The ground would get stills of tracks that it has not heard of."""
     rig = Rig(reports=True)
-    assert rig.stage.latest_tracks is None
+    before = rig.stage.latest_tracks
+    assert before is None
     rig.run(11)
     assert [row for row, _, _ in rig.out.puts[:2]] == [Channel.TRACKS, Channel.ROI]
     assert [payload[0] for row, payload, _ in rig.out.puts if row is Channel.TRACKS] == [0, 5, 10]

@@ -34,7 +34,7 @@ class Ground:
 
     def __init__(self, number: int, *, loss: float, seed: int) -> None:
         self.number, self.loss, self.random = number, loss, random.Random(f"{seed}-{number}")
-        self.reassembler: Reassembler[Header] = Reassembler()
+        self.reassembler: Reassembler = Reassembler()
         self.air: list[tuple[int, Header]] = []
         self.shown_ns: list[int] = []
         self.seen: set[int] = set()

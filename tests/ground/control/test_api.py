@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import zenoh
 
 import messages
 from hvt_common.errors import UserError
@@ -59,7 +60,7 @@ class ScriptedEdge:
         self.answer, self.outcome = YES, YES
         self.puts: list[tuple[bytes, bytes]] = [(DATA, HEADER.pack(DATA))]
         self.asked: list[ControlRequest] = []
-        self._publisher = None
+        self._publisher: zenoh.Publisher | None = None
 
     def control(self, question: bytes) -> bytes:
         """Note the request; the stills come a little later, as they do."""

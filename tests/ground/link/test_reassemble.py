@@ -41,9 +41,9 @@ class Ground:
     """A `Reassembler` with a clock that steps by one frame a unit, and all that came out of it."""
 
     def __init__(self) -> None:
-        self.core: Reassembler[Header] = Reassembler()
+        self.core: Reassembler = Reassembler()
         self.now_ns = 5_000_000_000
-        self.out: list[Arrival[Header]] = []
+        self.out: list[Arrival] = []
 
     def send(self, sequence, *, key=False, session=1, frame=None, after_ns=FRAME_NS):
         """Let one unit arrive ``after_ns`` later; (verdict, sequence) of all that is settled by it."""
@@ -78,7 +78,7 @@ def running(ground):
 
 def assert_decodable(out):
     """What a decoder was given: keyframe-started runs without a hole, in order, nothing twice."""
-    previous: Arrival[Header] | None = None
+    previous: Arrival | None = None
     for unit in (unit for unit in out if unit.verdict == "decode"):
         if unit.starts_run or previous is None:
             assert unit.header.keyframe

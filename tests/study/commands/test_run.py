@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from argparse import ArgumentParser
 
 import numpy as np
 import pytest
@@ -109,10 +110,9 @@ def test_video_spends_what_the_others_really_spent(done):
 
 def test_totals_are_of_the_bytes_that_were_sent(scene, done, tmp_path):
     """A total that forgot headers, tracks or status would give the hybrid bits for nothing."""
-    from hvt_study.cli import _Parser
     from hvt_study.commands.arguments import add_plan_arguments, open_sequences, study_plan
 
-    parser = _Parser()
+    parser = ArgumentParser()
     add_plan_arguments(parser)
     asked = parser.parse_args(arguments(scene, tmp_path, *METHODS, "--max-frames", "30"))
     plan = study_plan(asked, open_sequences(asked))

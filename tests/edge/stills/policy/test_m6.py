@@ -166,6 +166,7 @@ def test_any_weight_a_user_may_give_is_survived():
         assert isinstance(default, float)
         for value in (0.0, 1.0, 1e300):
             policy = method("M6", **{name: value})
+            assert isinstance(policy, ExpectedGain)
             for one in (car(), sent(car(), seconds=1), car(loss=None, sharpness=None)):
                 assert 0 <= policy.gain(one, step()) <= 1
                 policy.requests([one], step())

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hvt_common.errors import UserError
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
 from hvt_edge.stills.policy import METHODS, CostEstimate, CostModel, Step, method, tuning
+from hvt_edge.stills.policy.paper import Small, Utility
 
 SECOND = 1_000_000_000
 FPS = 15.0
@@ -199,6 +200,7 @@ def test_m5_score_is_monotone_in_every_term(some, index, draw):
     if not some:
         return
     one, policy, moment = some[index % len(some)], method("M5"), step()
+    assert isinstance(policy, Utility)
     before = policy.score(one, moment)
     share = draw.draw(st.floats(0, 1))
     better = [
@@ -294,8 +296,10 @@ def test_registry_names_all_and_says_what_is_accepted():
     for bad in (-1, float("nan"), float("inf")):
         with pytest.raises(UserError, match="area_share of method M4"):
             method("M4", area_share=bad)
+    small = method("M4")
+    assert isinstance(small, Small)
     with pytest.raises(FrozenInstanceError):
-        method("M4").area_share = 1.0
+        small.area_share = 1.0
 
 
 def test_tuning_reads_what_a_user_writes():

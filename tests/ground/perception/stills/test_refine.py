@@ -73,7 +73,7 @@ class Ground:
     def __init__(self, mode="replace", **settings):
         self.history = History(track_frames=100)
         self.now = -1
-        self.refiner: Refiner[str] = Refiner(
+        self.refiner: Refiner = Refiner(
             mode, fps=FPS, detector_classes=DETECTOR, classifier_classes=CLASSIFIER, **settings
         )
 
