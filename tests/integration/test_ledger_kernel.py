@@ -21,7 +21,8 @@ from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_common.transport.session import Inbox, LinkSettings, declare_publisher, open_session, subscribe
 
-pytestmark = [pytest.mark.integration, pytest.mark.realtime]  # time that passes is keep-alives that are counted
+# Time that passes is keep-alives that are counted.
+pytestmark = [pytest.mark.integration, pytest.mark.realtime]
 
 KEYS = EdgeKeys("uav-1")
 ATTACHMENT_BYTES = 39
