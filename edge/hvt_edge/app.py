@@ -9,6 +9,7 @@ from typing import Any
 
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.reporting import StatusLine
+from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.link_control import wait_for_ground
 from hvt_edge.link.publisher import EdgeLink
@@ -21,7 +22,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.status import StatusReporter
 from hvt_edge.summary import EdgeRun, summary
-from hvt_edge.wiring import SECOND_NS, Stages, build_stages, check_files
+from hvt_edge.wiring import Stages, build_stages, check_files
 from hvt_edge.world import World
 
 __all__ = ["Edge"]

@@ -15,7 +15,7 @@ from typing import Any
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, TrackNow, fitted_text
-from hvt_common.units import bitrate_text
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import LEAST_FPS, REGIMES, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests
@@ -29,10 +29,9 @@ from hvt_edge.video.share import FIRST_SHARE
 
 __all__ = ["Commands"]
 
-_SECOND_NS = 1_000_000_000
 _MOST_REQUESTS = 32
 """In a second, from all grounds together."""
-_REST_NS = 2 * _SECOND_NS
+_REST_NS = 2 * SECOND_NS
 """Between two changes of the budget: each costs a keyframe and the opening of an encoder."""
 _MOST_BPS = 1_000_000_000
 _QUALITIES_PCT = (5, 95)
@@ -136,7 +135,7 @@ class Commands:
 
     def _check_rate(self) -> None:
         now_ns, times = self._clock(), self._request_times
-        if len(times) == _MOST_REQUESTS and now_ns - times[0] < _SECOND_NS:
+        if len(times) == _MOST_REQUESTS and now_ns - times[0] < SECOND_NS:
             raise RefusedError(f"too many requests: at most {_MOST_REQUESTS} a second are served")
         times.append(now_ns)
 

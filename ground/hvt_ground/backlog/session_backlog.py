@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvt_common.protocol.messages import BacklogUnit, Info
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.video import BacklogVideo
@@ -18,7 +19,6 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 
 __all__ = ["BacklogTotals", "SessionBacklog"]
 
-_SECOND_NS = 1_000_000_000
 _LONGEST_S = 1.0
 """For so long one frame counts as video, where the next was left out."""
 
@@ -85,7 +85,7 @@ class SessionBacklog:
         self.log = log
         self._read = read
         self._stills = stills or StillSequenceWindow()
-        self._frame_ns = round(_SECOND_NS / info.fps)
+        self._frame_ns = round(SECOND_NS / info.fps)
         self._lock = threading.Lock()
         self._frames = SequenceWindow()
         self.totals = BacklogTotals()

@@ -25,6 +25,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.runtime.statistics import LatencyStats
 from hvt_common.transport.inbox import Received
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
@@ -41,9 +42,8 @@ from hvt_ground.sinks import Sink
 
 __all__ = ["GroundSession", "WorkerFactory"]
 
-_SECOND_NS = 1_000_000_000
 _MILLION = 1_000_000
-_ANEW_NS = 5 * _SECOND_NS
+_ANEW_NS = 5 * SECOND_NS
 """What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
@@ -228,7 +228,7 @@ class GroundSession:
         """Say in the recording how much of the backlog has come since the last time."""
         news = self.backlog.take_news()
         if news.first is not None:
-            at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // _SECOND_NS))
+            at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // SECOND_NS))
             self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
 
     def note(self, level: str, text: str) -> None:
@@ -398,8 +398,8 @@ class GroundSession:
         """Twice a second of the stream, how full the link was and how old the picture is."""
         if at_ns < self._next_traffic_ns:
             return
-        self._next_traffic_ns = at_ns + _SECOND_NS // 2
-        to_bps = 8 * _SECOND_NS / self.info.window_ns
+        self._next_traffic_ns = at_ns + SECOND_NS // 2
+        to_bps = 8 * SECOND_NS / self.info.window_ns
         self._emit(
             Traffic(
                 frame_index=self._last_index,
