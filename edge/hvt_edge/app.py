@@ -61,8 +61,7 @@ class Edge:
     def run(self) -> dict[str, Any]:
         """Play the source to its end or until ``stop`` is set; return the summary.
 
-        Raises:
-            UserError: before anything is sent, where a setting, a file or a port cannot be used.
+        Raises `UserError` before anything is sent, where a setting, a file or a port cannot be used.
         """
         config, world = self._config, self._world
         check_files(config)

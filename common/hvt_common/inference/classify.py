@@ -89,10 +89,8 @@ class OnnxClassifier:
     """A network from one image to one row of scores; arguments as of `open_classifier`.
 
     Construction runs the network once on noise, to distinguish logits (softmax is applied) from probabilities
-    (each row sums to one).
-
-    Raises:
-        UserError: The model is not a classifier, or its metadata or the labels do not fit.
+    (each row sums to one). Raises `UserError` where the model is not a classifier, or its metadata or the
+    labels do not fit.
     """
 
     def __init__(self, model: OnnxModel, *, labels: Path | None = None) -> None:

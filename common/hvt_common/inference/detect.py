@@ -90,10 +90,8 @@ def warm_up(detector: Detector, size: tuple[int, int]) -> None:
 class OnnxDetector:
     """A network with one of the known heads; arguments as of `open_detector`.
 
-    Construction runs the network once on grey: that tells the head by its values too, and warms it up.
-
-    Raises:
-        UserError: The model is not a detector, or the labels or the size do not fit it.
+    Construction runs the network once on grey: that tells the head by its values too, and warms it up. Raises
+    `UserError` where the model is not a detector, or the labels or the size do not fit it.
     """
 
     def __init__(

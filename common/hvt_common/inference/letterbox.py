@@ -118,8 +118,7 @@ class Letterboxer:
 def as_bgr(image: npt.NDArray[np.uint8]) -> Image:
     """Return the image as (height, width, 3) BGR: grey is spread over three channels, alpha is dropped.
 
-    Raises:
-        ValueError: No pixels, or not an image at all.
+    Raises `ValueError` where it has no pixels or is no image at all.
     """
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or 0 in image.shape:
         raise ValueError(f"an image of uint8 pixels is expected, not {image.dtype} {image.shape}")

@@ -34,11 +34,7 @@ class CameraGrabber:
         self._capture: cv2.VideoCapture | None = None
 
     def open(self) -> None:
-        """Open the device.
-
-        Raises:
-            UserError: if it is missing, no camera, busy or not permitted.
-        """
+        """Open the device. Raises `UserError` if it is missing, no camera, busy or not permitted."""
         path = Path(self.name)
         if not path.exists():
             found = ", ".join(sorted(str(one) for one in Path("/dev").glob("video*"))) or "none"

@@ -56,8 +56,7 @@ class Source(ABC):
 def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
     """Refuse sizes and rates that no base stream can have.
 
-    Raises:
-        UserError: names the value and what is accepted.
+    Raises `UserError`, which names the value and what is accepted.
     """
     wide, high = (64, 64) if callable(size) else size
     # HEVC codes 4:2:0 pictures in even sizes only.

@@ -45,8 +45,7 @@ class StreamGrabber:
     def open(self) -> None:
         """Open for the first time; does nothing where it is open already.
 
-        Raises:
-            UserError: if there is no video within ``open_s``.
+        Raises `UserError` if there is no video within ``open_s``.
         """
         if self._container is None:
             self._start(self._open_s)

@@ -120,8 +120,7 @@ class OnDemand:
     def request(self, request: OnDemandRequest) -> tuple[int, int]:
         """Crop a still; return its number and the index of the frame that it will show.
 
-        Raises:
-            RefusedError: with the reason.
+        Raises `RefusedError` with the reason.
         """
         if self._ended:
             raise RefusedError("the session is ending")
@@ -148,8 +147,7 @@ class OnDemand:
     def outcome(self, number: int) -> None:
         """Return where that still is pending or was sent.
 
-        Raises:
-            RefusedError: it was given up, or is not known (any more).
+        Raises `RefusedError` where it was given up, or is not known (any more).
         """
         with self._lock:
             if number not in self._refusals:

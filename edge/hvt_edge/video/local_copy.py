@@ -37,8 +37,7 @@ class BaseRecorder:
     def write(self, unit: AccessUnit) -> None:
         """Append one access unit; the first has to be a keyframe.
 
-        Raises:
-            UserError: the file cannot be written (any further).
+        Raises `UserError` where the file cannot be written (any further).
         """
         if self._stream is None:
             self._stream = self._open_stream(unit.data)

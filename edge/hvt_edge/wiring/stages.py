@@ -77,8 +77,7 @@ def build_stages(
 ) -> Stages:
     """Build every part once, each with all that it needs; files and threads end with ``stack``.
 
-    Raises:
-        UserError: x265 does not take the settings, or a file cannot be written.
+    Raises `UserError` where x265 does not take the settings, or a file cannot be written.
     """
     view, class_names = source.view, detector.class_names
     lockstep = config.pace == "lockstep"

@@ -106,9 +106,7 @@ class BacklogAssembly:
         """Take a chunk; the object's bytes where it is the last one that was missing, to be `settle`d later.
 
         With ``may_finish`` False a chunk that would complete its object is not taken, and will come again.
-
-        Raises:
-            WireError: the chunk cannot be one.
+        Raises `WireError` where the chunk cannot be one.
         """
         _check(header, payload)
         key = _key(header)

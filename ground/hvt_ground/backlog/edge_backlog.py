@@ -80,10 +80,8 @@ class EdgeBacklog:
     ) -> bool:
         """Take a chunk; True where it completes its object, which is handed to ``worker``.
 
-        ``own`` is the backlog of the session that is open.
-
-        Raises:
-            WireError: it cannot be one, or the object that it completes is unusable.
+        ``own`` is the backlog of the session that is open. Raises `WireError` where it cannot be one, or the
+        object that it completes is unusable.
         """
         is_own = header.session_id == own.info.session_id
         if not is_own and (self._recordings is None or not self._recordings.takes(header.session_id)):

@@ -97,8 +97,7 @@ class BacklogRecordings:
     def acquire(self, info: Info) -> SessionBacklog | None:
         """The backlog of that session's recording, which stays open until `release`; None where `takes` says no.
 
-        Raises:
-            UserError: its file cannot be made, or another could not be closed as it should.
+        Raises `UserError` where its file cannot be made, or another could not be closed as it should.
         """
         self._raise_error()
         with self._lock:

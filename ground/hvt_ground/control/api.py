@@ -80,8 +80,7 @@ class RequestedStill:
     def save(self, path: Path | str) -> None:
         """Write it as JPEG or PNG, by the suffix; a JPEG that came as one is written as it came.
 
-        Raises:
-            UserError: for another suffix, or where the file cannot be written.
+        Raises `UserError` for another suffix, or where the file cannot be written.
         """
         path = Path(path)
         check_suffix(path)
@@ -315,8 +314,7 @@ class EdgeClient:
     def connect(cls, *endpoints: str, zenoh_config: Path | None = None) -> EdgeClient:
         """Connect to a ground or a router, such as ``tcp/127.0.0.1:7447``, where one listens unless told otherwise.
 
-        Raises:
-            UserError: where nobody answers within three seconds, or a setting cannot be used.
+        Raises `UserError` where nobody answers within three seconds, or a setting cannot be used.
         """
         stack = ExitStack()
         settings = LinkSettings(role="client", connect=endpoints, zenoh_config=zenoh_config)

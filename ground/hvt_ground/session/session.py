@@ -184,8 +184,7 @@ class GroundSession:
     def tracks(self, step: TrackStep, item: Received) -> None:
         """Take what the edge tracked at one frame; one that is not newer than the last is ignored.
 
-        Raises:
-            WireError: its boxes make no sense.
+        Raises `WireError` where its boxes make no sense.
         """
         now_ns = self._clock()
         if step.sequence <= self._last_step:

@@ -73,8 +73,7 @@ class OpenVinoRunner:
     def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
         """Run on the only input; the outputs in their declared order, float tensors of their own.
 
-        Raises:
-            UserError: OpenVINO cannot run this model on an input of this shape.
+        Raises `UserError` where OpenVINO cannot run this model on an input of this shape.
         """
         try:
             request = self._request(feed.shape)
