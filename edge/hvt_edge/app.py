@@ -33,11 +33,8 @@ _GOODBYE_S = 1.5
 class Edge:
     """One run of one edge: build it, `run` it once.
 
-    Args:
-        config: the settings, checked.
-        stop: ends the run.
-        on_started: called once nothing is refused any more.
-        world: where frames come from and messages go; None for the real one.
+    ``on_started()`` is called once nothing is refused any more; ``world`` is where frames come from and messages
+    go.
     """
 
     def __init__(

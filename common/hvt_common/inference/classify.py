@@ -101,11 +101,7 @@ class OnnxClassifier:
         self.class_names = _class_names(model, classes, labels)
 
     def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
-        """Classify crops of any size; those of a model with a free batch go through together.
-
-        Args:
-            crops_bgr: (height, width, 3) uint8 each; grey is accepted too.
-        """
+        """Classify (height, width, 3) uint8 crops of any size (or grey); a free batch takes all of them at once."""
         batch = self._batch or _MAX_BATCH
         posteriors = []
         for start in range(0, len(crops_bgr), batch):

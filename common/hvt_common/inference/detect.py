@@ -117,11 +117,7 @@ class OnnxDetector:
         )
 
     def detect(self, image_bgr: Image) -> Detections:
-        """Run the network on one image of any size.
-
-        Args:
-            image_bgr: (height, width, 3) uint8; grey is accepted too.
-        """
+        """Run the network on one (height, width, 3) uint8 image of any size; grey is accepted too."""
         image = as_bgr(image_bgr)
         input_size = self.input_size((image.shape[1], image.shape[0]))
         tensor, letterbox = self._letterboxer.fill(image, input_size)

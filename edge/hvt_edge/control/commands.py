@@ -55,17 +55,8 @@ class _Result:
 class Commands:
     """Answers one session's requests; may be called from any thread.
 
-    Args:
-        config: the settings at the start.
-        operating: takes what is commanded.
-        session_id: of this run.
-        keyframes: where keyframes are requested, also the one that a change of rates waits for.
-        on_demand: serves stills and tracks.
-        chooser: takes another method.
-        backlog: None where nothing is stored while the link is offline.
-        base_size: (width, height) of the base stream.
-        clock: Unix nanoseconds, for the rate of requests.
-        loop_clock: the time that the budget's windows go by, which keyframes are planned in.
+    ``clock`` is Unix nanoseconds, for the rate of requests; ``loop_clock`` is the time of the budget's windows and
+    of planned keyframes.
     """
 
     def __init__(

@@ -21,12 +21,7 @@ _READ_MS = 2000
 
 
 class CameraGrabber:
-    """One V4L2 device.
-
-    Args:
-        path: /dev/videoN.
-        fps: requested of the camera.
-    """
+    """One V4L2 device: ``path`` is /dev/videoN, ``fps`` is requested of the camera."""
 
     def __init__(self, path: str, *, fps: float) -> None:
         self.name = path

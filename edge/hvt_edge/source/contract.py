@@ -35,9 +35,8 @@ class Source(ABC):
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """Frames 0, 1, 2 …; arrays are read-only.
 
-        Args:
-            start_ns: Unix time of frame 0. Files, folders and the demo count media time from it; live sources
-                ignore it and read their clock once, when a frame was grabbed.
+        ``start_ns`` is the Unix time of frame 0 for files, folders and the demo. Live sources ignore it and read
+        their clock when a frame is grabbed.
         """
 
     def close(self) -> None:

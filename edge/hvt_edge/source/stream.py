@@ -31,9 +31,7 @@ _OPTIONS = {
 class StreamGrabber:
     """Decodes a stream as it arrives, without frame threading, which would hold frames back.
 
-    Args:
-        url: of the stream; a password in it is never printed.
-        open_s: how long the first opening may take.
+    A password in ``url`` is never printed; ``open_s`` bounds the first opening.
     """
 
     def __init__(self, url: str, *, open_s: float = _OPEN_S) -> None:

@@ -77,14 +77,7 @@ class OnDemandStill(OutboxStill):
 class OnDemand:
     """The edge's end of ``control: still``. `request`, `outcome` and `tracks` may be called from any thread.
 
-    Args:
-        ring: where frames come from; filled by `add`.
-        outbox: where the stills wait.
-        maker: how stills are made; these never build on the base.
-        view: between source and base pixels.
-        class_names: the detector's.
-        most_bytes: the largest payload that the budget ever admits, as it is now.
-        settings: the bounds.
+    ``most_bytes()`` is the largest payload that the budget admits now. These stills never build on the base.
     """
 
     def __init__(

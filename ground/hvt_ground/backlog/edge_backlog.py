@@ -32,10 +32,7 @@ _MOST_INFOS = 64
 class EdgeBacklog:
     """Of one edge. `chunk` is for the receiving thread, `take_acknowledged_ranges` for any.
 
-    Args:
-        edge: its id.
-        recordings: where what is of another session goes; None refuses it.
-        assembly: puts chunks together.
+    ``recordings`` takes what is of another session; None refuses it.
     """
 
     def __init__(

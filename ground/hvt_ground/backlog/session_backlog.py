@@ -62,12 +62,7 @@ class BacklogTotals:
 class SessionBacklog:
     """Of one session, open or over. Safe for the receiving thread and the perception worker's.
 
-    Args:
-        info: of the session.
-        log: takes the events; they may lie before others that it has.
-        perception: finds boxes in the video; None leaves it without.
-        read: reads a still and gives out its events.
-        stills: which stills have come; the session's own where it is open.
+    ``log`` takes events that may lie before others it has; ``stills`` is the session's own where it is open.
     """
 
     def __init__(

@@ -77,13 +77,8 @@ class PipelineParts:
 class Pipeline:
     """One session's perception. Used by one thread; ``emit`` takes the events.
 
-    Args:
-        parts: detector, tracker, fusion and so on.
-        view: between source and base pixels.
-        fps: frames a second.
-        detect_every: frames from one detection to the next, at least.
-        wants_base: whether the reader uses the base frame of a still.
-        emit: takes the events.
+    Detections are at least ``detect_every`` frames apart; ``wants_base``: the reader uses the base frame of a
+    still.
     """
 
     def __init__(

@@ -54,18 +54,10 @@ WorkerFactory = Callable[[Analyze, Step, Read], PerceptionWorker]
 class GroundSession:
     """Fed by the receiving thread in order; a worker analyzes, so that decoding never waits for detection.
 
-    In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input gives
-    the same tracks.
-
-    Args:
-        info: of the session.
-        sinks: take its events.
-        pipeline_of: makes its perception; called with what takes the events.
-        clock: Unix nanoseconds without steps.
-        reports: to the edge; without it nothing is reported, and the edge's clock is this one.
-        recording: the file of its recording, for its summary.
-        backlog_perception: finds boxes in video that was stored while the link was down.
-        worker_of: makes the worker that analyzes; by default by the session's pace.
+    In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input
+    gives the same tracks. ``pipeline_of`` and ``worker_of`` make perception and its worker; without ``reports``
+    nothing is reported, and the edge's clock is this one (Unix nanoseconds without steps). ``recording`` is the
+    recording's file, for the summary.
     """
 
     def __init__(

@@ -52,13 +52,9 @@ def file_digest(path: Path) -> str:
 
 
 class Store:
-    """Models by name in one folder.
+    """Models by name in one folder, which is made when something is put into it (default: `cache_folder`).
 
-    Args:
-        folder: The cache folder; else `cache_folder`. It is made when something is put into it.
-
-    Raises:
-        UserError: ``added.toml`` in the folder is not a manifest.
+    Raises `UserError` where ``added.toml`` in the folder is not a manifest.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
