@@ -68,17 +68,11 @@ _TORCHVISION = Preparation(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 
 def open_classifier(
     spec: str, *, labels: Path | None = None, threads: int = 2, provider: str = "cpu"
 ) -> Classifier:
-    """Open an ONNX classifier.
+    """Open an ONNX classifier by the name of a model (see `resolve_model`) or the path of a file.
 
-    Args:
-        spec: The name of a model (see `resolve_model`), or the path of an ONNX file.
-        labels: Class names, one a line; else those of the metadata, ImageNet's, or "class 0" and so on. 1000 names
-            fit a model of 1001 classes (a background comes first), and the reverse. The first synonym is shown.
-        threads: CPU threads of the network.
-        provider: One of `providers.PROVIDERS`.
-
-    Raises:
-        UserError: No such model, not a classifier, metadata or labels that do not fit.
+    ``labels`` are class names, one a line; else those of the metadata, ImageNet's, or "class 0" and so on. 1000
+    names fit a model of 1001 classes (a background comes first), and the reverse. The first synonym is shown.
+    Raises `UserError` where there is no such model, it is not a classifier, or metadata or labels do not fit.
     """
     path = resolve_model(spec, role="classifier")
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
