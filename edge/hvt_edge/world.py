@@ -53,10 +53,7 @@ class World:
         )
 
     def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
-        """Open the link until ``stack`` closes.
-
-        Raises `UserError` where a port, an endpoint or the edge's id cannot be used.
-        """
+        """Open the link until ``stack`` closes. Raises `UserError` for a bad port, endpoint or edge id."""
         return stack.enter_context(
             ZenohLink(make_link_settings(config), edge_id=config.edge_id, clock=self.clock)
         )

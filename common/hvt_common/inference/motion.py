@@ -185,10 +185,7 @@ def _noise(difference: _Gray) -> float:
 def _regions(
     mask: _Gray, seeds: npt.NDArray[np.bool_], excess: npt.NDArray[np.float32], settings: MotionSettings
 ) -> tuple[_Floats, _Floats]:
-    """Boxes and confidences of the connected regions that may be objects.
-
-    ``excess`` is the difference in units of the threshold.
-    """
+    """Boxes and confidences of possible objects; ``excess`` is the difference in units of the threshold."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (settings.join_px, settings.join_px))
     closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel), np.uint8)
     _, labels, found, _ = cv2.connectedComponentsWithStats(closed, connectivity=8, ltype=cv2.CV_16U)

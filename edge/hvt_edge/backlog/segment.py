@@ -146,10 +146,7 @@ class OpenSegment:
 
 
 def read_segment(video: Path) -> tuple[BacklogUnit, ...]:
-    """The frames of a segment, bytes as x265 made them, up to the first that is missing or damaged.
-
-    Raises `DamagedError` where not even one is whole.
-    """
+    """The frames of a segment up to the first damaged one. Raises `DamagedError` where not even one is whole."""
     units: list[BacklogUnit] = []
     try:
         records = index_of(video).read_bytes()

@@ -130,10 +130,7 @@ class BacklogStage:
         return self._worker.failed
 
     def before_frame(self, now_ns: int, *, linked: bool) -> bool:
-        """Before each frame: notice that the link went or came; return whether it is away.
-
-        Raises what has ended the store's thread.
-        """
+        """Before each frame: whether the link is away. Raises what has ended the store's thread."""
         self._worker.check()
         self._linked = linked
         offline = self._outage.offline(now_ns, linked=linked) and not self.failed

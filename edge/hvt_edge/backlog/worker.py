@@ -326,10 +326,7 @@ class ChunkThread:
             self._changed.notify()
 
     def take(self) -> tuple[Chunk, int] | None:
-        """Return the chunk that was sent last and its line bytes, once; None while there is none.
-
-        Raises whatever ``send`` has raised.
-        """
+        """The chunk sent last and its line bytes, once; None until then. Raises whatever ``send`` has raised."""
         with self._changed:
             if self._error is not None:
                 raise self._error

@@ -3,11 +3,10 @@
 The signal is queueing delay (RFC 8298, section 4.1.2; RFC 6817): one-way delay above the least seen lately, so the
 two clocks need not agree. From it is taken what the edge's own messages would have waited on a link of exactly the
 present rate (`Progress.serialization_ns`): a keyframe or a burst is no congestion, and what is left, the
-**excess**, grows
-exactly where the link is slower than the rate. It counts as overuse where it stays high and does not fall over
-several reports (as in CoDel, a burst empties, a standing queue does not). Then the rate becomes a share of what
-arrived meanwhile, which is what the link carries. Messages sent before that say nothing about the new rate and are
-not judged: the hold-off lasts a round trip and the emptying of the queue, however long these are.
+**excess**, grows exactly where the link is slower than the rate. It is overuse where it stays high and does not
+fall over several reports (as in CoDel, a burst empties, a standing queue does not). Then the rate becomes a share
+of what arrived meanwhile, which is what the link carries. Messages sent before that say nothing about the new rate
+and are not judged: the hold-off lasts a round trip and the emptying of the queue, however long these are.
 
 Growth follows a cubic curve (RFC 9438, section 4.2, in time): quickly back to where it broke down last, long near
 there, then faster and faster beyond. So a link of constant rate sees a rate close to its own, and one that has come

@@ -53,10 +53,7 @@ class Source(ABC):
 
 
 def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
-    """Refuse sizes and rates that no base stream can have.
-
-    Raises `UserError`, which names the value and what is accepted.
-    """
+    """Raise `UserError` for a size or rate that no base stream can have, with what is accepted."""
     wide, high = (64, 64) if callable(size) else size
     # HEVC codes 4:2:0 pictures in even sizes only.
     if wide % 2 or high % 2 or not (64 <= wide <= 8192 and 64 <= high <= 8192):

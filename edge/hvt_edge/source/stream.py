@@ -41,10 +41,7 @@ class StreamGrabber:
         self._frames: Iterator[av.VideoFrame] = iter(())
 
     def open(self) -> None:
-        """Open for the first time; does nothing where it is open already.
-
-        Raises `UserError` if there is no video within ``open_s``.
-        """
+        """Open, where it is not open yet. Raises `UserError` if there is no video within ``open_s``."""
         if self._container is None:
             self._start(self._open_s)
 

@@ -111,10 +111,7 @@ class OnDemand:
     # From any thread
 
     def request(self, request: OnDemandRequest) -> tuple[int, int]:
-        """Crop a still; return its number and the index of the frame that it will show.
-
-        Raises `RefusedError` with the reason.
-        """
+        """Crop a still; return its number and frame index. Raises `RefusedError` with the reason."""
         if self._ended:
             raise RefusedError("the session is ending")
         self._check_queue()

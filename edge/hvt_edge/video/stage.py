@@ -71,10 +71,7 @@ class BaseStage:
     def encode(
         self, frame: Frame, decision: FrameDecision, *, now_ns: int, tracks: Tracks | None = None
     ) -> AccessUnit | None:
-        """Encode the frame as decided; None where it is not coded.
-
-        ``tracks`` are the newest that are known, in base pixels.
-        """
+        """Encode the frame as decided (None where it is not coded); ``tracks`` are the newest known."""
         if not decision.codes:
             return None
         if decision.reconfigures:

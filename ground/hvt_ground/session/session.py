@@ -174,10 +174,7 @@ class GroundSession:
         self.worker.still(ReceivedStill(header, item.payload, media_type))
 
     def tracks(self, step: TrackStep, item: Received) -> None:
-        """Take what the edge tracked at one frame; one that is not newer than the last is ignored.
-
-        Raises `WireError` where its boxes make no sense.
-        """
+        """Take a newer step of the edge's tracks. Raises `WireError` where its boxes make no sense."""
         now_ns = self._clock()
         if step.sequence <= self._last_step:
             if step.reference >= 0 or now_ns - self._stepped_ns < _ANEW_NS:
