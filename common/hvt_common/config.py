@@ -185,17 +185,18 @@ def switch(help_line: str, *, default: bool = False, group: str = "", rare: bool
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Settings that ``--help`` lists under one title."""
+    """Settings that ``--help`` lists under one title; those of a ``rare`` group only ``--help-all`` lists."""
 
     title: str
+    rare: bool = False
 
     def option(self, kind: SettingType, default: Any, help_line: str, **more: Any) -> Any:
         """See `option`."""
-        return option(kind, default, help_line, group=self.title, **more)
+        return option(kind, default, help_line, group=self.title, rare=self.rare, **more)
 
     def switch(self, help_line: str, **more: Any) -> Any:
         """See `switch`."""
-        return switch(help_line, group=self.title, **more)
+        return switch(help_line, group=self.title, rare=self.rare, **more)
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,8 +218,7 @@ def load(
 ) -> tuple[_Config, Loaded]:
     """Build the configuration of a process; ``--help`` and ``--version`` print and exit with 0.
 
-    Raises:
-        UserError: an unknown flag or key, a value that its kind does not take, an unreadable file.
+    Raises `UserError` for an unknown flag or key, a value that its kind does not take, or an unreadable file.
     """
     words = _with_joined_values(sys.argv[1:] if argv is None else argv)
     _refuse_gone(config_class, words)

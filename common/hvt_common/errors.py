@@ -31,11 +31,7 @@ def exit_with_sentence(
 
 @contextmanager
 def needs_extra(install: str) -> Iterator[None]:
-    """Within it a package that is not installed is a `UserError` that says what to install.
-
-    Args:
-        install: what ``pip install`` takes, such as ``'hvt[study]'``.
-    """
+    """Within it a missing package is a `UserError` that names what to ``pip install``, such as ``'hvt[study]'``."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -9,6 +9,7 @@ from fractions import Fraction
 from hvt_common.errors import UserError
 
 __all__ = [
+    "SECOND_NS",
     "bitrate_text",
     "exact_rate",
     "parse_bitrate",
@@ -18,6 +19,7 @@ __all__ = [
     "parse_size",
 ]
 
+SECOND_NS = 1_000_000_000
 _NUMBER = r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)"
 _BITRATE = re.compile(_NUMBER + r"\s*(bps|bit/s|kbps|kbit/s|k|Mbps|Mbit/s|M)?", re.IGNORECASE)
 _DURATION = re.compile(_NUMBER + r"\s*(ms|s|min|m|h)?")

@@ -9,6 +9,7 @@ from typing import Any
 
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.reporting import StatusLine
+from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.link_control import wait_for_ground
 from hvt_edge.link.publisher import EdgeLink
@@ -21,7 +22,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.status import StatusReporter
 from hvt_edge.summary import EdgeRun, summary
-from hvt_edge.wiring import SECOND_NS, Stages, build_stages, check_files
+from hvt_edge.wiring import Stages, build_stages, check_files
 from hvt_edge.world import World
 
 __all__ = ["Edge"]
@@ -32,11 +33,8 @@ _GOODBYE_S = 1.5
 class Edge:
     """One run of one edge: build it, `run` it once.
 
-    Args:
-        config: the settings, checked.
-        stop: ends the run.
-        on_started: called once nothing is refused any more.
-        world: where frames come from and messages go; None for the real one.
+    ``on_started()`` is called once nothing is refused any more; ``world`` is where frames come from and messages
+    go.
     """
 
     def __init__(
@@ -60,8 +58,7 @@ class Edge:
     def run(self) -> dict[str, Any]:
         """Play the source to its end or until ``stop`` is set; return the summary.
 
-        Raises:
-            UserError: before anything is sent, where a setting, a file or a port cannot be used.
+        Raises `UserError` before anything is sent, where a setting, a file or a port cannot be used.
         """
         config, world = self._config, self._world
         check_files(config)

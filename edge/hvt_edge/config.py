@@ -79,6 +79,9 @@ REGIMES = {
 _REFRESH_GONE = "give --fps auto, which shows more for the same bits, or --roi-depth 0.1 for the tracks alone"
 _SOURCE, _LINK, _SENT = Group("source"), Group("budget and link"), Group("what to send")
 _MODELS, _FILES = Group("models"), Group("files")
+_SOURCE_RARE, _LINK_RARE, _SENT_RARE, _MODELS_RARE, _FILES_RARE = (
+    replace(group, rare=True) for group in (_SOURCE, _LINK, _SENT, _MODELS, _FILES)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,21 +108,16 @@ class EdgeConfig:
         DEFAULT_FPS,
         "frame rate of the base stream; auto: up to 15, fewer and better frames where the rate is thin",
     )
-    fit: str = _SOURCE.option(
-        choice("letterbox", "crop"), "letterbox", "how another aspect ratio is fitted", rare=True
+    fit: str = _SOURCE_RARE.option(
+        choice("letterbox", "crop"), "letterbox", "how another aspect ratio is fitted"
     )
-    source_fps: float | None = _SOURCE.option(
-        number(0.1, 1000), None, "frame rate of an image folder, or instead of what a file says", rare=True
+    source_fps: float | None = _SOURCE_RARE.option(
+        number(0.1, 1000), None, "frame rate of an image folder, or instead of what a file says"
     )
-    seed: int = _SOURCE.option(integer(0, 2**31 - 1), 0, "seed of the demo scene", rare=True)
-    max_frames: int | None = _SOURCE.option(
-        integer(1, 10**9), None, "end after this many base frames", rare=True
-    )
-    pace: str = _SOURCE.option(
-        choice("realtime", "lockstep"),
-        "realtime",
-        "play at the clip's speed, or as fast as all parts allow",
-        rare=True,
+    seed: int = _SOURCE_RARE.option(integer(0, 2**31 - 1), 0, "seed of the demo scene")
+    max_frames: int | None = _SOURCE_RARE.option(integer(1, 10**9), None, "end after this many base frames")
+    pace: str = _SOURCE_RARE.option(
+        choice("realtime", "lockstep"), "realtime", "play at the clip's speed, or as fast as all parts allow"
     )
 
     budget: int | None = _LINK.option(
@@ -131,17 +129,17 @@ class EdgeConfig:
         "share of the budget for the base stream; auto follows the scene",
         shown_default="0.8125; 1 for M0",
     )
-    regime: str | None = _LINK.option(
-        choice(*REGIMES), None, "a budget of the paper: low 0.80 Mbps, moderate 1.40 Mbps", rare=True
+    regime: str | None = _LINK_RARE.option(
+        choice(*REGIMES), None, "a budget of the paper: low 0.80 Mbps, moderate 1.40 Mbps"
     )
     adapt: bool = _LINK.switch(
         "follow the link's rate below --budget by the ground's reports; never in lockstep", default=True
     )
-    min_budget: int | None = _LINK.option(
-        BITRATE, None, "what --adapt never goes below", shown_default="100kbps, at most --budget", rare=True
+    min_budget: int | None = _LINK_RARE.option(
+        BITRATE, None, "what --adapt never goes below", shown_default="100kbps, at most --budget"
     )
-    window: float = _LINK.option(
-        DURATION, 1.0, "the budget holds in every rolling window of this length", rare=True
+    window: float = _LINK_RARE.option(
+        DURATION, 1.0, "the budget holds in every rolling window of this length"
     )
     connect: tuple[str, ...] = _LINK.option(
         TEXT,
@@ -154,13 +152,10 @@ class EdgeConfig:
     zenoh_config: Path | None = _LINK.option(
         PATH, None, "Zenoh configuration, JSON5, that all this goes on top of"
     )
-    links: int = _LINK.option(
-        integer(1, 2),
-        1,
-        "2: one Zenoh link for what is urgent and one for the rest (docs/adaptation.md)",
-        rare=True,
+    links: int = _LINK_RARE.option(
+        integer(1, 2), 1, "2: one Zenoh link for what is urgent and one for the rest (docs/adaptation.md)"
     )
-    insecure: bool = _LINK.switch("allow listening beyond this machine without keys", rare=True)
+    insecure: bool = _LINK_RARE.switch("allow listening beyond this machine without keys")
     wait: float = _LINK.option(
         DURATION, 15.0, "how long a file, a folder or the demo waits for the first ground before it plays"
     )
@@ -169,58 +164,45 @@ class EdgeConfig:
     profile: str | None = _SENT.option(
         choice(*PROFILES), None, "settings in one word: thin is everything that helps on a thin link"
     )
-    tune: tuple[str, ...] = _SENT.option(
-        TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True, rare=True
+    tune: tuple[str, ...] = _SENT_RARE.option(
+        TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True
     )
-    borrow_unused: bool = _SENT.switch(
-        "stills may use what the base stream leaves unspent, never beyond --budget", rare=True
+    borrow_unused: bool = _SENT_RARE.switch(
+        "stills may use what the base stream leaves unspent, never beyond --budget"
     )
-    group_stills: bool = _SENT.switch("neighbours share one still where that is cheaper", rare=True)
-    cooldown: float = _SENT.option(
-        DURATION, 2.0, "least time between two stills of a track; 0 for the paper's plain methods", rare=True
+    group_stills: bool = _SENT_RARE.switch("neighbours share one still where that is cheaper")
+    cooldown: float = _SENT_RARE.option(
+        DURATION, 2.0, "least time between two stills of a track; 0 for the paper's plain methods"
     )
-    min_gain: float = _SENT.option(
-        number(1, 100), 1.2, "a track is sent again only when this much larger or sharper", rare=True
+    min_gain: float = _SENT_RARE.option(
+        number(1, 100), 1.2, "a track is sent again only when this much larger or sharper"
     )
     still_codec: str = _SENT.option(TEXT, "jpeg", "how stills are coded; residual sends what the base lacks")
-    fallback_codec: str = _SENT.option(
-        TEXT,
-        "h264-intra",
-        "how a still is coded where residual does not serve: no base, or no gain",
-        rare=True,
+    fallback_codec: str = _SENT_RARE.option(
+        TEXT, "h264-intra", "how a still is coded where residual does not serve: no base, or no gain"
     )
     jpeg_quality: int = _SENT.option(
         integer(5, 95), 65, "quality of the stills, in percent, whatever the codec"
     )
-    fidelity: float = _SENT.option(
+    fidelity: float = _SENT_RARE.option(
         number(0, 60, unit=" dB"),
         0.0,
         "fewest bytes that bring a still this near to the source; 0: --jpeg-quality",
-        rare=True,
     )
-    gate: float = _SENT.option(
-        number(0, 60, unit=" dB"),
-        0.0,
-        "no still where the base is already this good (luma PSNR); 0: no gate",
-        rare=True,
+    gate: float = _SENT_RARE.option(
+        number(0, 60, unit=" dB"), 0.0, "no still where the base is already this good (luma PSNR); 0: no gate"
     )
-    padding: float = _SENT.option(
-        number(0, 1), 0.15, "margin around a box, as a share of its sides", rare=True
-    )
+    padding: float = _SENT_RARE.option(number(0, 1), 0.15, "margin around a box, as a share of its sides")
     send_tracks: bool = _SENT.switch("also send the edge's own tracks, a few kbps, as part of --budget")
-    roi_depth: float = _SENT.option(
-        number(0, 1),
-        0.0,
-        "quantise active tracks better by so much; 0 for not, 0.1 for --method R0",
-        rare=True,
+    roi_depth: float = _SENT_RARE.option(
+        number(0, 1), 0.0, "quantise active tracks better by so much; 0 for not, 0.1 for --method R0"
     )
-    keyframe_interval: float | str = _SENT.option(
+    keyframe_interval: float | str = _SENT_RARE.option(
         or_auto(DURATION),
         AUTO,
         "time between keyframes beside those that grounds ask for; 0 for none; auto: 10s, up to 60s on a thin link",
-        rare=True,
     )
-    preset: str = _SENT.option(choice(*PRESETS), "veryfast", "x265 preset", rare=True)
+    preset: str = _SENT_RARE.option(choice(*PRESETS), "veryfast", "x265 preset")
 
     detector: str = _MODELS.option(
         TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
@@ -229,55 +211,44 @@ class EdgeConfig:
     candidates: str = _MODELS.option(
         choice("decoded", "source"), "decoded", "detect on the decoded base stream or on the source frame"
     )
-    tiles: str = _MODELS.option(
-        TEXT,
-        "off",
-        "detect in tiles of the source too: CxR, auto, or off; needs --candidates source",
-        rare=True,
+    tiles: str = _MODELS_RARE.option(
+        TEXT, "off", "detect in tiles of the source too: CxR, auto, or off; needs --candidates source"
     )
-    detect_every: int = _MODELS.option(
-        integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame", rare=True
-    )
+    detect_every: int = _MODELS_RARE.option(integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame")
     confidence: float = _MODELS.option(
         number(0.01, 1), 0.25, "confidence from which a detection starts a track"
     )
-    nms_iou: float = _MODELS.option(
-        number(0.01, 1), 0.45, "overlap above which two boxes of a class are one", rare=True
+    nms_iou: float = _MODELS_RARE.option(
+        number(0.01, 1), 0.45, "overlap above which two boxes of a class are one"
     )
-    camera_motion: str = _MODELS.option(
-        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion", rare=True
+    camera_motion: str = _MODELS_RARE.option(
+        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion"
     )
-    threads: int = _MODELS.option(integer(1, 64), 2, "threads of the detector", rare=True)
+    threads: int = _MODELS_RARE.option(integer(1, 64), 2, "threads of the detector")
     provider: str = _MODELS.option(
         choice(*PROVIDERS), "auto", "what runs the detector; auto says what it took and why"
     )
 
-    ring: int = _FILES.option(
-        BYTES,
-        256_000_000,
-        "memory for source frames, from which stills are served on demand; 0 for none",
-        rare=True,
+    ring: int = _FILES_RARE.option(
+        BYTES, 256_000_000, "memory for source frames, from which stills are served on demand; 0 for none"
     )
-    ring_time: float = _FILES.option(
-        DURATION, 5.0, "how far back those go; where memory is short, with frames left out", rare=True
+    ring_time: float = _FILES_RARE.option(
+        DURATION, 5.0, "how far back those go; where memory is short, with frames left out"
     )
     store: int = _FILES.option(
         BYTES, 200_000_000, "disk for what is seen while the link is away, and sent afterwards; 0 for none"
     )
-    store_folder: Path | None = _FILES.option(
+    store_folder: Path | None = _FILES_RARE.option(
         PATH,
         None,
         "where that is kept; made when the link first goes",
         shown_default="~/.local/state/hvt/EDGE_ID",
-        rare=True,
     )
-    store_age: float = _FILES.option(
-        DURATION, 3600.0, "what an earlier run kept longer ago than this is dropped at the start", rare=True
+    store_age: float = _FILES_RARE.option(
+        DURATION, 3600.0, "what an earlier run kept longer ago than this is dropped at the start"
     )
     record_base: Path | None = _FILES.option(PATH, None, "also keep the base stream in this Matroska file")
-    truth: Path | None = _FILES.option(
-        PATH, None, "write the demo's ground truth, MOTChallenge form", rare=True
-    )
+    truth: Path | None = _FILES_RARE.option(PATH, None, "write the demo's ground truth, MOTChallenge form")
     summary: Path | None = _FILES.option(PATH, None, "write the summary as JSON")
     quiet: bool = _FILES.switch("no status line")
 

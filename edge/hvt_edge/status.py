@@ -7,7 +7,7 @@ from collections.abc import Callable
 from hvt_common import __version__
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import Health, Info, Status, fitted_class_names
-from hvt_common.units import bitrate_text
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
@@ -19,7 +19,6 @@ from hvt_edge.stills.stage import StillStage
 
 __all__ = ["InfoReporter", "StatusReporter"]
 
-_SECOND_NS = 1_000_000_000
 _MILLION = 1_000_000
 
 
@@ -109,7 +108,7 @@ class StatusReporter:
     def line(self, link: str) -> str:
         """The status line."""
         config, now, ledger = self._config, self._operating.now, self._ledger
-        rate_bps = ledger.window_bytes(None, self._loop_clock()) * 8 * _SECOND_NS / ledger.window_ns
+        rate_bps = ledger.window_bytes(None, self._loop_clock()) * 8 * SECOND_NS / ledger.window_ns
         sent = sum(ledger.outcomes("sent").values())
         return (
             f"{config.edge_id} {self._counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "

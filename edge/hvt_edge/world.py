@@ -31,11 +31,7 @@ class World:
         """Runs perception in lockstep; None: a thread of its own."""
 
     def open_detector(self, config: EdgeConfig) -> Detector:
-        """Open the detector.
-
-        Raises:
-            UserError: there is none of that name.
-        """
+        """Open the detector. Raises `UserError` where there is none of that name."""
         return make_detector(config)
 
     def warm_up(self, config: EdgeConfig, detector: Detector, source: Source) -> None:
@@ -43,11 +39,7 @@ class World:
         warm_up_for(config, detector, source.view)
 
     def open_source(self, config: EdgeConfig) -> Source:
-        """Open what ``--source`` names.
-
-        Raises:
-            UserError: nothing usable is there.
-        """
+        """Open what ``--source`` names. Raises `UserError` where nothing usable is there."""
         assert config.source is not None, "check() refuses a missing source"
         return open_source(
             config.source,
@@ -61,11 +53,7 @@ class World:
         )
 
     def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
-        """Open the link until ``stack`` closes.
-
-        Raises:
-            UserError: a port, an endpoint or the edge's id cannot be used.
-        """
+        """Open the link until ``stack`` closes. Raises `UserError` for a bad port, endpoint or edge id."""
         return stack.enter_context(
             ZenohLink(make_link_settings(config), edge_id=config.edge_id, clock=self.clock)
         )

@@ -47,8 +47,7 @@ class Ground:
     def run(self) -> list[dict[str, Any]]:
         """Serve edges until ``stop`` is set, or with ``--once`` until they have ended; return a summary a session.
 
-        Raises:
-            UserError: before anything is received, where a setting, a file or a port cannot be used.
+        Raises `UserError` before anything is received, where a setting, a file or a port cannot be used.
         """
         config = self._config
         check_edge_pattern(config.edges)

@@ -18,6 +18,7 @@ DETECTOR, NONE, MOTION = "detector", "none", "motion"
 
 
 _LINK, _MODELS, _FILES = Group("link and edges"), Group("models"), Group("files and views")
+_LINK_RARE, _MODELS_RARE, _FILES_RARE = (replace(group, rare=True) for group in (_LINK, _MODELS, _FILES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +34,8 @@ class GroundConfig:
     zenoh_config: Path | None = _LINK.option(
         PATH, None, "Zenoh configuration, JSON5, that all this goes on top of"
     )
-    links: int = _LINK.option(
-        integer(1, 2),
-        1,
-        "2: where it connects, one Zenoh link for what is urgent and one for the rest",
-        rare=True,
+    links: int = _LINK_RARE.option(
+        integer(1, 2), 1, "2: where it connects, one Zenoh link for what is urgent and one for the rest"
     )
     insecure: bool = _LINK.switch("allow listening beyond this machine without keys")
     edges: str = _LINK.option(TEXT, "*", "which edges to serve, for example 'uav-*'")
@@ -45,32 +43,29 @@ class GroundConfig:
     wait: float = _LINK.option(
         DURATION, 0.0, "with --once: give up when no edge came for so long; 0 waits for ever"
     )
-    patience: float | None = _LINK.option(
+    patience: float | None = _LINK_RARE.option(
         DURATION,
         None,
         "how long an edge that went without a word may stay away before its session is closed",
         shown_default="10min; 5s with --once",
-        rare=True,
     )
 
     detector: str = _MODELS.option(
         TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
     )
     labels: Path | None = _MODELS.option(PATH, None, "class names of the classifier, one a line")
-    detector_labels: Path | None = _MODELS.option(
-        PATH, None, "class names of the detector, one a line", rare=True
-    )
+    detector_labels: Path | None = _MODELS_RARE.option(PATH, None, "class names of the detector, one a line")
     detect_every: int = _MODELS.option(
         integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame, less when behind"
     )
     confidence: float = _MODELS.option(
         number(0.01, 1), 0.25, "confidence from which a detection starts a track"
     )
-    nms_iou: float = _MODELS.option(
-        number(0.01, 1), 0.45, "overlap above which two boxes of a class are one", rare=True
+    nms_iou: float = _MODELS_RARE.option(
+        number(0.01, 1), 0.45, "overlap above which two boxes of a class are one"
     )
-    camera_motion: str = _MODELS.option(
-        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion", rare=True
+    camera_motion: str = _MODELS_RARE.option(
+        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion"
     )
     classifier: str | None = _MODELS.option(
         TEXT,
@@ -83,7 +78,7 @@ class GroundConfig:
         "replace",
         "a still's class replaces the track's, or is weighed with the others",
     )
-    threads: int = _MODELS.option(integer(1, 64), 2, "threads of the detector and the classifier", rare=True)
+    threads: int = _MODELS_RARE.option(integer(1, 64), 2, "threads of the detector and the classifier")
     provider: str = _MODELS.option(
         choice(*PROVIDERS), "auto", "what runs the networks; auto says what it took and why"
     )
@@ -94,8 +89,8 @@ class GroundConfig:
     tracks: Path | None = _FILES.option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
-    timing: Path | None = _FILES.option(
-        PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv", rare=True
+    timing: Path | None = _FILES_RARE.option(
+        PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
     )
     view: bool = _FILES.switch("also open the Rerun viewer")
     serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")

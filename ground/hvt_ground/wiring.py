@@ -40,12 +40,7 @@ __all__ = ["Models", "SessionFactory", "make_backlog_perception", "make_pipeline
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
-    Args:
-        config: of the ground.
-        models: they share.
-        clock: Unix nanoseconds without steps.
-        live_url: of a viewer; None shows nothing live.
-        timing: the table of ``--timing``.
+    ``live_url`` is of a viewer, None shows nothing live; ``timing`` is the table of ``--timing``.
     """
 
     def __init__(

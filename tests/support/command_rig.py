@@ -35,7 +35,7 @@ from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.suppression import Suppression
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.reconfigure import EncoderReconfiguration
-from hvt_edge.wiring import make_encoder, reconfiguration_settings
+from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
 
 SOURCE, BASE = (960, 540), (640, 360)
 VIEW = View.fitted(SOURCE, BASE, fit="letterbox")

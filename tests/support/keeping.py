@@ -44,7 +44,7 @@ from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
-from hvt_edge.wiring import make_encoder, reconfiguration_settings
+from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
 from hvt_ground.backlog import BacklogAssembly
 from kept import INFO, S, opened
 from messages import feedback

@@ -68,17 +68,11 @@ _TORCHVISION = Preparation(mean=(123.675, 116.28, 103.53), scale=(1 / 58.395, 1 
 def open_classifier(
     spec: str, *, labels: Path | None = None, threads: int = 2, provider: str = "cpu"
 ) -> Classifier:
-    """Open an ONNX classifier.
+    """Open an ONNX classifier by the name of a model (see `resolve_model`) or the path of a file.
 
-    Args:
-        spec: The name of a model (see `resolve_model`), or the path of an ONNX file.
-        labels: Class names, one a line; else those of the metadata, ImageNet's, or "class 0" and so on. 1000 names
-            fit a model of 1001 classes (a background comes first), and the reverse. The first synonym is shown.
-        threads: CPU threads of the network.
-        provider: One of `providers.PROVIDERS`.
-
-    Raises:
-        UserError: No such model, not a classifier, metadata or labels that do not fit.
+    ``labels`` are class names, one a line; else those of the metadata, ImageNet's, or "class 0" and so on. 1000
+    names fit a model of 1001 classes (a background comes first), and the reverse. The first synonym is shown.
+    Raises `UserError` where there is no such model, it is not a classifier, or metadata or labels do not fit.
     """
     path = resolve_model(spec, role="classifier")
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
@@ -89,10 +83,8 @@ class OnnxClassifier:
     """A network from one image to one row of scores; arguments as of `open_classifier`.
 
     Construction runs the network once on noise, to distinguish logits (softmax is applied) from probabilities
-    (each row sums to one).
-
-    Raises:
-        UserError: The model is not a classifier, or its metadata or the labels do not fit.
+    (each row sums to one). Raises `UserError` where the model is not a classifier, or its metadata or the
+    labels do not fit.
     """
 
     def __init__(self, model: OnnxModel, *, labels: Path | None = None) -> None:
@@ -103,11 +95,7 @@ class OnnxClassifier:
         self.class_names = _class_names(model, classes, labels)
 
     def classify(self, crops_bgr: Sequence[Image]) -> list[Posterior]:
-        """Classify crops of any size; those of a model with a free batch go through together.
-
-        Args:
-            crops_bgr: (height, width, 3) uint8 each; grey is accepted too.
-        """
+        """Classify (height, width, 3) uint8 crops of any size (or grey); a free batch takes all of them at once."""
         batch = self._batch or _MAX_BATCH
         posteriors = []
         for start in range(0, len(crops_bgr), batch):

@@ -53,20 +53,13 @@ def open_detector(
     threads: int = 2,
     provider: str = "cpu",
 ) -> Detector:
-    """Open the detector that ``spec`` names.
+    """Open a detector: ``motion``, the name of a model (see `resolve_model`), or an ONNX file.
 
-    Args:
-        spec: ``motion``, the name of a model (see `resolve_model`), or an ONNX file with a head of `detect_heads`.
-        labels: Class names, one a line; else those of the metadata, COCO (80), VisDrone (10), or "class 0" and so on.
-        confidence: Least confidence of a detection, 0…1.
-        nms_iou: Largest overlap of two detections of one class, 0…1.
-        size: (width, height) of the network's input where the model leaves it free; else each image gets the
-            multiples of 32 that hold it (at most 1920 on the longer side).
-        threads: CPU threads of the network.
-        provider: One of `providers.PROVIDERS`.
-
-    Raises:
-        UserError: No such model, not a detector, labels that do not fit, a setting out of its range.
+    ``labels`` are class names, one a line; else those of the metadata, COCO (80), VisDrone (10), or "class 0" and
+    so on. ``confidence`` is the least of a detection, ``nms_iou`` the largest overlap of two of one class, both
+    0…1. ``size`` is (width, height) of the network's input where the model leaves it free; else each image gets the
+    multiples of 32 that hold it (at most 1920 on the longer side). Raises `UserError` where there is no such model,
+    it is not a detector, its labels do not fit, or a setting is out of its range.
     """
     for name, value in (("confidence", confidence), ("NMS IoU", nms_iou)):
         if not 0 <= value <= 1:
@@ -90,10 +83,8 @@ def warm_up(detector: Detector, size: tuple[int, int]) -> None:
 class OnnxDetector:
     """A network with one of the known heads; arguments as of `open_detector`.
 
-    Construction runs the network once on grey: that tells the head by its values too, and warms it up.
-
-    Raises:
-        UserError: The model is not a detector, or the labels or the size do not fit it.
+    Construction runs the network once on grey: that tells the head by its values too, and warms it up. Raises
+    `UserError` where the model is not a detector, or the labels or the size do not fit it.
     """
 
     def __init__(
@@ -119,11 +110,7 @@ class OnnxDetector:
         )
 
     def detect(self, image_bgr: Image) -> Detections:
-        """Run the network on one image of any size.
-
-        Args:
-            image_bgr: (height, width, 3) uint8; grey is accepted too.
-        """
+        """Run the network on one (height, width, 3) uint8 image of any size; grey is accepted too."""
         image = as_bgr(image_bgr)
         input_size = self.input_size((image.shape[1], image.shape[0]))
         tensor, letterbox = self._letterboxer.fill(image, input_size)

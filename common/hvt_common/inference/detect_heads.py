@@ -89,10 +89,8 @@ class Head(Protocol):
 class YoloxHead:
     """YOLOX: BGR 0…255, image in the top-left corner.
 
-    Args:
-        classes: Number of classes.
-        strides: Cell sizes in input pixels, in the order of the output.
-        decoded: The network already wrote pixels.
+    ``strides`` are cell sizes in input pixels, in the order of the output; ``decoded``: the network already wrote
+    pixels.
     """
 
     anchor: Anchor = "top-left"
@@ -127,11 +125,7 @@ class YoloxHead:
 
 
 class UltralyticsHead:
-    """YOLOv8, 11 and kin, and YOLOv5-u: RGB 0…1, image centred.
-
-    Args:
-        classes: Number of classes.
-    """
+    """YOLOv8, 11 and kin, and YOLOv5-u: RGB 0…1, image centred."""
 
     anchor: Anchor = "centre"
     rgb = True

@@ -50,8 +50,7 @@ class ModelReport:
 def inspect_model(path: Path, *, provider: str = "cpu", threads: int = 2) -> ModelReport:
     """Open a model, try it as a detector and as a classifier, and time it.
 
-    Raises:
-        UserError: Not an ONNX model, or not one that this provider opens.
+    Raises `UserError` where it is no ONNX model, or not one that this provider opens.
     """
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
     adapter, because, class_names, once, timing = _fitted(model)

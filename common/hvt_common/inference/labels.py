@@ -20,10 +20,9 @@ _MAX_METADATA_CHARS = 1 << 20
 def read_labels(path: Path) -> tuple[str, ...]:
     """Read class names: UTF-8 text, one name a line, the first line is class 0.
 
-    Blank lines at the end are ignored; spaces around a name too. A name may occur twice (ImageNet has two cranes).
-
-    Raises:
-        UserError: Missing, not readable, not text, empty, a blank line in the middle, too many or too long names.
+    Blank lines at the end are ignored; spaces around a name too. A name may occur twice (ImageNet has two
+    cranes). Raises `UserError` where it is missing, not readable, not text, or empty, has a blank line in the
+    middle, or too many or too long names.
     """
     names = [line.strip() for line in _read_text(path).rstrip().splitlines()]
     if names == []:

@@ -61,11 +61,8 @@ class Letterbox:
 class Letterboxer:
     """Writes images into one reused network input; nothing is allocated while the geometry stays the same.
 
-    Args:
-        anchor: Where the image lies on the input.
-        rgb: Channel order of the network; images are BGR.
-        gain: The network sees ``pixel * gain``.
-        dtype: float32 or float16.
+    ``anchor`` is where the image lies; the network sees ``pixel * gain`` as float32 or float16, in RGB order where
+    ``rgb``.
     """
 
     def __init__(self, *, anchor: Anchor, rgb: bool, gain: float, dtype: np.dtype[Any]) -> None:
@@ -79,12 +76,7 @@ class Letterboxer:
         self._letterbox: Letterbox | None = None
 
     def fill(self, image_bgr: Image, input_size: tuple[int, int]) -> tuple[npt.NDArray[Any], Letterbox]:
-        """Return the (1, 3, height, width) input, valid until the next call, and how the image lies on it.
-
-        Args:
-            image_bgr: (height, width, 3) uint8.
-            input_size: (width, height) in pixels.
-        """
+        """Return the (1, 3, height, width) input, valid until the next call, and how the image lies on it."""
         image_size = (image_bgr.shape[1], image_bgr.shape[0])
         if (
             self._letterbox is None
@@ -118,8 +110,7 @@ class Letterboxer:
 def as_bgr(image: npt.NDArray[np.uint8]) -> Image:
     """Return the image as (height, width, 3) BGR: grey is spread over three channels, alpha is dropped.
 
-    Raises:
-        ValueError: No pixels, or not an image at all.
+    Raises `ValueError` where it has no pixels or is no image at all.
     """
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or 0 in image.shape:
         raise ValueError(f"an image of uint8 pixels is expected, not {image.dtype} {image.shape}")

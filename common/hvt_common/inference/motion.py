@@ -77,12 +77,7 @@ class MotionSettings:
 
 
 class MotionDetector:
-    """Finds what moves; stateful: one instance for one stream of images in order.
-
-    Args:
-        confidence: Least confidence of a detection, 0…1.
-        settings: What counts as a moving object.
-    """
+    """Finds what moves; stateful: one instance for one stream of images in order."""
 
     class_names: tuple[str, ...] = (MOVING,)
 
@@ -95,8 +90,7 @@ class MotionDetector:
     def detect(self, image_bgr: Image) -> Detections:
         """Moving objects in this image, in its pixels, best first; the image is remembered for the next calls.
 
-        Args:
-            image_bgr: (height, width, 3) uint8. An image of another size than the last starts afresh.
+        An image of another size than the last starts afresh.
         """
         image = _shrunk(as_bgr(image_bgr), self._settings.max_side_px)
         gray = np.asarray(cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (3, 3), 0), np.uint8)
@@ -191,10 +185,7 @@ def _noise(difference: _Gray) -> float:
 def _regions(
     mask: _Gray, seeds: npt.NDArray[np.bool_], excess: npt.NDArray[np.float32], settings: MotionSettings
 ) -> tuple[_Floats, _Floats]:
-    """Boxes and confidences of the connected regions that may be objects.
-
-    ``excess`` is the difference in units of the threshold.
-    """
+    """Boxes and confidences of possible objects; ``excess`` is the difference in units of the threshold."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (settings.join_px, settings.join_px))
     closed = np.asarray(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel), np.uint8)
     _, labels, found, _ = cv2.connectedComponentsWithStats(closed, connectivity=8, ltype=cv2.CV_16U)

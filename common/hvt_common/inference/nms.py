@@ -29,19 +29,11 @@ def suppress(
     any_class_iou: float = 1.0,
     limit: int = MAX_DETECTIONS,
 ) -> npt.NDArray[np.intp]:
-    """Return the indices of the boxes to keep, best first (equal scores: first come).
+    """Return the indices of the boxes to keep, best first (equal scores: first come), at most ``limit``.
 
-    A box is suppressed when a better one of the same class overlaps it by more than ``iou``. Classes are separated by
-    shifting each to its own place on the plane, in float64 so that no precision is lost.
-
-    Args:
-        boxes_xyxy: (N, 4) float32, finite.
-        scores: (N,) float32, finite.
-        class_ids: (N,) int32.
-        iou: Largest overlap that two boxes of one class may have, 0…1.
-        any_class_iou: Largest overlap that two boxes of any class may have: networks call one vehicle a car and a
-            truck. 1 lets them.
-        limit: At most so many boxes are returned.
+    A box is suppressed when a better one of the same class overlaps it by more than ``iou``, or one of any class by
+    more than ``any_class_iou``: networks call one vehicle a car and a truck. Boxes are (N, 4) float32 ``xyxy``.
+    Classes are separated by shifting each to its own place on the plane, in float64 so that no precision is lost.
     """
     if len(scores) == 0:
         return np.empty(0, np.intp)

@@ -54,13 +54,11 @@ def refuse_duplicate_edge(settings: LinkSettings, keys: EdgeKeys) -> None:
 def living_edge(settings: LinkSettings, keys: EdgeKeys, *, patience: float = 1.0) -> Info | None:
     """Return the `Info` of the living edge with these keys; None where none is found within a second or two.
 
-    One that is found is queried again for five seconds: it may be about to leave. A liveliness token alone is no
-    proof: that of a killed process stays until the link's lease runs out, so the edge has to answer on ``info``.
-    Searched where ``settings`` connect to; an edge that only listens cannot search. A fleet's access control does not
-    let an edge query, and then none is found: the ground notices. ``patience`` multiplies all time limits.
-
-    Raises:
-        UserError: the settings cannot be used.
+    One that is found is queried again for five seconds: it may be about to leave. A liveliness token alone is
+    no proof: that of a killed process stays until the link's lease runs out, so the edge has to answer on
+    ``info``. Searched where ``settings`` connect to; an edge that only listens cannot search. A fleet's
+    access control does not let an edge query, and then none is found: the ground notices. ``patience``
+    multiplies all time limits. Raises `UserError` where the settings cannot be used.
     """
     found = _attempt(settings, keys, patience)
     until_s = time.monotonic() + patience * _LEAVING_S

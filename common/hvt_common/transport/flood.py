@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Hashable
 
+from hvt_common.units import SECOND_NS
+
 __all__ = ["FloodWatch"]
 
-_SECOND_NS = 1_000_000_000
-_AGAIN_NS = 60 * _SECOND_NS
+_AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: a flood is not to fill the log."""
 
 
@@ -28,7 +29,7 @@ class FloodWatch:
     def note(self, kind: Hashable, *, now_ns: int) -> int | None:
         """A message of this kind came; its number in this second where that is worth a warning now, else None."""
         with self._lock:
-            second = now_ns // _SECOND_NS
+            second = now_ns // SECOND_NS
             if second != self._second:
                 self._second = second
                 self._counts.clear()

@@ -48,13 +48,10 @@ class Rights:
         return not self.enabled or self.default_allow or bool(self._rules_for(name))
 
     def allow(self, name: str, *, flow: str, message: str, key: str) -> bool:
-        """Whether the rules let this pass between us and that name.
+        """Whether the rules let this pass between us and that common name of a certificate.
 
-        Args:
-            name: common name of the certificate at the other end.
-            flow: ``ingress`` from there, ``egress`` to there.
-            message: Zenoh's word: ``put``, ``query``, ``reply``, ``declare_subscriber`` and so on.
-            key: the full key of the message.
+        ``flow`` is ``ingress`` from there or ``egress`` to there; ``message`` is Zenoh's word, such as ``put``,
+        ``query``, ``reply`` or ``declare_subscriber``.
         """
         if not self.enabled:
             return True

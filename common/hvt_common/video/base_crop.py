@@ -13,7 +13,7 @@ import numpy as np
 
 from hvt_common.values import Image, View
 
-__all__ = ["MAX_SIDE_PX", "base_crop", "coded_size"]
+__all__ = ["MAX_SIDE_PX", "base_crop", "coded_size", "resampled"]
 
 MAX_SIDE_PX = 512
 """A longer crop is coded smaller: an object that fills 512 pixels needs no more to be classified."""
@@ -37,24 +37,29 @@ def base_crop(
     shrunk.
     """
     x1, y1, x2, y2 = crop_source_px
-    step_x, step_y = (x2 - x1) / size[0] * view.scale, (y2 - y1) / size[1] * view.scale
-    fine = max(1, math.ceil(max(step_x, step_y) - 1e-6))
-    step_x, step_y = step_x / fine, step_y / fine
+    origin = x1 * view.scale + view.offset_px[0], y1 * view.scale + view.offset_px[1]
+    step = (x2 - x1) / size[0] * view.scale, (y2 - y1) / size[1] * view.scale
+    return resampled(base_bgr, origin, step, size)
+
+
+def resampled(
+    image_bgr: Image, origin_px: tuple[float, float], step_px: tuple[float, float], size: tuple[int, int]
+) -> Image:
+    """``size`` pixels of an image, from the corner ``origin_px`` on, ``step_px`` image pixels for each."""
+    fine = max(1, math.ceil(max(step_px) - 1e-6))
+    step_x, step_y = step_px[0] / fine, step_px[1] / fine
     # Pixel i covers i…i+1, hence the half pixels: boxes map by their edges, warpAffine by pixel centres.
     matrix = np.array(
-        [
-            [step_x, 0, x1 * view.scale + view.offset_px[0] + (step_x - 1) / 2],
-            [0, step_y, y1 * view.scale + view.offset_px[1] + (step_y - 1) / 2],
-        ],
+        [[step_x, 0, origin_px[0] + (step_x - 1) / 2], [0, step_y, origin_px[1] + (step_y - 1) / 2]],
         np.float64,
     )
-    crop = cv2.warpAffine(
-        base_bgr,
+    result = cv2.warpAffine(
+        image_bgr,
         matrix,
         (size[0] * fine, size[1] * fine),
         flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
     if fine > 1:
-        crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(crop, np.uint8)
+        result = cv2.resize(result, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(result, np.uint8)

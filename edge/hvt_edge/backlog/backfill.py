@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import chain
 
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
+from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.entry import Entry, Key
 
@@ -21,8 +22,7 @@ __all__ = ["Backfill", "Chunk"]
 
 _log = logging.getLogger(__name__)
 
-_SECOND_NS = 1_000_000_000
-_PATIENCE_NS = 2 * _SECOND_NS
+_PATIENCE_NS = 2 * SECOND_NS
 _TRIES, _TRIES_BEGUN = 3, 6
 """Without getting on: of an object of which the ground has nothing, and of one that it has a part of."""
 _MOST_ANSWERS = 300
@@ -33,7 +33,7 @@ _MOST_AHEAD_BYTES = 256 * 1024
 """Of one object, beyond what the ground has said it has."""
 _LEAST_CHUNK_BYTES = 600
 """A smaller one is mostly headers, unless it is the last."""
-_OTHER_RECEIVER_NS = 5 * _SECOND_NS
+_OTHER_RECEIVER_NS = 5 * SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,12 +87,8 @@ def check_folder(path: Path) -> None:
 class Folder:
     """The objects of this session and of those before it, in bounded room. For one thread; counts may be read by any.
 
-    Args:
-        path: made when something is stored for the first time.
-        max_bytes: of files, in whole blocks.
-        session_id: of this run.
-        info: this session's `Info`, packed; called when the first thing is stored.
-        oldest_ns: what was captured before is dropped when the folder is opened.
+    ``path`` is made when something is stored for the first time; ``max_bytes`` counts whole blocks. ``info()`` is
+    this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped when the folder is opened.
     """
 
     def __init__(

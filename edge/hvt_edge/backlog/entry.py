@@ -21,6 +21,7 @@ from hvt_common.protocol.messages import (
     pack_backlog_units,
     parse_backlog_still,
 )
+from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.segment import DamagedError, blocks, index_of, last_ns, read_segment
 
 __all__ = [
@@ -40,8 +41,7 @@ __all__ = [
 
 FIRST_STORED = 2**31
 """Stills that are stored for later have numbers of their own: those that are sent have no holes then."""
-_SECOND_NS = 1_000_000_000
-_HALF_LIFE_NS = 600 * _SECOND_NS
+_HALF_LIFE_NS = 600 * SECOND_NS
 _LEAST_STRENGTH = -60.0
 _STILL = re.compile(r"still-(\d{1,10})-(\d{1,19})-(\S{1,32})\.still")
 _BASE = re.compile(r"base-(\d{1,10})-(\d{1,19})\.mkv")

@@ -10,15 +10,15 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 
 __all__ = ["SILENCE_NS", "BaseInFlight", "InFlightSettings", "Outage"]
 
 _MS = 1_000_000
-_SECOND_NS = 1_000_000_000
 SILENCE_NS = 1_500 * _MS
 """Three reports in a row that did not come."""
-_LEFT_NS = 15 * _SECOND_NS
+_LEFT_NS = 15 * SECOND_NS
 """Who is silent for so long on a link that Zenoh still has, has left; others may subscribe
 that never report. The same as in `hvt_edge.link.pacer`."""
 
@@ -65,7 +65,7 @@ class Outage:
 class InFlightSettings:
     """Bounds of what is held for an outage that may come."""
 
-    max_age_ns: int = 4 * _SECOND_NS
+    max_age_ns: int = 4 * SECOND_NS
     max_bytes: int = 2 * 2**20
 
 

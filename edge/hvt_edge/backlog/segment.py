@@ -58,8 +58,7 @@ def index_of(video: Path) -> Path:
 class SegmentWriter:
     """Appends access units. ``parameter_sets`` is a keyframe that describes the stream: the first unit, if it is one.
 
-    Raises:
-        OSError: the disk takes no more.
+    Raises `OSError` where the disk takes no more.
     """
 
     def __init__(self, video: Path, *, parameter_sets: bytes) -> None:
@@ -147,11 +146,7 @@ class OpenSegment:
 
 
 def read_segment(video: Path) -> tuple[BacklogUnit, ...]:
-    """The frames of a segment, bytes as x265 made them, up to the first that is missing or damaged.
-
-    Raises:
-        DamagedError: not even one is whole.
-    """
+    """The frames of a segment up to the first damaged one. Raises `DamagedError` where not even one is whole."""
     units: list[BacklogUnit] = []
     try:
         records = index_of(video).read_bytes()

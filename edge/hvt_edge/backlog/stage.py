@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Self
 
 from hvt_common.protocol.messages import BacklogKind, BacklogStill, Feedback
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import SEGMENT_NS, Folder
@@ -30,15 +31,14 @@ from hvt_edge.operating.keyframes import KeyframeRequests
 
 __all__ = ["BacklogLink", "BacklogStage", "State"]
 
-_SECOND_NS = 1_000_000_000
-_STEADY_NS = 2 * _SECOND_NS
+_STEADY_NS = 2 * SECOND_NS
 """So long the link is back before anything stored is sent: the picture comes first."""
-_PROBE_NS = _SECOND_NS
+_PROBE_NS = SECOND_NS
 _RESERVE = 1 / 3
 """Of the stills' share of a window, left for a live one that may come."""
 _TRICKLE_BYTES = 1_400
 """Of a chunk that goes while live stills are pending: one packet."""
-_FINISH_NS, _STUCK_NS, _POLL_S = 60 * _SECOND_NS, 6 * _SECOND_NS, 0.05
+_FINISH_NS, _STUCK_NS, _POLL_S = 60 * SECOND_NS, 6 * SECOND_NS, 0.05
 """How long sending goes on after the end of a clip: in all, and without getting on."""
 
 
@@ -130,10 +130,7 @@ class BacklogStage:
         return self._worker.failed
 
     def before_frame(self, now_ns: int, *, linked: bool) -> bool:
-        """Before each frame: notice that the link went or came; return whether it is away.
-
-        Raises what has ended the store's thread.
-        """
+        """Before each frame: whether the link is away. Raises what has ended the store's thread."""
         self._worker.check()
         self._linked = linked
         offline = self._outage.offline(now_ns, linked=linked) and not self.failed

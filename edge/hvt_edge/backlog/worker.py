@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, pack_backlog_still
 from hvt_common.runtime.process import lower_priority
+from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.backfill import Backfill, Chunk
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.entry import Entry
@@ -31,7 +32,6 @@ _LAST_CHUNK_S = 1.0
 """What is being sent when no more is to be sent has so long to go."""
 _TRICKLE_SHARE = 1 / 40
 """Of the total, where live stills always wait: they must not hold up for ever what was admitted before."""
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,10 +158,10 @@ class StoreWorker:
         return StoreNumbers(
             stills=folder.stills,
             segments=folder.segments + folder.open_segments,
-            video_s=folder.span_ns / _SECOND_NS,
+            video_s=folder.span_ns / SECOND_NS,
             disk_bytes=folder.disk_bytes,
             sent_stills=self._sent_stills,
-            sent_video_s=self._sent_ns / _SECOND_NS,
+            sent_video_s=self._sent_ns / SECOND_NS,
             acknowledged_bytes=backfill.acknowledged_bytes,
             evicted_stills=folder.evicted_stills,
             evicted_segments=folder.evicted_segments,
@@ -257,7 +257,7 @@ class StoreWorker:
     def _enter(self, folder: Folder) -> None:
         """Another edge has the folder: it may have been the one before this, which has ended by now."""
         now_ns = self._clock()
-        if folder.locked_out and now_ns - self._entered_ns >= _SECOND_NS:
+        if folder.locked_out and now_ns - self._entered_ns >= SECOND_NS:
             self._entered_ns = now_ns
             try:
                 folder.enter()
@@ -279,7 +279,7 @@ class StoreWorker:
             return
         now_ns = self._clock()
         if done is not None:
-            pause_ns = 8 * _SECOND_NS * done[1] / (_TRICKLE_SHARE * self._total_bps())
+            pause_ns = 8 * SECOND_NS * done[1] / (_TRICKLE_SHARE * self._total_bps())
             self._trickle_ns = now_ns + round(pause_ns)
         allowance = None if self._sending.busy else self._allowance(now_ns)
         if allowance is None or (allowance.trickle and now_ns < self._trickle_ns):
@@ -326,10 +326,7 @@ class ChunkThread:
             self._changed.notify()
 
     def take(self) -> tuple[Chunk, int] | None:
-        """Return the chunk that was sent last and its line bytes, once; None while there is none.
-
-        Raises whatever ``send`` has raised.
-        """
+        """The chunk sent last and its line bytes, once; None until then. Raises whatever ``send`` has raised."""
         with self._changed:
             if self._error is not None:
                 raise self._error

@@ -15,7 +15,7 @@ from typing import Any
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, TrackNow, fitted_text
-from hvt_common.units import bitrate_text
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import LEAST_FPS, REGIMES, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests
@@ -29,10 +29,9 @@ from hvt_edge.video.share import FIRST_SHARE
 
 __all__ = ["Commands"]
 
-_SECOND_NS = 1_000_000_000
 _MOST_REQUESTS = 32
 """In a second, from all grounds together."""
-_REST_NS = 2 * _SECOND_NS
+_REST_NS = 2 * SECOND_NS
 """Between two changes of the budget: each costs a keyframe and the opening of an encoder."""
 _MOST_BPS = 1_000_000_000
 _QUALITIES_PCT = (5, 95)
@@ -56,17 +55,8 @@ class _Result:
 class Commands:
     """Answers one session's requests; may be called from any thread.
 
-    Args:
-        config: the settings at the start.
-        operating: takes what is commanded.
-        session_id: of this run.
-        keyframes: where keyframes are requested, also the one that a change of rates waits for.
-        on_demand: serves stills and tracks.
-        chooser: takes another method.
-        backlog: None where nothing is stored while the link is offline.
-        base_size: (width, height) of the base stream.
-        clock: Unix nanoseconds, for the rate of requests.
-        loop_clock: the time that the budget's windows go by, which keyframes are planned in.
+    ``clock`` is Unix nanoseconds, for the rate of requests; ``loop_clock`` is the time of the budget's windows and
+    of planned keyframes.
     """
 
     def __init__(
@@ -136,7 +126,7 @@ class Commands:
 
     def _check_rate(self) -> None:
         now_ns, times = self._clock(), self._request_times
-        if len(times) == _MOST_REQUESTS and now_ns - times[0] < _SECOND_NS:
+        if len(times) == _MOST_REQUESTS and now_ns - times[0] < SECOND_NS:
             raise RefusedError(f"too many requests: at most {_MOST_REQUESTS} a second are served")
         times.append(now_ns)
 

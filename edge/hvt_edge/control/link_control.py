@@ -25,21 +25,9 @@ _MOST_WAIT_NS = 100_000_000
 
 
 class LinkControl:
-    """`on_feedback` in the link's thread, all else in the frame loop.
+    """Applies receiver reports: `on_feedback` in the link's thread, all else in the frame loop.
 
-    Args:
-        has_ground: whether a ground subscribes.
-        session_id: reports on another session do not count.
-        transmitter: what leaves.
-        keyframes: where keyframes are requested.
-        inbox: takes what grounds made of stills.
-        reconfiguration: tracks the rate of the link.
-        clock: the edge's, for the time at which reports come.
-        pacer: None without ``--adapt``.
-        in_flight: access units that no report has named.
-        outbox: stills, until a report names them.
-        stills: stores what is lost after the last frame.
-        backlog: stores what the link cannot carry away; None where nobody does.
+    ``pacer`` is None without ``--adapt``, ``backlog`` where nothing is stored while the link is offline.
     """
 
     def __init__(

@@ -31,9 +31,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.units import SECOND_NS
+
 __all__ = ["BASE_PEAK", "BudgetSettings", "RollingBudget"]
 
-_SECOND_NS = 1_000_000_000
 _MEMORY_WINDOWS = 5
 """How many windows of the base's recent behaviour the forecast looks back on."""
 _FORECASTS = 30
@@ -54,7 +55,7 @@ class BudgetSettings:
     """B_v, the share of the base stream with its headers, overhead and ``status``."""
     fps: float
     """Coded frames a second."""
-    window_ns: int = _SECOND_NS
+    window_ns: int = SECOND_NS
     carry_s: float = 2.0
     metadata_bps: int = 0
     """Kept free of stills for messages beside base and stills, such as ``tracks``."""
@@ -75,7 +76,7 @@ class RollingBudget:
     """
 
     def __init__(self, settings: BudgetSettings) -> None:
-        self._total = settings.total_bps * settings.window_ns / 8 / _SECOND_NS
+        self._total = settings.total_bps * settings.window_ns / 8 / SECOND_NS
         self._events: list[tuple[int, int]] = []
         """(time, line bytes), in order of time."""
         self._base_events: deque[tuple[int, int]] = deque()
@@ -93,12 +94,12 @@ class RollingBudget:
     def _adopt(self, settings: BudgetSettings) -> None:
         """Take over settings with the same total and window; what the base did at another rate is forgotten."""
         self._settings = settings
-        self._step_ns = round(_SECOND_NS / settings.fps)
+        self._step_ns = round(SECOND_NS / settings.fps)
         steps = max(1, math.ceil(float(settings.window_ns) / self._step_ns - _ROUNDING))
         self._forecasts = np.unique(
             np.linspace(0, steps, min(steps, _FORECASTS) + 1).round().astype(np.int64)
         )
-        self._base_peak = BASE_PEAK * settings.base_bps * settings.window_ns / 8 / _SECOND_NS
+        self._base_peak = BASE_PEAK * settings.base_bps * settings.window_ns / 8 / SECOND_NS
         self._base_steps: deque[int] = deque(maxlen=steps * _MEMORY_WINDOWS)
         self._burst = self._recent_bursts()
         self._cap = settings.still_bps * settings.carry_s / 8
@@ -119,7 +120,7 @@ class RollingBudget:
         settings = self._settings
         self._refill(now_ns)
         self._settings = replace(settings, total_bps=total_bps)
-        self._total = total_bps * settings.window_ns / 8 / _SECOND_NS
+        self._total = total_bps * settings.window_ns / 8 / SECOND_NS
         if (base_bps, fps) != (settings.base_bps, settings.fps):
             self.set_base(base_bps, fps, now_ns=now_ns)
         self._cap = self._settings.still_bps * settings.carry_s / 8
@@ -138,7 +139,7 @@ class RollingBudget:
     @property
     def most_still_bytes(self) -> int:
         """The most line bytes that `still_allowance` ever gives, while the base keeps to its share."""
-        window_s = self._settings.window_ns / _SECOND_NS
+        window_s = self._settings.window_ns / SECOND_NS
         borrowed = self._settings.base_bps * window_s / 8 if self._settings.borrow_unused else 0.0
         return int(min(self._cap + borrowed, self._settings.still_bps * window_s / 8))
 
@@ -231,7 +232,7 @@ class RollingBudget:
             free = self._total - sum(size for at_ns, size in self._events if at_ns > after_ns)
         else:
             free = self._window_allowance(now_ns)
-        reserved = reserve * settings.still_bps * settings.window_ns / 8 / _SECOND_NS
+        reserved = reserve * settings.still_bps * settings.window_ns / 8 / SECOND_NS
         return max(0, int(free - reserved))
 
     def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int) -> bool:
@@ -251,7 +252,7 @@ class RollingBudget:
     def _refill(self, now_ns: int) -> None:
         if self._tokens_ns is not None:
             earned = self._settings.still_bps / 8
-            self._tokens += earned * (now_ns - self._tokens_ns) / _SECOND_NS
+            self._tokens += earned * (now_ns - self._tokens_ns) / SECOND_NS
             self._tokens = min(self._cap, self._tokens)
         self._tokens_ns = now_ns
 
@@ -274,7 +275,7 @@ class RollingBudget:
         last_ns = max(self._last_base_ns, now_ns - self._step_ns)
         first_ns = last_ns - settings.window_ns + self._step_ns // 2
         taken = sum(size for at_ns, size in self._base_events if at_ns > first_ns)
-        return max(0.0, settings.base_bps * settings.window_ns / 8 / _SECOND_NS - taken - borrowed)
+        return max(0.0, settings.base_bps * settings.window_ns / 8 / SECOND_NS - taken - borrowed)
 
     def _window_allowance(self, now_ns: int) -> float:
         """The least room over every window that would contain a message sent now.
@@ -293,7 +294,7 @@ class RollingBudget:
         times_ns = np.array([at_ns for at_ns, _ in self._events], np.int64)
         upto = np.cumsum([0, *(size for _, size in self._events)])
         spent = upto[-1] - upto[np.searchsorted(times_ns, now_ns - spans_ns, side="right")]
-        beside = self._settings.metadata_bps / 8 / _SECOND_NS * ahead_ns
+        beside = self._settings.metadata_bps / 8 / SECOND_NS * ahead_ns
         return float((self._total - spent - self._burst - beside).min())
 
     def _recent_bursts(self) -> npt.NDArray[np.float64]:

@@ -12,27 +12,27 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
+from hvt_common.units import SECOND_NS
 from hvt_edge.link.rate_control import LeastDelay, Progress, RateController
 from hvt_edge.link.receivers import Report
 
 __all__ = ["Flight", "Pacer"]
 
 _MS = 1_000_000
-_SECOND_NS = 1_000_000_000
 _MOST_BACKLOG_NS = 250 * _MS
 _STILL_BACKLOG_NS = 50 * _MS
 """A still goes when what was sent before it has (nearly) left: the next base frame finds the link free."""
 _SLACK_NS = 75 * _MS
 _LEAST_HELD_NS, _FIRST_HELD_NS, _MOST_HELD_NS = 50 * _MS, 150 * _MS, 300 * _MS
-_GIVEN_UP_NS = _SECOND_NS
+_GIVEN_UP_NS = SECOND_NS
 """A message so long overdue is lost, if reports come and name none newer for as long."""
-_SILENCE_NS = 2 * _SECOND_NS
-_PROBE_NS = _SECOND_NS
+_SILENCE_NS = 2 * SECOND_NS
+_PROBE_NS = SECOND_NS
 """In silence one frame goes out in so long: a ground that has forgotten the session hears nothing else."""
-_START_NS, _START_HOLD_NS = _SECOND_NS // 2, 2 * _SECOND_NS
+_START_NS, _START_HOLD_NS = SECOND_NS // 2, 2 * SECOND_NS
 """So much goes out from a keyframe on before the first report; then it is waited for, so long. A thin link that is
 overrun at once does not let the ground ask what the session is. Who never reports gets everything after that."""
-_FORGET_NS = 15 * _SECOND_NS
+_FORGET_NS = 15 * SECOND_NS
 """A receiver so long silent has left, where Zenoh still has the link: its lease is shorter."""
 _MOST_RECORDS = 1024
 
@@ -98,7 +98,7 @@ class Flight:
     def backlog_ns(self, *, now_ns: int, rate_bps: int) -> int:
         """How long a link of this rate has still to do with what was sent."""
         self._drain(now_ns, rate_bps)
-        return round(8 * _SECOND_NS * self._backlog_bytes / rate_bps)
+        return round(8 * SECOND_NS * self._backlog_bytes / rate_bps)
 
     def acknowledge(self, base_sequence: int, still_sequence: int) -> Sent | None:
         """Take off what has arrived; return the newest base message of it, None where there is none.
@@ -110,7 +110,7 @@ class Flight:
         newest: Sent | None = None
         while self._base and self._base[0].sequence <= base_sequence:
             newest = self._base.popleft()
-        latest_ns = -(2**63) if newest is None else newest.sent_ns - 2 * _SECOND_NS
+        latest_ns = -(2**63) if newest is None else newest.sent_ns - 2 * SECOND_NS
         while self._stills and (self._stills[0][0] <= still_sequence or self._stills[0][1] < latest_ns):
             self._stills.popleft()
         self._backlog_bytes = min(self._backlog_bytes, self.size_bytes)
@@ -135,7 +135,7 @@ class Flight:
         # Two threads send, with times that may differ a little: never back.
         elapsed_ns = max(0, now_ns - self._drained_ns)
         self._drained_ns = max(self._drained_ns, now_ns)
-        self._backlog_bytes = max(0.0, self._backlog_bytes - rate_bps * elapsed_ns / 8 / _SECOND_NS)
+        self._backlog_bytes = max(0.0, self._backlog_bytes - rate_bps * elapsed_ns / 8 / SECOND_NS)
 
 
 class Pacer:
@@ -154,8 +154,8 @@ class Pacer:
         self._progress_ns = 0
         """When it last named a base message that was on its way."""
         self._held_ns = _FIRST_HELD_NS
-        self._round_trip = LeastDelay(15 * _SECOND_NS)
-        self._round_trip_ns = _SECOND_NS // 2
+        self._round_trip = LeastDelay(15 * SECOND_NS)
+        self._round_trip_ns = SECOND_NS // 2
         self._last_sent_ns = 0
         self._linked: bool | None = None
         self._started_ns: int | None = None
@@ -306,8 +306,8 @@ class Pacer:
 
     def _forget_path(self) -> None:
         self._held_ns = _FIRST_HELD_NS
-        self._round_trip = LeastDelay(15 * _SECOND_NS)
-        self._round_trip_ns = _SECOND_NS // 2
+        self._round_trip = LeastDelay(15 * SECOND_NS)
+        self._round_trip_ns = SECOND_NS // 2
         self._controller.forget_path()
 
     def _note_times(self, sent: Sent, held_ns: int, now_ns: int) -> None:

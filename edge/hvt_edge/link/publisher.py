@@ -65,8 +65,7 @@ class EdgeLink(Outlet, Protocol):
 class ZenohLink:
     """One Zenoh session with publishers of all channels; a context manager.
 
-    Raises:
-        UserError: a port or an endpoint cannot be used, or another edge of that id is on the link.
+    Raises `UserError` where a port or an endpoint cannot be used, or another edge of that id is on the link.
     """
 
     def __init__(self, settings: LinkSettings, *, edge_id: str, clock: Callable[[], int]) -> None:

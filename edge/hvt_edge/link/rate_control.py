@@ -3,11 +3,10 @@
 The signal is queueing delay (RFC 8298, section 4.1.2; RFC 6817): one-way delay above the least seen lately, so the
 two clocks need not agree. From it is taken what the edge's own messages would have waited on a link of exactly the
 present rate (`Progress.serialization_ns`): a keyframe or a burst is no congestion, and what is left, the
-**excess**, grows
-exactly where the link is slower than the rate. It counts as overuse where it stays high and does not fall over
-several reports (as in CoDel, a burst empties, a standing queue does not). Then the rate becomes a share of what
-arrived meanwhile, which is what the link carries. Messages sent before that say nothing about the new rate and are
-not judged: the hold-off lasts a round trip and the emptying of the queue, however long these are.
+**excess**, grows exactly where the link is slower than the rate. It is overuse where it stays high and does not
+fall over several reports (as in CoDel, a burst empties, a standing queue does not). Then the rate becomes a share
+of what arrived meanwhile, which is what the link carries. Messages sent before that say nothing about the new rate
+and are not judged: the hold-off lasts a round trip and the emptying of the queue, however long these are.
 
 Growth follows a cubic curve (RFC 9438, section 4.2, in time): quickly back to where it broke down last, long near
 there, then faster and faster beyond. So a link of constant rate sees a rate close to its own, and one that has come
@@ -19,6 +18,8 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 
+from hvt_common.units import SECOND_NS
+
 __all__ = [
     "LeastDelay",
     "Progress",
@@ -29,13 +30,12 @@ __all__ = [
 ]
 
 _MS = 1_000_000
-_SECOND_NS = 1_000_000_000
-_ABSURD_NS = 60 * _SECOND_NS
+_ABSURD_NS = 60 * SECOND_NS
 """A delay that differs by so much is a clock that was set, not a queue."""
 _MTU_BITS = 12_000
 _SOME_LOSS = 0.02
 _GRAVE, _GRAVE_SPAN_NS = 2.5, 150 * _MS
-_LOSS_EVERY_NS = 3 * _SECOND_NS
+_LOSS_EVERY_NS = 3 * SECOND_NS
 """Loss is counted over some seconds: a lower rate shows as late."""
 
 
@@ -56,11 +56,11 @@ class RateSettings:
     """How long it takes back to where it broke down."""
     beyond_per_s3: float = 0.008
     """Growth beyond, as a share of that rate, by the third power of the seconds."""
-    resume_ns: int = 3 * _SECOND_NS
+    resume_ns: int = 3 * SECOND_NS
     """How long it takes back to the former rate after the link was gone."""
     most_loss: float = 0.12
     """Of messages; less is taken for the link's nature, and only slows growth down."""
-    memory_ns: int = 15 * _SECOND_NS
+    memory_ns: int = 15 * SECOND_NS
     """The least delay is that of so long: a route that became longer is no queue for ever."""
 
 
@@ -221,7 +221,7 @@ class RateController:
         return delay_ns - self._base_ns - progress.serialization_ns
 
     def _limit_ns(self) -> int:
-        return max(self._settings.excess_ns, round(2 * _MTU_BITS * _SECOND_NS / self._rate))
+        return max(self._settings.excess_ns, round(2 * _MTU_BITS * SECOND_NS / self._rate))
 
     def _verdict(self) -> list[_Judged]:
         """The newest judged reports, as few as suffice for a verdict; empty where there are too few."""
@@ -287,7 +287,7 @@ class RateController:
         if curve_ns < self._plateau_ns:
             left = 1 - curve_ns / self._plateau_ns
             return self._cubic_max - (self._cubic_max - self._low) * left**3
-        beyond_s = (curve_ns - self._plateau_ns) / _SECOND_NS
+        beyond_s = (curve_ns - self._plateau_ns) / SECOND_NS
         return self._cubic_max * (1 + self._settings.beyond_per_s3 * beyond_s**3)
 
     def _lately_bps(self) -> float:
@@ -295,9 +295,9 @@ class RateController:
         last = first = self._recent[-1].progress
         for one in reversed(self._recent):
             first = one.progress
-            if last.arrived_ns - first.arrived_ns >= _SECOND_NS:
+            if last.arrived_ns - first.arrived_ns >= SECOND_NS:
                 break
-        if last.arrived_ns - first.arrived_ns < _SECOND_NS // 2:
+        if last.arrived_ns - first.arrived_ns < SECOND_NS // 2:
             return self._rate / 2
         return _arrival_bps(first, last)
 
@@ -318,7 +318,7 @@ class ReconfigurationSettings:
     little: float = 0.02
     """At the ceiling, where the rate will stay."""
     rest_ns: int = 1_500 * _MS
-    some_ns: int = 3 * _SECOND_NS
+    some_ns: int = 3 * SECOND_NS
     """So long it must be off by `some`."""
 
 

@@ -35,6 +35,7 @@ from hvt_common.protocol.messages import (
     Status,
     fitted_text,
 )
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.outage import BaseInFlight
@@ -58,7 +59,6 @@ BACKLOG_ATTACHMENT_BYTES = 48
 _LEAST_CHUNK_BYTES, _MOST_CHUNK_BYTES = 1_000, 12_000
 _CHUNK_S = 0.05
 """So long the link is busy with a chunk at most, so that a frame or a live still need not wait for it."""
-_SECOND_NS = 1_000_000_000
 _GROWTH_BYTES = 16
 """By how much metadata may grow when it is made for a later moment: its two times."""
 
@@ -235,7 +235,7 @@ class Transmitter:
     @property
     def round_trip_ns(self) -> int:
         """Of the link; half a second where it is not measured."""
-        return _SECOND_NS // 2 if self._pacer is None else self._pacer.round_trip_ns
+        return SECOND_NS // 2 if self._pacer is None else self._pacer.round_trip_ns
 
     @property
     def total_bps(self) -> int:
@@ -309,7 +309,7 @@ class Transmitter:
     def takes_ns(self, line_bytes: int) -> int:
         """How long so many line bytes take the whole budget."""
         with self._lock:
-            return 8 * _SECOND_NS * line_bytes // self._budget.total_bps
+            return 8 * SECOND_NS * line_bytes // self._budget.total_bps
 
     def keyframe_fits(self, line_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a keyframe of so many line bytes leaves the budget whole."""

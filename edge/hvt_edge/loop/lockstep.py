@@ -40,17 +40,8 @@ _POLL_S = 0.1
 class LockstepPace:
     """Runs frames in media time; where a ground is there at the start, the loop waits for its answers.
 
-    Args:
-        base: the video stage.
-        stills: the still stage.
-        inbox: what the ground has answered.
-        keyframes: whether stills are held because one is due.
-        clock: advances with each frame.
-        fps: frame indices a second.
-        counts: counts frames.
-        has_ground: whether a ground subscribes.
-        stop: ends the waiting.
-        executor: runs perception beside the next frame's encoding; one worker, and closed with the pace.
+    ``fps`` counts frame indices a second; ``clock`` advances with each frame. The one worker of ``executor`` runs
+    perception beside the next frame's encoding; it is closed with the pace.
     """
 
     def __init__(

@@ -11,9 +11,10 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
+from hvt_common.units import SECOND_NS
+
 __all__ = ["KeyframeRequests", "KeyframeSettings", "KeyframeState"]
 
-_SECOND_NS = 1_000_000_000
 _MOST_RECEIVERS = 16
 """Whose losses are remembered: ids cost a sender nothing."""
 
@@ -22,15 +23,15 @@ _MOST_RECEIVERS = 16
 class KeyframeSettings:
     """Times in nanoseconds; ``interval_ns`` of 0 sends keyframes on demand only."""
 
-    interval_ns: int = 10 * _SECOND_NS
-    patience_ns: int = 3 * _SECOND_NS // 5
-    scheduled_patience_ns: int = 2 * _SECOND_NS
-    rest_ns: int = 3 * _SECOND_NS // 10
+    interval_ns: int = 10 * SECOND_NS
+    patience_ns: int = 3 * SECOND_NS // 5
+    scheduled_patience_ns: int = 2 * SECOND_NS
+    rest_ns: int = 3 * SECOND_NS // 10
     """After a keyframe, requests are taken as answered by it for so long: they crossed it on the way. With the
     second request of a ground (0.3 s after the first) and the patience it stays under a second."""
     burst: int = 6
     """So many may be requested in a row: losses come in bursts."""
-    refill_ns: int = 7 * _SECOND_NS // 10
+    refill_ns: int = 7 * SECOND_NS // 10
     """After that one in so long at the most, where losses were reported too; 0 for no limit. On a link that loses one
     frame in twenty, two seconds would show half of what 0.7 s shows."""
     request_share: float = 0.35
@@ -154,8 +155,8 @@ class KeyframeRequests:
         paid_ns = max(self._paid_ns, now_ns - settings.burst * cost_ns) + cost_ns
         if paid_ns > now_ns:
             return (
-                f"the last keyframe came {(now_ns - last_ns) / _SECOND_NS:.1f} s ago, after many others: ask again "
-                f"in {(paid_ns - now_ns) / _SECOND_NS:.1f} s"
+                f"the last keyframe came {(now_ns - last_ns) / SECOND_NS:.1f} s ago, after many others: ask again "
+                f"in {(paid_ns - now_ns) / SECOND_NS:.1f} s"
             )
         self._paid_ns = paid_ns
         return None

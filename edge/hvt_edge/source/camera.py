@@ -21,12 +21,7 @@ _READ_MS = 2000
 
 
 class CameraGrabber:
-    """One V4L2 device.
-
-    Args:
-        path: /dev/videoN.
-        fps: requested of the camera.
-    """
+    """One V4L2 device: ``path`` is /dev/videoN, ``fps`` is requested of the camera."""
 
     def __init__(self, path: str, *, fps: float) -> None:
         self.name = path
@@ -34,11 +29,7 @@ class CameraGrabber:
         self._capture: cv2.VideoCapture | None = None
 
     def open(self) -> None:
-        """Open the device.
-
-        Raises:
-            UserError: if it is missing, no camera, busy or not permitted.
-        """
+        """Open the device. Raises `UserError` if it is missing, no camera, busy or not permitted."""
         path = Path(self.name)
         if not path.exists():
             found = ", ".join(sorted(str(one) for one in Path("/dev").glob("video*"))) or "none"

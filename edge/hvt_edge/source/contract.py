@@ -35,9 +35,8 @@ class Source(ABC):
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """Frames 0, 1, 2 …; arrays are read-only.
 
-        Args:
-            start_ns: Unix time of frame 0. Files, folders and the demo count media time from it; live sources
-                ignore it and read their clock once, when a frame was grabbed.
+        ``start_ns`` is the Unix time of frame 0 for files, folders and the demo. Live sources ignore it and read
+        their clock when a frame is grabbed.
         """
 
     def close(self) -> None:
@@ -54,11 +53,7 @@ class Source(ABC):
 
 
 def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
-    """Refuse sizes and rates that no base stream can have.
-
-    Raises:
-        UserError: names the value and what is accepted.
-    """
+    """Raise `UserError` for a size or rate that no base stream can have, with what is accepted."""
     wide, high = (64, 64) if callable(size) else size
     # HEVC codes 4:2:0 pictures in even sizes only.
     if wide % 2 or high % 2 or not (64 <= wide <= 8192 and 64 <= high <= 8192):

@@ -37,11 +37,8 @@ class DrawnScene(Protocol):
 class DemoSource(Source):
     """The demo scene from its beginning to its end, at the base rate.
 
-    Attributes:
-        scene: what is drawn; the frame at ``index`` shows the moment ``index / fps``.
-
-    Raises:
-        UserError: no scene is installed.
+    The frame at ``index`` shows ``scene`` at the moment ``index / fps``. Raises `UserError` where no scene is
+    installed.
     """
 
     live = False

@@ -50,14 +50,9 @@ class Grabber(Protocol):
 class LiveSource(Source):
     """A camera or stream, resampled to the base rate by `Gate`; slow consumers lose frames, never gain delay.
 
-    Frames are not repeated when the camera is slower than the base rate. After a loss of signal the source is opened
-    again, with growing pauses, until it is closed.
-
-    Args:
-        clock: of the capture times, Unix nanoseconds; must not go back, or the source is silent for as long.
-
-    Attributes:
-        dropped: frames that the consumer was too slow to take.
+    Frames are not repeated when the camera is slower than the base rate. After a loss of signal the source is
+    opened again, with growing pauses, until it is closed. ``clock`` gives capture times in Unix nanoseconds and
+    must not go back, or the source is silent for as long. ``dropped`` counts what the consumer was too slow for.
     """
 
     live = True

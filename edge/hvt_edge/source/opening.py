@@ -32,21 +32,13 @@ def open_source(
     source_fps: float | None = None,
     clock: Callable[[], int] | None = None,
 ) -> Source:
-    """Open a source of base frames.
+    """Open a source of base frames: a video file, an image folder, a stream's URL, a V4L2 device, or ``demo``.
 
-    Args:
-        spec: path of a video file or an image folder, a stream's URL, a V4L2 device, or ``demo``.
-        size: (width, height) of the base frames in pixels, even, 64…8192, or how they follow from the source's.
-        fps: base rate in frames a second, above 0, at most 240.
-        fit: what happens to a source of another aspect ratio; see `View.fitted`.
-        seed: of the demo scene.
-        max_frames: end after so many base frames.
-        source_fps: the rate at which the images of a folder were taken (default: the base rate), or a rate that
-            overrides a video file's own time stamps. Live sources and the demo ignore it.
-        clock: of a live source's capture times, Unix nanoseconds without steps; None for one of its own.
-
-    Raises:
-        UserError: if nothing usable is there, or size or rate are impossible.
+    ``size`` is (width, height) of the base frames in pixels, even, 64…8192, or how they follow from the source's;
+    ``fps`` is above 0 and at most 240; for ``fit`` see `View.fitted`. ``source_fps`` is the rate at which the
+    images of a folder were taken (default: the base rate), or overrides a video file's own time stamps. ``clock``
+    gives a live source's capture times, Unix nanoseconds without steps; None for one of its own. Raises `UserError`
+    if nothing usable is there, or size or rate are impossible.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
     if spec == "demo":

@@ -46,18 +46,11 @@ def hold(
     tail_s: Fraction,
     slack_s: Fraction = Fraction(0),
 ) -> Iterator[tuple[int, _T]]:
-    """Bring frames with times to the base rate.
+    """Bring (seconds, frame) in order to the base rate: (index, frame) for index 0, 1, 2 … without a gap.
 
-    Args:
-        stamped: (seconds, frame) in order; the first is the clip's zero. A frame that does not come after its
-            predecessor replaces it.
-        fps: base rate.
-        tail_s: how long the last frame is shown.
-        slack_s: how much too late a time stamp may be and still count as on time: the container's time base, because
-            Matroska rounds times to milliseconds and 2/30 s becomes 0.067 s.
-
-    Yields:
-        (index, frame) for index 0, 1, 2 … without a gap: the latest frame at or before index / fps.
+    At each index that is the latest frame at or before index / fps; the first is the clip's zero, and the last is
+    shown for ``tail_s``. A frame that does not come after its predecessor replaces it. A time stamp ``slack_s`` too
+    late still counts as on time: Matroska rounds times to milliseconds, and 2/30 s becomes 0.067 s.
     """
     slack = min(slack_s, 1 / (4 * fps))
     index = 0

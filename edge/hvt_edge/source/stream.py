@@ -31,9 +31,7 @@ _OPTIONS = {
 class StreamGrabber:
     """Decodes a stream as it arrives, without frame threading, which would hold frames back.
 
-    Args:
-        url: of the stream; a password in it is never printed.
-        open_s: how long the first opening may take.
+    A password in ``url`` is never printed; ``open_s`` bounds the first opening.
     """
 
     def __init__(self, url: str, *, open_s: float = _OPEN_S) -> None:
@@ -43,11 +41,7 @@ class StreamGrabber:
         self._frames: Iterator[av.VideoFrame] = iter(())
 
     def open(self) -> None:
-        """Open for the first time; does nothing where it is open already.
-
-        Raises:
-            UserError: if there is no video within ``open_s``.
-        """
+        """Open, where it is not open yet. Raises `UserError` if there is no video within ``open_s``."""
         if self._container is None:
             self._start(self._open_s)
 

@@ -142,11 +142,7 @@ def without_password(url: str) -> str:
 
 
 def _open(spec: str) -> tuple[Any, Any]:
-    """Open a file or a URL and its first video stream.
-
-    Raises:
-        UserError: if there is none.
-    """
+    """Open a file or a URL and its first video stream. Raises `UserError` if there is none."""
     name = without_password(spec)
     if "://" not in spec and Path(spec).stat().st_size == 0:
         raise UserError(f"source {spec!r} is an empty file; accepted is a video file")

@@ -77,14 +77,7 @@ class OnDemandStill(OutboxStill):
 class OnDemand:
     """The edge's end of ``control: still``. `request`, `outcome` and `tracks` may be called from any thread.
 
-    Args:
-        ring: where frames come from; filled by `add`.
-        outbox: where the stills wait.
-        maker: how stills are made; these never build on the base.
-        view: between source and base pixels.
-        class_names: the detector's.
-        most_bytes: the largest payload that the budget ever admits, as it is now.
-        settings: the bounds.
+    ``most_bytes()`` is the largest payload that the budget admits now. These stills never build on the base.
     """
 
     def __init__(
@@ -118,11 +111,7 @@ class OnDemand:
     # From any thread
 
     def request(self, request: OnDemandRequest) -> tuple[int, int]:
-        """Crop a still; return its number and the index of the frame that it will show.
-
-        Raises:
-            RefusedError: with the reason.
-        """
+        """Crop a still; return its number and frame index. Raises `RefusedError` with the reason."""
         if self._ended:
             raise RefusedError("the session is ending")
         self._check_queue()
@@ -148,8 +137,7 @@ class OnDemand:
     def outcome(self, number: int) -> None:
         """Return where that still is pending or was sent.
 
-        Raises:
-            RefusedError: it was given up, or is not known (any more).
+        Raises `RefusedError` where it was given up, or is not known (any more).
         """
         with self._lock:
             if number not in self._refusals:

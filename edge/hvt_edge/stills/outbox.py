@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Still
 from hvt_edge.backlog.entry import FIRST_STORED
 from hvt_edge.link.transmitter import StillEnvelope
@@ -18,7 +19,6 @@ __all__ = ["AGAIN", "Outbox", "OutboxSettings", "OutboxStill", "StillState"]
 
 AGAIN = "again"
 """The reason of a still whose crop was sent before, and the parameter that names the sequence of the first."""
-_SECOND_NS = 1_000_000_000
 _MIB = 2**20
 
 
@@ -39,17 +39,17 @@ class OutboxSettings:
 
     max_pending: int = 8
     """Of the method; those that grounds request have their own bound."""
-    max_pending_ns: int = _SECOND_NS
+    max_pending_ns: int = SECOND_NS
     """A crop that has waited longer shows a past the operator no longer needs."""
-    max_on_demand_ns: int = 10 * _SECOND_NS
+    max_on_demand_ns: int = 10 * SECOND_NS
     max_sent: int = 64
     max_sent_bytes: int = 2 * _MIB
     """Of coded stills that are not acknowledged."""
     max_crop_bytes: int = 8 * _MIB
     """Of the pixels of sent stills that can be coded again."""
-    max_sent_ns: int = 4 * _SECOND_NS
+    max_sent_ns: int = 4 * SECOND_NS
     """What was sent longer ago is not sent again."""
-    least_wait_ns: int = _SECOND_NS
+    least_wait_ns: int = SECOND_NS
     wait_round_trips: int = 3
     """A still is overdue after so many round trips, and after ``least_wait_ns`` at the earliest."""
 

@@ -34,10 +34,7 @@ class Suppression:
 
     @classmethod
     def for_cooldown(cls, cooldown_s: float, *, min_gain: float = 1.2) -> Suppression:
-        """What ``--cooldown`` means: 0 is off altogether; else the wait for a gain is five times as long.
-
-        ``min_gain`` is ``--min-gain``.
-        """
+        """``--cooldown``: 0 is off; else the wait for a gain (``--min-gain``) is five times as long."""
         if cooldown_s == 0:
             return cls(cooldown_s=0.0, min_gain=1.0, avoid_border=False)
         return cls(cooldown_s=cooldown_s, min_gain=min_gain, gain_s=5 * cooldown_s)

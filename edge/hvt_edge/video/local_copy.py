@@ -35,11 +35,7 @@ class BaseRecorder:
         self._stream: av.VideoStream | None = None
 
     def write(self, unit: AccessUnit) -> None:
-        """Append one access unit; the first has to be a keyframe.
-
-        Raises:
-            UserError: the file cannot be written (any further).
-        """
+        """Append an access unit, a keyframe first. Raises `UserError` where the file cannot be written."""
         if self._stream is None:
             self._stream = self._open_stream(unit.data)
             self._start_ns = unit.capture_ns

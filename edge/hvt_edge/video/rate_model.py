@@ -43,16 +43,10 @@ def choose_base(
 ) -> tuple[tuple[int, int], int]:
     """The base stream's (width, height), and n where each n-th frame of ``most_fps`` is coded.
 
-    Args:
-        payload_bps: what x265 gets, without headers of any transport.
-        source_size: (width, height) of the source; with ``size`` None the base is never larger.
-        size: what the user sets; None is ``--size auto``.
-        fps: what the user sets: each source frame, so n is 1. None is ``--fps auto``.
-        most_fps: source frame rate where ``fps`` is None.
-        least_fps: the lowest rate of coded frames.
-
-    Raises:
-        UserError: the source is too small for any base stream.
+    ``payload_bps`` is what x265 gets, without headers of any transport. ``size`` and ``fps`` are what the user
+    sets, None for ``auto``: then the base is never larger than the source, and no slower than ``least_fps``. A set
+    ``fps`` codes each source frame, so n is 1. Raises `UserError` where the source is too small for any base
+    stream.
     """
     nominal_fps = most_fps if fps is None else fps
     most_n = 1 if fps is not None else most_decimation(most_fps, least_fps=least_fps)

@@ -21,19 +21,10 @@ __all__ = ["BaseStage"]
 class BaseStage:
     """Runs in the frame loop: `decide` for each source frame; `encode` and `send` for each that is coded.
 
-    Args:
-        encoder: opened for the first frame rate; with ``side_data`` where there are regions.
-        keyframes: requests for keyframes; the plan is this stage's own.
-        transmitter: takes the units.
-        recorder: writes them to a file too.
-        first_keyframe_bytes: the guess until a keyframe has been coded.
-        regions: which regions get more bits; None for none.
-        frame_skip: which source frames are coded; all by default.
-        reconfigure: called with (decimation, ``now_ns``) before each keyframe for the link. Returns an encoder newly
-            opened, where anything has changed, or None. x265 takes neither another frame rate nor another bit rate
-            once it is open. Needed where the decimation changes.
-        admits: called with ``now_ns``: whether pacer and budget have room for a frame.
-        backlog: takes the units while the link is offline.
+    ``first_keyframe_bytes`` is the guess until a keyframe has been coded. ``reconfigure(decimation, now_ns)`` runs
+    before each keyframe for the link and returns a newly opened encoder, or None where nothing has changed: x265
+    takes neither another frame rate nor another bit rate once it is open. ``admits(now_ns)`` says whether pacer and
+    budget have room for a frame.
     """
 
     def __init__(
@@ -80,10 +71,7 @@ class BaseStage:
     def encode(
         self, frame: Frame, decision: FrameDecision, *, now_ns: int, tracks: Tracks | None = None
     ) -> AccessUnit | None:
-        """Encode the frame as decided; None where it is not coded.
-
-        ``tracks`` are the newest that are known, in base pixels.
-        """
+        """Encode the frame as decided (None where it is not coded); ``tracks`` are the newest known."""
         if not decision.codes:
             return None
         if decision.reconfigures:

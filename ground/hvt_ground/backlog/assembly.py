@@ -68,13 +68,10 @@ class _Open:
 
 
 class BacklogAssembly:
-    """Of one edge. Not safe for threads.
+    """Assembles the chunks of one edge. Not safe for threads.
 
-    Args:
-        max_objects: how many may be in progress.
-        max_bytes: how many bytes they, and those handed out and not settled yet, may have in all; at least one
-            object of the largest size.
-        remember: how many delivered objects are known again.
+    At most ``max_objects`` are in progress. ``max_bytes`` bounds them and what is handed out and not settled yet,
+    and holds one object of the largest size. ``remember`` delivered objects are known again.
     """
 
     def __init__(
@@ -106,9 +103,7 @@ class BacklogAssembly:
         """Take a chunk; the object's bytes where it is the last one that was missing, to be `settle`d later.
 
         With ``may_finish`` False a chunk that would complete its object is not taken, and will come again.
-
-        Raises:
-            WireError: the chunk cannot be one.
+        Raises `WireError` where the chunk cannot be one.
         """
         _check(header, payload)
         key = _key(header)

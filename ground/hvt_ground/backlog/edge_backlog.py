@@ -32,10 +32,7 @@ _MOST_INFOS = 64
 class EdgeBacklog:
     """Of one edge. `chunk` is for the receiving thread, `take_acknowledged_ranges` for any.
 
-    Args:
-        edge: its id.
-        recordings: where what is of another session goes; None refuses it.
-        assembly: puts chunks together.
+    ``recordings`` takes what is of another session; None refuses it.
     """
 
     def __init__(
@@ -80,10 +77,8 @@ class EdgeBacklog:
     ) -> bool:
         """Take a chunk; True where it completes its object, which is handed to ``worker``.
 
-        ``own`` is the backlog of the session that is open.
-
-        Raises:
-            WireError: it cannot be one, or the object that it completes is unusable.
+        ``own`` is the backlog of the session that is open. Raises `WireError` where it cannot be one, or the
+        object that it completes is unusable.
         """
         is_own = header.session_id == own.info.session_id
         if not is_own and (self._recordings is None or not self._recordings.takes(header.session_id)):

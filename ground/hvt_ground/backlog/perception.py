@@ -76,12 +76,8 @@ class StretchTracker:
 class BacklogPerception:
     """Of one session. For one thread at a time.
 
-    Args:
-        info: of the session.
-        checkout: gives the models for the time of a job.
-        tracker_of: makes a tracker for one stretch.
-        reader_of: makes of detector and classifier what names stills.
-        detect_every: frames from one detection to the next, at least.
+    ``checkout`` gives the models for the time of a job, ``tracker_of`` makes a tracker for one stretch,
+    ``reader_of`` makes what names stills of detector and classifier.
     """
 
     def __init__(

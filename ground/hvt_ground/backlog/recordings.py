@@ -54,14 +54,10 @@ class BacklogRecording:
 class BacklogRecordings:
     """Of one edge: opened when something comes of a session. Safe for threads.
 
-    Where too many are open, the one that nothing came for the longest is closed, in a thread of its own, for a footer
-    may take seconds. One that is in use is not: should all be, one more is open for the time being. When more comes
-    of a session whose recording is closed, it gets another file.
-
-    Args:
-        open_one: makes the recording of a session.
-        most: how many may be open.
-        most_files: how many are made in all.
+    Where more than ``most`` are open, the one that nothing came for the longest is closed, in a thread of its own,
+    for a footer may take seconds. One that is in use is not: should all be, one more is open for the time being.
+    When more comes of a session whose recording is closed, it gets another file; at most ``most_files`` are made in
+    all.
     """
 
     def __init__(
@@ -97,8 +93,7 @@ class BacklogRecordings:
     def acquire(self, info: Info) -> SessionBacklog | None:
         """The backlog of that session's recording, which stays open until `release`; None where `takes` says no.
 
-        Raises:
-            UserError: its file cannot be made, or another could not be closed as it should.
+        Raises `UserError` where its file cannot be made, or another could not be closed as it should.
         """
         self._raise_error()
         with self._lock:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvt_common.protocol.messages import BacklogUnit, Info
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.video import BacklogVideo
@@ -18,7 +19,6 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 
 __all__ = ["BacklogTotals", "SessionBacklog"]
 
-_SECOND_NS = 1_000_000_000
 _LONGEST_S = 1.0
 """For so long one frame counts as video, where the next was left out."""
 
@@ -62,12 +62,7 @@ class BacklogTotals:
 class SessionBacklog:
     """Of one session, open or over. Safe for the receiving thread and the perception worker's.
 
-    Args:
-        info: of the session.
-        log: takes the events; they may lie before others that it has.
-        perception: finds boxes in the video; None leaves it without.
-        read: reads a still and gives out its events.
-        stills: which stills have come; the session's own where it is open.
+    ``log`` takes events that may lie before others it has; ``stills`` is the session's own where it is open.
     """
 
     def __init__(
@@ -85,7 +80,7 @@ class SessionBacklog:
         self.log = log
         self._read = read
         self._stills = stills or StillSequenceWindow()
-        self._frame_ns = round(_SECOND_NS / info.fps)
+        self._frame_ns = round(SECOND_NS / info.fps)
         self._lock = threading.Lock()
         self._frames = SequenceWindow()
         self.totals = BacklogTotals()

@@ -80,8 +80,7 @@ class RequestedStill:
     def save(self, path: Path | str) -> None:
         """Write it as JPEG or PNG, by the suffix; a JPEG that came as one is written as it came.
 
-        Raises:
-            UserError: for another suffix, or where the file cannot be written.
+        Raises `UserError` for another suffix, or where the file cannot be written.
         """
         path = Path(path)
         check_suffix(path)
@@ -200,17 +199,11 @@ class RemoteEdge:
     ) -> RequestedStill:
         """Ask for a still of the untouched source frame, and wait for it.
 
-        Args:
-            track: the edge's id of a track (`tracks`).
-            box: x, y, width and height in source pixels; with neither, the whole frame.
-            at_s: when, in seconds before the edge's newest frame, as ``-3``.
-            frame: or at which frame, by its index; with neither, the newest.
-            quality_pct: 5 to 95; less where the budget has no room for it. None: the edge's ``--jpeg-quality``.
-            timeout_s: how long to wait.
-
-        Raises:
-            RefusedError: the edge refused it, or gave it up.
-            UserError: it did not answer, or the still did not come in time.
+        Of a ``track`` (the edge's id, see `tracks`), of a ``box`` (x, y, width and height in source pixels), or
+        else the whole frame; ``at_s`` seconds before the edge's newest frame (as ``-3``), at ``frame``, or else the
+        newest. ``quality_pct`` is 5 to 95, None for the edge's ``--jpeg-quality``; less where the budget has no
+        room. Raises `RefusedError` where the edge refused it or gave it up, `UserError` where it did not come in
+        time.
         """
         arguments = _still_arguments(track=track, box=box, at_s=at_s, frame=frame, quality_pct=quality_pct)
         until_s = time.monotonic() + timeout_s
@@ -315,8 +308,7 @@ class EdgeClient:
     def connect(cls, *endpoints: str, zenoh_config: Path | None = None) -> EdgeClient:
         """Connect to a ground or a router, such as ``tcp/127.0.0.1:7447``, where one listens unless told otherwise.
 
-        Raises:
-            UserError: where nobody answers within three seconds, or a setting cannot be used.
+        Raises `UserError` where nobody answers within three seconds, or a setting cannot be used.
         """
         stack = ExitStack()
         settings = LinkSettings(role="client", connect=endpoints, zenoh_config=zenoh_config)

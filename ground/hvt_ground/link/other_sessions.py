@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 
+from hvt_common.units import SECOND_NS
 from hvt_ground.link.packets import StatusPacket, StillPacket
 
 __all__ = ["DuplicatePublishers", "PreSessionBuffer"]
 
 _MOST_STILLS = 16
-_SECOND_NS = 1_000_000_000
-_AGAIN_NS = 60 * _SECOND_NS
+_AGAIN_NS = 60 * SECOND_NS
 """Between two warnings: sessions' ids cost a forger nothing, and a log is not to fill."""
 
 

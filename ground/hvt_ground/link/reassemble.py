@@ -35,21 +35,9 @@ from hvt_common.protocol.messages import BaseHeader
 __all__ = ["Arrival", "Reassembler", "StreamCounters", "Verdict"]
 
 Verdict = Literal["decode", "skip", "duplicate", "stale", "foreign", "implausible"]
-"""What to do with an access unit:
-
-decode
-    hand it to the decoder now.
-skip
-    fresh, but undecodable: a unit before it is lost, or no keyframe has come yet.
-duplicate
-    it has been here before.
-stale
-    older than what was already given up or shown: late, or replayed.
-foreign
-    of a session that is not (or no longer) the present one.
-implausible
-    its numbers cannot be true.
-"""
+"""What to do with an access unit. skip: fresh, but a unit before it is lost, or no keyframe has come yet;
+stale: older than what was given up or shown; foreign: of a session that is not the present one; implausible:
+its numbers cannot be true."""
 
 REORDER_UNITS = 2
 REORDER_WAIT_NS = 100_000_000
@@ -60,9 +48,7 @@ DUPLICATE_SILENCE_NS = 5_000_000_000
 RESTART_SILENCE_NS = 2_000_000_000
 MAX_RATE_HZ = 240
 SEQUENCE_SLACK = 64
-FRAME_SLACK = (
-    4096  # after an outage a backlog comes at once, with all the frames the edge dropped in its holes
-)
+FRAME_SLACK = 4096  # after an outage a backlog comes at once, with holes for the frames that the edge dropped
 _WINDOW_MASK = (1 << SEQUENCE_SLACK) - 1
 _REMEMBERED_SESSIONS = 16
 _REQUEST_INTERVALS_NS = (300_000_000, 300_000_000, 600_000_000, 1_000_000_000)

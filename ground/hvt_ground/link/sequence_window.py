@@ -18,10 +18,8 @@ _NEVER_NS = -(2**64)
 class SequenceWindow:
     """A set of numbers from 0, one bit each. What was missed long ago may still come, and is known to be new.
 
-    Args:
-        pages: how many stretches of 4096 numbers are kept, half a kilobyte each; beyond, the one that nobody came to
-            for the longest is forgotten. So forged numbers, however many, cost memory up to that, and do not make
-            anything that is to come look as if it had been.
+    At most ``pages`` stretches of 4096 numbers are stored, half a kilobyte each; beyond, the one longest unused is
+    forgotten. So forged numbers cost bounded memory, and do not make what is to come look as if it had been.
     """
 
     def __init__(self, *, pages: int = 4096) -> None:

@@ -12,19 +12,19 @@ from collections import deque
 from dataclasses import dataclass
 
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
+from hvt_common.units import SECOND_NS
 
 __all__ = ["REPORT_LINE_BYTES", "LinkMeasurement", "ReceptionStatistics", "Uptime"]
 
 _MS = 1_000_000
-_SECOND_NS = 1_000_000_000
 REPORT_LINE_BYTES = 180
 """What a report without results takes on the line."""
 _SHARE = 0.03
 _LEAST_NS, _MOST_NS = 100 * _MS, 500 * _MS
-_RATE_OVER_NS = 2 * _SECOND_NS
+_RATE_OVER_NS = 2 * SECOND_NS
 _MOST_DELAYS = 256
 _HELD_US = 2**32 - 1
-_MISSED_NS = 6 * _SECOND_NS
+_MISSED_NS = 6 * SECOND_NS
 """A still that has not come for so long does not come any more: reports need not name it for ever."""
 
 

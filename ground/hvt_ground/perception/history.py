@@ -24,11 +24,8 @@ DEFAULT_MAX_BYTES = 96 * 1024 * 1024
 class History:
     """Two bounded rings of one session, of pictures and of tracks; both grow by rising frame index only.
 
-    Args:
-        max_frames: how many pictures are kept at most.
-        max_bytes: how many bytes of pictures are kept at most; the newest picture is always kept.
-        track_frames: for how many frames the tracks are kept; at least the seconds that a still may be late.
-        gap_frames: how many frames the base stream may leave out and still tell where tracks were between.
+    The newest picture is stored whatever ``max_bytes``. ``track_frames`` covers at least the time that a still may
+    be late; over ``gap_frames`` that the base stream leaves out, tracks are still interpolated.
     """
 
     def __init__(

@@ -13,6 +13,7 @@ from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Image, Tracks, View
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath
@@ -25,7 +26,6 @@ from hvt_ground.perception.stills.stage import Progress, StillStage
 
 __all__ = ["DecodedFrame", "Pipeline", "PipelineParts", "ReceivedStill"]
 
-_SECOND_NS = 1_000_000_000
 _FARTHEST_S = 5
 """A step further ahead of all that is known is not plausible: nothing that comes after it could be shown."""
 _GAP_S = 1.0
@@ -77,13 +77,8 @@ class PipelineParts:
 class Pipeline:
     """One session's perception. Used by one thread; ``emit`` takes the events.
 
-    Args:
-        parts: detector, tracker, fusion and so on.
-        view: between source and base pixels.
-        fps: frames a second.
-        detect_every: frames from one detection to the next, at least.
-        wants_base: whether the reader uses the base frame of a still.
-        emit: takes the events.
+    Detections are at least ``detect_every`` frames apart; ``wants_base``: the reader uses the base frame of a
+    still.
     """
 
     def __init__(
@@ -98,7 +93,7 @@ class Pipeline:
     ) -> None:
         self._parts = parts
         self._detect_every = detect_every
-        self._frame_ns = _SECOND_NS / fps
+        self._frame_ns = SECOND_NS / fps
         self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
         gap_frames = max(1, round(_GAP_S * fps))

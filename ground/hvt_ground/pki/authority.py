@@ -88,10 +88,8 @@ class Authority:
     def issue(self, name: str, *, hosts: Sequence[str] = (), now: dt.datetime | None = None) -> None:
         """Write ``name.key`` and ``name.pem``; an older pair of that name is replaced, but not withdrawn.
 
-        Args:
-            name: the common name; also accepted as a host name.
-            hosts: names or addresses at which others connect to this machine.
-            now: when its time begins to count, with a time zone; None for this moment.
+        ``name`` is the common name, also accepted as a host name; others connect to this machine at ``hosts``.
+        Validity counts from ``now``, with a time zone; None for this moment.
         """
         key = ec.generate_private_key(ec.SECP256R1())
         authority_id = x509.SubjectKeyIdentifier.from_public_key(self._key.public_key())

@@ -39,12 +39,7 @@ _SILENT_NS = 2_000_000_000
 
 
 class Receiver:
-    """Of one edge, over all its sessions.
-
-    Args:
-        edge: its id.
-        clock: Unix nanoseconds without steps.
-    """
+    """Of one edge, over all its sessions; ``clock`` is Unix nanoseconds without steps."""
 
     def __init__(self, edge: str, *, clock: Callable[[], int]) -> None:
         self._edge = edge

@@ -17,14 +17,7 @@ _MOST_DELAY_MS = 3_600_000.0
 
 
 class ReceiverReports:
-    """Makes and sends them, in the order of their numbers.
-
-    Args:
-        publish: sends one.
-        clock: Unix nanoseconds without steps.
-        clock_offset: what is known of the edge's clock.
-        backlog: holds what is to be acknowledged of the backlog.
-    """
+    """Makes and sends them, in the order of their numbers; ``clock`` is Unix nanoseconds without steps."""
 
     def __init__(
         self,

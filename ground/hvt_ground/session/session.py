@@ -25,6 +25,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.runtime.statistics import LatencyStats
 from hvt_common.transport.inbox import Received
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
@@ -41,9 +42,8 @@ from hvt_ground.sinks import Sink
 
 __all__ = ["GroundSession", "WorkerFactory"]
 
-_SECOND_NS = 1_000_000_000
 _MILLION = 1_000_000
-_ANEW_NS = 5 * _SECOND_NS
+_ANEW_NS = 5 * SECOND_NS
 """What has to rise may begin anew after so long without anything newer: the high numbers may have been forged."""
 _MOST_RESULTS = 4096
 """Reports take 32 each; in a flood the newest count."""
@@ -54,18 +54,10 @@ WorkerFactory = Callable[[Analyze, Step, Read], PerceptionWorker]
 class GroundSession:
     """Fed by the receiving thread in order; a worker analyzes, so that decoding never waits for detection.
 
-    In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input gives
-    the same tracks.
-
-    Args:
-        info: of the session.
-        sinks: take its events.
-        pipeline_of: makes its perception; called with what takes the events.
-        clock: Unix nanoseconds without steps.
-        reports: to the edge; without it nothing is reported, and the edge's clock is this one.
-        recording: the file of its recording, for its summary.
-        backlog_perception: finds boxes in video that was stored while the link was down.
-        worker_of: makes the worker that analyzes; by default by the session's pace.
+    In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input
+    gives the same tracks. ``pipeline_of`` and ``worker_of`` make perception and its worker; without ``reports``
+    nothing is reported, and the edge's clock is this one (Unix nanoseconds without steps). ``recording`` is the
+    recording's file, for the summary.
     """
 
     def __init__(
@@ -182,11 +174,7 @@ class GroundSession:
         self.worker.still(ReceivedStill(header, item.payload, media_type))
 
     def tracks(self, step: TrackStep, item: Received) -> None:
-        """Take what the edge tracked at one frame; one that is not newer than the last is ignored.
-
-        Raises:
-            WireError: its boxes make no sense.
-        """
+        """Take a newer step of the edge's tracks. Raises `WireError` where its boxes make no sense."""
         now_ns = self._clock()
         if step.sequence <= self._last_step:
             if step.reference >= 0 or now_ns - self._stepped_ns < _ANEW_NS:
@@ -228,7 +216,7 @@ class GroundSession:
         """Say in the recording how much of the backlog has come since the last time."""
         news = self.backlog.take_news()
         if news.first is not None:
-            at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // _SECOND_NS))
+            at = time.strftime("%H:%M:%S", time.gmtime(news.first[1] // SECOND_NS))
             self.note("info", f"{news.amount()} from the outage at {at} UTC arrived")
 
     def note(self, level: str, text: str) -> None:
@@ -398,8 +386,8 @@ class GroundSession:
         """Twice a second of the stream, how full the link was and how old the picture is."""
         if at_ns < self._next_traffic_ns:
             return
-        self._next_traffic_ns = at_ns + _SECOND_NS // 2
-        to_bps = 8 * _SECOND_NS / self.info.window_ns
+        self._next_traffic_ns = at_ns + SECOND_NS // 2
+        to_bps = 8 * SECOND_NS / self.info.window_ns
         self._emit(
             Traffic(
                 frame_index=self._last_index,

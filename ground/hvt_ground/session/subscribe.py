@@ -129,13 +129,7 @@ class EdgePort:
 
 
 class GroundLink:
-    """Sorts what comes by edge. `ports` grows as edges appear.
-
-    Args:
-        session: of this ground.
-        edges: the pattern of ``--edges``.
-        clock: of the times of arrival, Unix nanoseconds; one of its own by default.
-    """
+    """Sorts what comes by edge. `ports` grows as edges appear that ``edges``, the pattern, accepts."""
 
     def __init__(self, session: zenoh.Session, *, edges: str, clock: Callable[[], int] | None = None) -> None:
         self._session = session

@@ -45,8 +45,7 @@ _MOST_UNREAD = 512
 class TimingTable:
     """The file, for all sessions of this ground. Any thread may write; killing the process loses no line.
 
-    Raises:
-        UserError: it cannot be created, or (from `line`) written any further.
+    Raises `UserError` where it cannot be created, or (from `line`) written any further.
     """
 
     def __init__(self, path: Path) -> None:

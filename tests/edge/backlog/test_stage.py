@@ -11,7 +11,7 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Flags, RoiHeader, parse_backlog_still
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.wiring import make_backlog
+from hvt_edge.wiring.storing import make_backlog
 from keeping import STILL, Rig
 from kept import INFO, opened
 from processes import eventually

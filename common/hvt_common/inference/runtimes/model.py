@@ -111,8 +111,7 @@ class OnnxModel:
     def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
         """Run the model on its only input; return its outputs in their declared order.
 
-        Raises:
-            UserError: This model cannot run on an input of this shape.
+        Raises `UserError` where this model cannot run on an input of this shape.
         """
         port = self.inputs[0]
         if len(feed.shape) != len(port.shape) or any(
@@ -144,9 +143,8 @@ class _OnnxRuntimeRunner:
 def open_model(path: Path, *, settings: ModelSettings | None = None) -> OnnxModel:
     """Open an ONNX file; what runs it is logged, with the reason.
 
-    Raises:
-        UserError: No such file, too large, not an ONNX model, one that the runtime cannot load, or a provider that is
-            unknown, not installed or cannot start.
+    Raises `UserError` where there is no such file, or it is too large, no ONNX model or one that the runtime
+    cannot load; or for a provider that is unknown, not installed or cannot start.
     """
     settings = settings or ModelSettings()
     choice = choose_provider(

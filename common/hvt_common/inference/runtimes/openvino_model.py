@@ -38,18 +38,11 @@ def find_openvino() -> OpenVinoCpu | None:
 
 
 class OpenVinoRunner:
-    """One ONNX file on the processor through OpenVINO.
+    """One ONNX file on the processor through OpenVINO, in bf16 or float32.
 
     A network is compiled for each image size (0.2 s; the last four are cached): with free sizes the same network
-    takes a fifth longer. A free batch stays free, for batches come in every size.
-
-    Args:
-        path: The ONNX file.
-        threads: CPU threads.
-        bf16: Ask for bf16; else float32.
-
-    Raises:
-        UserError: OpenVINO cannot read the model.
+    takes a fifth longer. A free batch stays free, for batches come in every size. Raises `UserError` where OpenVINO
+    cannot read the model.
     """
 
     def __init__(self, path: Path, *, threads: int, bf16: bool) -> None:
@@ -73,8 +66,7 @@ class OpenVinoRunner:
     def run(self, feed: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
         """Run on the only input; the outputs in their declared order, float tensors of their own.
 
-        Raises:
-            UserError: OpenVINO cannot run this model on an input of this shape.
+        Raises `UserError` where OpenVINO cannot run this model on an input of this shape.
         """
         try:
             request = self._request(feed.shape)

@@ -64,15 +64,11 @@ class ProviderChoice:
 def choose_provider(
     wanted: str, *, onnxruntime: Collection[str], openvino: Callable[[], OpenVinoCpu | None]
 ) -> ProviderChoice:
-    """Resolve ``wanted`` to a provider that is installed here.
+    """Resolve ``wanted``, one of `PROVIDERS`, to a provider that is installed here.
 
-    Args:
-        wanted: One of `PROVIDERS`.
-        onnxruntime: The providers that the installed onnxruntime has, by its own names.
-        openvino: Looks for OpenVINO; called only where the answer matters.
-
-    Raises:
-        UserError: An unknown word, or a provider that is not installed, with what installs it.
+    ``onnxruntime`` has the providers of the installed onnxruntime; ``openvino()`` looks for OpenVINO, where the
+    answer matters. Raises `UserError` for an unknown word, or a provider that is not installed, with what installs
+    it.
     """
     if wanted not in PROVIDERS:
         raise UserError(f"--provider '{wanted}' is not known: choose one of {', '.join(PROVIDERS)}")

@@ -52,11 +52,7 @@ def builtin_manifest() -> dict[str, ModelEntry]:
 
 
 def parse_manifest(text: str, *, origin: str) -> dict[str, ModelEntry]:
-    """Read a manifest.
-
-    Raises:
-        UserError: Not TOML, or an entry that is not as described here; the sentence names ``origin``.
-    """
+    """Read a manifest. Raises `UserError` where it is none, in a sentence that names ``origin``."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -34,15 +34,9 @@ def resolve_model(
 ) -> Path:
     """The file of a model that is named or that is a file already; a model of the cache is checked first.
 
-    Args:
-        spec: The name of an embedded model, of one of the cache, or a path: what has a folder or a suffix in it.
-        role: What the user calls it, for the sentence.
-        words: Further accepted words, for the sentence.
-        store: The cache; else the usual one.
-
-    Raises:
-        UserError: Nothing of that name. For a model that could be had, the command that fetches it and the way to
-            bring it by hand.
+    ``spec`` is a name, or a path: what has a folder or a suffix in it. The sentence of an error calls it ``role``
+    and lists ``words`` too. Raises `UserError` where there is nothing of that name; for a model that could be had,
+    with the command that fetches it and the way to bring it by hand.
     """
     separators = [os.sep, os.altsep or os.sep]
     if "." in spec or any(separator in spec for separator in separators):

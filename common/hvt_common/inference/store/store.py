@@ -43,11 +43,7 @@ def cache_folder() -> Path:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file in 64 hexadecimal digits.
-
-    Raises:
-        UserError: It cannot be read.
-    """
+    """SHA-256 of a file in 64 hexadecimal digits. Raises `UserError` where it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -56,13 +52,9 @@ def file_digest(path: Path) -> str:
 
 
 class Store:
-    """Models by name in one folder.
+    """Models by name in one folder, which is made when something is put into it (default: `cache_folder`).
 
-    Args:
-        folder: The cache folder; else `cache_folder`. It is made when something is put into it.
-
-    Raises:
-        UserError: ``added.toml`` in the folder is not a manifest.
+    Raises `UserError` where ``added.toml`` in the folder is not a manifest.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -98,8 +90,7 @@ class Store:
     def verified(self, name: str) -> Path:
         """The path of a model that is there and is the pinned file, size and SHA-256.
 
-        Raises:
-            UserError: It is not there, with the ways to get it, or it is another file.
+        Raises `UserError` where it is not there, with the ways to get it, or it is another file.
         """
         entry, path = self.entry(name), self.path(name)
         if not path.exists():
@@ -119,11 +110,9 @@ class Store:
     ) -> Path:
         """Get a model from its first address that gives it; nothing is done where it is there and right.
 
-        ``progress`` gets the bytes held so far. ``on_wait`` is called once where another process is fetching the same
-        model; then this one waits for it. ``pauses_s`` are the seconds after each try that brought nothing.
-
-        Raises:
-            UserError: No address gives the pinned file, or the folder cannot be written.
+        ``progress`` gets the bytes held so far. ``on_wait`` is called once where another process is fetching
+        the same model; then this one waits for it. ``pauses_s`` are the seconds after each try that brought
+        nothing. Raises `UserError` where no address gives the pinned file, or the folder cannot be written.
         """
         entry, path = self.entry(name), self.path(name)
         with self._lock(name, on_wait):
@@ -147,10 +136,9 @@ class Store:
     def add(self, file: Path, *, name: str, sha256: str | None = None) -> Path:
         """Copy a file that was brought by hand into the folder, if it is the pinned one.
 
-        ``sha256`` must be given for a new name, and pins it; for a built-in name it must agree with the manifest.
-
-        Raises:
-            UserError: Another file than pinned, a missing pin, or the folder cannot be written.
+        ``sha256`` must be given for a new name, and pins it; for a built-in name it must agree with the
+        manifest. Raises `UserError` for another file than pinned, a missing pin, or a folder that cannot be
+        written.
         """
         check_name(name)
         given = check_digest(sha256) if sha256 is not None else None

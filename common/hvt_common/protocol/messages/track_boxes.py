@@ -83,10 +83,8 @@ def write_tracks(
 ) -> tuple[bytes, list[CodedTrack]]:
     """Code the tracks of a step; return the bytes and the list as the reader will have it.
 
-    Args:
-        listed: Ids, classes, confidences and boxes; velocities too, where there is no reference.
-        reference: The list that the step before left; None for a step that stands by itself.
-        frames: From the reference's frame to this one.
+    ``reference`` is the list that the step ``frames`` before left; None for a step that stands by itself, whose
+    velocities are coded too.
     """
     encoder = Encoder()
     wanted = {track.track_id: track for track in listed}

@@ -136,11 +136,9 @@ class TrackStepDecoder:
         """The tracks of this step, boxes in base pixels, ordered by id; None where its reference never came.
 
         None too for a step that is not newer than the last one. ``ids`` are the edge's; ``class_ids`` index
-        ``Info.class_names``; ``confidences`` are right within 0.1; ``born_frames`` is the first step that listed the
-        track here; ``started`` marks those that the last readable step did not list.
-
-        Raises:
-            WireError: The coded boxes make no sense; the decoder is as it was before.
+        ``Info.class_names``; ``confidences`` are right within 0.1; ``born_frames`` is the first step that
+        listed the track here; ``started`` marks those that the last readable step did not list. Raises
+        `WireError` where the coded boxes make no sense; the decoder is as it was before.
         """
         if step.sequence <= self._sequence or step.reference not in (-1, self._sequence):
             return None

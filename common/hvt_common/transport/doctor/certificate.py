@@ -102,11 +102,8 @@ class TlsFiles:
 def check_own_keys(config: zenoh.Config, *, listen: Sequence[str], name: str | None, now_s: float) -> None:
     """Raise UserError for keys that no other side would accept; warn of what will soon be, or may be, a fault.
 
-    Args:
-        config: the configuration in use.
-        listen: the endpoints that will be listened on.
-        name: who this machine has to be by its certificate: the id of an edge; None for anybody.
-        now_s: Unix time.
+    ``name`` is who this machine has to be by its certificate: the id of an edge; None for anybody. ``now_s`` is
+    Unix time.
     """
     files = TlsFiles.of(config)
     listening, connecting = _any_secured(listen), _any_secured(connect_endpoints(config))

@@ -52,13 +52,9 @@ def control_unanswered(edge: str, *, who: str = "this ground") -> str:
 class LinkWatch:
     """Watches the links of one session, in a thread of its own; a context manager.
 
-    Args:
-        session: the session that was opened with these settings.
-        settings: how it was opened.
-        served: whether a machine of that name has shown life to us, or we to it: an edge that has appeared, a ground
-            that subscribes. Called from the thread.
-        patience_s: a link that is merely slow to come, or to be of use, needs no explanation.
-        examine: gives one sentence for each endpoint that this configuration connects to; may block for seconds.
+    ``served(name)`` says, in that thread, whether an edge of that name has appeared or a ground subscribes. A link
+    slower than ``patience_s`` is explained; ``examine`` gives one sentence for each endpoint that this
+    configuration connects to, and may block for seconds.
     """
 
     def __init__(

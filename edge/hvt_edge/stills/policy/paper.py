@@ -37,10 +37,7 @@ class TracksFirst(VideoOnly):
 
 @dataclass(frozen=True, slots=True)
 class Periodic:
-    """M1: every active track falls due at a fixed interval, most overdue first.
-
-    A track of which nothing was sent is due from its first frame.
-    """
+    """M1: each active track falls due at a fixed interval, from its first frame on; most overdue first."""
 
     every_frames: int = 15
     """The paper's interval: one second at 15 fps."""

@@ -1,4 +1,4 @@
-"""Every method by name: the one table that ``--method``, its help and the study read."""
+"""Every method by name: the one table that ``--method`` and the study read."""
 
 from __future__ import annotations
 
@@ -31,40 +31,27 @@ class MethodEntry:
     """A row of the table."""
 
     make: Callable[..., Method]
-    help: str
     parameters: Mapping[str, float]
     """Name and default of what may be tuned."""
 
 
-def _entry(make: type[Any], text: str) -> MethodEntry:
+def _entry(make: type[Any]) -> MethodEntry:
     defaults = make()
     tunable: dict[str, float] = {one.name: getattr(defaults, one.name) for one in fields(make) if one.init}
-    return MethodEntry(make, text, MappingProxyType(tunable))
+    return MethodEntry(make, MappingProxyType(tunable))
 
-
-_SELECTOR_HELP = {
-    "permissive": "pilot: up to 3 detections a frame, small first, then least confident",
-    "conf_size_top1": "pilot: 1 road user a frame, small first, then least confident",
-    "strict_small_only": "pilot: 1 road user a frame, small first, larger ones only where nothing is small",
-    "balanced_top2": "pilot: up to 2 road users a frame, by doubt, then smallness",
-}
 
 METHODS: Mapping[str, MethodEntry] = MappingProxyType(
     {
-        "M0": _entry(VideoOnly, "video only: no stills"),
-        "M1": _entry(Periodic, "every track each 15 frames, most overdue first"),
-        "M2": _entry(OnStart, "when a track begins or is found again"),
-        "M3": _entry(Uncertain, "tracks of low confidence: detector's, or classifier's once known"),
-        "M4": _entry(Small, "tracks that are small in the frame"),
-        "M5": _entry(Utility, "most utility per byte: uncertain, small, not refined lately"),
-        "M6": _entry(ExpectedGain, "most expected gain per byte, from what the base lost of each track"),
-        "R0": _entry(TracksFirst, "video only, active tracks quantised better (--roi-depth)"),
-        **{
-            row.name: MethodEntry(
-                partial(SelectorMethod, row), _SELECTOR_HELP[row.name], MappingProxyType({})
-            )
-            for row in SELECTORS
-        },
+        "M0": _entry(VideoOnly),
+        "M1": _entry(Periodic),
+        "M2": _entry(OnStart),
+        "M3": _entry(Uncertain),
+        "M4": _entry(Small),
+        "M5": _entry(Utility),
+        "M6": _entry(ExpectedGain),
+        "R0": _entry(TracksFirst),
+        **{row.name: MethodEntry(partial(SelectorMethod, row), MappingProxyType({})) for row in SELECTORS},
     }
 )
 

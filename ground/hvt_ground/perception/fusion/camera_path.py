@@ -19,12 +19,8 @@ _Floats = npt.NDArray[np.float64]
 class CameraPath:
     """The motion between decoded frames, and from it that between any two frames.
 
-    Between two decoded frames the motion is spread evenly over the frames; after the newest it goes on as it was for
-    ``ahead_ticks`` and then stands; before the oldest it stands.
-
-    Args:
-        ahead_frames: for how long the last motion is extrapolated.
-        frames: how many motions are remembered.
+    Between two decoded frames the motion is spread evenly over the frames; after the newest it goes on as it was
+    for ``ahead_frames`` and then stands; before the oldest it stands. ``frames`` motions are remembered.
     """
 
     def __init__(self, *, ahead_frames: int, frames: int = 90) -> None:

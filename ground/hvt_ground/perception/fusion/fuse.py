@@ -80,11 +80,8 @@ def unified_names(own: Sequence[str], edge: Sequence[str]) -> tuple[tuple[str, .
 class Fusion:
     """The entities of one session. The ``take_…`` methods update it; `listed` changes nothing.
 
-    Args:
-        fps: frames a second.
-        edge_classes: for each class id of the edge its place in the unified names.
-        path: the camera's motion, which the caller feeds.
-        edge_class_weight: what the edge's class is worth against ours; 1 where both see the same pixels.
+    ``edge_classes`` maps class ids of the edge to the unified names; ``edge_class_weight`` is what the edge's class
+    is worth against ours, 1 where both see the same pixels. The caller feeds ``path``.
     """
 
     def __init__(

@@ -113,13 +113,9 @@ class CropReader:
 class Redetection:
     """Pastes the stills into the decoded frame at their places and detects on the composite, once a frame.
 
-    The detector sees the objects sharp and in their surroundings, which is what it was trained on. Where its input is
-    larger than the base, so is the composite, and the stills keep their detail.
-
-    Args:
-        detector: What is run; its confidence is the least at which a class or a box counts.
-        view: Between source and base pixels.
-        new_confidence: Least confidence of an object that nobody has named.
+    The detector sees the objects sharp and in their surroundings, which is what it was trained on. Where its input
+    is larger than the base, so is the composite, and the stills keep their detail. A class or a box counts from the
+    detector's confidence on, an object that nobody has named from ``new_confidence`` on.
     """
 
     def __init__(self, detector: Detector, *, view: View, new_confidence: float = 0.5) -> None:

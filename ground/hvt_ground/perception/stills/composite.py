@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from hvt_common.values import Image, View
+from hvt_common.video.base_crop import resampled
 from hvt_ground.perception.stills.decode import DecodedStill
 
 __all__ = ["Patch", "composite", "patch_of"]
@@ -62,7 +62,7 @@ def patch_of(still: DecodedStill, *, view: View, zoom: float, size: tuple[int, i
     still_height, still_width = still.image_bgr.shape[:2]
     step_x, step_y = still_width / (x2 - x1), still_height / (y2 - y1)
     origin = ((left - x1) * step_x, (top - y1) * step_y)
-    image = _resampled(still.image_bgr, origin, (step_x, step_y), (right - left, bottom - top))
+    image = resampled(still.image_bgr, origin, (step_x, step_y), (right - left, bottom - top))
     across = _coverage(np.arange(left, right) + 0.5, x1, x2)
     down = _coverage(np.arange(top, bottom) + 0.5, y1, y2)
     return Patch(left, top, image, np.outer(down, across).astype(np.float32))
@@ -79,33 +79,7 @@ def _enlarged(base_bgr: Image, zoom: float) -> Image:
         return base_bgr.copy()
     height, width = base_bgr.shape[:2]
     size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
-    return _resampled(base_bgr, (0.0, 0.0), (1 / zoom, 1 / zoom), size)
-
-
-def _resampled(
-    image_bgr: Image, origin_px: tuple[float, float], step_px: tuple[float, float], size: tuple[int, int]
-) -> Image:
-    """``size`` pixels of an image, from the corner ``origin_px`` on, ``step_px`` image pixels for each."""
-    fine = max(1, math.ceil(max(step_px) - 1e-6))
-    step_x, step_y = step_px[0] / fine, step_px[1] / fine
-    # Pixel i covers i…i+1: its centre is at i + 0.5, and warpAffine counts centres.
-    matrix = np.array(
-        [
-            [step_x, 0, origin_px[0] + (step_x - 1) / 2],
-            [0, step_y, origin_px[1] + (step_y - 1) / 2],
-        ],
-        np.float64,
-    )
-    result = cv2.warpAffine(
-        image_bgr,
-        matrix,
-        (size[0] * fine, size[1] * fine),
-        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    if fine > 1:
-        result = cv2.resize(result, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(result, np.uint8)
+    return resampled(base_bgr, (0.0, 0.0), (1 / zoom, 1 / zoom), size)
 
 
 def _coverage(centres: npt.NDArray[np.floating[Any]], first: float, last: float) -> npt.NDArray[np.float64]:

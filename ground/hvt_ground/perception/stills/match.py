@@ -61,9 +61,8 @@ class TrackMatch:
 class Matcher:
     """Remembers which edge track is which ground track, for one session and in bounded memory.
 
-    Args:
-        least_iou: the threshold that the evidence must reach.
-        owned_frames: for how many frames after a still a ground track counts as the edge track's own.
+    ``least_iou`` is the threshold of the evidence; for ``owned_frames`` after a still a ground track counts as the
+    edge track's own.
     """
 
     def __init__(self, *, least_iou: float, owned_frames: int) -> None:

@@ -80,17 +80,10 @@ class _Held:
 class Refiner:
     """Holds stills until their track is known, and the classes that came of them. One for each session.
 
-    Args:
-        mode: ``replace`` or ``fuse``.
-        fps: frames a second of the base stream; turns the seconds below into frames.
-        detector_classes: names of ``Tracks.class_ids``.
-        classifier_classes: names of ``Posterior.probabilities``.
-        hold_s: how long a still waits for its frame to be tracked.
-        confirm_s: how long after its frame a track that was detected then, but not confirmed, may appear.
-        forget_s: how long after its last frame a track's class is remembered; more than a lost track may
-            take to be found again.
-        iou: the least overlap of a still's box with a track's. Half is the usual threshold of detection
-            benchmarks; boxes of two neighbours of one size and shape rarely reach it both.
+    ``mode`` is ``replace`` or ``fuse``. A still waits ``hold_s`` for its frame to be tracked, and ``confirm_s`` for
+    a track that was detected but not confirmed then. A track's class is remembered for ``forget_s`` after its last
+    frame, more than a lost track may take to be found again. ``iou`` is the least overlap of a still's box with a
+    track's: half is the usual threshold of benchmarks, and boxes of two similar neighbours rarely reach it both.
     """
 
     def __init__(

@@ -43,15 +43,7 @@ class Progress:
 class StillStage:
     """One session's stills. Used by one thread; ``emit`` takes the events.
 
-    Args:
-        reader: names what stills show.
-        refiner: matches them to tracks.
-        history: the pictures and tracks by frame.
-        fusion: learns where stills show objects.
-        view: between source and base pixels.
-        wants_base: whether ``reader`` uses the base frame; then all stills wait for theirs, not only residuals.
-        gap_ticks: how many frames the base stream may leave out and still say where tracks were between.
-        emit: takes the events.
+    ``wants_base``: ``reader`` uses the base frame, so all stills wait for theirs, not only residuals.
     """
 
     def __init__(

@@ -47,14 +47,9 @@ def screen(
 ) -> rrb.Blueprint:
     """Video with boxes, plots below; gallery of stills, session facts and events to the right.
 
-    The video has a second tab: with the stills in their places, and boxes only of tracks that a still has spoken on.
-
-    Args:
-        base_size: (width, height) of the base stream in pixels.
-        fps: The base stream's rate; the viewer plays a frame timeline at it.
-        budget_bps: The budget in all; sets the height of the bitrate plot.
-        clocked: Whether latencies are known; without them their plot is left out.
-        live: Follow the newest data, rather than play from the beginning.
+    The video has a second tab: with the stills in their places, and boxes only of tracks that a still has spoken
+    on. ``fps`` sets the pace of the frame timeline, ``budget_bps`` the height of the bitrate plot. Latencies are
+    plotted where ``clocked``; ``live`` follows the newest data rather than play from the beginning.
     """
     left = rrb.Vertical(_videos(base_size), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
     right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.35, 0.62, 0.93])

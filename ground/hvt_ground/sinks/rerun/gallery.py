@@ -83,9 +83,7 @@ class Put(Generic[T]):
 class Gallery(Generic[T]):
     """Hands out slots so that a pair can be looked at: each is held for a while. Not safe for threads.
 
-    Args:
-        empty: the captions while nothing is shown, one a slot.
-        hold_ns: for how long a pair keeps its slot at least, in capture time.
+    ``empty`` has the captions while nothing is shown, one a slot; ``hold_ns`` is in capture time.
     """
 
     def __init__(self, empty: tuple[T, ...], *, hold_ns: int = round(HOLD_S * 1e9)) -> None:

@@ -34,13 +34,8 @@ _MEMORY_LIMIT = "512MB"
 class LiveView:
     """A viewer process of our own; ends with the context, except the native window, which its user closes.
 
-    Args:
-        kind: ``"spawn"`` opens the native viewer, ``"serve"`` the web viewer for a browser on this machine.
-        port: TCP port of loopback for the data (9876 is Rerun's own default).
-        web_port: TCP port of loopback for the web page, ``"serve"`` only.
-
-    Raises:
-        UserError: the port is in use by something else, or the viewer does not start.
+    ``kind``: ``"spawn"`` opens the native viewer, ``"serve"`` the web viewer (at ``web_port``). Raises `UserError`
+    where a port is in use by something else, or the viewer does not start.
     """
 
     def __init__(self, kind: Literal["spawn", "serve"], *, port: int = 9876, web_port: int = 9090) -> None:

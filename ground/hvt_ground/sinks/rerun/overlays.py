@@ -87,14 +87,10 @@ class _Screen:
 class OverlayEncoder:
     """Turns overlays into the smallest updates that show them.
 
-    Movement is written at the overlay's own rate while it costs less than ``share`` of the bytes received, and less
-    often beyond that; a change of the set of tracks, of a class or of a label is always written.
-
-    Args:
-        share: of the bytes received, for movement.
-        credit_bytes: for movement, before anything was received.
-        afresh: nothing is known of what is on the screen, so the first overlay is written whole.
-        with_origins: write origins from the first overlay on, not only once one is not of the base stream.
+    Movement is written at the overlay's own rate while it costs less than ``share`` of the bytes received (and
+    ``credit_bytes`` before that), and less often beyond; a change of the set of tracks, of a class or of a label is
+    always written. ``afresh`` writes the first overlay whole; ``with_origins`` writes origins from the first
+    overlay on, not only once one is not of the base stream.
     """
 
     def __init__(
@@ -172,13 +168,9 @@ class _Hole:
 class BacklogOverlays:
     """Boxes in a hole that is filled later: what to write so that they end where the live stream goes on.
 
-    A viewer shows the latest value before its time. Boxes that are written into a hole would stand over what follows
-    it, where that only said what had changed since before the hole. So at the first overlay after it all is written
-    once more. Of one recording; not safe for threads.
-
-    Args:
-        fps: frames a second.
-        least_s: shorter holes are none: the base stream leaves out frames, and boxes go on.
+    A viewer shows the latest value before its time, so boxes in a hole would stand over what follows it. At the
+    first overlay after the hole all is therefore written once more. Holes shorter than ``least_s`` are none: the
+    base stream leaves out frames. Of one recording; not safe for threads.
     """
 
     def __init__(self, *, fps: float, least_s: float = 1.0) -> None:

@@ -81,11 +81,9 @@ class RecorderSettings:
 class Recorder:
     """Records the events of one edge's session. Several may run in one process; `log` may be called by any thread.
 
-    When `log` returns, the event is in the file: killing the process loses nothing that was logged. A live viewer
-    that goes away is left behind with one warning.
-
-    Raises:
-        UserError: the file cannot be created, or (from `log` and `close`) written any further.
+    When `log` returns, the event is in the file: killing the process loses nothing that was logged. A live
+    viewer that goes away is left behind with one warning. Raises `UserError` where the file cannot be
+    created, or (from `log` and `close`) written any further.
     """
 
     def __init__(self, settings: RecorderSettings) -> None:

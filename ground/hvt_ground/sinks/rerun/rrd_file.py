@@ -51,8 +51,7 @@ much for one of a few seconds."""
 class RrdFile:
     """A recording on disk; each call has written its bytes when it returns.
 
-    Raises:
-        UserError: the file cannot be created, or (later) written any further.
+    Raises `UserError` where the file cannot be created, or (later) written any further.
     """
 
     live = False

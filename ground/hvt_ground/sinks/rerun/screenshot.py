@@ -32,17 +32,11 @@ _MENU_PX = 37
 def screenshot(
     recording: Path, *, frame: int, out: Path, size: tuple[int, int] = (1920, 1080), settle_s: float = 4.0
 ) -> None:
-    """Open ``recording`` in a headless viewer, go to ``frame``, and write its screen as PNG.
+    """Open ``recording`` (.rrd) in a headless viewer, go to ``frame`` of its timeline, and write its screen as PNG.
 
-    Args:
-        recording: An .rrd file.
-        frame: Value of the ``frame`` timeline.
-        out: The PNG to write.
-        size: (width, height) of the window in pixels; the picture is lower by the menu bar.
-        settle_s: How long the viewer may decode and lay out before the picture is taken.
-
-    Raises:
-        UserError: the file or a part that the viewer needs is missing, or the viewer does not start.
+    ``size`` is the window's in pixels (the picture is lower by the menu bar); the viewer has ``settle_s`` to decode
+    and lay out. Raises `UserError` where a file or a part that the viewer needs is missing, or the viewer does not
+    start.
     """
     if not recording.is_file():
         raise UserError(f"recording {recording} does not exist: give an .rrd file")

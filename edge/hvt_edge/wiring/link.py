@@ -1,0 +1,60 @@
+"""The link and its budget, from the settings."""
+
+from __future__ import annotations
+
+from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_common.units import SECOND_NS
+from hvt_edge.config import LEAST_FPS, EdgeConfig
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.video.encoder_settings import least_base_bps
+from hvt_edge.video.share import Split, SplitSettings
+
+
+def make_link_settings(config: EdgeConfig) -> LinkSettings:
+    """How the edge takes part in Zenoh."""
+    return LinkSettings(
+        role="edge",
+        listen=config.listen,
+        connect=config.connect,
+        zenoh_config=config.zenoh_config,
+        insecure=config.insecure,
+        name=config.edge_id,
+        links=2 if config.links == 2 else 1,
+    )
+
+
+def make_budget(config: EdgeConfig, *, decimation: int) -> RollingBudget:
+    """B_tot and B_v over the rolling window."""
+    return RollingBudget(
+        BudgetSettings(
+            total_bps=config.budget_bps,
+            base_bps=config.base_bps,
+            fps=config.nominal_fps / decimation,
+            window_ns=round(config.window * SECOND_NS),
+            metadata_bps=config.metadata_bps,
+            borrow_unused=config.borrow_unused,
+        )
+    )
+
+
+def make_split(config: EdgeConfig, size: tuple[int, int]) -> Split | None:
+    """Who moves the base's share of the budget; None where it is fixed."""
+    if not isinstance(config.video_share, str):
+        return None
+    fps = LEAST_FPS if config.auto_fps else config.nominal_fps
+    return Split(
+        SplitSettings(
+            total_bps=config.budget_bps,
+            least_base_bps=least_base_bps(size, fps, edge_id=config.edge_id),
+            metadata_bps=config.metadata_bps,
+        )
+    )
+
+
+def make_pacer(config: EdgeConfig) -> Pacer | None:
+    """What tracks the link's rate; None where the budget is to stay as it is."""
+    if not config.adapts:
+        return None
+    return Pacer(RateController(RateSettings(ceiling_bps=config.budget_bps, floor_bps=config.floor_bps)))

@@ -1,0 +1,216 @@
+"""Every part of an edge, built once from what it needs. The parts form a tree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+
+from hvt_common.inference.detect import Detector
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.ledger import Ledger
+from hvt_edge.backlog.outage import BaseInFlight
+from hvt_edge.backlog.stage import BacklogStage
+from hvt_edge.config import EdgeConfig
+from hvt_edge.control.commands import Commands
+from hvt_edge.control.link_control import LinkControl
+from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.publisher import EdgeLink
+from hvt_edge.link.tracks_channel import TrackReporter
+from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.operating.point import LoopClock, Operating
+from hvt_edge.source.contract import Source
+from hvt_edge.source.demo import write_truth_of
+from hvt_edge.status import InfoReporter
+from hvt_edge.stills.outbox import Outbox
+from hvt_edge.stills.sending import StillSender
+from hvt_edge.stills.stage import StillStage
+from hvt_edge.video.frame_skip import LimitedFrameSkip
+from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.reconfigure import EncoderReconfiguration
+from hvt_edge.video.stage import BaseStage
+from hvt_edge.wiring.link import make_budget, make_pacer, make_split
+from hvt_edge.wiring.perception import make_analyzer
+from hvt_edge.wiring.stills import make_chooser, make_on_demand, make_still_maker
+from hvt_edge.wiring.storing import make_backlog
+from hvt_edge.wiring.video import (
+    first_decimation,
+    make_encoder,
+    make_frame_skip,
+    make_keyframes,
+    make_regions,
+    reconfiguration_settings,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """What a frame goes through, and what a ground reaches."""
+
+    base: BaseStage
+    stills: StillStage
+    transmitter: Transmitter
+    link_control: LinkControl
+    commands: Commands
+    reconfiguration: EncoderReconfiguration
+    operating: Operating
+    keyframes: KeyframeRequests
+    backlog: BacklogStage | None
+    info: InfoReporter
+
+
+def build_stages(
+    stack: ExitStack,
+    config: EdgeConfig,
+    *,
+    source: Source,
+    detector: Detector,
+    link: EdgeLink,
+    session_id: int,
+    ledger: Ledger,
+    inbox: FeedbackInbox,
+    clock: Callable[[], int],
+    loop_clock: LoopClock,
+    wait_until: Callable[[int], None],
+) -> Stages:
+    """Build every part once, each with all that it needs; files and threads end with ``stack``.
+
+    Raises `UserError` where x265 does not take the settings, or a file cannot be written.
+    """
+    view, class_names = source.view, detector.class_names
+    lockstep = config.pace == "lockstep"
+    decimation = first_decimation(config, view.base_size)
+    operating = Operating(
+        budget_bps=config.budget_bps,
+        video_share=config.fixed_share,
+        base_bps=config.base_bps,
+        method=config.method,
+        decimation=decimation,
+    )
+    keyframes, pacer = make_keyframes(config), make_pacer(config)
+    open_encoder = partial(make_encoder, config, size=view.base_size)
+    encoder = open_encoder(total_bps=config.budget_bps, base_bps=config.base_bps, decimation=decimation)
+    budget = make_budget(config, decimation=decimation)
+    # Files come after all that may be refused: a failed start leaves nothing behind.
+    write_truth_of(source, config.truth, fps=config.nominal_fps)
+    recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
+    in_flight, outbox = BaseInFlight(), Outbox(reports=not lockstep)
+    transmitter = Transmitter(
+        link,
+        ledger=ledger,
+        budget=budget,
+        edge_id=config.edge_id,
+        session_id=session_id,
+        lockstep=lockstep,
+        wait_until=wait_until,
+        pacer=pacer,
+        in_flight=None if lockstep else in_flight,
+    )
+    reconfiguration = EncoderReconfiguration(
+        operating,
+        reconfiguration_settings(config, view.base_size),
+        open_encoder=open_encoder,
+        transmitter=transmitter,
+        split=make_split(config, view.base_size),
+        pacer=pacer,
+    )
+    info = InfoReporter(
+        config,
+        session_id=session_id,
+        operating=operating,
+        view=view,
+        class_names=class_names,
+        clock=clock,
+    )
+    backlog = make_backlog(
+        config,
+        session_id=session_id,
+        live=source.live,
+        has_subscriber=partial(link.has_subscriber, Channel.BACKLOG),
+        transmitter=transmitter,
+        in_flight=in_flight,
+        outbox=outbox,
+        keyframes=keyframes,
+        clock=clock,
+        info=info.info,
+    )
+    if backlog is not None:
+        stack.enter_context(backlog)
+    still_sender = StillSender(
+        outbox, maker=make_still_maker(config), transmitter=transmitter, backlog=backlog
+    )
+    stack.callback(lambda: still_sender.close(clock()))
+    link_control = LinkControl(
+        has_ground=link.has_ground,
+        session_id=session_id,
+        transmitter=transmitter,
+        keyframes=keyframes,
+        inbox=inbox,
+        reconfiguration=reconfiguration,
+        clock=clock,
+        pacer=pacer,
+        in_flight=in_flight,
+        outbox=outbox,
+        stills=still_sender,
+        backlog=backlog,
+    )
+    base = BaseStage(
+        encoder,
+        keyframes=keyframes,
+        transmitter=transmitter,
+        recorder=recorder,
+        first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
+        regions=make_regions(config, view.base_size),
+        frame_skip=LimitedFrameSkip(make_frame_skip(config, decimation), reconfiguration.least_decimation),
+        reconfigure=reconfiguration,
+        admits=link_control.admits,
+        backlog=backlog,
+    )
+    on_demand = make_on_demand(
+        config, outbox=outbox, view=view, class_names=class_names, most_bytes=transmitter.most_still_bytes
+    )
+    chooser = make_chooser(
+        config,
+        outbox=outbox,
+        view=view,
+        class_names=class_names,
+        most_bytes=transmitter.most_still_bytes(),
+        on_outcome=transmitter.outcome,
+        observe=reconfiguration.observe,
+        on_demand=on_demand,
+    )
+    stills = StillStage(
+        make_analyzer(config, detector=detector, view=view),
+        chooser,
+        outbox=outbox,
+        sender=still_sender,
+        transmitter=transmitter,
+        keyframes=keyframes,
+        reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
+    )
+    commands = Commands(
+        config,
+        operating=operating,
+        session_id=session_id,
+        keyframes=keyframes,
+        on_demand=on_demand,
+        chooser=chooser,
+        backlog=backlog,
+        base_size=view.base_size,
+        clock=clock,
+        loop_clock=loop_clock,
+    )
+    return Stages(
+        base,
+        stills,
+        transmitter,
+        link_control,
+        commands,
+        reconfiguration,
+        operating,
+        keyframes,
+        backlog,
+        info,
+    )

@@ -1,0 +1,89 @@
+"""The makers and choosers of stills, from the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from hvt_common.units import SECOND_NS
+from hvt_common.values import View
+from hvt_common.video.still_codecs import still_codec
+from hvt_edge.config import EdgeConfig
+from hvt_edge.perception.candidates import Candidate, TrackMemory
+from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from hvt_edge.stills.maker import StillMaker
+from hvt_edge.stills.on_demand import OnDemand
+from hvt_edge.stills.outbox import Outbox
+from hvt_edge.stills.policy.base import Step
+from hvt_edge.stills.policy.registry import method, tuning
+from hvt_edge.stills.scheduler import Chooser, ChooserSettings
+from hvt_edge.stills.suppression import Gate, Suppression
+
+
+def make_suppression(config: EdgeConfig) -> Suppression:
+    """Which tracks pause, and for how long."""
+    return Suppression.for_cooldown(config.cooldown, min_gain=config.min_gain)
+
+
+def make_chooser(
+    config: EdgeConfig,
+    *,
+    outbox: Outbox,
+    view: View,
+    class_names: tuple[str, ...],
+    most_bytes: int,
+    on_outcome: Callable[[str, str], None],
+    observe: Callable[[Sequence[Candidate], Step], None],
+    on_demand: OnDemand,
+) -> Chooser:
+    """Method, suppression, gate and maker; ``most_bytes`` is the largest payload the budget ever admits."""
+    return Chooser(
+        method(config.method, **tuning(config.tune)),
+        suppression=make_suppression(config),
+        outbox=outbox,
+        maker=make_still_maker(config),
+        memory=TrackMemory(padding=config.padding),
+        view=view,
+        class_names=class_names,
+        settings=ChooserSettings(
+            fps=config.nominal_fps,
+            most_bytes=most_bytes,
+            gate=Gate(psnr_y_db=config.gate),
+            share=config.group_stills,
+            from_source=config.candidates == "source",
+        ),
+        on_outcome=on_outcome,
+        observe=observe,
+        on_demand=on_demand,
+    )
+
+
+def make_on_demand(
+    config: EdgeConfig,
+    *,
+    outbox: Outbox,
+    view: View,
+    class_names: tuple[str, ...],
+    most_bytes: Callable[[], int],
+) -> OnDemand:
+    """The ring of source frames, and who serves stills from it."""
+    ring = FrameRing(RingSettings(max_bytes=config.ring, max_age_ns=round(config.ring_time * SECOND_NS)))
+    return OnDemand(
+        ring,
+        outbox=outbox,
+        maker=make_still_maker(config),
+        view=view,
+        class_names=class_names,
+        most_bytes=most_bytes,
+    )
+
+
+def make_still_maker(config: EdgeConfig) -> StillMaker:
+    """Codec, quality and fallback of stills."""
+    codec = still_codec(config.still_codec)
+    return StillMaker(
+        codec=codec,
+        fallback=still_codec(config.fallback_codec) if codec.needs_base else None,
+        quality_pct=config.jpeg_quality,
+        fidelity_db=config.fidelity,
+        padding=config.padding,
+    )

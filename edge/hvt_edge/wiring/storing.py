@@ -1,0 +1,67 @@
+"""What is written on the edge, from the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from hvt_common.runtime.reporting import check_writable
+from hvt_common.units import SECOND_NS
+from hvt_edge.backlog.disk import Folder, check_folder, default_folder
+from hvt_edge.backlog.outage import BaseInFlight
+from hvt_edge.backlog.stage import BacklogLink, BacklogStage
+from hvt_edge.config import EdgeConfig
+from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.stills.outbox import Outbox
+
+
+def check_files(config: EdgeConfig) -> None:
+    """Raise `UserError` for a file or folder that could not be written."""
+    for path, name in (
+        (config.summary, "--summary"),
+        (config.truth, "--truth"),
+        (config.record_base, "--record-base"),
+    ):
+        check_writable(path, name=name)
+    if config.store and config.pace != "lockstep":
+        check_folder(config.store_folder or default_folder(config.edge_id))
+
+
+def make_backlog(
+    config: EdgeConfig,
+    *,
+    session_id: int,
+    live: bool,
+    has_subscriber: Callable[[], bool],
+    transmitter: Transmitter,
+    in_flight: BaseInFlight,
+    outbox: Outbox,
+    keyframes: KeyframeRequests,
+    clock: Callable[[], int],
+    info: Callable[[], bytes],
+) -> BacklogStage | None:
+    """Who stores what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
+    if not config.store or config.pace == "lockstep":
+        return None
+    path = config.store_folder or default_folder(config.edge_id)
+    oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
+    return BacklogStage(
+        lambda: Folder(path, max_bytes=config.store, session_id=session_id, info=info, oldest_ns=oldest_ns),
+        session_id=session_id,
+        live=live,
+        link=BacklogLink(
+            has_subscriber=has_subscriber,
+            allowance_bytes=lambda now_ns, reserve: transmitter.backlog_allowance_bytes(
+                now_ns, reserve=reserve
+            ),
+            send=lambda chunk, now_ns: transmitter.backlog(chunk, now_ns=now_ns),
+            round_trip_ns=lambda: transmitter.round_trip_ns,
+            total_bps=lambda: transmitter.total_bps,
+            stills_pending=lambda: outbox.any_pending,
+            stills_in_flight=lambda: outbox.unacknowledged,
+        ),
+        in_flight=in_flight,
+        keyframes=keyframes,
+        clock=clock,
+        on_outcome=transmitter.outcome,
+    )
