@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from processes import free_ports
+from programs.processes import free_ports
 
 ROOT = Path(__file__).resolve().parent.parent
 

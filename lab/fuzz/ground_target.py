@@ -9,7 +9,6 @@ from random import Random
 from typing import NamedTuple
 from unittest.mock import patch
 
-from flight import Flight, Port, pipeline_of
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Received
 from hvt_ground.session.edge_sessions import EdgeSessions
@@ -18,6 +17,7 @@ from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from lab.fuzz.contract import Target, scratch
 from lab.fuzz.mutate import Bytes, changed_values, joined, parted, with_checksum
+from rigs.flight import Flight, Port, pipeline_of
 
 __all__ = ["TARGETS"]
 

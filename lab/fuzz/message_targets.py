@@ -9,8 +9,6 @@ from random import Random
 
 import numpy as np
 
-import messages
-from flight import tracks_at
 from hvt_common.protocol.channels import parse_key
 from hvt_common.protocol.messages import (
     BacklogHeader,
@@ -36,6 +34,8 @@ from hvt_common.protocol.messages import (
 )
 from lab.fuzz.contract import Target
 from lab.fuzz.mutate import Bytes, changed_values, each_part, joined, parted, plain, with_checksum
+from rigs import messages
+from rigs.flight import tracks_at
 
 __all__ = ["ROI", "TARGETS", "feedback"]
 

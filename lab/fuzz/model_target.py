@@ -9,7 +9,7 @@ import numpy as np
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from lab.fuzz.contract import Target, scratch
-from onnx_models import colour_classifier, constant_model
+from media.onnx_models import colour_classifier, constant_model
 
 __all__ = ["TARGETS"]
 

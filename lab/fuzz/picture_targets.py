@@ -9,9 +9,6 @@ from functools import cache
 
 import numpy as np
 
-from clips import framed, smooth_pictures
-from crops import textured, washed_out
-from hevc_pictures import coded_picture
 from hvt_common.protocol.messages import RoiHeader, WireError
 from hvt_common.values import View
 from hvt_common.video.base_crop import base_crop, coded_size
@@ -24,6 +21,9 @@ from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import ROI
 from lab.fuzz.mutate import changed_values, each_part, joined, parted
 from lab.fuzz.picture_mutations import inside
+from media.clips import framed, smooth_pictures
+from media.crops import textured, washed_out
+from media.hevc_pictures import coded_picture
 
 __all__ = ["CODECS", "TARGETS"]
 

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
-from command_rig import SESSION, Rig
 from hvt_common.protocol.messages import ControlRequest, Feedback, WireError
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.pacer import Pacer
@@ -18,6 +17,7 @@ from hvt_ground.link.reassemble import REORDER_UNITS, Arrival, Reassembler
 from lab.fuzz.contract import Target
 from lab.fuzz.message_targets import REQUESTS, feedback
 from lab.fuzz.mutate import changed_values, each_part, joined, parted
+from rigs.command_rig import SESSION, Rig
 
 __all__ = ["TARGETS"]
 

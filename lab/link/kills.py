@@ -33,9 +33,9 @@ from lab.link.measures.store_left import StoreLeft, store_left
 from lab.link.measures.timing import Arrival, read_timing
 from lab.link.script import load_scenario
 from lab.link.started import Started
-from pictures import write_scene
-from processes import eventually, free_ports
-from rrd import Recording
+from media.pictures import write_scene
+from programs.processes import eventually, free_ports
+from programs.rrd import Recording
 
 __all__ = [
     "BARS",

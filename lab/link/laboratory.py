@@ -21,7 +21,7 @@ from lab.link.measures.store_left import store_left
 from lab.link.measures.timing import read_timing
 from lab.link.script import Length, Scenario, Script, Transport
 from lab.link.started import Started
-from processes import eventually, free_ports
+from programs.processes import eventually, free_ports
 
 __all__ = ["CARRIERS", "Carrier", "Run", "run"]
 

@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import Any, Self
 
-from processes import Running
+from programs.processes import Running
 
 __all__ = ["Started"]
 

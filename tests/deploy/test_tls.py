@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet_keys import Fleet
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings
+from programs.fleet_keys import Fleet
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 EDGES = ("rov-1", "uav-1")

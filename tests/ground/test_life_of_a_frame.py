@@ -8,12 +8,12 @@ import time
 
 import pytest
 
-from flight import Flight, Port, pipeline_of
 from hvt_common.protocol.messages import Info
 from hvt_ground.events import Event, Overlay, VideoSample
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
+from rigs.flight import Flight, Port, pipeline_of
 
 TO_THE_PICTURE, TO_THE_TRACKS = 9, 9
 """Files of the ground that a frame enters at most in the receiving thread, and in that of the worker."""

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fleet_keys import Fleet
-from pictures import write_scene
-from processes import Link
+from media.pictures import write_scene
+from programs.fleet_keys import Fleet
+from programs.processes import Link
 
 
 @pytest.fixture

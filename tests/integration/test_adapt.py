@@ -9,7 +9,7 @@ import pytest
 
 from lab.link.carriers.relay import Relay
 from lab.link.script import LinkState, Phase, Script
-from processes import Link
+from programs.processes import Link
 
 pytestmark = pytest.mark.integration
 

@@ -13,7 +13,7 @@ import pytest
 
 from hvt_edge.cli import main
 from hvt_edge.stills.policy.registry import METHODS
-from processes import free_ports
+from programs.processes import free_ports
 
 pytestmark = [pytest.mark.integration, pytest.mark.apart, pytest.mark.realdata, pytest.mark.timeout(120)]
 

@@ -18,9 +18,9 @@ import zenoh
 
 from hvt_common.protocol.messages import Info, RoiHeader
 from hvt_common.video.hevc import BaseDecoder
-from outsider import Message, Tap, answer, joined
-from processes import Link, eventually
-from rrd import Recording
+from programs.outsider import Message, Tap, answer, joined
+from programs.processes import Link, eventually
+from programs.rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(300)]
 

@@ -12,9 +12,9 @@ import pytest
 
 from hvt_common.protocol.messages import BaseHeader, Command, ControlAnswer, ControlRequest
 from lab.link.measures.timing import read_timing
-from outsider import Tap, answer, joined
-from processes import Link, Running, eventually
-from rrd import Recording
+from programs.outsider import Tap, answer, joined
+from programs.processes import Link, Running, eventually
+from programs.rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 

@@ -9,8 +9,8 @@ from typing import Any
 import av
 import pytest
 
-from processes import Link
-from rrd import Recording
+from programs.processes import Link
+from programs.rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout(180)]
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import pytest
 
-from clips import START_NS
-from keeping import FRAMES, Ground, Rig
 from lab.link.carriers.pipe import SEGMENT_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
 from lab.link.script import LinkState, Phase, Script
+from media.clips import START_NS
+from rigs.keeping import FRAMES, Ground, Rig
 
 FRAME_S = 1 / 15
 LIGHT = LinkState(rate_bps=1_000_000, delay_s=0.02)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hvt_ground.control import EdgeClient, EdgeTrack, RefusedError, RequestedStill
-from processes import Link, eventually
+from programs.processes import Link, eventually
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 

@@ -19,9 +19,9 @@ from hvt_common.protocol.messages import Feedback
 from lab.link.carriers.relay import Relay
 from lab.link.measures.timing import Arrival, read_timing
 from lab.link.script import LinkState, Phase, Script
-from outsider import Tap, joined
-from processes import Link, Running, eventually
-from rrd import Recording
+from programs.outsider import Tap, joined
+from programs.processes import Link, Running, eventually
+from programs.rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
 
@@ -319,7 +319,7 @@ def test_clocks_that_are_set_leave_no_trace(link: Link, monkeypatch: pytest.Monk
     The ground's clock is set back by an hour and the edge's forward, in one flight. The other cases need no flight:
     see tests/common/protocol/test_clock_offset.py.
     """
-    (link.folder / "stepped.py").write_text((TESTS / "stepped.py").read_text())
+    (link.folder / "stepped.py").write_text((TESTS / "programs" / "stepped.py").read_text())
 
     def stepped(program: str, step_s: int, *arguments: str, name: str) -> Running:
         monkeypatch.setenv("HVT_STEPPED", f"{program} {step_s}")

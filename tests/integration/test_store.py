@@ -14,8 +14,8 @@ from hvt_edge.backlog.entry import FIRST_STORED
 from hvt_edge.backlog.segment import read_segment
 from lab.link.carriers.relay import Relay
 from lab.link.script import LinkState, Phase, Script
-from processes import Link, eventually
-from rrd import Recording
+from programs.processes import Link, eventually
+from programs.rrd import Recording
 
 pytestmark = pytest.mark.integration
 

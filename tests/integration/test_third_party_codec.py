@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from processes import Link
-from rrd import Recording
-from third_party_codec import install
+from media.third_party_codec import install
+from programs.processes import Link
+from programs.rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from clips import framed, smooth_pictures
-from flight import Flight
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
@@ -22,6 +20,8 @@ from lab.link.kills import (
 )
 from lab.link.measures.store_left import StoreLeft, store_left
 from lab.link.measures.timing import Arrival
+from media.clips import framed, smooth_pictures
+from rigs.flight import Flight
 
 KILLS = 4
 SIZE = (320, 192)

@@ -16,7 +16,7 @@ import pytest
 from lab.link.carriers.pipe import DATAGRAM_HEADER_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
 from lab.link.carriers.relay import Relay
 from lab.link.script import LinkState, Phase, Script
-from processes import eventually
+from programs.processes import eventually
 
 PACKET = 1200 + DATAGRAM_HEADER_BYTES
 

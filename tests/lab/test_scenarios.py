@@ -17,7 +17,7 @@ from lab.link.carriers.netns import UnavailableError
 from lab.link.laboratory import Run, run
 from lab.link.measures.outcome import Outcome, measures
 from lab.link.script import load_scenario, scenario_names
-from pictures import write_scene
+from media.pictures import write_scene
 
 pytestmark = [pytest.mark.integration, pytest.mark.realtime, pytest.mark.timeout(900)]
 

@@ -19,8 +19,8 @@ from lab.link.carriers.tunnel import GROUND_HOST, Flight, Tunnel, UnavailableErr
 from lab.link.laboratory import Run, run
 from lab.link.measures.outcome import measures
 from lab.link.script import LinkState, Phase, Script, load_scenario
-from pictures import write_scene
-from processes import eventually
+from media.pictures import write_scene
+from programs.processes import eventually
 
 pytestmark = pytest.mark.integration
 

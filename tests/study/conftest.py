@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from small_study import write_scene
+from studies.small_study import write_scene
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ import pytest
 import hvt_edge.cli
 import hvt_ground.cli
 from hvt_common.runtime.process import STOP_SIGNALS
-from refusal import checked, snapshot
+from programs.refusal import checked, snapshot
 
 Refused = Callable[..., str]
 

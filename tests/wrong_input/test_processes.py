@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from refusal import checked, snapshot
+from programs.refusal import checked, snapshot
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 

@@ -11,7 +11,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.runtimes.model import open_model
-from onnx_models import colour_classifier, colour_detector, constant_model
+from media.onnx_models import colour_classifier, colour_detector, constant_model
 
 PLAIN = {"hvt.mean": "0", "hvt.scale": "[1]"}
 BLUE = np.full((20, 30, 3), (200, 100, 50), np.uint8)  # BGR

@@ -25,7 +25,7 @@ from hvt_common.inference.letterbox import Letterbox, as_bgr
 from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
 from hvt_common.inference.runtimes.model import open_model
-from onnx_models import STRIDES, cells, colour_classifier, colour_detector, constant_model
+from media.onnx_models import STRIDES, cells, colour_classifier, colour_detector, constant_model
 
 RGB = str({0: "red", 1: "green", 2: "blue"})
 

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from clear_mot import Frames, score
 from hvt_common.tracking import kalman
 from hvt_common.tracking.association import assign, overlaps
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Detections, Tracks
+from studies.clear_mot import Frames, score
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -10,11 +10,11 @@ from contextlib import contextmanager
 import pytest
 import zenoh
 
-from flight import Flight
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.duplicate_edge import living_edge
 from hvt_common.transport.session import open_session, serve
 from hvt_common.transport.zenoh_config import LinkSettings
+from rigs.flight import Flight
 
 KEYS = EdgeKeys("uav-1")
 PATIENCE = 12.0

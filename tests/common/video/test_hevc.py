@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from clips import framed, smooth_pictures
 from hvt_common.video.hevc import MAX_SIDE_PX, BaseDecoder
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
+from media.clips import framed, smooth_pictures
 
 SIZE = (320, 192)
 

@@ -12,8 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image as Pillow
 
-from clips import real_pictures
-from crops import textured, washed_out
 from hvt_common.video.still_codecs import (
     CodedCrop,
     StillCodec,
@@ -25,6 +23,8 @@ from hvt_common.video.still_codecs import (
 from hvt_common.video.still_codecs.plugins.avif import av1_data, av1_size, avif_file
 from hvt_common.video.still_codecs.plugins.jxl import jxl_size
 from hvt_common.video.still_codecs.plugins.webp import webp_size
+from media.clips import real_pictures
+from media.crops import textured, washed_out
 
 BUILT_IN = ("jpeg", "webp", "avif", "jxl", "h264-intra", "residual")
 SIZE = (56, 40)

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from crops import textured
 from hvt_common.errors import UserError
 from hvt_common.video.still_codecs import StillError, registry, still_codec, still_codec_names
-from third_party_codec import install
+from media.crops import textured
+from media.third_party_codec import install
 
 
 @pytest.fixture

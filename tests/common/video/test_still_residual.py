@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from crops import textured, washed_out
 from hvt_common.video.still_codecs import (
     BaseMissingError,
     StillError,
@@ -18,6 +17,7 @@ from hvt_common.video.still_codecs.bits import BitReader, BitWriter, escaped, na
 from hvt_common.video.still_codecs.h264_syntax import parameter_sets, verbatim_picture
 from hvt_common.video.still_codecs.residual import CHECKSUM
 from hvt_common.video.still_codecs.yuv420 import difference_bgr, filled_outside, to_bgr, to_planar
+from media.crops import textured, washed_out
 
 CODEC = still_codec("residual")
 SIZE = (117, 50)

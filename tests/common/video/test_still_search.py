@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crops import textured, washed_out
 from hvt_common.video.still_codecs import best_fitting, psnr_y_db, smallest_reaching, still_codec
+from media.crops import textured, washed_out
 
 CROP = textured(117, 50, seed=2)
 BASE = washed_out(CROP)

@@ -17,7 +17,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_edge.backlog.backfill import Backfill, Chunk
 from hvt_ground.backlog import BacklogAssembly, backlog_content
-from kept import UNITS, S, add_stills, add_units, opened, shifted
+from rigs.kept import UNITS, S, add_stills, add_units, opened, shifted
 
 RTT = 100_000_000
 

@@ -16,14 +16,14 @@ from pathlib import Path
 import av
 import pytest
 
-from clips import START_NS
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Info, RoiHeader, parse_backlog_still, parse_backlog_units
 from hvt_edge.app import Edge
 from hvt_edge.backlog.disk import check_folder, default_folder
 from hvt_edge.backlog.segment import DamagedError, SegmentWriter, index_of, read_segment
 from hvt_edge.config import EdgeConfig, check
-from kept import INFO, UNITS, S, add_stills, add_units, opened, packed_still, shifted
+from media.clips import START_NS
+from rigs.kept import INFO, UNITS, S, add_stills, add_units, opened, packed_still, shifted
 
 TESTS = Path(__file__).resolve().parents[3] / "tests" / "support"
 
@@ -312,7 +312,7 @@ import sys
 sys.path[:0] = [{tests!r}]
 import time
 from pathlib import Path
-from kept import *
+from rigs.kept import *
 folder = opened(Path({path!r}))
 units = coded(150)
 said = 0

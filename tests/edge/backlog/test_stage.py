@@ -6,15 +6,15 @@ import logging
 
 import pytest
 
-from clips import START_NS
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Flags, RoiHeader, parse_backlog_still
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.wiring.storing import make_backlog
-from keeping import STILL, Rig
-from kept import INFO, opened
-from processes import eventually
+from media.clips import START_NS
+from programs.processes import eventually
+from rigs.keeping import STILL, Rig
+from rigs.kept import INFO, opened
 
 
 def test_what_is_coded_in_an_outage_is_kept_and_all_else_is_sent(tmp_path):

@@ -9,9 +9,9 @@ from hvt_common.protocol.channels import Channel
 from hvt_edge.backlog.worker import ChunkAllowance
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.outbox import OutboxStill
-from keeping import STILL, Rig
-from kept import S, add_stills, opened
-from processes import eventually
+from programs.processes import eventually
+from rigs.keeping import STILL, Rig
+from rigs.kept import S, add_stills, opened
 
 
 def test_what_nobody_acknowledged_is_kept_when_the_run_ends(tmp_path):

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from clips import START_NS
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.intake import EndSegment, Intake, IntakeUnit
 from hvt_edge.backlog.worker import ChunkAllowance, ChunkThread, StoreWorker
-from keeping import Rig
-from kept import INFO, UNITS, S, add_stills, add_units, opened, shifted
-from processes import eventually
+from media.clips import START_NS
+from programs.processes import eventually
+from rigs.keeping import Rig
+from rigs.kept import INFO, UNITS, S, add_stills, add_units, opened, shifted
 
 UNIT = IntakeUnit(UNITS[0], UNITS[0].data)
 

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clips import START_NS
-from command_rig import FRAME_NS, SESSION, VIEW, Rig, picture
 from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from media.clips import START_NS
+from rigs.command_rig import FRAME_NS, SESSION, VIEW, Rig, picture
 
 
 def shown(header: RoiHeader, data: bytes) -> np.ndarray:

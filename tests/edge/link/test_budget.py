@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from footprint import footprint_bytes
 from hvt_edge.link.budget import BASE_PEAK, BudgetSettings, RollingBudget
+from rigs.footprint import footprint_bytes
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_790_000_000 * SECOND_NS

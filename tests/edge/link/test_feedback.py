@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import threading
 
-from footprint import footprint_bytes
 from hvt_common.protocol.messages import Feedback, StillResult
 from hvt_edge.link.feedback import FeedbackInbox
-from messages import counted, feedback
+from rigs.footprint import footprint_bytes
+from rigs.messages import counted, feedback
 
 U32 = 2**32 - 1
 

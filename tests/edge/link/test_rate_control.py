@@ -26,7 +26,7 @@ from hvt_edge.link.rate_control import (
 )
 from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.video.frame_skip import FrameSkip, LimitedFrameSkip
-from messages import counted, feedback
+from rigs.messages import counted, feedback
 
 MS = 1_000_000
 S = 1_000_000_000

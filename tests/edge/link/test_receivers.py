@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hvt_edge.link.receivers import PrimaryReceiver
-from messages import feedback
+from rigs.messages import feedback
 
 S = 1_000_000_000
 SENT = (100, 100)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from clips import START_NS
 from hvt_common.protocol.messages import TrackStep, TrackStepDecoder
 from hvt_common.values import Frame, Tracks
 from hvt_edge.link.tracks_channel import TrackReporter, TrackReportSettings
 from hvt_edge.perception.analyzer import AnalyzedFrame
+from media.clips import START_NS
 
 PIXELS = np.zeros((8, 8, 3), np.uint8)
 

@@ -21,7 +21,7 @@ from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
 from hvt_edge.link.receivers import PrimaryReceiver
 from hvt_edge.link.transmitter import Transmitter
-from messages import feedback
+from rigs.messages import feedback
 
 SECOND_NS = 1_000_000_000
 NOW_NS = 1_790_000_000 * SECOND_NS

@@ -17,7 +17,7 @@ from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
-from keeping import STILL, Out
+from rigs.keeping import STILL, Out
 
 S = 1_000_000_000
 NOW_NS = 1_790_000_000 * S

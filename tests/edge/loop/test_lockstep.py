@@ -6,7 +6,6 @@ import threading
 
 import pytest
 
-from clips import framed, smooth_pictures
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import BaseHeader
@@ -21,7 +20,8 @@ from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
-from messages import counted, feedback
+from media.clips import framed, smooth_pictures
+from rigs.messages import counted, feedback
 
 SIZE = (320, 192)
 

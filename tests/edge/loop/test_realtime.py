@@ -6,7 +6,6 @@ import threading
 
 import pytest
 
-from clips import framed, smooth_pictures
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.clock import SteadyClock
@@ -21,6 +20,7 @@ from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
+from media.clips import framed, smooth_pictures
 
 SIZE = (320, 192)
 

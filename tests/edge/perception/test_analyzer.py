@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from clips import framed, smooth_pictures
-from flight import CLASSES, SIZE, RedSquares, square_box
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import RoiHeader, StillResult
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -25,7 +23,9 @@ from hvt_edge.perception.candidates import TrackMemory
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
-from still_stage import make_still_stage
+from media.clips import framed, smooth_pictures
+from rigs.flight import CLASSES, SIZE, RedSquares, square_box
+from rigs.still_stage import make_still_stage
 
 NOISE = (
     8

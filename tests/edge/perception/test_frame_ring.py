@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clips import START_NS
-from flight import tracks_at
 from hvt_common.values import Frame
 from hvt_edge.perception.frame_ring import FrameRing, RingSettings
+from media.clips import START_NS
+from rigs.flight import tracks_at
 
 SECOND_NS = 1_000_000_000
 PICTURE = np.zeros((10, 20, 3), np.uint8)  # 600 bytes

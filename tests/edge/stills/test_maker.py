@@ -12,7 +12,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from base_coded import Hopeless, StandIn
 from hvt_common.values import Frame, Still, View
 from hvt_common.video.base_crop import base_crop, coded_size
 from hvt_common.video.still_codecs import BaseMissingError, JpegCodec, still_codec
@@ -21,6 +20,7 @@ from hvt_edge.perception.candidates import Candidate
 from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.maker import NoStill, StillMaker
 from hvt_edge.stills.policy import Request
+from media.base_coded import Hopeless, StandIn
 
 SIZE = (1280, 720)
 CODEC = JpegCodec()

@@ -12,8 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from base_coded import StandIn
-from clips import START_NS, hard_pictures
 from hvt_common.values import Frame, Still, Tracks, View
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.perception.analyzer import AnalyzedFrame
@@ -25,6 +23,8 @@ from hvt_edge.stills.policy.base import Request, Step
 from hvt_edge.stills.policy.cost import CostModel
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
+from media.base_coded import StandIn
+from media.clips import START_NS, hard_pictures
 
 SIZE = (640, 360)
 PICTURE = hard_pictures(1, size=SIZE)[0]

@@ -10,9 +10,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from base_coded import StandIn
-from clips import framed, smooth_pictures
-from flight import CLASSES, SIZE, RedSquares, square_box
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import RoiHeader, StillResult
@@ -29,7 +26,10 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
-from still_stage import make_still_stage
+from media.base_coded import StandIn
+from media.clips import framed, smooth_pictures
+from rigs.flight import CLASSES, SIZE, RedSquares, square_box
+from rigs.still_stage import make_still_stage
 
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 _NOISE = np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0]))

@@ -7,8 +7,6 @@ from collections import Counter
 import cv2
 import numpy as np
 
-from base_coded import StandIn
-from flight import CLASSES, RedSquares
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Command, ControlRequest, RoiHeader, parse_backlog_still
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -19,10 +17,12 @@ from hvt_edge.config import EdgeConfig, check
 from hvt_edge.control.commands import Commands
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
 from hvt_edge.stills.maker import StillMaker
-from keeping import FRAMES, SIZE, Rig
-from kept import opened
-from processes import eventually
-from still_stage import make_still_stage
+from media.base_coded import StandIn
+from programs.processes import eventually
+from rigs.flight import CLASSES, RedSquares
+from rigs.keeping import FRAMES, SIZE, Rig
+from rigs.kept import opened
+from rigs.still_stage import make_still_stage
 
 VIEW = View.fitted(SIZE, SIZE, fit="letterbox")
 _NOISE = np.random.default_rng(0).normal(0, 12, (SIZE[1], SIZE[0]))

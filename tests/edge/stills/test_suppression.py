@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clips import hard_pictures
 from hvt_common.values import Tracks, View
 from hvt_edge.perception.base_loss import BaseLoss, measure_loss
 from hvt_edge.perception.candidates import Candidate, TrackMemory, sharpness
 from hvt_edge.stills.suppression import Gate, Suppression
+from media.clips import hard_pictures
 
 SECOND = 1_000_000_000
 VIEW = View.fitted((1920, 1080), (1280, 720), fit="letterbox")

@@ -9,9 +9,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from base_coded import StandIn
-from clips import framed, smooth_pictures
-from flight import CLASSES, SIZE, RedSquares
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -25,7 +22,10 @@ from hvt_edge.stills.maker import StillMaker
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder
-from still_stage import make_still_stage
+from media.base_coded import StandIn
+from media.clips import framed, smooth_pictures
+from rigs.flight import CLASSES, SIZE, RedSquares
+from rigs.still_stage import make_still_stage
 
 MOST_FILES = 15
 

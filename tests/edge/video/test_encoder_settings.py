@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from clips import framed, hard_pictures, real_pictures
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import overhead_bytes
 from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES, STATUS_BYTES
 from hvt_edge.video.encoder_settings import EncoderSettings, encoder_settings, least_base_bps, minimum_bps
 from hvt_edge.video.x265 import BaseEncoder
+from media.clips import framed, hard_pictures, real_pictures
 
 SIZE, FPS = (1280, 720), 15
 KEYFRAMES = (20, 46, 95, 125)

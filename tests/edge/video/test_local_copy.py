@@ -14,12 +14,12 @@ import av
 import numpy as np
 import pytest
 
-from clips import START_NS, framed, smooth_pictures
 from hvt_common.errors import UserError
 from hvt_common.values import AccessUnit
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.local_copy import BaseRecorder
 from hvt_edge.video.x265 import BaseEncoder
+from media.clips import START_NS, framed, smooth_pictures
 
 SIZE = (320, 192)
 TESTS = Path(__file__).resolve().parents[3] / "tests" / "support"

@@ -8,8 +8,6 @@ import av
 import numpy as np
 import pytest
 
-from clips import START_NS, framed, hard_pictures, smooth_pictures
-from flight import tracks_at
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.video.hevc import BaseDecoder
@@ -22,6 +20,8 @@ from hvt_edge.video.local_copy import BaseRecorder
 from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
+from media.clips import START_NS, framed, hard_pictures, smooth_pictures
+from rigs.flight import tracks_at
 
 SIZE = (320, 192)
 SECOND_NS = 1_000_000_000

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clips import framed, hard_pictures, smooth_pictures
 from hvt_common.errors import UserError
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder_settings import PRESETS, EncoderSettings, keyframe_floor_bytes, minimum_bps
 from hvt_edge.video.regions import MOST_REGIONS, Region
 from hvt_edge.video.x265 import BaseEncoder
+from media.clips import framed, hard_pictures, smooth_pictures
 
 SIZE = (320, 192)
 VPS, SPS, PPS, IDR = 32, 33, 34, (19, 20)

@@ -8,9 +8,6 @@ import pytest
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
-from backlog_chunks import info_object, still_object, video_object
-from flight import Flight
-from footprint import footprint_bytes
 from hvt_common.protocol.messages import (
     MAX_BACKLOG_BYTES,
     AcknowledgedRange,
@@ -23,6 +20,9 @@ from hvt_common.protocol.messages import (
 )
 from hvt_ground.backlog import BacklogAssembly, StoredStill, backlog_content
 from hvt_ground.link.sequence_window import SequenceWindow
+from rigs.backlog_chunks import info_object, still_object, video_object
+from rigs.flight import Flight
+from rigs.footprint import footprint_bytes
 
 
 def header(offset: int = 0, total: int = 10, *, kind="still", number=3, session=7) -> BacklogHeader:

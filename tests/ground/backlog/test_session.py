@@ -14,9 +14,6 @@ from typing import Self
 import av
 import pytest
 
-from backlog_chunks import chunks, info_object, still_object, video_object
-from flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
-from handled import WatchedInbox, end
 from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import (
     AcknowledgedRange,
@@ -39,7 +36,10 @@ from hvt_ground.sinks import Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.timing import SessionTiming, TimingTable
 from hvt_ground.status import summary, table
-from rrd import Recording
+from programs.rrd import Recording
+from rigs.backlog_chunks import chunks, info_object, still_object, video_object
+from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
+from rigs.handled import WatchedInbox, end
 
 
 def wait_for(condition, *, timeout_s: float = 30) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import zenoh
 
-import messages
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeader
@@ -22,6 +21,7 @@ from hvt_common.video.still_codecs import JpegCodec
 from hvt_ground.cli import main
 from hvt_ground.control import EdgeClient, RefusedError, RequestedStill
 from hvt_ground.control.command import run
+from rigs import messages
 
 KEYS = EdgeKeys("uav-1")
 PICTURE = cv2.resize(

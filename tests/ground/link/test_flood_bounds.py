@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import pytest
 
-from flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader, RoiHeader, Status, TrackStep
 from hvt_ground.events import MessageTiming
 from hvt_ground.link.packets import BasePacket
@@ -16,6 +15,7 @@ from hvt_ground.link.reassemble import Arrival
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.worker import RealtimeWorker
 from hvt_ground.session.session import GroundSession
+from rigs.flight import Flight, pipeline_of
 
 BOX = {1: (30.0, 60.0, 62.0, 96.0)}
 SECOND_NS = 1_000_000_000

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from footprint import footprint_bytes
 from hvt_ground.link.reassemble import (
     ADOPTION_INTERVAL_NS,
     DUPLICATE_AFTER_NS,
@@ -21,6 +20,7 @@ from hvt_ground.link.reassemble import (
     Arrival,
     Reassembler,
 )
+from rigs.footprint import footprint_bytes
 
 FRAME_NS = 1_000_000_000 // 15
 MS = 1_000_000

@@ -6,9 +6,9 @@ import threading
 
 import pytest
 
-from footprint import footprint_bytes
 from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
 from hvt_ground.link.statistics import REPORT_LINE_BYTES, ReceptionStatistics
+from rigs.footprint import footprint_bytes
 
 MS = 1_000_000
 S = 1_000_000_000

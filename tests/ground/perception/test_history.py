@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight import tracks_at
 from hvt_common.values import Tracks
 from hvt_ground.perception.history import History
+from rigs.flight import tracks_at
 
 
 def picture(value, *, height=4, width=6):

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from flight import CLASSES, Flight, RedSquares, SameAnswer, pipeline_of, square_box, tracks_at
 from hvt_common.protocol.messages import AlsoShown, RoiHeader
 from hvt_common.values import Detections, Posterior, View
 from hvt_common.video.base_crop import base_crop
@@ -17,6 +16,7 @@ from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
 from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading
+from rigs.flight import CLASSES, Flight, RedSquares, SameAnswer, pipeline_of, square_box, tracks_at
 
 
 @pytest.fixture(scope="module")

@@ -13,13 +13,13 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
-from fleet_keys import Fleet
 from hvt_common.errors import UserError
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.zenoh_config import LinkSettings, configure
 from hvt_ground.cli import main
 from hvt_ground.pki.command import run
 from hvt_ground.pki.roster import Roster
+from programs.fleet_keys import Fleet
 
 DEPLOY = Path(__file__).resolve().parents[3] / "deploy"
 

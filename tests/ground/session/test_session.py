@@ -10,8 +10,6 @@ from typing import Self
 
 import pytest
 
-from flight import Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
-from handled import WatchedInbox, end
 from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Inbox, Received
@@ -20,6 +18,8 @@ from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.status import summary, table
+from rigs.flight import Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
+from rigs.handled import WatchedInbox, end
 
 
 def wait_for(condition, *, timeout_s: float = 30) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from flight import Flight, pipeline_of
 from hvt_common.protocol.messages import Info
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline
 from hvt_ground.wiring import Models, make_pipeline
+from rigs.flight import Flight, pipeline_of
 
 
 def test_pictures_are_let_go_of():

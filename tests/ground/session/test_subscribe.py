@@ -11,8 +11,8 @@ import zenoh
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.session.subscribe import MAX_EDGES, GroundLink
-from outsider import joined
-from processes import eventually
+from programs.outsider import joined
+from programs.processes import eventually
 
 
 @pytest.fixture

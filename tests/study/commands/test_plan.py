@@ -18,8 +18,8 @@ from hvt_study.matrix.tuning import tuned_methods
 from hvt_study.runs.methods import chosen_methods
 from hvt_study.runs.run_settings import edge_flags
 from hvt_study.runs.spec import ModelChoice
-from layouts import write_visdrone
-from small_study import SIZE, arguments
+from studies.layouts import write_visdrone
+from studies.small_study import SIZE, arguments
 
 CLIPS = 79
 NINE = "M0,R0,M1,M2,M3,M4,M5,M6,DDS"

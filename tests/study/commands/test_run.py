@@ -20,9 +20,9 @@ from hvt_study.runs.methods import chosen_methods
 from hvt_study.runs.run_context import open_run_context
 from hvt_study.runs.run_settings import flown
 from hvt_study.runs.spec import ModelChoice
-from layouts import write_images, write_visdrone
-from onnx_models import colour_classifier, colour_detector
-from small_study import PATIENT_S, SIZE, arguments, entries, flights, said, study, table
+from media.onnx_models import colour_classifier, colour_detector
+from studies.layouts import write_images, write_visdrone
+from studies.small_study import PATIENT_S, SIZE, arguments, entries, flights, said, study, table
 
 METHODS = ("--methods", "M0,R0,M5,DDS", "--regimes", "150kbps")
 

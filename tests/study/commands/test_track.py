@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clear_mot import score
 from hvt_common.errors import UserError
 from hvt_study.cli import main
 from hvt_study.datasets.mot_files import detections_by_frame, read_mot
+from studies.clear_mot import score
 
 LINE = "{frame},-1,{x},20,40,60,{score},-1,-1,-1\n"
 

@@ -11,7 +11,7 @@ from hvt_study.cache.results import ResultCache
 from hvt_study.cli import main
 from hvt_study.matrix.tune import split, tunable
 from hvt_study.matrix.tuning import tuned_methods
-from small_study import arguments, write_scene
+from studies.small_study import arguments, write_scene
 
 NAMES = ("north", "east", "west")
 

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from flight import RedSquares
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, MOVING, VISDRONE_NAMES
 from hvt_common.values import Posterior
@@ -20,7 +19,8 @@ from hvt_study.datasets.labels import covered_share
 from hvt_study.datasets.layouts.uri import open_dataset
 from hvt_study.datasets.reference import reference_labels, with_labels
 from hvt_study.datasets.virtual_camera import VirtualCamera
-from layouts import SIZE, square_xywh, write_visdrone
+from rigs.flight import RedSquares
+from studies.layouts import SIZE, square_xywh, write_visdrone
 
 BLOCKS = [(300, 200, 40, 24), (620, 330, 30, 40), (480, 260, 24, 24)]
 """x, y, w, h of white blocks on dark ground."""

@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from clips import smooth_pictures
-from flight import RedSquares
 from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig
@@ -27,7 +25,9 @@ from hvt_study.datasets.layouts.mot import mot_table
 from hvt_study.datasets.layouts.uri import open_dataset, open_datasets
 from hvt_study.flights.flight import FlightPlan, fly
 from hvt_study.flights.flight_ground import SharedModels
-from layouts import SIZE, square_xywh, write_images, write_mot, write_uavdt, write_visdrone
+from media.clips import smooth_pictures
+from rigs.flight import RedSquares
+from studies.layouts import SIZE, square_xywh, write_images, write_mot, write_uavdt, write_visdrone
 
 
 def xyxy(x, y, w, h):

@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clips import smooth_pictures
-from flight import SIZE, RedSquares, square_box
 from hvt_common.config import load
 from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
@@ -17,7 +15,9 @@ from hvt_ground.config import check as check_ground
 from hvt_study.datasets.clip import Clip
 from hvt_study.flights.flight import FlightPlan, coded_frames, fly
 from hvt_study.flights.flight_ground import SharedModels
-from metric_frames import list_f1
+from media.clips import smooth_pictures
+from rigs.flight import SIZE, RedSquares, square_box
+from studies.metric_frames import list_f1
 
 FRAMES = 46
 

@@ -10,8 +10,8 @@ from contextlib import ExitStack
 import pytest
 
 from hvt_common.inference.store import resolve_model
-from processes import eventually, free_ports
-from small_study import PATIENT_S, arguments, flights, said, study, table, until
+from programs.processes import eventually, free_ports
+from studies.small_study import PATIENT_S, arguments, flights, said, study, table, until
 
 pytest.importorskip("distributed")
 pytestmark = pytest.mark.nightly

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from small_study import FRAMES, SIZE, write_scene
+from studies.small_study import FRAMES, SIZE, write_scene
 
 FLY = """
 import sys

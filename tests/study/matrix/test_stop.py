@@ -9,7 +9,7 @@ import signal
 import psutil
 import pytest
 
-from small_study import PATIENT_S, arguments, entries, flights, said, study, table, until
+from studies.small_study import PATIENT_S, arguments, entries, flights, said, study, table, until
 
 METHODS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
 

@@ -10,7 +10,7 @@ from hvt_common.inference.class_names import kind_of
 from hvt_study.metrics.classes import ClassCounts, class_score
 from hvt_study.metrics.first_correct import first_correct
 from hvt_study.metrics.frames import FrameView
-from metric_frames import labels, square, view
+from studies.metric_frames import labels, square, view
 
 
 def frame_of_four():

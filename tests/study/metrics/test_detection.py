@@ -12,7 +12,7 @@ from hvt_common.inference.class_names import kind_of
 from hvt_common.values import iou
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import FrameView
-from metric_frames import labels, square, view
+from studies.metric_frames import labels, square, view
 
 
 def test_a_curve_drawn_by_hand():

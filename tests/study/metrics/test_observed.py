@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clips import smooth_pictures
-from flight import SIZE, RedSquares, square_box
 from hvt_common.config import load
 from hvt_common.values import Posterior
 from hvt_edge.config import EdgeConfig
@@ -34,7 +32,9 @@ from hvt_study.metrics.observed import (
 from hvt_study.metrics.proxy import proxies
 from hvt_study.metrics.stills import still_delays_ms
 from hvt_study.metrics.tracking import tracking_score
-from metric_frames import labels
+from media.clips import smooth_pictures
+from rigs.flight import SIZE, RedSquares, square_box
+from studies.metric_frames import labels
 
 FRAMES = 40
 TRUTH = [labels((square_box(frame_index), "bus", 1)) for frame_index in range(FRAMES)]

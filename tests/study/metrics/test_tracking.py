@@ -10,7 +10,7 @@ import pytest
 from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.hota import ALPHAS
 from hvt_study.metrics.tracking import TrackingScore, compare_tracks, tracking_score
-from metric_frames import labels, square, view
+from studies.metric_frames import labels, square, view
 
 SEQUENCES = ("TUD-Campus", "TUD-Stadtmitte")
 

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from clips import hard_pictures, smooth_pictures
-from flight import CLASSES, SIZE, RedSquares, square_box
 from hvt_common.errors import UserError
 from hvt_common.values import Detections
 from hvt_study.datasets.clip import Clip
 from hvt_study.metrics.observed import detected_frames
 from hvt_study.peers.dds import DdsSettings, fly_dds
-from metric_frames import list_f1
+from media.clips import hard_pictures, smooth_pictures
+from rigs.flight import CLASSES, SIZE, RedSquares, square_box
+from studies.metric_frames import list_f1
 
 FRAMES = 46
 BUDGET_BPS = 200_000

@@ -13,8 +13,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from clips import smooth_pictures
-from flight import SIZE, RedSquares, square_box
 from hvt_common.config import load
 from hvt_common.errors import UserError
 from hvt_edge.config import EdgeConfig
@@ -56,7 +54,9 @@ from hvt_study.report.tables.sweep_table import sweep_table
 from hvt_study.report.write import write_report
 from hvt_study.runs.columns import COLUMNS
 from hvt_study.runs.run_context import RunContext
-from study_rows import column, row, study
+from media.clips import smooth_pictures
+from rigs.flight import SIZE, RedSquares, square_box
+from studies.study_rows import column, row, study
 
 # The file
 

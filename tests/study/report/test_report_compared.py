@@ -30,7 +30,7 @@ from hvt_study.report.tables.pair_tables import differences_table, equal_table
 from hvt_study.report.tables.sweep_table import sweep_table
 from hvt_study.report.write import write_report
 from hvt_study.runs.methods import METHODS
-from study_rows import column, row, study, to_m5
+from studies.study_rows import column, row, study, to_m5
 
 DASH = "\N{EN DASH}"
 

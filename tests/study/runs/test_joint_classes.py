@@ -8,7 +8,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, VISDRONE_NAMES
 from hvt_study.metrics.classes import class_score
 from hvt_study.runs.joint_classes import joint_classes
-from metric_frames import labels, square, view
+from studies.metric_frames import labels, square, view
 
 UAVDT = ("bus", "car", "truck")
 

@@ -14,7 +14,7 @@ from onnx import TensorProto, helper
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.onnx_file import MAX_MODEL_BYTES
-from onnx_models import colour_detector, constant_model
+from media.onnx_models import colour_detector, constant_model
 
 
 def test_a_model_says_its_ports_and_metadata_and_runs(tmp_path: Path) -> None:

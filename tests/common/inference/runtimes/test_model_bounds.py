@@ -14,7 +14,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
-from onnx_models import constant_model
+from media.onnx_models import constant_model
 
 ONE_THREAD = ModelSettings(threads=1)
 PORT = helper.make_tensor_value_info

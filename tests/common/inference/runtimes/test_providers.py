@@ -25,7 +25,7 @@ from hvt_edge.config import EdgeConfig
 from hvt_edge.wiring import make_detector
 from hvt_ground.config import GroundConfig
 from hvt_ground.wiring import Models
-from onnx_models import colour_classifier, colour_detector, constant_model, save
+from media.onnx_models import colour_classifier, colour_detector, constant_model, save
 
 CPU = ("AzureExecutionProvider", "CPUExecutionProvider")
 WITH_CUDA = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")

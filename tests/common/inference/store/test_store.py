@@ -27,7 +27,7 @@ from hvt_common.inference.runtimes.model import open_model
 from hvt_common.inference.store import embedded_models, resolve_model
 from hvt_common.inference.store.manifest import builtin_manifest, parse_manifest
 from hvt_common.inference.store.store import Store, cache_folder
-from onnx_models import colour_classifier, colour_detector, constant_model
+from media.onnx_models import colour_classifier, colour_detector, constant_model
 
 CONTENT = np.random.default_rng(7).bytes(300_000)
 DIGEST = hashlib.sha256(CONTENT).hexdigest()

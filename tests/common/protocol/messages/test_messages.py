@@ -64,7 +64,7 @@ from hvt_common.protocol.messages.fields import (
     TupleOf,
 )
 from hvt_common.values import View
-from messages import BASE, EXAMPLES, FEEDBACK, INFO, REQUEST, ROI, STATUS, STEP
+from rigs.messages import BASE, EXAMPLES, FEEDBACK, INFO, REQUEST, ROI, STATUS, STEP
 
 DOCUMENT = Path(__file__).resolve().parents[4] / "docs" / "wire-messages.md"
 MESSAGES: tuple[type[Message], ...] = (

@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet_keys import EXPIRED, Fleet
 from hvt_common.errors import UserError
 from hvt_common.transport.doctor.certificate import KeyPair, TlsFiles
 from hvt_common.transport.doctor.diagnose import LinkWatch, visit
@@ -23,8 +22,9 @@ from hvt_common.transport.doctor.probe import why_no_link
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings, configure
-from outsider import joined
-from processes import free_ports
+from programs.fleet_keys import EXPIRED, Fleet
+from programs.outsider import joined
+from programs.processes import free_ports
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def _server(answer: bytes | None) -> Iterator[int]:
             thread.join(5)
 
 
-# Probes of what is not Zenoh. Those of Zenoh with one fault each are in tests/integration/test_security.py.
+# Probes of what is not Zenoh. Those of Zenoh with one fault each are in tests/integration/hostile/test_security.py.
 
 
 @pytest.mark.parametrize(

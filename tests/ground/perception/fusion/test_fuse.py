@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight import tracks_at
-from footprint import footprint_bytes
 from hvt_common.values import Detections, Tracks
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
+from rigs.flight import tracks_at
+from rigs.footprint import footprint_bytes
 
 A = (100.0, 100.0, 140.0, 130.0)
 B = (300.0, 100.0, 340.0, 130.0)

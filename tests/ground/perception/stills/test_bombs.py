@@ -17,9 +17,6 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from clips import framed
-from crops import textured
-from hevc_pictures import coded_picture
 from hvt_common.protocol.messages import RoiHeader, WireError
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import StillError, still_codec, still_codec_names
@@ -28,6 +25,9 @@ from hvt_common.video.still_codecs.h264_syntax import parameter_sets
 from hvt_common.video.still_codecs.plugins.avif import av1_data, avif_file
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
+from media.clips import framed
+from media.crops import textured
+from media.hevc_pictures import coded_picture
 
 SIZE = (56, 40)
 _MOST_MB = 48
@@ -52,7 +52,7 @@ _SESSION = """
 import pickle, resource, sys, time
 sys.path[:0] = sys.argv[1:]
 from dataclasses import replace
-from flight import Flight, pipeline_of
+from rigs.flight import Flight, pipeline_of
 from hvt_common.protocol.messages import BaseHeader
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import Arrival

@@ -23,7 +23,7 @@ from hvt_ground.perception.stills.classify import (
     object_crops,
 )
 from hvt_ground.perception.stills.composite import composite
-from onnx_models import colour_classifier
+from media.onnx_models import colour_classifier
 
 SOURCE, BASE = (1280, 720), (320, 180)
 VIEW = View.fitted(SOURCE, BASE, fit="letterbox")

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from footprint import footprint_bytes
 from hvt_common.values import Posterior, Tracks, iou
 from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher, StillToMatch
 from hvt_ground.perception.stills.refine import MAX_HELD, Refiner, StillSeen
+from rigs.footprint import footprint_bytes
 
 DETECTOR = ("car", "van", "person")
 CLASSIFIER = ("Person", "car", "truck")

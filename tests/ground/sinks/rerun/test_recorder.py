@@ -22,8 +22,8 @@ from hvt_ground.sinks.rerun.live_view import LiveView, free_port, listening
 from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
 from hvt_ground.sinks.rerun.palette import class_colour
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session
-from rrd import Recording
+from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session
+from programs.rrd import Recording
 
 SIZE = (320, 192)
 FRAMES = 45

@@ -12,7 +12,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.screenshot import main, screenshot
-from recorded_feed import coded, drawn_frames, session
+from media.recorded_feed import coded, drawn_frames, session
 
 needs_viewer = pytest.mark.skipif(
     shutil.which("ffmpeg") is None or not list(Path("/usr/share/vulkan/icd.d").glob("*.json")),

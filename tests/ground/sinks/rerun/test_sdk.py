@@ -9,8 +9,8 @@ import pytest
 
 from hvt_ground.sinks.rerun import sdk
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from processes import eventually
-from rrd import Recording
+from programs.processes import eventually
+from programs.rrd import Recording
 
 
 def settings_of(folder: Path, number: int = 0) -> RecorderSettings:

@@ -16,8 +16,8 @@ from hvt_ground.sinks.rerun.gallery import Placement
 from hvt_ground.sinks.rerun.overlays import ORIGINS, REPORTED_MARK
 from hvt_ground.sinks.rerun.patches import FRESH_NS, PATCHES, Moved, Patches
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from recorded_feed import START_NS, STEP_NS, coded, drawn_frames
-from rrd import Recording
+from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
+from programs.rrd import Recording
 
 
 def settings(path: Path) -> RecorderSettings:

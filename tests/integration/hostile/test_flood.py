@@ -20,8 +20,8 @@ import pytest
 
 from hvt_common.protocol.messages import BaseHeader, ControlAnswer, ControlRequest, Feedback
 from hvt_edge.operating.keyframes import KeyframeSettings
-from outsider import Tap, answer, joined
-from processes import Link, Running, eventually
+from programs.outsider import Tap, answer, joined
+from programs.processes import Link, Running, eventually
 
 pytestmark = [pytest.mark.integration, pytest.mark.nightly, pytest.mark.timeout(280)]
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from hvt_scene import Scene
 from hvt_study.report.data.table_file import read_results
-from processes import eventually
+from programs.processes import eventually
 
 __all__ = [
     "FRAMES",

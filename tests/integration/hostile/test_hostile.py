@@ -19,9 +19,9 @@ from hvt_common.protocol.messages import (
     ControlRequest,
     Flags,
 )
-from outsider import Message, Tap, answer, joined
-from processes import Link, eventually
-from rrd import Recording
+from programs.outsider import Message, Tap, answer, joined
+from programs.processes import Link, eventually
+from programs.rrd import Recording
 
 pytestmark = [pytest.mark.integration, pytest.mark.realtime, pytest.mark.timeout(120)]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from flight import Flight
 from hvt_common.protocol.channels import MSGPACK_ENCODING
 from hvt_common.protocol.messages import (
     BacklogHeader,
@@ -16,6 +15,7 @@ from hvt_common.protocol.messages import (
     pack_backlog_units,
 )
 from hvt_common.transport.inbox import Received
+from rigs.flight import Flight
 
 __all__ = ["chunks", "info_object", "still_object", "video_object"]
 

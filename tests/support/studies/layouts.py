@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 
-from clips import smooth_pictures
+from media.clips import smooth_pictures
 
 __all__ = ["SIZE", "square_xywh", "write_images", "write_mot", "write_uavdt", "write_visdrone"]
 

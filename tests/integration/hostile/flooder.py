@@ -18,7 +18,7 @@ from pathlib import Path
 
 import zenoh
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "support"))
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import (
@@ -31,7 +31,7 @@ from hvt_common.protocol.messages import (
     Status,
     TrackStep,
 )
-from outsider import Message, Tap, joined
+from programs.outsider import Message, Tap, joined
 
 Said = tuple[Channel, bytes, bytes | None]
 

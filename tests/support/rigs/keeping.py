@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from clips import START_NS, framed, smooth_pictures
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import (
@@ -46,8 +45,9 @@ from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
 from hvt_ground.backlog import BacklogAssembly
-from kept import INFO, S, opened
-from messages import feedback
+from media.clips import START_NS, framed, smooth_pictures
+from rigs.kept import INFO, S, opened
+from rigs.messages import feedback
 
 __all__ = ["FRAMES", "SIZE", "STILL", "Ground", "Out", "Rig", "link_of"]
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from clips import START_NS, framed, smooth_pictures
 from hvt_common.protocol.channels import MSGPACK_ENCODING
 from hvt_common.protocol.messages import (
     BaseHeader,
@@ -33,6 +32,7 @@ from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import DecodedStill, FrameReadings, ObjectReading
 from hvt_ground.perception.stills.refine import Refiner
+from media.clips import START_NS, framed, smooth_pictures
 
 __all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "pipeline_of", "square_box", "tracks_at"]
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from clips import START_NS, framed, smooth_pictures
-from flight import Flight
 from hvt_common.protocol.messages import BacklogStill, RoiHeader, pack_backlog_still
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
+from media.clips import START_NS, framed, smooth_pictures
+from rigs.flight import Flight
 
 __all__ = ["INFO", "UNITS", "S", "add_stills", "add_units", "coded", "opened", "packed_still", "shifted"]
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from fleet_keys import Fleet
 from hvt_ground.cli import main
-from processes import Running, eventually, free_ports
+from programs.fleet_keys import Fleet
+from programs.processes import Running, eventually, free_ports
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 

@@ -15,13 +15,13 @@ import pytest
 import zenoh
 
 import hvt_edge.cli
-from fleet_keys import EXPIRED, Fleet
 from hvt_common.protocol.channels import Channel, EdgeKeys, selector
 from hvt_common.runtime.process import STOP_SIGNALS
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import declare_publisher, open_session, query, serve
 from hvt_common.transport.zenoh_config import LinkSettings, configure
-from processes import Running, eventually, free_ports
+from programs.fleet_keys import EXPIRED, Fleet
+from programs.processes import Running, eventually, free_ports
 
 pytestmark = pytest.mark.integration
 

@@ -8,9 +8,6 @@ from functools import partial
 import cv2
 import numpy as np
 
-from base_coded import StandIn
-from clips import START_NS
-from flight import tracks_at
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, RoiHeader
@@ -36,6 +33,9 @@ from hvt_edge.stills.suppression import Suppression
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
+from media.base_coded import StandIn
+from media.clips import START_NS
+from rigs.flight import tracks_at
 
 SOURCE, BASE = (960, 540), (640, 360)
 VIEW = View.fitted(SOURCE, BASE, fit="letterbox")

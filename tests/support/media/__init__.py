@@ -1,0 +1,1 @@
+"""Pictures, streams, still codecs and models that tests make."""

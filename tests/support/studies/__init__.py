@@ -1,0 +1,1 @@
+"""Small data sets, studies and their rows."""
