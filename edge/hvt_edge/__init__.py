@@ -1,1 +1,1 @@
-"""The edge side: camera to link."""
+"""The edge side, camera to link: `app.Edge` is all of it, `wiring` builds its parts."""

@@ -1,1 +1,1 @@
-"""What a ground may ask for, and what the state of the link decides."""
+"""What a ground may ask for (`commands`), and what the state of the link decides (`link_control`)."""

@@ -1,1 +1,1 @@
-"""The edge's end of the link: the one transmitter, budget, pacing, rate control, and who receives."""
+"""The edge's end of the link: `transmitter` sends, after `budget`, `pacer`, `rate_control`; `receivers` judges reports."""

@@ -1,1 +1,1 @@
-"""One frame after the other: in real time, or in lockstep with media time."""
+"""One frame after the other: `realtime`, or `lockstep` with media time; `counts` of frames."""

@@ -1,1 +1,1 @@
-"""What changes in flight: rates, method and keyframe requests, read by everybody and written by their owners."""
+"""What changes in flight, with one owner each: `point` (rates, method) and `keyframes` (requests from any thread)."""

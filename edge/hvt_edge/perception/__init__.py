@@ -1,1 +1,1 @@
-"""Decoded base and source in, tracks and candidates out; and the ring of source frames that stills are cut from."""
+"""Decoded base and source in, tracks and candidates out: `analyzer`, `candidates`, `frame_ring` (source frames)."""

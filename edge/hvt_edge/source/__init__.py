@@ -1,1 +1,1 @@
-"""The kinds of sources, one file each, behind the contract that `hvt_edge.source.opening` hands out."""
+"""Where frames come from, one file a kind: others use `opening.open_source`, the `contract`, `resample`."""

@@ -1,1 +1,1 @@
-"""The base stream: x265, its rate, frame rate, regions and keyframes, and a local copy of it."""
+"""The base stream: `frame_decision` and `stage` a frame, `x265`, `reconfigure` its rates, `regions` its ROIs."""
