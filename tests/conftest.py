@@ -23,20 +23,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--nightly", action="store_true", help="run the tests marked nightly, too")
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Tests of one file run in one process, in order; those that wait for other processes first, then the long ones.
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Tests of one file run in one process: its fixtures are made once.
 
-    A file's fixtures are made once that way. A test marked ``apart`` shares none, and may run beside its neighbours.
+    One marked ``apart`` shares none, and may run beside its neighbours. Here and not below, where xdist reads groups.
     """
+    group = item.nodeid if item.get_closest_marker("apart") else str(item.path)
+    item.add_marker(pytest.mark.xdist_group(group))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Those that wait for other processes come first, then the long ones."""
     items.sort(
         key=lambda item: (item.get_closest_marker("integration") is None, "study" not in item.path.parts)
     )
     for item in items:
         if item.get_closest_marker("nightly") and not config.getoption("nightly"):
             item.add_marker(pytest.mark.skip(reason="takes minutes: `make nightly` runs it"))
-        group = item.nodeid if item.get_closest_marker("apart") else str(item.path)
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(autouse=True, scope="session")
