@@ -32,7 +32,7 @@ demo: setup      ## edge and ground as two processes on the drawn scene: demo.rr
 JOBS ?= $(shell echo $$((2 + $$(getconf _NPROCESSORS_ONLN))))
 
 test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX models and recordings; JOBS=
-	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder; \
+	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder; \
 		together=$$?; $(BIN)/python -m pytest -m realtime && exit $$together
 
 nightly: setup   ## hours: the nightly tests, every scenario at full length, kills, fuzzers, soak; COUNT= RUNS= LASTS=

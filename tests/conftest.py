@@ -23,15 +23,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--nightly", action="store_true", help="run the tests marked nightly, too")
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """Tests of one file run in one process: its fixtures are made once.
-
-    One marked ``apart`` shares none, and may run beside its neighbours. Here and not below, where xdist reads groups.
-    """
-    group = item.nodeid if item.get_closest_marker("apart") else str(item.path)
-    item.add_marker(pytest.mark.xdist_group(group))
-
-
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Those that wait for other processes come first, then the long ones."""
     items.sort(

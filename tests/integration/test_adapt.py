@@ -54,7 +54,6 @@ def test_stills_find_their_moment_between_few_frames(tmp_path, scene):
     assert summary["stills"]["sent"] >= 10
 
 
-@pytest.mark.apart
 def test_lockstep_never_adapts(tmp_path, scene):
     """The same input would not give the same bytes."""
     summary = flown(tmp_path / "lockstep", scene, "--pace", "lockstep", "--adapt", "--max-frames", "45")

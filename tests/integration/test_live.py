@@ -249,7 +249,6 @@ def test_the_killed_edge_left_a_base_file_that_plays(fleet):
     assert shown >= killed["frames_decoded"] - 3, "a fifth of a second may be missing at the end"
 
 
-@pytest.mark.apart
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_either_side_stops_before_anybody_came(link, scene, sign):
     """Who started the wrong side first, or a service manager, would need a kill -9."""

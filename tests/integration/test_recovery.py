@@ -174,7 +174,6 @@ def router(endpoint: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-@pytest.mark.apart
 def test_both_sides_come_back_to_a_router_that_was_killed(link: Link):
     """After a power cut at the relay station somebody would have to start everything again, in the right order."""
     with router(link.ground_endpoint):
@@ -206,7 +205,6 @@ def as_list(summaries: Any) -> list[dict[str, Any]]:
 # Two edges of one id
 
 
-@pytest.mark.apart
 def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
     """Two drones would fight for one screen; a fleet's copy-and-paste mistake would be found out in the air."""
     ground = link.ground(*SEES, "--record", "flights", "--timing", "timing.csv")
@@ -229,7 +227,6 @@ def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
     }
 
 
-@pytest.mark.apart
 def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(link: Link):
     """The picture would jump between two drones, or be another's, without a word."""
     edges = {name: link.edge(*PLAYS, "--wait", "0s", name=name) for name in ("one", "two")}
@@ -253,7 +250,6 @@ def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(lin
 # Stills that are lost
 
 
-@pytest.mark.apart
 def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
     """On a radio that loses datagrams the sharp pictures would have holes; or the gallery show some twice."""
     lossy = Script(
@@ -312,7 +308,6 @@ def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
 # Clocks that are set
 
 
-@pytest.mark.apart
 def test_clocks_that_are_set_leave_no_trace(link: Link, monkeypatch: pytest.MonkeyPatch):
     """For hours the picture would be an hour old by the ground's account, or reports and keyframes cease.
 

@@ -64,7 +64,6 @@ def admitted(sent: dict[str, Any]) -> set[int]:
     return set(range(sum(live.values()))) | {FIRST_STORED + number for number in range(kept)}
 
 
-@pytest.mark.apart
 @pytest.mark.parametrize(
     ("dark_s", "frames"),
     [
@@ -112,7 +111,6 @@ def test_nothing_that_was_admitted_is_lost_in_an_outage(tmp_path, scene, dark_s,
     assert said["backlog_bytes"] == sent["backlog_bytes"] > 0
 
 
-@pytest.mark.apart
 def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, scene):
     """What a drone saw before its computer was started again would stay on it for ever."""
     store = tmp_path / "store"
