@@ -14,6 +14,7 @@ COMMANDS: Final = {
     "tune": "Search for a method's parameters on some sequences; report what they are worth on others.",
     "score": "Score the tracks of hvt-ground --tracks against ground truth.",
     "sweep": "Apply the pilot's four selectors to raw detections and print what each keeps.",
+    "detect": "Detect on pictures; score labelled ones and show the worst false alarms and misses.",
     "track": "Run ByteTrack over a MOTChallenge file of detections.",
 }
 """One line each for ``hvt-study --help``. A module is imported when its command is given: needs differ."""

@@ -13,13 +13,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.learning.detector import STRIDES
+from hvt_train.pictures.real import LARGE_VEHICLE, SMALL_VEHICLE
 
 __all__ = ["Targets", "detector_loss"]
 
 _RANGES = ((0.0, 110.0), (22.0, 240.0), (70.0, 1e6))
 """Longer sides in pixels for which a stride may answer."""
 _FAR = 1e4
+_PRIORS = {
+    SMALL_VEHICLE: {"car": 2.0, "van": 0.0, "truck": 0.0},
+    LARGE_VEHICLE: {"van": 0.0, "truck": 0.5, "bus": 0.5},
+}
+"""Kinds that a vehicle of unknown kind may be, and how much (in logits) each is favoured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +38,13 @@ class Targets:
     boxes_px: Tensor
     """(M, 4) float32 x1 y1 x2 y2."""
     class_ids: Tensor
-    """(M,) int64, -1 for what is ignored."""
+    """(M,) int64; -1 is ignored, `SMALL_VEHICLE` and `LARGE_VEHICLE` are vehicles of unknown kind."""
 
 
 def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[str, float]]:
     """Weighted sum of overlap, objectness and class losses, and its parts for the log."""
     rows, grid, stride, shapes = _flat(maps)
+    targets = Targets(targets.pictures, targets.boxes_px, _named(rows.detach(), shapes, targets))
     boxes = _decoded(rows[..., :4], grid, stride)
     real = targets.class_ids >= 0
     with torch.no_grad():
@@ -67,6 +75,22 @@ def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[st
         "cells": float(len(cells)),
     }
     return total, parts
+
+
+def _named(rows: Tensor, shapes: list[tuple[int, int]], targets: Targets) -> Tensor:
+    """Class ids in which a vehicle of unknown kind has the likeliest kind by what the network says of it now."""
+    kinds = targets.class_ids.clone()
+    for code, prior in _PRIORS.items():
+        which = torch.nonzero(kinds == code)[:, 0]
+        if len(which):
+            numbers, allowed = _candidates(shapes, targets.boxes_px[which])
+            said = rows[targets.pictures[which][:, None], numbers, 5:]
+            mean = (said * allowed[..., None]).sum(1) / allowed.sum(1).clamp(min=1)[:, None]
+            table = torch.full((rows.shape[2] - 5,), -1e9)
+            for name, weight in prior.items():
+                table[CLASS_NAMES.index(name)] = weight
+            kinds[which] = (mean + table).argmax(1)
+    return kinds
 
 
 def _flat(maps: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, list[tuple[int, int]]]:

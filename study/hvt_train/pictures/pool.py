@@ -32,6 +32,7 @@ __all__ = [
     "Shot",
     "coded",
     "fill_pool",
+    "save_picture",
     "shoot",
 ]
 
@@ -111,12 +112,12 @@ def _draw(job: tuple[Path, str, int, int]) -> list[Path]:
     if kind == "place":
         path = folder / f"place-{number:05d}.npz"
         if not path.exists():
-            _save(path, draw_place(np.random.default_rng([TRAIN_SEED, number])))
+            save_picture(path, draw_place(np.random.default_rng([TRAIN_SEED, number])))
         return [path]
     paths = [folder / f"{name}-{number:05d}-{m}.npz" for name in ("demo", "base") for m in range(moments)]
     if not all(path.exists() for path in paths):
         for path, picture in zip(paths, _pictures(number, moments), strict=True):
-            _save(path, picture)
+            save_picture(path, picture)
     return paths
 
 
@@ -136,7 +137,7 @@ def _pictures(number: int, moments: int) -> Iterator[Picture]:
         yield Picture(picture, truth.boxes_px, truth.class_ids, truth.visible)
 
 
-def _save(path: Path, picture: Picture) -> None:
+def save_picture(path: Path, picture: Picture) -> None:
     """Write whole or not at all: a run that is stopped leaves no half file."""
     partial = path.with_suffix(".part")
     with partial.open("wb") as file:

@@ -17,8 +17,14 @@ __all__ = ["View", "ViewSettings", "ViewSource", "degrade", "read_picture"]
 
 _Rng = np.random.Generator
 _FILL = 114
-_CLASSES = 7
-_DAMAGE = {"demo": (0.6, 0.3), "base": (0.4, 0.1), "place": (1.0, 0.6)}
+_DAMAGE = {
+    "demo": (0.6, 0.3),
+    "base": (0.4, 0.1),
+    "place": (1.0, 0.6),
+    "kit": (0.6, 0.15),
+    "road": (0.7, 0.2),
+    "thermal": (0.5, 0.15),
+}
 """Strength and how often the codec is bad. Base pictures have been through x265 already."""
 
 
@@ -37,7 +43,10 @@ class ViewSettings:
     """How views are cut."""
 
     side: int = 416
-    shares: tuple[tuple[str, float], ...] = (("demo", 0.4), ("base", 0.35), ("place", 0.25))
+    shares: tuple[tuple[str, float], ...] = (
+        *(("demo", 0.1), ("base", 0.2), ("place", 0.15)),
+        *(("kit", 0.13), ("road", 0.22), ("thermal", 0.2)),
+    )
     """How often each kind of picture is taken."""
     least_visible: float = 0.3
     least_side_px: float = 4.0
@@ -70,6 +79,8 @@ class ViewSource:
         scale = _scale(kind, rng)
         view = self._cropped(picture, scale)
         view = _turned(view, rng)
+        if kind == "thermal" and rng.random() < 0.4:  # cameras show heat black or white
+            view = View(255 - view.image_bgr, view.boxes_px, view.class_ids)
         strength, compress = _DAMAGE[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
         return View(image, view.boxes_px, view.class_ids)
@@ -80,8 +91,8 @@ class ViewSource:
         high, wide = picture.image_bgr.shape[:2]
         window = side / scale
         if len(picture.boxes_px) and rng.random() < 0.75:
-            counts = np.bincount(picture.class_ids, minlength=_CLASSES)
-            weights = 1.0 / counts[picture.class_ids]
+            _, which, counts = np.unique(picture.class_ids, return_inverse=True, return_counts=True)
+            weights = 1.0 / counts[which] * np.where(picture.class_ids == -1, 0.2, 1.0)
             box = picture.boxes_px[rng.choice(len(weights), p=weights / weights.sum())]
             middle = (box[:2] + box[2:]) / 2 + rng.uniform(-0.4, 0.4, 2) * window
         else:
@@ -127,7 +138,14 @@ def _scale(kind: str, rng: _Rng) -> float:
         return 1.0 if draw < 0.4 else 0.5
     if kind == "demo" and draw < 0.45:
         return float(rng.uniform(0.8, 1.25))
-    low, high = {"demo": (0.3, 1.6), "base": (0.35, 1.3), "place": (0.26, 1.2)}[kind]
+    low, high = {
+        "demo": (0.3, 1.6),
+        "base": (0.35, 1.3),
+        "place": (0.26, 1.2),
+        "kit": (0.6, 2.6),
+        "road": (0.25, 1.7),
+        "thermal": (0.6, 1.9),
+    }[kind]
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 

@@ -1,0 +1,271 @@
+"""``hvt-study detect``: how good a detector is on pictures, in figures and in sheets to look at."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import kind_of
+from hvt_common.inference.detect import Detector, open_detector
+from hvt_common.inference.store import EMBEDDED_DETECTOR
+from hvt_common.inference.tiles import tiled
+from hvt_common.units import parse_size
+from hvt_common.values import Detections, Image, View
+from hvt_edge.source.resample import Resizer
+from hvt_study.commands.progress import RunProgress
+from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
+from hvt_study.datasets.labels import NO_ID, inside_frame
+from hvt_study.metrics.detection import detection_score
+from hvt_study.metrics.frames import FrameView, LabelledFrame
+from hvt_study.metrics.judged import Judged, judged
+from hvt_study.metrics.operating_point import calibration_error, operating_point, right_boxes
+from hvt_study.report.figures.sheet import Finding, write_sheet
+
+__all__ = ["add_arguments", "run"]
+
+_LEAST_CONFIDENCE = 0.01
+"""Average precision needs the whole curve."""
+_VEHICLE = "vehicle"
+_VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
+_COLUMNS = ("file", "x1", "y1", "x2", "y2", "confidence", "class")
+_Word = Callable[[str], str]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Pictures, the detector, and what their labels leave out."""
+    parser.add_argument(
+        "pictures",
+        nargs="+",
+        type=Path,
+        metavar="PICTURES",
+        help="pictures, folders of them, a folder with images/ and labels/ (YOLO) or annotations/ (VisDrone), "
+        "or COCO's JSON",
+    )
+    parser.add_argument("--out", type=Path, required=True, default=argparse.SUPPRESS, metavar="DIR")
+    parser.add_argument("--detector", default=EMBEDDED_DETECTOR, metavar="FILE", help="as of hvt-edge")
+    parser.add_argument(
+        "--size",
+        default="1280x720",
+        metavar="WxH",
+        help="what the detector is given: pictures are fitted into it",
+    )
+    parser.add_argument("--tiles", default="off", help="as of hvt-edge: off, auto or CxR")
+    parser.add_argument(
+        "--confidence", type=float, default=0.25, help="least confidence of what is written and counted"
+    )
+    parser.add_argument("--classes", default="", metavar="NAME,…", help="of YOLO labels without classes.txt")
+    parser.add_argument(
+        "--labelled",
+        default="",
+        metavar="KIND,…",
+        help="kinds that the set labels, such as vehicle; boxes of others count neither way (default: all it names)",
+    )
+    parser.add_argument(
+        "--vehicles-as-one", action="store_true", help="car, van, truck and bus are one class"
+    )
+    parser.add_argument("--provider", default="auto", help="what runs the network, as of hvt-edge")
+    parser.add_argument("--threads", type=int, default=2, help="of the network")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Detect on all pictures; write detections.csv, and score.json and two sheets where there are labels."""
+    size = parse_size(arguments.size, name="--size")
+    if not _LEAST_CONFIDENCE <= arguments.confidence <= 1:
+        raise UserError(f"--confidence is {arguments.confidence}, must be from {_LEAST_CONFIDENCE} to 1")
+    names = _list(arguments.classes)
+    pictures = [one for place in arguments.pictures for one in find_pictures(place, classes=names or None)]
+    detector = tiled(
+        open_detector(
+            arguments.detector,
+            confidence=_LEAST_CONFIDENCE,
+            threads=arguments.threads,
+            provider=arguments.provider,
+        ),
+        arguments.tiles,
+    )
+    word: _Word = _as_one if arguments.vehicles_as_one else kind_of
+    classes = _counted(pictures, _list(arguments.labelled), word)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    paths, frames, skipped = [], [], 0
+    with (arguments.out / "detections.csv").open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(_COLUMNS)
+        for picture, image, view in _progress(pictures, detector, size):
+            if image is None:
+                skipped += 1
+                print(f"{picture.path} cannot be read as a picture; skipped", file=sys.stderr)
+                continue
+            table.writerows(_rows(picture.path, view, arguments.confidence))
+            labels = picture.read((image.shape[1], image.shape[0]))
+            if labels is not None:
+                paths.append(picture.path)
+                frames.append((labels, view))
+    if skipped:
+        print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
+    if frames:
+        result = _score(frames, word=word, classes=classes, confidence=arguments.confidence)
+        about = {"detector": arguments.detector, "pictures": len(frames), "skipped": skipped, **result}
+        (arguments.out / "score.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+        _write_sheets(
+            arguments.out, paths, frames, word=word, classes=classes, confidence=arguments.confidence
+        )
+        _print(about)
+    print(f"{arguments.out}: {len(pictures) - skipped} pictures, {len(frames)} of them labelled")
+    return 0 if len(pictures) > skipped else 2
+
+
+def _progress(
+    pictures: Sequence[LabelledPicture], detector: Detector, size: tuple[int, int]
+) -> Iterator[tuple[LabelledPicture, Image | None, FrameView]]:
+    with RunProgress("pictures") as progress:
+        for number, picture in enumerate(pictures, start=1):
+            image = read_image(picture.path)
+            yield picture, image, FrameView() if image is None else _detected(detector, image, size)
+            progress.update(number, len(pictures))
+
+
+def _detected(detector: Detector, image: Image, size: tuple[int, int]) -> FrameView:
+    """What the detector says of a picture that is fitted into ``size``, in the picture's pixels."""
+    source_size = (image.shape[1], image.shape[0])
+    base = Resizer(source_size, size, fit="letterbox").frame(image, index=0, capture_ns=0).base_bgr
+    found: Detections = detector.detect(base)
+    boxes = View.fitted(source_size, size, fit="letterbox").to_source(found.boxes_xyxy_px)
+    names = tuple(detector.class_names[kind] for kind in found.class_ids.tolist())
+    ids = np.full(len(names), NO_ID, np.int64)
+    return FrameView(inside_frame(boxes, source_size), ids, names, found.confidences, names)
+
+
+def _rows(path: Path, view: FrameView, confidence: float) -> list[tuple[Any, ...]]:
+    return [
+        (path, *(round(side, 2) for side in box), round(sure, 4), name)
+        for box, sure, name in zip(
+            view.boxes_xyxy_px.tolist(), view.confidences.tolist(), view.class_names, strict=True
+        )
+        if sure >= confidence
+    ]
+
+
+def _list(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _as_one(name: str) -> str:
+    kind = kind_of(name)
+    return _VEHICLE if kind in _VEHICLES or kind.endswith(_VEHICLE) else kind
+
+
+def _counted(pictures: Sequence[LabelledPicture], labelled: Sequence[str], word: _Word) -> tuple[str, ...]:
+    """The words that count: what ``--labelled`` names, else every class that the labels may use."""
+    names = labelled or sorted({name for picture in pictures for name in picture.class_names})
+    if labelled and _VEHICLE in labelled:
+        names = [*names, *_VEHICLES]
+    return tuple(sorted({word(name) for name in names}))
+
+
+def _score(
+    frames: Sequence[LabelledFrame], *, word: _Word, classes: Sequence[str], confidence: float
+) -> dict[str, Any]:
+    whole = detection_score(frames, word=word, classes=classes)
+    used = judged(_above(frames, confidence), word=word, classes=classes)
+    seen = sorted({name for one in used for name in (*one.class_names, *one.view.class_names)})
+    points = {name: operating_point(used, name=name) for name in seen}
+    total = {
+        field: sum(getattr(one, field) for one in points.values()) for field in ("right", "boxes", "labels")
+    }
+    confidences, right = _sure_and_right(used, seen)
+    return {
+        "confidence": confidence,
+        "labels": total["labels"],
+        "boxes": total["boxes"],
+        "precision": _share(total["right"], total["boxes"]),
+        "recall": _share(total["right"], total["labels"]),
+        "f1": _share(2 * total["right"], total["boxes"] + total["labels"]),
+        "calibration_error": _number(calibration_error(confidences, right)),
+        "ap50": _number(whole.mean.at_50),
+        "ap50_95": _number(whole.mean.at_50_95),
+        "ap50_by_size": {size: _number(one.at_50) for size, one in whole.by_size.items()},
+        "by_class": {
+            name: {
+                "labels": one.labels,
+                "boxes": one.boxes,
+                "precision": _number(one.precision),
+                "recall": _number(one.recall),
+                "f1": _number(one.f1),
+                "ap50": _number(whole.by_class[name].at_50) if name in whole.by_class else None,
+            }
+            for name, one in points.items()
+        },
+    }
+
+
+def _above(frames: Sequence[LabelledFrame], confidence: float) -> list[LabelledFrame]:
+    return [(labels, view.rows(view.confidences >= confidence)) for labels, view in frames]
+
+
+def _sure_and_right(
+    frames: Sequence[Judged], names: Sequence[str]
+) -> tuple[np.ndarray[Any, np.dtype[np.float64]], np.ndarray[Any, np.dtype[np.bool_]]]:
+    right = [np.zeros(len(frame.view), np.bool_) for frame in frames]
+    for flags, frame in zip(right, frames, strict=True):
+        flags[right_boxes(frame, classes=names)[1]] = True
+    sure = [frame.view.confidences.astype(np.float64) for frame in frames]
+    return np.concatenate([*sure, np.zeros(0)]), np.concatenate([*right, np.zeros(0, np.bool_)])
+
+
+def _write_sheets(
+    out: Path,
+    paths: Sequence[Path],
+    frames: Sequence[LabelledFrame],
+    *,
+    word: _Word,
+    classes: Sequence[str],
+    confidence: float,
+) -> None:
+    """The surest false alarms, and the largest labels that were missed."""
+    false, missed = [], []
+    for path, frame in zip(
+        paths, judged(_above(frames, confidence), word=word, classes=classes), strict=True
+    ):
+        labels, boxes = right_boxes(frame, classes=classes)
+        view = frame.view
+        for row in np.setdiff1d(np.arange(len(view)), boxes).tolist():
+            sure = float(view.confidences[row])
+            text = f"{view.class_names[row]} {sure:.2f}"
+            false.append(Finding(path, view.boxes_xyxy_px[row].tolist(), text, sure))
+        for row in np.setdiff1d(np.arange(len(frame.class_names)), labels).tolist():
+            box = frame.boxes_xyxy_px[row].tolist()
+            missed.append(Finding(path, box, frame.class_names[row], float(frame.areas_px2[row])))
+    write_sheet(out / "false-alarms.png", false)
+    write_sheet(out / "misses.png", missed)
+
+
+def _print(score: dict[str, Any]) -> None:
+    table = Table(title=f"{score['detector']} at confidence {score['confidence']:g}", title_justify="left")
+    for column in ("", "labels", "boxes", "precision", "recall", "F1", "AP50"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, one in [*score["by_class"].items(), ("all", score)]:
+        shares = (one[field] for field in ("precision", "recall", "f1", "ap50"))
+        cells = ("-" if value is None else f"{value:.3f}" for value in shares)
+        table.add_row(name, str(one["labels"]), str(one["boxes"]), *cells)
+    Console(highlight=False).print(table)
+    error = score["calibration_error"]
+    print("expected calibration error " + ("-" if error is None else f"{error:.3f}"))
+
+
+def _share(part: int, whole: int) -> float | None:
+    return round(part / whole, 4) if whole else None
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 4)

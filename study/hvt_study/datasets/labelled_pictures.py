@@ -1,0 +1,188 @@
+"""Pictures beside labels: a YOLO folder, COCO JSON, VisDrone's image layout, or pictures alone.
+
+::
+
+    ROOT/images/NAME.jpg, ROOT/labels/NAME.txt, [ROOT/classes.txt]     YOLO: class cx cy w h, 0…1 of the picture
+    ROOT/images/NAME.jpg, ROOT/annotations/NAME.txt                    VisDrone-DET
+    FILE.json                                                          COCO; pictures lie beside it or in images/
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import VISDRONE_NAMES
+from hvt_common.inference.labels import read_labels
+from hvt_common.values import Image
+from hvt_edge.source.folder import sequence_files
+from hvt_study.datasets.labels import NO_ID, FrameLabels
+from hvt_study.datasets.layouts.visdrone import table_of
+from hvt_study.datasets.visdrone_rows import read_image_rows
+
+__all__ = ["IGNORED", "LabelledPicture", "find_pictures", "read_image"]
+
+IGNORED = frozenset({"dontcare", "ignore", "ignored"})
+"""Classes (any case) whose boxes count neither for nor against."""
+_COLUMNS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledPicture:
+    """A picture and where its labels are."""
+
+    path: Path
+    labels: Path | Sequence[Mapping[str, Any]] | None
+    """A YOLO or VisDrone file, COCO's annotations of the picture, or None: nobody labelled it."""
+    class_names: Sequence[str]
+    visdrone: bool = False
+
+    def read(self, size: tuple[int, int]) -> FrameLabels | None:
+        """The labels in the pixels of the picture, which is (width, height) large.
+
+        Raises:
+            UserError: names the file and the line that cannot be.
+        """
+        if self.labels is None:
+            return None
+        if not isinstance(self.labels, Path):
+            return _from_coco(self.labels, self.class_names)
+        if self.visdrone:
+            return _from_visdrone(self.labels, size)
+        return _from_yolo(self.labels, self.class_names, size)
+
+
+def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[LabelledPicture]:
+    """All pictures of one argument, in natural order.
+
+    Args:
+        place: a picture, a folder, or COCO's JSON.
+        classes: names of a YOLO folder's classes; None: those of its ``classes.txt``.
+
+    Raises:
+        UserError: nothing is there, or YOLO labels have no names.
+    """
+    if place.suffix == ".json" and place.is_file():
+        return _coco_pictures(place)
+    if place.is_file():
+        return [LabelledPicture(place, None, ())]
+    if not place.is_dir():
+        raise UserError(f"{place} does not exist; a picture, a folder of pictures or a COCO file is expected")
+    images = place / "images" if (place / "images").is_dir() else place
+    files = sequence_files(images)
+    if not files:
+        raise UserError(f"{images} holds no pictures")
+    for folder in ("labels", "annotations"):
+        if (place / folder).is_dir():
+            visdrone = folder == "annotations"
+            names = VISDRONE_NAMES if visdrone else _yolo_names(place, classes)
+            found = {file.stem: file for file in (place / folder).glob("*.txt")}
+            return [LabelledPicture(file, found.get(file.stem), names, visdrone) for file in files]
+    return [LabelledPicture(file, None, ()) for file in files]
+
+
+def read_image(path: Path) -> Image | None:
+    """(height, width, 3) uint8 BGR; None where it is no picture that can be read."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    return None if image is None else np.asarray(image, np.uint8)
+
+
+def _yolo_names(root: Path, classes: Sequence[str] | None) -> Sequence[str]:
+    if classes is not None:
+        return classes
+    if not (root / "classes.txt").is_file():
+        raise UserError(f"{root} has labels, but no classes.txt: add one, one name a line, or give --classes")
+    return read_labels(root / "classes.txt")
+
+
+def _from_yolo(path: Path, names: Sequence[str], size: tuple[int, int]) -> FrameLabels:
+    boxes, kinds = [], []
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        if line.strip():
+            kind, *sides = _yolo_row(path, number, line, len(names))
+            boxes.append(sides)
+            kinds.append(names[int(kind)])
+    middle_sides = np.array(boxes, np.float64).reshape(-1, 4)
+    half = middle_sides[:, 2:] / 2
+    corners = np.hstack([middle_sides[:, :2] - half, middle_sides[:, :2] + half]) * [*size, *size]
+    return _labels(corners, kinds)
+
+
+def _yolo_row(path: Path, number: int, line: str, classes: int) -> list[float]:
+    try:
+        row = [float(word) for word in line.split()[:_COLUMNS]]
+    except ValueError:
+        row = []
+    if len(row) < _COLUMNS or not all(map(math.isfinite, row)):
+        raise UserError(f"{path}, line {number} is {line[:60]!r}; accepted is class cx cy w h, all numbers")
+    if row[0] not in range(classes):
+        raise UserError(f"{path}, line {number} has class {row[0]:g}; there are {classes}, from 0")
+    if not all(0 <= value <= 1 for value in row[1:]):
+        raise UserError(
+            f"{path}, line {number} has a box outside the picture: {line[:60]!r}; 0 to 1 is accepted"
+        )
+    return row
+
+
+def _from_visdrone(path: Path, size: tuple[int, int]) -> FrameLabels:
+    return table_of(read_image_rows(path), size=size).at(0)
+
+
+def _coco_pictures(path: Path) -> list[LabelledPicture]:
+    """COCO's ``images``, ``annotations`` (also ``annotation``) and ``categories``."""
+    try:
+        about = json.loads(_text(path))
+        names = {row["id"]: str(row["name"]) for row in about["categories"]}
+        rows = about["annotations"] if "annotations" in about else about["annotation"]
+        of: dict[Any, list[dict[str, Any]]] = {image["id"]: [] for image in about["images"]}
+        for row in rows:
+            of[row["image_id"]].append({"name": names[row["category_id"]], **row})
+        files = {
+            image["id"]: str(image["file_name"] if "file_name" in image else image["filename"])
+            for image in about["images"]
+        }
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is not COCO's JSON: {type(error).__name__} {error}") from None
+    return [
+        LabelledPicture(_beside(path, name), tuple(of[key]), tuple(names.values()))
+        for key, name in files.items()
+    ]
+
+
+def _beside(path: Path, name: str) -> Path:
+    places = [path.parent / name, path.parent / "images" / name, path.parent.parent / "images" / name]
+    return next((place for place in places if place.is_file()), places[0])
+
+
+def _from_coco(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> FrameLabels:
+    boxes = np.array([row.get("bbox", ()) for row in rows], np.float64).reshape(-1, 4)
+    if not np.isfinite(boxes).all() or (boxes[:, 2:] < 0).any():
+        raise UserError(f"COCO annotations {names} have a box that is no x, y, w, h of finite numbers")
+    kinds = ["ignore" if row.get("iscrowd") else str(row["name"]) for row in rows]
+    return _labels(np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]), kinds)
+
+
+def _labels(corners: np.ndarray[Any, np.dtype[np.float64]], names: Sequence[str]) -> FrameLabels:
+    passed = np.array([name.casefold() in IGNORED for name in names], bool)
+    boxes = corners.astype(np.float32)
+    return FrameLabels(
+        boxes_xyxy_px=boxes[~passed],
+        ids=np.full(np.count_nonzero(~passed), NO_ID, np.int64),
+        class_names=tuple(name for name, skip in zip(names, passed, strict=True) if not skip),
+        ignored_xyxy_px=boxes[passed],
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} cannot be read as text: {error}") from None

@@ -1,0 +1,67 @@
+"""Go on from an ONNX file of ours: its weights, and batch norms measured anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from onnx import numpy_helper
+from torch import Tensor, nn
+
+__all__ = ["load_onnx"]
+
+
+def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
+    """Put the weights of ``path`` into ``net``, which then computes the same and can be trained further.
+
+    The file's convolutions have swallowed their batch norms, so that a norm's mean and variance are measured on
+    ``images`` ((N, 3, H, W) float32 BGR 0…255), and scale and shift are set to undo them.
+
+    Raises `ValueError` where the file is of another architecture.
+    """
+    weights = _convolutions(onnx.load(str(path)).graph)
+    hooks, order = [], iter(weights)
+
+    def take(conv: nn.Module, _inputs: object) -> None:
+        weight, bias = next(order, (np.zeros(0), np.zeros(0)))
+        assert isinstance(conv, nn.Conv2d)
+        if weight.shape != tuple(conv.weight.shape):
+            raise ValueError(
+                f"{path} has weights {weight.shape} where {tuple(conv.weight.shape)} are expected"
+            )
+        conv.weight.data = torch.from_numpy(weight.copy())
+        pending.append(torch.from_numpy(bias.copy()))
+        if conv.bias is not None:
+            conv.bias.data = pending.pop()
+
+    def measure(norm: nn.Module, inputs: tuple[Tensor]) -> None:
+        assert isinstance(norm, nn.BatchNorm2d)
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
+        mean, variance = inputs[0].mean((0, 2, 3)), inputs[0].var((0, 2, 3))
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
+        norm.weight.data = (variance + norm.eps).sqrt()
+        norm.bias.data = pending.pop() + mean
+
+    pending: list[Tensor] = []
+    for module in net.modules():
+        if isinstance(module, nn.Conv2d):
+            hooks.append(module.register_forward_pre_hook(take))
+        elif isinstance(module, nn.BatchNorm2d):
+            hooks.append(module.register_forward_pre_hook(measure))
+    with torch.no_grad():
+        net.eval()(images)
+    for hook in hooks:
+        hook.remove()
+
+
+def _convolutions(graph: onnx.GraphProto) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Weight and bias of each convolution, as float32, in the order in which the file computes them."""
+    values = {item.name: numpy_helper.to_array(item).astype(np.float32) for item in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Cast" and node.input[0] in values:
+            values[node.output[0]] = values[node.input[0]]
+    return [(values[node.input[1]], values[node.input[2]]) for node in graph.node if node.op_type == "Conv"]

@@ -1,0 +1,156 @@
+"""Real labelled pictures for the pool: three public sets, each with what it labels and what it leaves out.
+
+Every picture goes through x265 at 80 to 1400 kbps (of a 1280x720 base) or stays clean, and is kept as one file of the
+pool. ``class_ids`` beyond the classes: -1 is neither object nor background, `SMALL_VEHICLE` and `LARGE_VEHICLE` are
+vehicles whose kind the set does not tell.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable, Iterator
+from importlib import resources
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Frame, Image
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.x265 import BaseEncoder
+from hvt_scene.drawing.vehicles import CLASS_NAMES
+from hvt_train.pictures.places import Picture
+from hvt_train.pictures.pool import BASE_SIZE, save_picture
+
+__all__ = ["LARGE_VEHICLE", "SETS", "SMALL_VEHICLE", "fill_real"]
+
+SMALL_VEHICLE, LARGE_VEHICLE = -2, -3
+_ID = {name: number for number, name in enumerate(CLASS_NAMES)}
+_KIT = (_ID["car"], _ID["truck"], _ID["bus"], _ID["van"])
+_HIT = (_ID["pedestrian"], _ID["car"], _ID["motor"], LARGE_VEHICLE, -1)
+_HIT_JUDGES = {"20210115", "20210123"}
+_HIT_HELD_OUT = {"20210114", "20210119"}
+_KIT_HELD_OUT = "MunichStreet02"
+_FPS, _CODED_FRAMES = 15.0, 6
+_BORDER_PX = 26  # Madison leaves out vehicles that the border cuts
+_LARGE_PX = 74  # a Madison car is about 58 pixels long
+
+_Labelled = tuple[Path, npt.NDArray[np.float32], npt.NDArray[np.int32]]
+
+
+def fill_real(folder: Path, data: Path, *, seed: int = 1) -> list[Path]:
+    """Put the sets that lie under ``data`` (``kit_ais``, ``hit_uav``, ``cats_madison``) into the pool ``folder``.
+
+    Flights and sequences that are held out for measuring are left out. What is there already stays.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, read in SETS.items():
+        for number, (path, boxes, kinds) in enumerate(read(data)):
+            target = folder / f"{name}-{number:05d}.npz"
+            written.append(target)
+            if not target.exists():
+                rng = np.random.default_rng([seed, number])
+                image = cv2.imread(str(path))
+                assert image is not None, path
+                if rng.random() < 0.65:
+                    image = _coded(image, rng)
+                high, wide = image.shape[:2]
+                inside = boxes.clip(0, (wide, high, wide, high)).astype(np.float32)
+                save_picture(target, Picture(image, inside, kinds, np.ones(len(kinds), np.float32)))
+    return written
+
+
+def _coded(image: Image, rng: np.random.Generator) -> Image:
+    """The picture under a slowly moving camera, after x265 at the bits a pixel of a thin base."""
+    high, wide = (side - side % 8 for side in image.shape[:2])
+    image = image[:high, :wide]
+    kbps = math.exp(rng.uniform(math.log(80), math.log(1400)))
+    share = wide * high / (BASE_SIZE[0] * BASE_SIZE[1]) * float(rng.uniform(0.7, 1.5))
+    encoder = BaseEncoder(
+        EncoderSettings(size=(wide, high), fps=_FPS, bitrate_bps=max(20_000, round(kbps * 1000 * share)))
+    )
+    decoder, picture = BaseDecoder(), image
+    step = rng.uniform(-4, 4, 2)
+    for index in range(_CODED_FRAMES):
+        back = step * (_CODED_FRAMES - 1 - index)
+        shift = np.array([[1, 0, back[0]], [0, 1, back[1]]], np.float32)
+        moved = np.asarray(
+            cv2.warpAffine(image, shift, (wide, high), borderMode=cv2.BORDER_REFLECT), np.uint8
+        )
+        frame = Frame(index=index, capture_ns=0, source_bgr=moved, base_bgr=moved)
+        decoded = decoder.decode(encoder.encode(frame).data)
+        picture = picture if decoded is None else decoded
+    return picture
+
+
+def _yolo(path: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """(N, 5): class, x1, y1, x2, y2 in pixels."""
+    rows = np.array([line.split()[:5] for line in path.read_text().splitlines() if line.strip()], float)
+    rows = rows.reshape(-1, 5)
+    middle, sides = rows[:, 1:3] * size, rows[:, 3:5] * size
+    return np.hstack([rows[:, :1], middle - sides / 2, middle + sides / 2])
+
+
+def _pairs(root: Path) -> Iterator[tuple[Path, npt.NDArray[np.float64]]]:
+    for path in sorted((root / "images").glob("*.jpg")):
+        label = root / "labels" / f"{path.stem}.txt"
+        image = cv2.imread(str(path))
+        if image is not None and label.is_file():
+            yield path, _yolo(label, (image.shape[1], image.shape[0]))
+
+
+def _kit(data: Path) -> Iterator[_Labelled]:
+    """KIT AIS: all vehicles. A person there is three pixels long, too small to be asked for."""
+    for path, rows in _pairs(data / "kit_ais"):
+        if not path.name.startswith(_KIT_HELD_OUT):
+            yield path, rows[:, 1:].astype(np.float32), np.array([_KIT[int(k)] for k in rows[:, 0]], np.int32)
+
+
+def _thermal(data: Path) -> Iterator[_Labelled]:
+    """HIT-UAV: everything is labelled. The flights that judge, and those held out, are left out by date."""
+    for part in ("train", "val", "test"):
+        about = json.loads((data / "hit_uav" / "annotations" / f"{part}.json").read_text())
+        boxes: dict[int, list[list[float]]] = {}
+        for row in about["annotation"]:
+            boxes.setdefault(row["image_id"], []).append([row["category_id"], *row["bbox"]])
+        for picture in about["images"]:
+            if picture["date_captured"] in _HIT_JUDGES | _HIT_HELD_OUT:
+                continue
+            rows = np.array(boxes.get(picture["id"], []), np.float32).reshape(-1, 5)
+            corners = np.hstack([rows[:, 1:3], rows[:, 1:3] + rows[:, 3:5]])
+            kinds = np.array([_HIT[int(k)] for k in rows[:, 0]], np.int32)
+            yield data / "hit_uav" / part / picture["filename"], corners, kinds
+
+
+def _road(data: Path) -> Iterator[_Labelled]:
+    """Madison: vehicles of unknown kind, and the people that we marked (``madison_people.csv``).
+
+    Only pictures of views that hover long enough to tell what moves are taken: there, who walks is marked.
+    """
+    marks: dict[str, list[tuple[int, list[float]]]] = {}
+    with resources.files("hvt_train.pictures").joinpath("madison_people.csv").open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            box = [float(row[name]) for name in ("x1", "y1", "x2", "y2")]
+            kind = _ID["pedestrian"] if row["kind"] == "person" else -1
+            marks.setdefault(row["file"], []).append((kind, box))
+    for path, rows in _pairs(data / "cats_madison"):
+        if path.name not in marks:
+            continue
+        high, wide = 640, 640
+        vehicles = rows[:, 1:]
+        longest = (vehicles[:, 2:] - vehicles[:, :2]).max(1, initial=0) if len(vehicles) else np.zeros(0)
+        kinds = [LARGE_VEHICLE if side > _LARGE_PX else SMALL_VEHICLE for side in longest]
+        people = [(kind, box) for kind, box in marks[path.name] if box[2] > 0]
+        edge = [[0, 0, wide, _BORDER_PX], [0, high - _BORDER_PX, wide, high]]
+        edge += [[0, 0, _BORDER_PX, high], [wide - _BORDER_PX, 0, wide, high]]
+        boxes = np.array([*vehicles.tolist(), *[box for _, box in people], *edge], np.float32)
+        yield path, boxes, np.array([*kinds, *[kind for kind, _ in people], -1, -1, -1, -1], np.int32)
+
+
+SETS: dict[str, Callable[[Path], Iterator[_Labelled]]] = {"kit": _kit, "thermal": _thermal, "road": _road}
+"""Kinds of the pool and who reads them."""

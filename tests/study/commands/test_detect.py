@@ -1,0 +1,154 @@
+"""``hvt-study detect``: files, figures and sheets of a detector over labelled pictures."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_scene import Scene
+from hvt_study.cli import main
+from hvt_study.metrics.operating_point import calibration_error
+
+CLASSES = "car,van,truck,bus,motor,pedestrian,other"
+
+
+def draw(folder: Path, *, moments: int = 2) -> Path:
+    """A YOLO folder of drawn pictures, 1280x720, with the truth of what is at least half visible."""
+    scene = Scene(5, size=(1280, 720))
+    (folder / "images").mkdir(parents=True)
+    (folder / "labels").mkdir()
+    for number in range(moments):
+        truth = scene.truth(1.0 + number)
+        cv2.imwrite(str(folder / f"images/{number}.png"), scene.image(1.0 + number))
+        boxes = truth.boxes_source_px.clip(0, (1280, 720, 1280, 720)) / (1280, 720, 1280, 720)
+        rows = [
+            f"{kind} {(x1 + x2) / 2:.6f} {(y1 + y2) / 2:.6f} {x2 - x1:.6f} {y2 - y1:.6f}\n"
+            for kind, (x1, y1, x2, y2), seen in zip(truth.class_ids, boxes, truth.visible, strict=True)
+            if seen >= 0.5 and x2 > x1 and y2 > y1
+        ]
+        (folder / f"labels/{number}.txt").write_text("".join(rows))
+    (folder / "classes.txt").write_text("\n".join(Scene.class_names) + "\n")
+    return folder
+
+
+def sentence(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The last line on stderr of a call that must end with exit code 2."""
+    assert main(["detect", *map(str, arguments), "--provider", "cpu"]) == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err
+    return captured.err.splitlines()[-1]
+
+
+def test_figures_files_and_sheets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The embedded detector on the scene it knows: found, scored, shown; an unreadable picture costs only itself."""
+    folder, out = draw(tmp_path / "set"), tmp_path / "out"
+    (folder / "images" / "broken.png").write_bytes(b"no picture")
+    assert main(["detect", str(folder), "--provider", "cpu", "--vehicles-as-one", "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert "broken.png cannot be read as a picture; skipped" in said.err
+    assert "1 of 3 pictures skipped" in said.err
+    score = json.loads((out / "score.json").read_text())
+    vehicle = score["by_class"]["vehicle"]
+    assert score["pictures"] == 2
+    assert vehicle["recall"] > 0.8
+    assert vehicle["precision"] > 0.7
+    assert 0 <= score["calibration_error"] <= 1
+    with (out / "detections.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["file", "x1", "y1", "x2", "y2", "confidence", "class"]
+    assert sum(Path(row["file"]).name == "0.png" for row in rows) > 5
+    assert all(float(row["confidence"]) >= 0.25 and float(row["x2"]) <= 1280 for row in rows)
+    judged = [row for row in rows if row["class"] in CLASSES.split(",")]
+    assert score["boxes"] == len(judged)
+    sheets = [
+        cv2.imread(str(path)) for path in (out / "false-alarms.png", out / "misses.png") if path.exists()
+    ]
+    assert sheets
+    assert all(sheet is not None and sheet.shape[1] == 8 * 150 for sheet in sheets)
+
+
+def test_classes_that_a_set_does_not_label_count_neither_way(tmp_path: Path) -> None:
+    """Minsk and Madison label no people: whoever sees them there is not wrong."""
+    folder = draw(tmp_path / "set", moments=1)
+    for path in (folder / "labels").glob("*.txt"):
+        path.write_text("".join(line for line in path.read_text().splitlines(True) if line[0] in "0123"))
+    run = ["detect", str(folder), "--provider", "cpu", "--labelled", "vehicle", "--vehicles-as-one"]
+    assert main([*run, "--out", str(tmp_path / "out")]) == 0
+    assert list(json.loads((tmp_path / "out/score.json").read_text())["by_class"]) == ["vehicle"]
+
+
+def test_coco_and_yolo_say_the_same(tmp_path: Path) -> None:
+    """One set in two formats has one score."""
+    folder = draw(tmp_path / "set", moments=1)
+    names, wide, high = list(Scene.class_names), 1280, 720
+    annotations = []
+    for line in (folder / "labels/0.txt").read_text().splitlines():
+        kind, cx, cy, w, h = map(float, line.split())
+        box = [(cx - w / 2) * wide, (cy - h / 2) * high, w * wide, h * high]
+        annotations.append({"image_id": 7, "category_id": int(kind) + 1, "bbox": box})
+    coco = {
+        "images": [{"id": 7, "file_name": "0.png"}],
+        "categories": [{"id": number + 1, "name": name} for number, name in enumerate(names)],
+        "annotations": annotations,
+    }
+    (folder / "coco.json").write_text(json.dumps(coco))
+    scores = []
+    for place in (folder, folder / "coco.json"):
+        assert main(["detect", str(place), "--provider", "cpu", "--out", str(tmp_path / place.name)]) == 0
+        scores.append(json.loads((tmp_path / place.name / "score.json").read_text()))
+    assert scores[0] == scores[1]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("9 0.5 0.5 0.1 0.1", "line 1 has class 9; there are 7, from 0"),
+        ("0 1.5 0.5 0.1 0.1", "line 1 has a box outside the picture"),
+        ("0 nan 0.5 0.1 0.1", "line 1 is '0 nan 0.5 0.1 0.1'; accepted is class cx cy w h, all numbers"),
+        ("car", "line 1 is 'car'; accepted is class cx cy w h, all numbers"),
+    ],
+)
+def test_wrong_labels_are_named_with_file_and_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, said: str
+) -> None:
+    """A label that cannot be must not move a figure."""
+    folder = draw(tmp_path / "set", moments=1)
+    (folder / "labels/0.txt").write_text(line + "\n")
+    heard = sentence(capsys, folder, "--out", tmp_path / "out")
+    assert "labels/0.txt, " in heard
+    assert said in heard
+
+
+def test_what_cannot_be_is_said_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No folder, no pictures, no names."""
+    out = tmp_path / "out"
+    assert "does not exist" in sentence(capsys, tmp_path / "none", "--out", out)
+    (tmp_path / "empty").mkdir()
+    assert "holds no pictures" in sentence(capsys, tmp_path / "empty", "--out", out)
+    folder = draw(tmp_path / "set", moments=1)
+    (folder / "classes.txt").unlink()
+    assert "no classes.txt: add one, one name a line, or give --classes" in sentence(
+        capsys, folder, "--out", out
+    )
+    assert "--confidence is 2.0, must be from 0.01 to 1" in sentence(
+        capsys, folder, "--confidence", 2, "--out", out
+    )
+    (tmp_path / "bad.json").write_text("[]")
+    assert "is not COCO's JSON" in sentence(capsys, tmp_path / "bad.json", "--out", out)
+    assert not out.exists()
+
+
+def test_calibration_error_of_known_confidences() -> None:
+    """Hand-made: bins that are right as often as they say have no error."""
+    sure = np.array([0.75] * 4 + [0.25] * 4)
+    right = np.array([1, 1, 1, 0, 1, 0, 0, 0], bool)
+    assert calibration_error(sure, right) == pytest.approx(0)
+    assert calibration_error(sure, ~right) == pytest.approx(0.5)
+    assert np.isnan(calibration_error(sure[:0], right[:0]))
