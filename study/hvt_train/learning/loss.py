@@ -23,7 +23,7 @@ _RANGES = ((0.0, 110.0), (22.0, 240.0), (70.0, 1e6))
 """Longer sides in pixels for which a stride may answer."""
 _FAR = 1e4
 _PRIORS = {
-    SMALL_VEHICLE: {"car": 2.0, "van": 0.0, "truck": 0.0},
+    SMALL_VEHICLE: {"car": 5.0, "van": 1.0, "truck": 0.0},
     LARGE_VEHICLE: {"van": 0.0, "truck": 0.5, "bus": 0.5},
 }
 """Kinds that a vehicle of unknown kind may be, and how much (in logits) each is favoured."""

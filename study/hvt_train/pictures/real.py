@@ -36,6 +36,7 @@ _HIT_JUDGES = {"20210115", "20210123"}
 _HIT_HELD_OUT = {"20210114", "20210119"}
 _KIT_HELD_OUT = "MunichStreet02"
 _FPS, _CODED_FRAMES = 15.0, 6
+_CODED_SHARE = 0.65
 _BORDER_PX = 26  # Madison leaves out vehicles that the border cuts
 _LARGE_PX = 74  # a Madison car is about 58 pixels long
 
@@ -55,9 +56,10 @@ def fill_real(folder: Path, data: Path, *, seed: int = 1) -> list[Path]:
             written.append(target)
             if not target.exists():
                 rng = np.random.default_rng([seed, number])
-                image = cv2.imread(str(path))
-                assert image is not None, path
-                if rng.random() < 0.65:
+                loaded = cv2.imread(str(path))
+                assert loaded is not None, path
+                image = np.asarray(loaded, np.uint8)
+                if rng.random() < _CODED_SHARE:
                     image = _coded(image, rng)
                 high, wide = image.shape[:2]
                 inside = boxes.clip(0, (wide, high, wide, high)).astype(np.float32)

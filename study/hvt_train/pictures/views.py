@@ -44,8 +44,8 @@ class ViewSettings:
 
     side: int = 416
     shares: tuple[tuple[str, float], ...] = (
-        *(("demo", 0.1), ("base", 0.2), ("place", 0.15)),
-        *(("kit", 0.13), ("road", 0.22), ("thermal", 0.2)),
+        *(("demo", 0.08), ("base", 0.18), ("place", 0.15)),
+        *(("kit", 0.13), ("road", 0.2), ("thermal", 0.26)),
     )
     """How often each kind of picture is taken."""
     least_visible: float = 0.3
