@@ -50,8 +50,13 @@ def _parser() -> argparse.ArgumentParser:
         own.add_argument("--classifier-steps", type=int, default=5000, help="of 64 crops each")
         own.add_argument("--minutes", type=float, default=None, help="end each network's schedule by then")
         own.add_argument(
-            "--start", type=Path, default=None, metavar="STATE", help="detector weights to go on from"
+            "--real",
+            type=Path,
+            default=None,
+            metavar="DATA",
+            help="folder of kit_ais, hit_uav and cats_madison",
         )
+        own.add_argument("--start", default=None, metavar="embedded|FOLDER", help="ONNX files to go on from")
     own = commands.add_parser("eval", help="measure", formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     own.add_argument("--drawn", action="store_true", help="on held-out drawn scenes")
     own.add_argument(

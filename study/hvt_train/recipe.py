@@ -1,4 +1,4 @@
-"""The whole recipe: draw the pool, train, export, and leave logs and weights beside the files."""
+"""The whole recipe: draw the pool, add real pictures, train, export, and leave logs and weights beside the files."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
+from hvt_common.inference.store import embedded_models
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.evaluate import CLEAN, drawn_pictures, evaluate_drawn
 from hvt_train.learning.classifier import export_classifier, train_classifier
 from hvt_train.learning.export import metadata
 from hvt_train.learning.loop import LoopSettings
 from hvt_train.learning.train_detector import export_detector, train_detector
-from hvt_train.pictures.crops import CropSource, held_out_crops, pool_crops, scene_crops
+from hvt_train.pictures.crops import CropSource, held_out_crops, pool_crops, real_crops, scene_crops
 from hvt_train.pictures.pool import PoolPlan, fill_pool
+from hvt_train.pictures.real import fill_real
 from hvt_train.pictures.views import ViewSettings
 
 __all__ = ["run_recipe"]
@@ -34,10 +36,14 @@ _VALIDATION = range(100, 104)
 """Held-out scenes by which the best weights are chosen; ``eval`` measures on others."""
 
 _SUMMARY = {
-    DETECTOR: "Vehicles and people seen from above or aslant, trained on drawn scenes alone. Input BGR 0…255, free"
+    DETECTOR: "Vehicles and people seen from above or aslant, in daylight and thermal. Input BGR 0…255, free"
     " multiples of 32, letterboxed top-left with 114; output a raw YOLOX head.",
-    CLASSIFIER: "Class of a 96x96 crop (padded by 15 %) of a vehicle or person, trained on drawn scenes alone.",
+    CLASSIFIER: "Class of a 96x96 crop (padded by 15 %) of a vehicle or person; other is anything else.",
 }
+_CREDITS = (
+    "Drawn scenes of this project; KIT AIS (CC BY 3.0, labels by jekhor); HIT-UAV (Suo et al., Sci Data 2023,"
+    " CC BY 4.0); CATS-Lab Madison drone-view vehicles, with our marks of people"
+)
 
 
 def run_recipe(arguments: argparse.Namespace) -> None:
@@ -48,6 +54,8 @@ def run_recipe(arguments: argparse.Namespace) -> None:
     out.mkdir(parents=True, exist_ok=True)
     plan = PoolPlan(scenes=arguments.scenes, places=arguments.places)
     pool = fill_pool(out / "pool", plan, workers=arguments.workers)
+    if arguments.real is not None:
+        pool += fill_real(out / "pool", arguments.real)
     if arguments.command in ("detector", "all"):
         _detector(arguments, pool)
     if arguments.command in ("classifier", "all"):
@@ -75,7 +83,7 @@ def _detector(arguments: argparse.Namespace, pool: list[Path]) -> None:
         workers=arguments.workers,
         log=arguments.out / f"{DETECTOR}.jsonl",
         check=best.check,
-        start=arguments.start,
+        start=_started(arguments, DETECTOR),
     )
 
 
@@ -88,6 +96,9 @@ def _classifier(arguments: argparse.Namespace, pool: list[Path]) -> None:
         return float(np.mean([p.class_name == name for p, name in zip(posteriors, names, strict=True)]))
 
     groups = [*pool_crops(pool, most=40), *scene_crops(range(arguments.crop_scenes), moments=4, most=60)]
+    if arguments.real is not None:
+        finds_too_much = open_detector(DETECTOR, confidence=0.12, threads=arguments.threads)
+        groups += real_crops(pool, finds_too_much, most=8)
     train_classifier(
         CropSource(groups, seed=arguments.seed),
         settings=LoopSettings(
@@ -100,7 +111,17 @@ def _classifier(arguments: argparse.Namespace, pool: list[Path]) -> None:
         batch=64,
         workers=arguments.workers,
         log=arguments.out / f"{CLASSIFIER}.jsonl",
+        start=_started(arguments, CLASSIFIER),
         check=_Best(arguments, CLASSIFIER, export_classifier, measure).check,
+    )
+
+
+def _started(arguments: argparse.Namespace, name: str) -> Path | None:
+    """``--start embedded`` goes on from the file of the package, ``--start FOLDER`` from the one there."""
+    if arguments.start is None:
+        return None
+    return (
+        embedded_models()[name] if arguments.start == "embedded" else Path(arguments.start) / f"{name}.onnx"
     )
 
 
@@ -141,6 +162,7 @@ def _properties(name: str, seed: int) -> dict[str, str]:
         commit=_commit(),
         date=dt.datetime.now(dt.UTC).date().isoformat(),
         summary=_SUMMARY[name],
+        **{"hvt.training_data": _CREDITS},
     )
 
 

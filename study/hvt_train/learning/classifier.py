@@ -15,6 +15,7 @@ from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.learning.detector import Block, Conv
 from hvt_train.learning.export import export_onnx
 from hvt_train.learning.loop import LoopSettings, Loss, train
+from hvt_train.learning.start import load_onnx
 from hvt_train.pictures.crops import CROP_SIDE, CropSource
 
 __all__ = ["MEAN", "SCALE", "ClassifierNet", "export_classifier", "train_classifier"]
@@ -78,8 +79,9 @@ def train_classifier(
     workers: int,
     log: Path,
     check: Callable[[nn.Module, int], dict[str, float]] | None = None,
+    start: Path | None = None,
 ) -> ClassifierNet:
-    """Train on crops."""
+    """Train on crops; ``start`` is an ONNX file to go on from."""
     torch.manual_seed(seed)
     loader = DataLoader(
         _Stream(source),
@@ -89,6 +91,9 @@ def train_classifier(
         prefetch_factor=4 if workers else None,
     )
     net = ClassifierNet(len(CLASS_NAMES))
+    if start is not None:
+        images, _ = _batch_of([source.next() for _ in range(128)])
+        load_onnx(net, start, (images.float() - MEAN) * SCALE)
     trained = train(net, loader, loss_of=_loss_of, settings=settings, log=log, check=check)
     assert isinstance(trained, ClassifierNet)
     return trained

@@ -21,7 +21,7 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
 
     Raises `ValueError` where the file is of another architecture.
     """
-    weights = _convolutions(onnx.load(str(path)).graph)
+    weights = _weights(onnx.load(str(path)).graph)
     hooks, order = [], iter(weights)
 
     def take(conv: nn.Module, _inputs: object) -> None:
@@ -48,7 +48,7 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
 
     pending: list[Tensor] = []
     for module in net.modules():
-        if isinstance(module, nn.Conv2d):
+        if isinstance(module, (nn.Conv2d, nn.Linear)):
             hooks.append(module.register_forward_pre_hook(take))
         elif isinstance(module, nn.BatchNorm2d):
             hooks.append(module.register_forward_pre_hook(measure))
@@ -58,10 +58,14 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
         hook.remove()
 
 
-def _convolutions(graph: onnx.GraphProto) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Weight and bias of each convolution, as float32, in the order in which the file computes them."""
+def _weights(graph: onnx.GraphProto) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Weight and bias of each layer that has some, as float32, in the order in which the file computes them."""
     values = {item.name: numpy_helper.to_array(item).astype(np.float32) for item in graph.initializer}
     for node in graph.node:
         if node.op_type == "Cast" and node.input[0] in values:
             values[node.output[0]] = values[node.input[0]]
-    return [(values[node.input[1]], values[node.input[2]]) for node in graph.node if node.op_type == "Conv"]
+    return [
+        (values[node.input[1]], values[node.input[2]])
+        for node in graph.node
+        if node.op_type in {"Conv", "Gemm"}
+    ]

@@ -16,6 +16,7 @@ from hvt_train.learning.detector import DetectorNet, ExportedDetector
 from hvt_train.learning.export import export_onnx
 from hvt_train.learning.loop import LoopSettings, Loss, train
 from hvt_train.learning.loss import Targets, detector_loss
+from hvt_train.learning.start import load_onnx
 from hvt_train.pictures.views import View, ViewSettings, ViewSource
 
 __all__ = ["Batch", "batch_of", "export_detector", "loss_of", "train_detector"]
@@ -73,10 +74,13 @@ def train_detector(
     check: Callable[[nn.Module, int], dict[str, float]] | None = None,
     start: Path | None = None,
 ) -> DetectorNet:
-    """Train on a pool; ``start`` is a state to go on from."""
+    """Train on a pool; ``start`` is an ONNX file or a state (``.pt``) to go on from."""
     torch.manual_seed(seed)
     net = DetectorNet(len(CLASS_NAMES))
-    if start is not None:
+    if start is not None and start.suffix == ".onnx":
+        source = ViewSource(pool, seed=seed, settings=views)
+        load_onnx(net, start, batch_of([source.next() for _ in range(48)]).images.float())
+    elif start is not None:
         net.load_state_dict(torch.load(start))
     loader = DataLoader(
         _Views(pool, seed=seed * 1000, settings=views),

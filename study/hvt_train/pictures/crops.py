@@ -10,15 +10,26 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.inference.detect import Detector
 from hvt_common.values import Image
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.perception.crop import PADDING, crop_box
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import HELD_OUT_SEED, SOURCE_SIZE, TRAIN_SEED, Shot, shoot
+from hvt_train.pictures.real import SETS, SMALL_VEHICLE
 from hvt_train.pictures.views import degrade, read_picture
 
-__all__ = ["CROP_SIDE", "CropSource", "Crops", "collect_crops", "held_out_crops", "pool_crops", "scene_crops"]
+__all__ = [
+    "CROP_SIDE",
+    "CropSource",
+    "Crops",
+    "collect_crops",
+    "held_out_crops",
+    "pool_crops",
+    "real_crops",
+    "scene_crops",
+]
 
 CROP_SIDE = 96
 """Pixels of the classifier's square input."""
@@ -44,7 +55,8 @@ class Crops:
 def collect_crops(picture: Picture, *, most: int, rng: _Rng) -> Crops:
     """Up to ``most`` crops of what is well visible, rare classes first, and one of the ground as "other"."""
     sides = (picture.boxes_px[:, 2:] - picture.boxes_px[:, :2]).max(1)
-    rows = np.nonzero((picture.visible >= _LEAST_VISIBLE) & (sides >= _LEAST_SIDE_PX))[0]
+    known = picture.class_ids >= 0
+    rows = np.nonzero(known & (picture.visible >= _LEAST_VISIBLE) & (sides >= _LEAST_SIDE_PX))[0]
     counts = np.bincount(picture.class_ids[rows], minlength=len(CLASS_NAMES))
     order = rng.permutation(rows)
     rows = order[np.argsort(counts[picture.class_ids[order]], kind="stable")][:most]
@@ -58,6 +70,28 @@ def collect_crops(picture: Picture, *, most: int, rng: _Rng) -> Crops:
     crops = [_stored(picture.image_bgr, box) for box in boxes]
     inner = np.array([box for _, box in crops], np.float32).reshape(-1, 4)
     return Crops([image for image, _ in crops], inner, np.array(kinds, np.int32))
+
+
+def real_crops(pool: list[Path], detector: Detector, *, most: int) -> Iterator[Crops]:
+    """Crops of real pictures, and as "other" what ``detector`` finds where no label is: its false alarms.
+
+    A vehicle of unknown kind counts as a car where it is as small as one; larger ones are left out.
+    """
+    real = [path for path in pool if path.name.startswith(tuple(SETS))]
+    for number, path in enumerate(real):
+        rng = np.random.default_rng([TRAIN_SEED, 4, number])
+        picture = read_picture(path)
+        kinds = np.where(picture.class_ids == SMALL_VEHICLE, CLASS_NAMES.index("car"), picture.class_ids)
+        named = Picture(picture.image_bgr, picture.boxes_px, kinds.astype(np.int32), picture.visible)
+        yield collect_crops(named, most=most, rng=rng)
+        found = detector.detect(picture.image_bgr).boxes_xyxy_px
+        begins, ends = found[:, None, :2] < picture.boxes_px[:, 2:], found[:, None, 2:] > picture.boxes_px[:, :2]
+        touches = np.logical_and(begins, ends).all(axis=2)
+        alarms = found[~np.any(touches, axis=1)][: 2 * most]
+        crops = [_stored(picture.image_bgr, box) for box in alarms]
+        inner = np.array([box for _, box in crops], np.float32).reshape(-1, 4)
+        other = np.full(len(crops), CLASS_NAMES.index("other"), np.int32)
+        yield Crops([image for image, _ in crops], inner, other)
 
 
 def _empty_box(picture: Picture, rng: _Rng) -> npt.NDArray[np.float32] | None:
