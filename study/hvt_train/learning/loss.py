@@ -15,18 +15,15 @@ from torch.nn import functional
 
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.learning.detector import STRIDES
-from hvt_train.pictures.real import LARGE_VEHICLE, SMALL_VEHICLE
+from hvt_train.pictures.real import LARGE_VEHICLE
 
 __all__ = ["Targets", "detector_loss"]
 
 _RANGES = ((0.0, 110.0), (22.0, 240.0), (70.0, 1e6))
 """Longer sides in pixels for which a stride may answer."""
 _FAR = 1e4
-_PRIORS = {
-    SMALL_VEHICLE: {"car": 5.0, "van": 1.0, "truck": 0.0},
-    LARGE_VEHICLE: {"van": 0.0, "truck": 0.5, "bus": 0.5},
-}
-"""Kinds that a vehicle of unknown kind may be, and how much (in logits) each is favoured."""
+_PRIOR = {"van": 0.0, "truck": 0.5, "bus": 0.5}
+"""What a `LARGE_VEHICLE` may be, and how much (in logits) each is favoured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +35,7 @@ class Targets:
     boxes_px: Tensor
     """(M, 4) float32 x1 y1 x2 y2."""
     class_ids: Tensor
-    """(M,) int64; -1 is ignored, `SMALL_VEHICLE` and `LARGE_VEHICLE` are vehicles of unknown kind."""
+    """(M,) int64; -1 is ignored, `LARGE_VEHICLE` a van, truck or bus."""
 
 
 def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[str, float]]:
@@ -80,16 +77,13 @@ def detector_loss(maps: list[Tensor], targets: Targets) -> tuple[Tensor, dict[st
 def _named(rows: Tensor, shapes: list[tuple[int, int]], targets: Targets) -> Tensor:
     """Class ids in which a vehicle of unknown kind has the likeliest kind by what the network says of it now."""
     kinds = targets.class_ids.clone()
-    for code, prior in _PRIORS.items():
-        which = torch.nonzero(kinds == code)[:, 0]
-        if len(which):
-            numbers, allowed = _candidates(shapes, targets.boxes_px[which])
-            said = rows[targets.pictures[which][:, None], numbers, 5:]
-            mean = (said * allowed[..., None]).sum(1) / allowed.sum(1).clamp(min=1)[:, None]
-            table = torch.full((rows.shape[2] - 5,), -1e9)
-            for name, weight in prior.items():
-                table[CLASS_NAMES.index(name)] = weight
-            kinds[which] = (mean + table).argmax(1)
+    which = torch.nonzero(kinds == LARGE_VEHICLE)[:, 0]
+    if len(which):
+        numbers, allowed = _candidates(shapes, targets.boxes_px[which])
+        said = rows[targets.pictures[which][:, None], numbers, 5:]
+        mean = (said * allowed[..., None]).sum(1) / allowed.sum(1).clamp(min=1)[:, None]
+        prior = torch.tensor([_PRIOR.get(name, -1e9) for name in CLASS_NAMES])
+        kinds[which] = (mean + prior).argmax(1)
     return kinds
 
 

@@ -17,7 +17,7 @@ from hvt_edge.perception.crop import PADDING, crop_box
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import HELD_OUT_SEED, SOURCE_SIZE, TRAIN_SEED, Shot, shoot
-from hvt_train.pictures.real import SETS, SMALL_VEHICLE
+from hvt_train.pictures.real import SETS
 from hvt_train.pictures.views import degrade, read_picture
 
 __all__ = [
@@ -73,19 +73,17 @@ def collect_crops(picture: Picture, *, most: int, rng: _Rng) -> Crops:
 
 
 def real_crops(pool: list[Path], detector: Detector, *, most: int) -> Iterator[Crops]:
-    """Crops of real pictures, and as "other" what ``detector`` finds where no label is: its false alarms.
-
-    A vehicle of unknown kind counts as a car where it is as small as one; larger ones are left out.
-    """
+    """Crops of real pictures, and as "other" what ``detector`` finds where no label is: its false alarms."""
     real = [path for path in pool if path.name.startswith(tuple(SETS))]
     for number, path in enumerate(real):
         rng = np.random.default_rng([TRAIN_SEED, 4, number])
         picture = read_picture(path)
-        kinds = np.where(picture.class_ids == SMALL_VEHICLE, CLASS_NAMES.index("car"), picture.class_ids)
-        named = Picture(picture.image_bgr, picture.boxes_px, kinds.astype(np.int32), picture.visible)
-        yield collect_crops(named, most=most, rng=rng)
+        yield collect_crops(picture, most=most, rng=rng)
         found = detector.detect(picture.image_bgr).boxes_xyxy_px
-        begins, ends = found[:, None, :2] < picture.boxes_px[:, 2:], found[:, None, 2:] > picture.boxes_px[:, :2]
+        begins, ends = (
+            found[:, None, :2] < picture.boxes_px[:, 2:],
+            found[:, None, 2:] > picture.boxes_px[:, :2],
+        )
         touches = np.logical_and(begins, ends).all(axis=2)
         alarms = found[~np.any(touches, axis=1)][: 2 * most]
         crops = [_stored(picture.image_bgr, box) for box in alarms]

@@ -1,8 +1,8 @@
 """Real labelled pictures for the pool: three public sets, each with what it labels and what it leaves out.
 
 Every picture goes through x265 at 80 to 1400 kbps (of a 1280x720 base) or stays clean, and is kept as one file of the
-pool. ``class_ids`` beyond the classes: -1 is neither object nor background, `SMALL_VEHICLE` and `LARGE_VEHICLE` are
-vehicles whose kind the set does not tell.
+pool. ``class_ids`` beyond the classes: -1 is neither object nor background, `LARGE_VEHICLE` is a van,
+truck or bus: the set does not tell which.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import BASE_SIZE, save_picture
 
-__all__ = ["LARGE_VEHICLE", "SETS", "SMALL_VEHICLE", "fill_real"]
+__all__ = ["LARGE_VEHICLE", "SETS", "fill_real"]
 
-SMALL_VEHICLE, LARGE_VEHICLE = -2, -3
+LARGE_VEHICLE = -2
 _ID = {name: number for number, name in enumerate(CLASS_NAMES)}
 _KIT = (_ID["car"], _ID["truck"], _ID["bus"], _ID["van"])
 _HIT = (_ID["pedestrian"], _ID["car"], _ID["motor"], LARGE_VEHICLE, -1)
@@ -38,7 +38,7 @@ _KIT_HELD_OUT = "MunichStreet02"
 _FPS, _CODED_FRAMES = 15.0, 6
 _CODED_SHARE = 0.65
 _BORDER_PX = 26  # Madison leaves out vehicles that the border cuts
-_LARGE_PX = 74  # a Madison car is about 58 pixels long
+_LARGE_PX = 128  # a car is 96 pixels long there, one in twenty vehicles longer than 118
 
 _Labelled = tuple[Path, npt.NDArray[np.float32], npt.NDArray[np.int32]]
 
@@ -130,7 +130,7 @@ def _thermal(data: Path) -> Iterator[_Labelled]:
 
 
 def _road(data: Path) -> Iterator[_Labelled]:
-    """Madison: vehicles of unknown kind, and the people that we marked (``madison_people.csv``).
+    """Madison: vehicles, of which the small ones count as cars, and the people that we marked (``madison_people.csv``).
 
     Only pictures of views that hover long enough to tell what moves are taken: there, who walks is marked.
     """
@@ -146,7 +146,7 @@ def _road(data: Path) -> Iterator[_Labelled]:
         high, wide = 640, 640
         vehicles = rows[:, 1:]
         longest = (vehicles[:, 2:] - vehicles[:, :2]).max(1, initial=0) if len(vehicles) else np.zeros(0)
-        kinds = [LARGE_VEHICLE if side > _LARGE_PX else SMALL_VEHICLE for side in longest]
+        kinds = [LARGE_VEHICLE if side > _LARGE_PX else _ID["car"] for side in longest]
         people = [(kind, box) for kind, box in marks[path.name] if box[2] > 0]
         edge = [[0, 0, wide, _BORDER_PX], [0, high - _BORDER_PX, wide, high]]
         edge += [[0, 0, _BORDER_PX, high], [wide - _BORDER_PX, 0, wide, high]]
