@@ -81,6 +81,7 @@ class Edge:
                 session_id=world.session_id,
                 ledger=self.ledger,
                 inbox=world.inbox,
+                failures=self._failures,
                 clock=world.clock,
                 loop_clock=self._loop_clock,
                 wait_until=self._wait_until,
@@ -222,4 +223,5 @@ class Edge:
             perception_ms=stages.stills.analyzer.mean_ms,
             unusable_messages=link.unusable,
             store=None if backlog is None else backlog.numbers,
+            failed=self._failures.parts,
         )

@@ -11,7 +11,7 @@ from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.video.frame_decision import FrameDecision, FrameInputs, decide
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.keyframes import KeyframePlan
-from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.x265 import BaseEncoder
 
@@ -33,7 +33,7 @@ class BaseStage:
         *,
         keyframes: KeyframeRequests,
         transmitter: Transmitter,
-        recorder: BaseRecorder | None,
+        local_copy: LocalCopy | None,
         first_keyframe_bytes: int,
         regions: TrackRegions | None = None,
         frame_skip: FrameSkip | None = None,
@@ -45,7 +45,7 @@ class BaseStage:
         self._requests = keyframes
         self._plan = KeyframePlan(keyframes)
         self._transmitter = transmitter
-        self._recorder = recorder
+        self._local_copy = local_copy
         self._keyframe_bytes = first_keyframe_bytes
         self._regions = regions
         self._frame_skip = frame_skip or FrameSkip()
@@ -84,8 +84,8 @@ class BaseStage:
             self._plan.done(now_ns)
         if decision.resumes and self._backlog is not None:
             self._backlog.resume()
-        if self._recorder is not None:
-            self._recorder.write(unit)
+        if self._local_copy is not None:
+            self._local_copy.write(unit)
         return unit
 
     def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> None:

@@ -75,7 +75,7 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
             lockstep=False,
             wait_until=lambda _at_ns: None,
         ),
-        recorder=None,
+        local_copy=None,
         first_keyframe_bytes=5000,
     )
     frames = list(framed(smooth_pictures(60, size=SIZE)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import av
@@ -10,13 +11,14 @@ import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
+from hvt_common.runtime.failures import Failures
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
-from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
@@ -64,7 +66,7 @@ class Rig:
                 lockstep=True,
                 wait_until=lambda _at_ns: None,
             ),
-            recorder=recorder,
+            local_copy=recorder,
             first_keyframe_bytes=5000,
             regions=regions,
             frame_skip=self.frame_skip,
@@ -147,7 +149,7 @@ def test_the_same_frames_give_the_same_bytes():
 def test_a_recording_keeps_its_times_across_a_change(tmp_path):
     """The flight's video on the drone would run at the wrong speed after the first change."""
     path = tmp_path / "base.mkv"
-    with BaseRecorder(path) as recorder:
+    with LocalCopy(path, failures=Failures(time.time_ns)) as recorder:
         rig = Rig(frame_skip=starving(), recorder=recorder, interval_s=2.0)
         coded = rig.play(hard_pictures(90, size=SIZE))
     assert rig.opened
