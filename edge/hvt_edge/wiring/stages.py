@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 
-from hvt_common.inference.detect import Detector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
@@ -22,6 +21,7 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.point import LoopClock, Operating
+from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
 from hvt_edge.status import InfoReporter
@@ -67,7 +67,7 @@ def build_stages(
     config: EdgeConfig,
     *,
     source: Source,
-    detector: Detector,
+    detector: FailingDetector,
     link: EdgeLink,
     session_id: int,
     ledger: Ledger,
@@ -171,6 +171,8 @@ def build_stages(
         reconfigure=reconfiguration,
         admits=link_control.admits,
         backlog=backlog,
+        reopen=None if lockstep else reconfiguration.reopen,
+        failures=failures,
     )
     on_demand = make_on_demand(
         config, outbox=outbox, view=view, class_names=class_names, most_bytes=transmitter.most_still_bytes
