@@ -26,7 +26,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.status import StatusReporter
 from hvt_edge.summary import EdgeRun, summary
-from hvt_edge.wiring import Stages, build_stages, check_files
+from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files
 from hvt_edge.world import World
 
 __all__ = ["Edge"]
@@ -67,6 +67,7 @@ class Edge:
         """
         config, world = self._config, self._world
         check_files(config)
+        check_codecs(config)
         opened = world.open_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
