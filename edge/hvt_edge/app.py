@@ -9,7 +9,6 @@ from typing import Any
 
 from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.ledger import Account, Ledger
-from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
@@ -56,7 +55,7 @@ class Edge:
         self._lockstep = config.pace == "lockstep"
         self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep)
         self._counts = FrameCounts()
-        self._failures = Failures(self._world.clock)
+        self._failures = self._world.failures
         self.ledger = Ledger(window_ns=config.window_ns)
         """Every byte that left."""
 
@@ -129,17 +128,19 @@ class Edge:
         self, source: Source, stages: Stages, link: EdgeLink, status: StatusReporter, line: StatusLine
     ) -> None:
         """Take one frame after the other; once a second report."""
-        next_status_ns = 0
+        next_status_ns = restarts = 0
         with ExitStack() as stack:
             if source.live:
                 stack.enter_context(closing_on(self._stop, source))
             pace = self._make_pace(source, stages, link)
             stack.enter_context(pace)
-            for frame in source.frames(start_ns=stages.operating.now.started_ns):
+            for frame in source.steps(start_ns=stages.operating.now.started_ns):
                 if self._stop.is_set():
                     break
-                self._counts.captured += 1
-                pace.step(frame)
+                if source.restarts != restarts:  # another picture than the last
+                    restarts = source.restarts
+                    stages.keyframes.require(self._loop_clock())
+                pace.step(frame, missed=source.missed)
                 now_ns = self._loop_clock()
                 if now_ns >= next_status_ns:
                     next_status_ns = now_ns + SECOND_NS
