@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from hvt_common.errors import FlightError, UserError
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
@@ -201,9 +202,11 @@ class Edge:
 
     @staticmethod
     def _link_text(stages: Stages, link: EdgeLink) -> str:
-        ground = (
-            "a ground listens" if link.has_ground() else "no link" if link.trouble else "no ground listens"
-        )
+        ground = "no link" if link.trouble else "no ground listens"
+        if link.has_ground():
+            ground = "a ground listens"
+        elif link.has_subscriber(Channel.BASE):
+            ground = "somebody watches who reports nothing"
         return f"{ground}  {'' if stages.backlog is None else stages.backlog.text()}".rstrip()
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink, status: StatusReporter) -> None:

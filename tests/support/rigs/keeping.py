@@ -22,6 +22,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit, Frame, Still
 from hvt_edge.backlog.disk import Folder
 from hvt_edge.backlog.outage import BaseInFlight
@@ -168,6 +169,7 @@ class Rig:
         session_id: int = 7,
         budget: tuple[int, int] = (800_000, 400_000),
         maker: StillMaker | None = None,
+        inbox: FeedbackInbox | None = None,
     ) -> None:
         self.path, self.out, self.now_ns = folder, Out(), START_NS
         self.linked = True
@@ -208,12 +210,17 @@ class Rig:
             method=config.method,
             decimation=1,
         )
+        self.failures = Failures(lambda: self.now_ns)
+        self.watched = False
+        """Somebody subscribes to the video who is no ground."""
         self.link_control = LinkControl(
             has_ground=self._has_ground,
+            has_subscriber=lambda: self.watched,
+            failures=self.failures,
             session_id=session_id,
             transmitter=self.sender,
             keyframes=self.keyframes,
-            inbox=FeedbackInbox(),
+            inbox=inbox or FeedbackInbox(),
             reconfiguration=EncoderReconfiguration(
                 self.operating,
                 reconfiguration_settings(config, SIZE),
