@@ -80,7 +80,7 @@ class Edge:
             if not self._lockstep:  # whose result would be of something else
                 detector = GuardedDetector(
                     opened,
-                    reopen=lambda: world.open_detector(config),
+                    open_again=lambda: world.open_detector(config),
                     failures=self._failures,
                     clock=world.clock,
                 )

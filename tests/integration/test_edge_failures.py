@@ -177,7 +177,7 @@ def test_on_a_slow_machine_perception_gives_way_to_video(link, tmp_path):
     finally:
         os.sched_setaffinity(0, cores)
     summary = edge.finish()
-    assert summary["frames"] > 50, "with threads of equal rank it was 15 to 40"
-    assert summary["frames_unanalyzed"] > 10
+    assert summary["frames"] > 45, "with threads of equal rank it was 15 to 40"
+    assert summary["frames_unanalyzed"] > 5
     assert summary["cores_needed"] > 0.5
     assert "of 100 frames not analyzed" in edge.told

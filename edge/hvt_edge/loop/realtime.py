@@ -98,7 +98,7 @@ class RealtimePace:
         sending_ns = time.perf_counter_ns() - encoded_ns
         self._link_bound = sending_ns > max(encoded_ns - began_ns, _LINK_BOUND_NS)
         # Video goes first: perception gets no frame while the loop is late.
-        self._counts.unanalyzed += not self._worker.take(frame, unit, room=not behind)
+        self._counts.unanalyzed += not self._worker.take(frame, unit, late=behind)
 
     def __enter__(self) -> Self:
         return self
