@@ -31,8 +31,8 @@ class BaseStage:
     ``first_keyframe_bytes`` is the guess until a keyframe has been coded. ``reconfigure(decimation, now_ns)`` runs
     before each keyframe for the link and returns a newly opened encoder, or None where nothing has changed: x265
     takes neither another frame rate nor another bit rate once it is open. ``admits(now_ns)`` says whether pacer and
-    budget have room for a frame. ``open_again()`` gives another encoder where the one there is has failed; without it, as
-    in lockstep, the failure is raised.
+    budget have room for a frame. ``open_again()`` gives another encoder for one that has failed; without it,
+    as in lockstep, the failure is raised.
     """
 
     def __init__(
