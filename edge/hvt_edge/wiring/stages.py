@@ -10,6 +10,7 @@ from functools import partial
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
+from hvt_common.runtime.failures import Failures
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
@@ -74,6 +75,7 @@ def build_stages(
     clock: Callable[[], int],
     loop_clock: LoopClock,
     wait_until: Callable[[int], None],
+    failures: Failures,
 ) -> Stages:
     """Build every part once, each with all that it needs; files and threads end with ``stack``.
 
@@ -135,6 +137,7 @@ def build_stages(
         keyframes=keyframes,
         clock=clock,
         info=info.info,
+        failures=failures,
     )
     if backlog is not None:
         stack.enter_context(backlog)

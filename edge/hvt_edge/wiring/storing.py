@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 
+from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import SECOND_NS
-from hvt_edge.backlog.disk import Folder, check_folder, default_folder
+from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig
@@ -27,6 +31,34 @@ def check_files(config: EdgeConfig) -> None:
         check_folder(config.store_folder or default_folder(config.edge_id))
 
 
+def default_folder(edge_id: str) -> Path:
+    """Where programs keep what outlives them: ``$XDG_STATE_HOME`` or ``~/.local/state``, then ``hvt/<edge>``."""
+    state = os.environ.get("XDG_STATE_HOME", "")
+    if Path(state).is_absolute():
+        return Path(state) / "hvt" / edge_id
+    try:
+        return Path.home() / ".local" / "state" / "hvt" / edge_id
+    except RuntimeError:
+        raise UserError(
+            "what is seen while the link is away has no place, because there is no home folder: give --store-folder, "
+            "or --store 0 to keep nothing"
+        ) from None
+
+
+def check_folder(path: Path) -> None:
+    """Raise `UserError` now where a store could not be made in mid-flight; makes nothing."""
+    try:
+        there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+        usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    except OSError:  # a part of the path may not be looked into
+        usable, there = False, path
+    if not usable:
+        raise UserError(
+            f"--store-folder {path} cannot be used, because {there} is no folder that can be written: name another, "
+            "or give --store 0 to keep nothing"
+        )
+
+
 def make_backlog(
     config: EdgeConfig,
     *,
@@ -39,6 +71,7 @@ def make_backlog(
     keyframes: KeyframeRequests,
     clock: Callable[[], int],
     info: Callable[[], bytes],
+    failures: Failures,
 ) -> BacklogStage | None:
     """Who stores what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
     if not config.store or config.pace == "lockstep":
@@ -46,7 +79,7 @@ def make_backlog(
     path = config.store_folder or default_folder(config.edge_id)
     oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
     return BacklogStage(
-        lambda: Folder(path, max_bytes=config.store, session_id=session_id, info=info, oldest_ns=oldest_ns),
+        Store(path, max_bytes=config.store, session_id=session_id, info=info, oldest_ns=oldest_ns),
         session_id=session_id,
         live=live,
         link=BacklogLink(
@@ -64,4 +97,5 @@ def make_backlog(
         keyframes=keyframes,
         clock=clock,
         on_outcome=transmitter.outcome,
+        failures=failures,
     )

@@ -9,6 +9,7 @@ import pytest
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Flags, RoiHeader, parse_backlog_still
 from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.backlog.entry import worth
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.wiring.storing import make_backlog
 from media.clips import START_NS
@@ -113,7 +114,7 @@ def test_stills_that_the_outage_took_are_known_with_their_worth(tmp_path):
         (entry,) = folder.best_stills()
         kept = parse_backlog_still(folder.read(entry))
         assert (entry.number, kept.payload) == (0, STILL.data)
-        assert entry.path.name.endswith("-2.5.still"), "with its utility"
+        assert entry.rank == worth(2.5, STILL.capture_ns), "with its utility"
 
 
 def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, caplog):
@@ -153,6 +154,7 @@ def test_nobody_keeps_where_nothing_is_to_be_kept(tmp_path, settings):
         keyframes=rig.keyframes,
         clock=lambda: START_NS,
         info=INFO.pack,
+        failures=rig.failures,
     )
     rig.backlog.close()
     assert backlog is None
