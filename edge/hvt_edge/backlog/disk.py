@@ -36,10 +36,10 @@ _log = logging.getLogger(__name__)
 FILE_NAME = "backlog.sqlite"
 _STILLS_SHARE = 0.25
 _PAGE_BYTES = 4096
-_JOURNAL_BYTES = 2 * 64 * _PAGE_BYTES
+_LOG_BYTES = 2 * 64 * _PAGE_BYTES
 """Of the write-ahead log: 64 pages are moved into the file, and the last write before that may be a large one."""
 _TRIAL_BYTES = 256 * 1024
-# One process at a time: exclusive locking also keeps the journal's index in memory, so no disk needs shared mappings.
+# One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
 _OPEN = """
 PRAGMA locking_mode = EXCLUSIVE;
 PRAGMA page_size = 4096;
@@ -63,7 +63,7 @@ CREATE TEMP TABLE gone (id INTEGER PRIMARY KEY);
 CREATE TEMP VIEW here AS SELECT * FROM object WHERE id NOT IN (SELECT id FROM gone);
 COMMIT;
 """
-# `gone` is what has arrived and cannot be deleted yet, because a full disk has no space for the journal either.
+# `gone` is what has arrived and cannot be deleted yet, because a full disk has no space for the log either.
 # After a kill the segment that was open has no size yet.
 _ADOPT = """
 UPDATE object SET
@@ -82,7 +82,7 @@ _ENTRY = "SELECT id, session, kind, number, rank, span_ns FROM here"
 class Store:
     """The objects of this session and of those before it, in bounded space. For one thread; any may read the counts.
 
-    The folder is made when something is stored for the first time; ``max_bytes`` counts the file and its journal.
+    The folder is made when something is stored for the first time; ``max_bytes`` counts the file and its log.
     ``info()`` is this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped by `enter`.
     Every method raises `OSError` where the disk refuses, and can be called again.
     """
@@ -93,7 +93,7 @@ class Store:
         self.path = path
         self._file = path / FILE_NAME
         self._max_bytes = max_bytes
-        self._file_bytes = max_bytes - _JOURNAL_BYTES
+        self._file_bytes = max_bytes - _LOG_BYTES
         self._session = f"{session_id:016x}"
         self._session_id = session_id
         self._info = info

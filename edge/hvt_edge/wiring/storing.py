@@ -27,8 +27,6 @@ def check_files(config: EdgeConfig) -> None:
         (config.record_base, "--record-base"),
     ):
         check_writable(path, name=name)
-    if config.store and config.pace != "lockstep":
-        check_folder(config.store_folder or default_folder(config.edge_id))
 
 
 def default_folder(edge_id: str) -> Path:
@@ -40,13 +38,16 @@ def default_folder(edge_id: str) -> Path:
         return Path.home() / ".local" / "state" / "hvt" / edge_id
     except RuntimeError:
         raise UserError(
-            "what is seen while the link is away has no place, because there is no home folder: give --store-folder, "
-            "or --store 0 to keep nothing"
+            "what is captured while the link is down has no place, because there is no home folder: give "
+            "--store-folder, or --store 0 to store nothing"
         ) from None
 
 
-def check_folder(path: Path) -> None:
+def check_store(config: EdgeConfig, *, live: bool) -> None:
     """Raise `UserError` now where a store could not be made in mid-flight; makes nothing."""
+    if not config.store_bytes(live=live):
+        return
+    path = config.store_folder or default_folder(config.edge_id)
     try:
         there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
         usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
@@ -55,7 +56,7 @@ def check_folder(path: Path) -> None:
     if not usable:
         raise UserError(
             f"--store-folder {path} cannot be used, because {there} is no folder that can be written: name another, "
-            "or give --store 0 to keep nothing"
+            "or give --store 0 to store nothing"
         )
 
 
@@ -74,12 +75,13 @@ def make_backlog(
     failures: Failures,
 ) -> BacklogStage | None:
     """Who stores what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
-    if not config.store or config.pace == "lockstep":
+    max_bytes = config.store_bytes(live=live)
+    if not max_bytes:
         return None
     path = config.store_folder or default_folder(config.edge_id)
     oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
     return BacklogStage(
-        Store(path, max_bytes=config.store, session_id=session_id, info=info, oldest_ns=oldest_ns),
+        Store(path, max_bytes=max_bytes, session_id=session_id, info=info, oldest_ns=oldest_ns),
         session_id=session_id,
         live=live,
         link=BacklogLink(

@@ -21,7 +21,7 @@ from hvt_common.protocol.messages import Info, RoiHeader, parse_backlog_still, p
 from hvt_edge.app import Edge
 from hvt_edge.backlog.disk import FILE_NAME, Store
 from hvt_edge.config import EdgeConfig, check
-from hvt_edge.wiring.storing import check_folder, default_folder
+from hvt_edge.wiring.storing import check_store, default_folder
 from media.clips import START_NS
 from rigs.kept import INFO, UNITS, S, add_stills, add_units, opened, packed_still, shifted
 
@@ -203,7 +203,7 @@ def test_the_store_is_bounded_and_the_least_useful_goes_first(tmp_path):
         assert folder.evicted_stills > 0
         assert kept == list(range(1499, 1499 - len(kept), -1)), "those with the least utility went"
         on_disk = sum(512 * one.stat().st_blocks for one in tmp_path.rglob("*") if one.is_file())
-        assert on_disk <= 2_000_000, "with the journal"
+        assert on_disk <= 2_000_000, "with its log"
 
 
 def test_a_still_loses_worth_with_age(tmp_path):
@@ -236,7 +236,7 @@ def test_a_folder_that_may_not_be_written_is_refused_at_the_start(tmp_path):
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
     with pytest.raises(UserError, match="cannot be used"):
-        check_folder(locked / "store")
+        check_store(EdgeConfig(source="demo", store_folder=locked / "store"), live=False)
 
 
 def test_a_folder_that_cannot_be_made_is_refused_at_the_start(tmp_path, monkeypatch):
@@ -244,9 +244,9 @@ def test_a_folder_that_cannot_be_made_is_refused_at_the_start(tmp_path, monkeypa
     (tmp_path / "file").write_text("in the way")
     for path in (tmp_path / "file", tmp_path / "file" / "store"):
         with pytest.raises(UserError, match=r"--store-folder .* cannot be used"):
-            check_folder(path)
-    check_folder(tmp_path / "deep" / "store")
-    check_folder(tmp_path)
+            check_store(EdgeConfig(source="demo", store_folder=path), live=False)
+    for path in (tmp_path / "deep" / "store", tmp_path):
+        check_store(EdgeConfig(source="demo", store_folder=path), live=False)
     assert [one.name for one in tmp_path.iterdir()] == ["file"], "nothing is made"
 
     def homeless() -> Path:
@@ -258,7 +258,8 @@ def test_a_folder_that_cannot_be_made_is_refused_at_the_start(tmp_path, monkeypa
     monkeypatch.setenv("XDG_STATE_HOME", "")
     monkeypatch.setattr(Path, "home", homeless)
     with pytest.raises(UserError, match="no home folder"):
-        default_folder("uav-1")
+        check_store(EdgeConfig(source="/dev/video0"), live=True)
+    check_store(EdgeConfig(source="demo"), live=False)
 
 
 def test_the_default_folder_is_where_programs_keep_their_state(monkeypatch, tmp_path):
