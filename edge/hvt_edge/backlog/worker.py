@@ -11,6 +11,7 @@ import logging
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from queue import SimpleQueue
 
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, pack_backlog_still
 from hvt_common.runtime.failures import Failures, RetryPause
@@ -268,63 +269,47 @@ class StoreWorker:
 class ChunkThread:
     """Sends one chunk at a time in a thread of its own: a link that is full for seconds must not hold up the disk.
 
-    `put` and `take` are for one thread; ``on_done()`` is called in its own after each chunk. ``send(chunk)`` returns
-    the line bytes, 0 where it was not sent; it may block.
+    `put`, `take` and `busy` are for one thread; ``on_done()`` is called in its own after each chunk. ``send(chunk)``
+    returns the line bytes, 0 where it was not sent; it may block.
     """
 
     def __init__(self, send: Callable[[Chunk], int], *, on_done: Callable[[], None]) -> None:
         self._send = send
         self._on_done = on_done
-        self._changed = threading.Condition()
-        self._chunk: Chunk | None = None
-        self._done: tuple[Chunk, int] | None = None
+        self._chunks: SimpleQueue[Chunk | None] = SimpleQueue()
+        self._done: SimpleQueue[tuple[Chunk, int | BaseException]] = SimpleQueue()
         self._closed = False
-        self._error: BaseException | None = None
+        self.busy = False
+        """Whether a chunk is being sent, or was sent and not taken note of."""
         self._thread = threading.Thread(target=self._run, name="hvt-backlog", daemon=True)
         self._thread.start()
 
-    @property
-    def busy(self) -> bool:
-        """Whether a chunk is being sent, or was sent and not taken note of."""
-        return self._chunk is not None or self._done is not None
-
     def put(self, chunk: Chunk) -> None:
         """Send this; only where it is not `busy`."""
-        assert not self.busy, "one at a time"
-        with self._changed:
-            self._chunk = chunk
-            self._changed.notify()
+        self.busy = True
+        self._chunks.put(chunk)
 
     def take(self) -> tuple[Chunk, int] | None:
         """The chunk sent last and its line bytes, once; None until then. Raises whatever ``send`` has raised."""
-        with self._changed:
-            if self._error is not None:
-                raise self._error
-            done, self._done = self._done, None
-        return done
+        if self._done.empty():
+            return None
+        chunk, sent = self._done.get()
+        self.busy = False
+        if isinstance(sent, BaseException):
+            raise sent
+        return chunk, sent
 
     def close(self, timeout_s: float) -> None:
         """Send no more; what is being sent has so long to go."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
+        self._closed = True
+        self._chunks.put(None)
         self._thread.join(timeout=timeout_s)
 
     def _run(self) -> None:
         lower_priority()
-        while (chunk := self._next()) is not None:
+        while (chunk := self._chunks.get()) is not None and not self._closed:
             try:
-                line_bytes = self._send(chunk)
+                self._done.put((chunk, self._send(chunk)))
             except BaseException as error:  # noqa: BLE001 - handed to the disk thread, which hands it on
-                with self._changed:
-                    self._error = error
-                self._on_done()
-                return
-            with self._changed:
-                self._done, self._chunk = (chunk, line_bytes), None
+                self._done.put((chunk, error))
             self._on_done()
-
-    def _next(self) -> Chunk | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._chunk is not None or self._closed)
-            return None if self._closed else self._chunk
