@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import StatusLine
@@ -18,12 +19,14 @@ from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating.point import LoopClock
+from hvt_edge.perception.analyzer import FailingDetector
+from hvt_edge.perception.guarded_detector import GuardedDetector
 from hvt_edge.source.closing import closing_on
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.status import StatusReporter
 from hvt_edge.summary import EdgeRun, summary
-from hvt_edge.wiring import Stages, build_stages, check_files, check_store
+from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store
 from hvt_edge.world import World
 
 __all__ = ["Edge"]
@@ -64,13 +67,22 @@ class Edge:
         """
         config, world = self._config, self._world
         check_files(config)
-        detector = world.open_detector(config)
+        check_codecs(config)
+        opened = world.open_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
-            world.warm_up(config, detector, source)
+            world.warm_up(config, opened, source)
+            detector: FailingDetector = opened
+            if not self._lockstep:  # whose result would be of something else
+                detector = GuardedDetector(
+                    opened,
+                    reopen=lambda: world.open_detector(config),
+                    failures=self._failures,
+                    clock=world.clock,
+                )
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = world.open_link(stack, config)
             stages = build_stages(
@@ -82,10 +94,10 @@ class Edge:
                 session_id=world.session_id,
                 ledger=self.ledger,
                 inbox=world.inbox,
+                failures=self._failures,
                 clock=world.clock,
                 loop_clock=self._loop_clock,
                 wait_until=self._wait_until,
-                failures=self._failures,
             )
             status = self._status_reporter(stages)
             link.listen(
@@ -105,6 +117,10 @@ class Edge:
             stages.operating.start(world.clock())
             try:
                 self._play(source, stages, link, status, line)
+            except UserError as error:
+                if not self._counts.encoded:
+                    raise
+                raise FlightError(str(error)) from error
             finally:
                 stages.stills.close()
                 self._say_goodbye(stages, link, status)
@@ -158,6 +174,7 @@ class Edge:
             live=source.live,
             counts=self._counts,
             stop=self._stop,
+            failures=self._failures,
             before_frame=stages.link_control.before_frame,
         )
 
@@ -177,6 +194,7 @@ class Edge:
             transmitter=stages.transmitter,
             stills=stages.stills,
             inbox=self._world.inbox,
+            failures=self._failures,
             clock=self._world.clock,
             loop_clock=self._loop_clock,
         )
@@ -223,4 +241,5 @@ class Edge:
             perception_ms=stages.stills.analyzer.mean_ms,
             unusable_messages=link.unusable,
             store=None if backlog is None else backlog.numbers,
+            failed=self._failures.parts,
         )

@@ -38,7 +38,7 @@ _STILLS_SHARE = 0.25
 _PAGE_BYTES = 4096
 _LOG_BYTES = 2 * 64 * _PAGE_BYTES
 """Of the write-ahead log: 64 pages are moved into the file, and the last write before that may be a large one."""
-_TRIAL_BYTES = 256 * 1024
+_TRIAL_BYTES = 64 * 1024
 # One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
 _OPEN = """
 PRAGMA locking_mode = EXCLUSIVE;

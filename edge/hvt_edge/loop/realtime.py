@@ -8,6 +8,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
@@ -17,9 +18,7 @@ from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.frame_decision import Action
 from hvt_edge.video.stage import BaseStage
 
-__all__ = ["RealtimePace", "SkippedUnits"]
-
-_MOST_SKIPPED_BYTES = 2 * 2**20
+__all__ = ["RealtimePace"]
 
 
 class RealtimePace:
@@ -40,6 +39,7 @@ class RealtimePace:
         live: bool,
         counts: FrameCounts,
         stop: threading.Event,
+        failures: Failures,
         before_frame: Callable[[int], None] = lambda _now_ns: None,
     ) -> None:
         self._base = base
@@ -50,13 +50,12 @@ class RealtimePace:
         self._counts = counts
         self._stop = stop
         self._before_frame = before_frame
-        self._skipped = SkippedUnits()
-        self._worker = StillWorker(stills, results=inbox.take, clock=clock)
+        self._worker = StillWorker(stills, results=inbox.take, failures=failures, clock=clock)
 
     def step(self, frame: Frame) -> None:
         """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it."""
         if not self._live and not realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop):
-            self._counts.dropped += 1
+            self._counts.dropped_cpu += 1
             return
         now_ns = self._clock()
         self._before_frame(now_ns)
@@ -67,7 +66,7 @@ class RealtimePace:
             self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
             self._base.send(unit, decision, now_ns=self._clock())
         elif decision.action is Action.HOLD:
-            self._counts.dropped += 1
+            self._counts.dropped_link += 1
         self._analyze(frame, unit)
 
     def __enter__(self) -> Self:
@@ -79,39 +78,4 @@ class RealtimePace:
         self._worker.close()
 
     def _analyze(self, frame: Frame, unit: AccessUnit | None) -> None:
-        if self._worker.full:
-            self._counts.unanalyzed += 1
-            self._skipped.add(unit)
-        else:
-            self._worker.offer(frame, *self._skipped.take(unit))
-
-
-class SkippedUnits:
-    """Access units of frames that were not analyzed: the decoder needs them before the next. Bounded in bytes."""
-
-    def __init__(self) -> None:
-        self._units: list[AccessUnit] = []
-        self._whole = True
-        """Whether all since the last keyframe are there."""
-
-    def add(self, unit: AccessUnit | None) -> None:
-        """This frame is not analyzed; ``unit`` is None where it was not coded."""
-        if unit is None:
-            return
-        if unit.keyframe:
-            self._units, self._whole = [], True
-        self._units.append(unit)
-        if not self._whole or sum(len(one.data) for one in self._units) > _MOST_SKIPPED_BYTES:
-            self._units, self._whole = [], False
-
-    def take(self, unit: AccessUnit | None) -> tuple[AccessUnit | None, tuple[AccessUnit, ...]]:
-        """Return what the decoder may be given now: this frame's unit, and those before it.
-
-        Where units are missing it is nothing until a keyframe: the frame is analyzed as one that was not coded.
-        """
-        if unit is None:
-            return None, ()
-        if unit.keyframe:
-            self._units, self._whole = [], True
-        skipped, self._units = tuple(self._units), []
-        return (unit, skipped) if self._whole else (None, ())
+        self._counts.unanalyzed += not self._worker.take(frame, unit)

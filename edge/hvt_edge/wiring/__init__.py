@@ -3,6 +3,7 @@
 from hvt_edge.wiring.link import make_link_settings
 from hvt_edge.wiring.perception import make_detector, warm_up_for
 from hvt_edge.wiring.stages import Stages, build_stages
+from hvt_edge.wiring.stills import check_codecs
 from hvt_edge.wiring.storing import check_files, check_store
 from hvt_edge.wiring.video import base_size
 
@@ -10,6 +11,7 @@ __all__ = [
     "Stages",
     "base_size",
     "build_stages",
+    "check_codecs",
     "check_files",
     "check_store",
     "make_detector",

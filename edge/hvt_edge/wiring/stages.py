@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 
-from hvt_common.inference.detect import Detector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failures
@@ -22,6 +21,7 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.point import LoopClock, Operating
+from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
 from hvt_edge.status import InfoReporter
@@ -29,7 +29,7 @@ from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.video.frame_skip import LimitedFrameSkip
-from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.wiring.link import make_budget, make_pacer, make_split
@@ -67,15 +67,15 @@ def build_stages(
     config: EdgeConfig,
     *,
     source: Source,
-    detector: Detector,
+    detector: FailingDetector,
     link: EdgeLink,
     session_id: int,
     ledger: Ledger,
     inbox: FeedbackInbox,
+    failures: Failures,
     clock: Callable[[], int],
     loop_clock: LoopClock,
     wait_until: Callable[[int], None],
-    failures: Failures,
 ) -> Stages:
     """Build every part once, each with all that it needs; files and threads end with ``stack``.
 
@@ -97,7 +97,9 @@ def build_stages(
     budget = make_budget(config, decimation=decimation)
     # Files come after all that may be refused: a failed start leaves nothing behind.
     write_truth_of(source, config.truth, fps=config.nominal_fps)
-    recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
+    local_copy = None
+    if config.record_base:
+        local_copy = stack.enter_context(LocalCopy(config.record_base, failures=failures, wait=lockstep))
     in_flight, outbox = BaseInFlight(), Outbox(reports=not lockstep)
     transmitter = Transmitter(
         link,
@@ -163,13 +165,15 @@ def build_stages(
         encoder,
         keyframes=keyframes,
         transmitter=transmitter,
-        recorder=recorder,
+        local_copy=local_copy,
         first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
         regions=make_regions(config, view.base_size),
         frame_skip=LimitedFrameSkip(make_frame_skip(config, decimation), reconfiguration.least_decimation),
         reconfigure=reconfiguration,
         admits=link_control.admits,
         backlog=backlog,
+        reopen=None if lockstep else reconfiguration.reopen,
+        failures=failures,
     )
     on_demand = make_on_demand(
         config, outbox=outbox, view=view, class_names=class_names, most_bytes=transmitter.most_still_bytes

@@ -241,7 +241,7 @@ class Rig:
             BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast")),
             keyframes=self.keyframes,
             transmitter=self.sender,
-            recorder=None,
+            local_copy=None,
             first_keyframe_bytes=5000,
             admits=self._asked_to_admit,
             backlog=self.backlog,
