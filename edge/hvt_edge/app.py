@@ -27,7 +27,7 @@ from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.status import StatusReporter
 from hvt_edge.summary import EdgeRun, summary
-from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files
+from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store
 from hvt_edge.world import World
 
 __all__ = ["Edge"]
@@ -74,6 +74,7 @@ class Edge:
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
+            check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
             background(lambda: world.warm_up(config, opened, source))
             detector: FailingDetector = opened

@@ -7,14 +7,21 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 
-__all__ = ["Failure", "Failures", "RetryPause"]
+__all__ = ["Failure", "Failures", "RetryPause", "reason_of"]
 
 _log = logging.getLogger(__name__)
 
 _STEADY_NS = 60 * SECOND_NS
 """What fails again after it worked for so long is news, and begins with a short pause."""
+
+
+def reason_of(error: BaseException) -> str:
+    """What an error says, in one line: a sentence as it is, anything else after its kind."""
+    text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    return " ".join(text.split())[:300]
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,8 +124,6 @@ class BaseStage:
             else:
                 self._transmitter.store_base(unit, now_ns=now_ns)
             return
-        if self._backlog is not None:
-            self._backlog.sent(unit)
         line_bytes = self._transmitter.base(unit, now_ns=now_ns)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes

@@ -139,6 +139,7 @@ def build_stages(
         keyframes=keyframes,
         clock=clock,
         info=info.info,
+        failures=failures,
     )
     if backlog is not None:
         stack.enter_context(backlog)

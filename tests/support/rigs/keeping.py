@@ -24,7 +24,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit, Frame, Still
-from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig, check
@@ -189,8 +189,9 @@ class Rig:
             in_flight=self.in_flight,
         )
         self.outcomes: list[tuple[str, str]] = []
+        self.failures = Failures(lambda: self.now_ns)
         self.backlog = BacklogStage(
-            lambda: Folder(folder, max_bytes=50_000_000, session_id=session_id, info=info),
+            Store(folder, max_bytes=50_000_000, session_id=session_id, info=info),
             session_id=session_id,
             live=live,
             link=link_of(self.sender, self.outbox),
@@ -198,6 +199,7 @@ class Rig:
             keyframes=self.keyframes,
             clock=lambda: self.now_ns,
             on_outcome=lambda *outcome: self.outcomes.append(outcome),
+            failures=self.failures,
         )
         config = check(EdgeConfig(source="demo", size=SIZE, budget=budget[0], preset="ultrafast"))
         self.stills = StillSender(
@@ -328,11 +330,11 @@ class Rig:
                 for unit in parse_backlog_units(folder.read(entry))
             ]
 
-    def stored_stills(self) -> dict[int, str]:
-        """Numbers and file names of the stills that another start of the edge finds."""
+    def stored_stills(self) -> dict[int, float]:
+        """Numbers and worth of the stills that another start of the edge finds."""
         self.close()
         with opened(self.path, session_id=8) as folder:
-            return {entry.number: entry.path.name for entry in folder.best_stills()}
+            return {entry.number: entry.rank for entry in folder.best_stills()}
 
 
 def link_of(sender: Transmitter, outbox: Outbox) -> BacklogLink:
