@@ -62,11 +62,11 @@ class Edge:
         """
         config, world = self._config, self._world
         check_files(config)
-        detector = world.open_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
             check_rate(config, source.view.base_size)
+            detector = world.open_detector(config)
             world.warm_up(config, detector, source)
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = world.open_link(stack, config)

@@ -2,9 +2,8 @@
 
 Frames are kept raw: a still has to be cut from what the camera gave, and another loss before the still codec would be
 paid in its bits. The bound is in bytes and in seconds. Where the bytes do not hold every frame of those
-seconds, frames are kept further apart, evenly, so that the ring reaches as far back as asked for: 256 MB hold
-every frame of 5 s at 1280x720 and 15 fps, every second one at 1920x1080, and one each 0.7 s at 3840x2160. The
-newest frame is always there.
+seconds, frames are kept further apart, evenly, so that the ring reaches as far back as asked for: 64 MB hold
+one frame each 0.25 s at 1280x720, one each 0.6 s at 1920x1080 and two at 3840x2160. The newest is always there.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ __all__ = ["FrameRing", "RingFrame", "RingSettings"]
 class RingSettings:
     """The bounds; with fewer bytes than a frame takes, nothing is kept."""
 
-    max_bytes: int = 256_000_000
+    max_bytes: int = 64_000_000
     max_age_ns: int = 5_000_000_000
 
 

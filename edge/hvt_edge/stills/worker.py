@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import queue
 import threading
-import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
@@ -13,24 +10,24 @@ from typing import Self
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.process import lower_priority
 from hvt_common.values import AccessUnit, Frame
+from hvt_edge.perception.frame_queue import FrameQueue
 from hvt_edge.stills.stage import StillStage
 
 __all__ = ["MAX_QUEUE_BYTES", "StillWorker"]
 
 _BEHIND_FRAMES = 3
 """With more frames queued than this, detection is put off; decoding never is."""
-_LEAST_FRAMES = 2
-MAX_QUEUE_BYTES = 160 * 2**20
-"""Of frames that are queued: 16 of 1280x720 and 1920x1080, 5 of 3840x2160."""
+MAX_QUEUE_BYTES = 40 * 2**20
+"""Of frames that are queued: 7 of 1280x720, 4 of 1920x1080, 2 of 3840x2160."""
 _RETRY_S = 0.025
 
 
 class StillWorker:
     """Runs a `StillStage` in a thread of its own.
 
-    The queue is bounded in frames and in bytes; where it is `full` the frame loop goes on without
-    analysis. Before each frame the thread takes ``results()``, what grounds have reported of stills. An error in it
-    ends the process: `full`, `offer` and `close` raise it.
+    The queue is bounded in frames and in bytes: the newest has a place, and the oldest goes unanalyzed. Before each
+    frame the thread takes ``results()``, what grounds have reported of stills. An error in it ends the process:
+    `offer` and `close` raise it.
     """
 
     def __init__(
@@ -46,11 +43,7 @@ class StillWorker:
         self._stage = stage
         self._results = results
         self._clock = clock
-        self._frames: queue.Queue[tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None] = queue.Queue(
-            length
-        )
-        self._most_frames = length
-        self._max_bytes = max_bytes
+        self._frames = FrameQueue(length=length, max_bytes=max_bytes)
         self._finish_s = finish_s
         self._error: BaseException | None = None
         self._given_up = threading.Event()
@@ -60,28 +53,17 @@ class StillWorker:
     @property
     def queued(self) -> int:
         """Frames that are not taken yet."""
-        return self._frames.qsize()
+        return len(self._frames)
 
-    @property
-    def full(self) -> bool:
-        """Whether the next `offer` would have to wait."""
-        self._raise_error()  # a dead thread leaves a full queue, and `offer` is not called any more
-        return self._frames.qsize() >= self._most_frames
-
-    def offer(self, frame: Frame, unit: AccessUnit | None, skipped: Sequence[AccessUnit] = ()) -> None:
-        """Hand over one frame, in order, with its access unit if it has one, and those skipped before it."""
+    def offer(self, frame: Frame, unit: AccessUnit | None) -> int:
+        """Hand over one frame, in order, with its access unit if it has one; return how many go unanalyzed for it."""
         self._raise_error()
-        # All frames of a source have one size, so a bound in bytes is a bound in frames.
-        fitting = self._max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
-        self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
-        self._frames.put((frame, unit, skipped))
+        return self._frames.put(frame, unit)
 
     def close(self) -> None:
         """Let the thread finish what it has, at most for ``finish_s``, then leave the rest; join it."""
-        until_s = time.monotonic() + self._finish_s
-        with contextlib.suppress(queue.Full):
-            self._frames.put(None, timeout=self._finish_s)
-        self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
+        self._frames.close()
+        self._thread.join(timeout=self._finish_s)
         self._given_up.set()
         self._thread.join(timeout=self._finish_s)
         self._raise_error()
@@ -98,7 +80,7 @@ class StillWorker:
         lower_priority()
         try:
             while (item := self._next()) is not None and not self._given_up.is_set():
-                behind = self._frames.qsize() >= _BEHIND_FRAMES
+                behind = len(self._frames) >= _BEHIND_FRAMES
                 self._stage.on_results(self._results())
                 analyzed = self._stage.analyze(*item, hurry=behind)
                 self._stage.send(analyzed, now_ns=self._clock())
@@ -110,12 +92,12 @@ class StillWorker:
 
         Right behind a base frame the link is busy: with few frames a second there would be no other moment.
         """
-        while True:
-            try:
-                return self._frames.get(timeout=_RETRY_S)
-            except queue.Empty:
-                if self._stage.any_pending:
-                    self._stage.send_pending(now_ns=self._clock())
+        while not self._frames.ended:
+            if (item := self._frames.get(timeout_s=_RETRY_S)) is not None:
+                return item
+            if self._stage.any_pending:
+                self._stage.send_pending(now_ns=self._clock())
+        return None
 
     def _raise_error(self) -> None:
         if self._error is not None:

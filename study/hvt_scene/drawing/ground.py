@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -76,12 +76,15 @@ class _Painter:
         high, wide = (round(metres / m_per_px) for metres in (WORLD_M[1], WORLD_M[0]))
         self.bgr = np.zeros((high, wide, 3), np.uint8)
         self._shade = np.zeros((high, wide), np.uint8)
-        fine = rng.standard_normal((high, wide), np.float32)
-        self._fine = 0.6 * fine + 0.8 * _noise(rng, (high, wide), cell_px=0.16 / m_per_px)
-        self._middle = _noise(rng, (high, wide), cell_px=0.9 / m_per_px)
-        self._coarse = 0.7 * _noise(rng, (high, wide), cell_px=5 / m_per_px) + 0.7 * _noise(
-            rng, (high, wide), cell_px=19 / m_per_px
-        )
+        # Each of these pictures of the world takes 43 MB: none is made that is not needed.
+        self._fine = rng.standard_normal((high, wide), np.float32)
+        self._fine *= np.float32(0.6)
+        _add_noise(self._fine, rng, cell_px=0.16 / m_per_px, gain=0.8)
+        self._middle = np.zeros((high, wide), np.float32)
+        _add_noise(self._middle, rng, cell_px=0.9 / m_per_px, gain=1.0)
+        self._coarse = np.zeros((high, wide), np.float32)
+        for cell_m in (5, 19):
+            _add_noise(self._coarse, rng, cell_px=cell_m / m_per_px, gain=0.7)
 
     def surface(self, kind: str, rect: Rect) -> None:
         """Cover a rectangle with a material."""
@@ -104,20 +107,17 @@ class _Painter:
             "tiles": ((70.0, 86.0, 150.0), 0.07, 0.05, 0.04),
         }
         colour, fine, middle, coarse = materials[kind]
-        region = self._slice(rect)
         gain = self._appearance.texture_gain
-        noise = (
-            fine * self._fine[region] + middle * self._middle[region] + coarse * self._coarse[region]
-        ) * gain + 1
-        tint = np.array(colour, np.float32)
-        if kind in {"grass", "island"}:  # dry patches lean towards the soil
-            dry = np.clip(0.20 + 0.22 * self._coarse[region] + 0.1 * self._middle[region], 0, 0.75)[..., None]
-            picture = (tint * (1 - dry) + np.array(self._appearance.soil_bgr, np.float32) * dry) * noise[
-                ..., None
-            ]
-        else:
-            picture = tint * noise[..., None]
-        self.bgr[region] = np.clip(picture, 0, 255)
+        tint, soil = (np.array(one, np.float32) for one in (colour, appearance.soil_bgr))
+        for region in _strips(*self._slice(rect)):
+            noise = (
+                fine * self._fine[region] + middle * self._middle[region] + coarse * self._coarse[region]
+            ) * gain + 1
+            picture = tint
+            if kind in {"grass", "island"}:  # dry patches lean towards the soil
+                dry = np.clip(0.20 + 0.22 * self._coarse[region] + 0.1 * self._middle[region], 0, 0.75)
+                picture = tint * (1 - dry[..., None]) + soil * dry[..., None]
+            self.bgr[region] = np.clip(picture * noise[..., None], 0, 255)
         if kind in {"lot", "court"}:
             self.frame(rect, wide_m=0.25, colour=_gain(appearance.paving_bgr, 0.98))
         if kind == "court":
@@ -179,11 +179,12 @@ class _Painter:
             radius = round(0.92 * tree.r / self._m_per_px * 16)
             cv2.circle(self._shade, centre.tolist(), radius, 225, -1, cv2.LINE_AA, _SHIFT)
         self._shade = np.asarray(cv2.blur(self._shade, (5, 5)), np.uint8)
-        dark = 1 - self._appearance.shadow_strength * (self._shade.astype(np.float32) / 255)
-        # Skylight is blue, so a shadow keeps a little more of it.
-        for channel, share in enumerate((1.10, 1.03, 1.0)):
-            plane = self.bgr[..., channel] * np.minimum(dark * np.where(dark < 1, share, 1), 1)
-            self.bgr[..., channel] = plane
+        for region in _strips(*(slice(0, length) for length in self._shade.shape)):
+            dark = 1 - self._appearance.shadow_strength * (self._shade[region].astype(np.float32) / 255)
+            # Skylight is blue, so a shadow keeps a little more of it.
+            for channel, share in enumerate((1.10, 1.03, 1.0)):
+                plane = self.bgr[region][..., channel]
+                plane[:] = plane * np.minimum(dark * np.where(dark < 1, share, 1), 1)
 
     def canopy(self, tree: Tree, picture: npt.NDArray[np.uint8]) -> None:
         """Lay a tree's crown over the ground."""
@@ -203,6 +204,7 @@ class _Painter:
         size = (round(WORLD_M[0] / step), round(WORLD_M[1] / step))
         shade = cv2.resize(self._shade, size, interpolation=cv2.INTER_AREA)
         light = (1 - self._appearance.shadow_strength * shade / 255.0).astype(np.float32)
+        del self._fine, self._middle, self._coarse
         bgra = np.asarray(cv2.cvtColor(self.bgr, cv2.COLOR_BGR2BGRA), np.uint8)
         return Ground(bgra, self._m_per_px, light, step)
 
@@ -342,7 +344,15 @@ def _mix(first: Bgr, second: Bgr) -> Bgr:
     return ((first[0] + second[0]) / 2, (first[1] + second[1]) / 2, (first[2] + second[2]) / 2)
 
 
-def _noise(rng: _Rng, shape: tuple[int, int], *, cell_px: float) -> npt.NDArray[np.float32]:
-    """Smooth noise of unit strength with features about ``cell_px`` wide."""
-    small = rng.standard_normal((int(shape[0] / cell_px) + 3, int(shape[1] / cell_px) + 3), np.float32)
-    return np.asarray(cv2.resize(small, shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+def _strips(rows: slice, columns: slice, *, height: int = 128) -> Iterator[tuple[slice, slice]]:
+    """The region in strips, for what needs many numbers a pixel."""
+    for top in range(rows.start, rows.stop, height):
+        yield slice(top, min(top + height, rows.stop)), columns
+
+
+def _add_noise(field: npt.NDArray[np.float32], rng: _Rng, *, cell_px: float, gain: float) -> None:
+    """Smooth noise of that strength with features about ``cell_px`` wide."""
+    small = rng.standard_normal([int(side / cell_px) + 3 for side in field.shape], np.float32)
+    noise = np.asarray(cv2.resize(small, field.shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+    noise *= np.float32(gain)
+    field += noise

@@ -301,7 +301,7 @@ def test_the_worker_takes_all_frames_in_order_and_finishes():
     assert [one.frame_index for one in rig.out.stills] == [0, 15]
 
 
-def test_an_error_in_the_worker_is_raised_even_when_its_queue_is_full():
+def test_an_error_in_the_worker_is_raised_with_the_next_frame():
     """The edge would drop every further frame in silence and look alive."""
     offered = threading.Event()
 
@@ -316,13 +316,14 @@ def test_an_error_in_the_worker_is_raised_even_when_its_queue_is_full():
         worker.offer(frame, unit)
     offered.set()
 
-    def stays_full() -> None:
+    def is_offered_frames() -> None:
         until_s = time.monotonic() + 30
-        while worker.full and time.monotonic() < until_s:
+        while time.monotonic() < until_s:
+            worker.offer(FRAMES[3], None)
             time.sleep(0.001)
 
     with pytest.raises(RuntimeError, match="model is gone"):
-        stays_full()
+        is_offered_frames()
     worker.close()
 
 
