@@ -17,8 +17,8 @@ __all__ = ["MAX_QUEUE_BYTES", "StillWorker"]
 
 _BEHIND_FRAMES = 3
 """With more frames queued than this, detection is put off; decoding never is."""
-MAX_QUEUE_BYTES = 40 * 2**20
-"""Of frames that are queued: 7 of 1280x720, 4 of 1920x1080, 2 of 3840x2160."""
+MAX_QUEUE_BYTES = 32 * 2**20
+"""Of frames that are queued: 6 of 1280x720, 3 of 1920x1080, 2 of 3840x2160."""
 _RETRY_S = 0.025
 
 

@@ -26,13 +26,13 @@ class Ground:
     """The painted ground.
 
     Attributes:
-        bgra: (H, W, 4) uint8, the world from its north-west corner; the fourth channel means nothing.
+        bgr: (H, W, 3) uint8, the world from its north-west corner.
         m_per_px: its resolution.
         light: (h, w) float32 at ``light_m_per_px``: 1 in the sun, lower in the shade of roofs and trees.
         light_m_per_px: resolution of ``light``.
     """
 
-    bgra: npt.NDArray[np.uint8]
+    bgr: npt.NDArray[np.uint8]
     m_per_px: float
     light: npt.NDArray[np.float32]
     light_m_per_px: float
@@ -76,15 +76,16 @@ class _Painter:
         high, wide = (round(metres / m_per_px) for metres in (WORLD_M[1], WORLD_M[0]))
         self.bgr = np.zeros((high, wide, 3), np.uint8)
         self._shade = np.zeros((high, wide), np.uint8)
-        # Each of these pictures of the world takes 43 MB: none is made that is not needed.
+        # Each of these pictures of the world takes 43 MB: never more than three at once.
         self._fine = rng.standard_normal((high, wide), np.float32)
+        fine, middle, coarse, broad = (
+            _noise(rng, (high, wide), cell_px=cell_m / m_per_px) for cell_m in (0.16, 0.9, 5, 19)
+        )
         self._fine *= np.float32(0.6)
-        _add_noise(self._fine, rng, cell_px=0.16 / m_per_px, gain=0.8)
-        self._middle = np.zeros((high, wide), np.float32)
-        _add_noise(self._middle, rng, cell_px=0.9 / m_per_px, gain=1.0)
-        self._coarse = np.zeros((high, wide), np.float32)
-        for cell_m in (5, 19):
-            _add_noise(self._coarse, rng, cell_px=cell_m / m_per_px, gain=0.7)
+        self._fine += _enlarged(fine, (high, wide), gain=0.8)
+        self._coarse = _enlarged(coarse, (high, wide), gain=0.7)
+        self._coarse += _enlarged(broad, (high, wide), gain=0.7)
+        self._middle = _enlarged(middle, (high, wide), gain=1.0)
 
     def surface(self, kind: str, rect: Rect) -> None:
         """Cover a rectangle with a material."""
@@ -204,9 +205,7 @@ class _Painter:
         size = (round(WORLD_M[0] / step), round(WORLD_M[1] / step))
         shade = cv2.resize(self._shade, size, interpolation=cv2.INTER_AREA)
         light = (1 - self._appearance.shadow_strength * shade / 255.0).astype(np.float32)
-        del self._fine, self._middle, self._coarse
-        bgra = np.asarray(cv2.cvtColor(self.bgr, cv2.COLOR_BGR2BGRA), np.uint8)
-        return Ground(bgra, self._m_per_px, light, step)
+        return Ground(self.bgr, self._m_per_px, light, step)
 
     def _slice(self, rect: Rect) -> tuple[slice, slice]:
         x0, y0, x1, y1 = (max(0, round(v / self._m_per_px)) for v in (rect.x0, rect.y0, rect.x1, rect.y1))
@@ -344,15 +343,21 @@ def _mix(first: Bgr, second: Bgr) -> Bgr:
     return ((first[0] + second[0]) / 2, (first[1] + second[1]) / 2, (first[2] + second[2]) / 2)
 
 
-def _strips(rows: slice, columns: slice, *, height: int = 128) -> Iterator[tuple[slice, slice]]:
+def _strips(rows: slice, columns: slice, *, height: int = 32) -> Iterator[tuple[slice, slice]]:
     """The region in strips, for what needs many numbers a pixel."""
     for top in range(rows.start, rows.stop, height):
         yield slice(top, min(top + height, rows.stop)), columns
 
 
-def _add_noise(field: npt.NDArray[np.float32], rng: _Rng, *, cell_px: float, gain: float) -> None:
-    """Smooth noise of that strength with features about ``cell_px`` wide."""
-    small = rng.standard_normal([int(side / cell_px) + 3 for side in field.shape], np.float32)
-    noise = np.asarray(cv2.resize(small, field.shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
-    noise *= np.float32(gain)
-    field += noise
+def _noise(rng: _Rng, shape: tuple[int, int], *, cell_px: float) -> npt.NDArray[np.float32]:
+    """Noise of unit strength, one number for each ``cell_px``."""
+    return rng.standard_normal((int(shape[0] / cell_px) + 3, int(shape[1] / cell_px) + 3), np.float32)
+
+
+def _enlarged(
+    noise: npt.NDArray[np.float32], shape: tuple[int, int], *, gain: float
+) -> npt.NDArray[np.float32]:
+    """The noise, smooth, over the whole world."""
+    large = np.asarray(cv2.resize(noise, shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+    large *= np.float32(gain)
+    return large
