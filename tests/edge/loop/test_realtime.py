@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import Failures
+from hvt_common.values import AccessUnit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
@@ -16,6 +19,7 @@ from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
@@ -74,13 +78,13 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
             lockstep=False,
             wait_until=lambda _at_ns: None,
         ),
-        recorder=None,
+        local_copy=None,
         first_keyframe_bytes=5000,
     )
     frames = list(framed(smooth_pictures(60, size=SIZE)))
     with RealtimePace(
         base, stills, inbox=FeedbackInbox(), clock=SteadyClock(), fps=15, live=True, counts=counts,
-        stop=threading.Event(),
+        stop=threading.Event(), failures=Failures(time.time_ns),
     ) as pace:  # fmt: skip
         for frame in frames[:50]:  # more than three seconds
             pace.step(frame)
@@ -91,3 +95,26 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
             pace.step(frame)
     assert out.units == 60
     assert stills.decoded == max(stills.frames) + 1, "no unit is missing before any frame that was analyzed"
+
+
+def unit(index: int, *, keyframe: bool = False, size: int = 1_000) -> AccessUnit:
+    """An access unit."""
+    return AccessUnit(index, index, bytes(size), keyframe)
+
+
+def test_what_was_skipped_is_bounded_and_decoding_goes_on_at_a_keyframe():
+    """A link that is full for minutes would fill the memory; or the decoder would be given what it cannot use."""
+    skipped = SkippedUnits()
+    skipped.add(unit(1))
+    skipped.add(None)
+    assert skipped.take(None) == (None, ()), "a frame that is not coded needs nothing yet"
+    assert skipped.take(unit(3)) == (unit(3), (unit(1),))
+    assert skipped.take(unit(4)) == (unit(4), ())
+    for index in range(5, 10):
+        skipped.add(unit(index, size=2**19))
+    assert skipped.take(unit(10)) == (None, ())
+    skipped.add(unit(11, keyframe=True))
+    skipped.add(unit(12))
+    assert skipped.take(unit(13)) == (unit(13), (unit(11, keyframe=True), unit(12)))
+    skipped.add(unit(14))
+    assert skipped.take(unit(15, keyframe=True)) == (unit(15, keyframe=True), ())
