@@ -69,13 +69,13 @@ class Edge:
         config, world = self._config, self._world
         check_files(config)
         check_codecs(config)
-        background = (lambda call: call()) if self._lockstep else with_lower_priority
-        opened = background(lambda: world.open_detector(config))
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
+            background = (lambda call: call()) if self._lockstep else with_lower_priority
+            opened = background(lambda: world.open_detector(config))
             background(lambda: world.warm_up(config, opened, source))
             detector: FailingDetector = opened
             if not self._lockstep:  # whose result would be of something else
