@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from typing import Any
 
 from hvt_common.errors import FlightError, UserError
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
-from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
@@ -56,7 +56,7 @@ class Edge:
         self._lockstep = config.pace == "lockstep"
         self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep)
         self._counts = FrameCounts()
-        self._failures = Failures(self._world.clock)
+        self._failures = self._world.failures
         self.ledger = Ledger(window_ns=config.window_ns)
         """Every byte that left."""
 
@@ -130,17 +130,19 @@ class Edge:
         self, source: Source, stages: Stages, link: EdgeLink, status: StatusReporter, line: StatusLine
     ) -> None:
         """Take one frame after the other; once a second report."""
-        next_status_ns = 0
+        next_status_ns = restarts = 0
         with ExitStack() as stack:
             if source.live:
                 stack.enter_context(closing_on(self._stop, source))
             pace = self._make_pace(source, stages, link)
             stack.enter_context(pace)
-            for frame in source.frames(start_ns=stages.operating.now.started_ns):
+            for frame in source.steps(start_ns=stages.operating.now.started_ns):
                 if self._stop.is_set():
                     break
-                self._counts.captured += 1
-                pace.step(frame)
+                if source.restarts != restarts:  # another picture than the last
+                    restarts = source.restarts
+                    stages.keyframes.require(self._loop_clock())
+                pace.step(frame, missed=source.missed)
                 now_ns = self._loop_clock()
                 if now_ns >= next_status_ns:
                     next_status_ns = now_ns + SECOND_NS
@@ -201,9 +203,11 @@ class Edge:
 
     @staticmethod
     def _link_text(stages: Stages, link: EdgeLink) -> str:
-        ground = (
-            "a ground listens" if link.has_ground() else "no link" if link.trouble else "no ground listens"
-        )
+        ground = "no link" if link.trouble else "no ground listens"
+        if link.has_ground():
+            ground = "a ground listens"
+        elif link.has_subscriber(Channel.BASE):
+            ground = "somebody watches who reports nothing"
         return f"{ground}  {'' if stages.backlog is None else stages.backlog.text()}".rstrip()
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink, status: StatusReporter) -> None:

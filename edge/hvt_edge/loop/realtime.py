@@ -9,7 +9,8 @@ from types import TracebackType
 from typing import Self
 
 from hvt_common.runtime.failures import Failures
-from hvt_common.values import AccessUnit, Frame
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.source.pacing import realtime_admits
@@ -19,6 +20,9 @@ from hvt_edge.video.frame_decision import Action
 from hvt_edge.video.stage import BaseStage
 
 __all__ = ["RealtimePace"]
+
+_BEHIND_SHARE = 0.5
+"""Of the time between two frames: later than that the loop is late."""
 
 
 class RealtimePace:
@@ -50,24 +54,44 @@ class RealtimePace:
         self._counts = counts
         self._stop = stop
         self._before_frame = before_frame
+        self._missed: int | None = None
+        self._link_bound = False
+        """Sending the last frame took longer than coding it."""
         self._worker = StillWorker(stills, results=inbox.take, failures=failures, clock=clock)
 
-    def step(self, frame: Frame) -> None:
-        """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it."""
-        if not self._live and not realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop):
-            self._counts.dropped_cpu += 1
+    def step(self, frame: Frame | None, *, missed: int = 0) -> None:
+        """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it.
+
+        ``missed`` counts frames of a live source that came before this loop took them; None: there is none now.
+        """
+        if frame is None:
+            self._before_frame(self._clock())
             return
+        if self._missed is None:  # before the first frame there was no loop
+            self._missed = missed
+        newly_missed, self._missed = missed - self._missed, missed
+        self._counts.captured += 1 + newly_missed
+        self._drop(newly_missed)
+        behind = newly_missed > 0
+        if not self._live:
+            if not realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop):
+                self._drop(1)
+                return
+            behind = self._clock() - frame.capture_ns > _BEHIND_SHARE * SECOND_NS / self._fps
         now_ns = self._clock()
         self._before_frame(now_ns)
         began_ns = time.perf_counter_ns()
         decision = self._base.decide(frame.index, now_ns=now_ns)
         unit = self._base.encode(frame, decision, now_ns=now_ns, tracks=self._stills.latest_tracks)
+        encoded_ns = time.perf_counter_ns()
         if unit is not None:
-            self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
+            self._counts.note(frame.index, encode_ns=encoded_ns - began_ns)
             self._base.send(unit, decision, now_ns=self._clock())
         elif decision.action is Action.HOLD:
             self._counts.dropped_link += 1
-        self._analyze(frame, unit)
+        self._link_bound = time.perf_counter_ns() - encoded_ns > encoded_ns - began_ns
+        # Video goes first: perception gets no frame while the loop is late.
+        self._counts.unanalyzed += not self._worker.take(frame, unit, room=not behind)
 
     def __enter__(self) -> Self:
         return self
@@ -77,5 +101,9 @@ class RealtimePace:
     ) -> None:
         self._worker.close()
 
-    def _analyze(self, frame: Frame, unit: AccessUnit | None) -> None:
-        self._counts.unanalyzed += not self._worker.take(frame, unit)
+    def _drop(self, count: int) -> None:
+        """So many frames came while the one before was coded or sent, whichever took longer."""
+        if self._link_bound:
+            self._counts.dropped_link += count
+        else:
+            self._counts.dropped_cpu += count

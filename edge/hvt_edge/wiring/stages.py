@@ -149,6 +149,7 @@ def build_stages(
     stack.callback(lambda: still_sender.close(clock()))
     link_control = LinkControl(
         has_ground=link.has_ground,
+        has_subscriber=partial(link.has_subscriber, Channel.BASE),
         session_id=session_id,
         transmitter=transmitter,
         keyframes=keyframes,
@@ -160,6 +161,7 @@ def build_stages(
         outbox=outbox,
         stills=still_sender,
         backlog=backlog,
+        failures=failures,
     )
     base = BaseStage(
         encoder,

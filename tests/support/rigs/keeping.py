@@ -169,6 +169,7 @@ class Rig:
         session_id: int = 7,
         budget: tuple[int, int] = (800_000, 400_000),
         maker: StillMaker | None = None,
+        inbox: FeedbackInbox | None = None,
     ) -> None:
         self.path, self.out, self.now_ns = folder, Out(), START_NS
         self.linked = True
@@ -211,12 +212,17 @@ class Rig:
             method=config.method,
             decimation=1,
         )
+        self.failures = Failures(lambda: self.now_ns)
+        self.watched = False
+        """Somebody subscribes to the video who is no ground."""
         self.link_control = LinkControl(
             has_ground=self._has_ground,
+            has_subscriber=lambda: self.watched,
+            failures=self.failures,
             session_id=session_id,
             transmitter=self.sender,
             keyframes=self.keyframes,
-            inbox=FeedbackInbox(),
+            inbox=inbox or FeedbackInbox(),
             reconfiguration=EncoderReconfiguration(
                 self.operating,
                 reconfiguration_settings(config, SIZE),
