@@ -44,6 +44,7 @@ _STILLS_SHARE = 0.25
 _PAGE_BYTES = 4096
 _LOG_BYTES = 2 * 64 * _PAGE_BYTES
 """Of the write-ahead log: 64 pages are moved into the file, and the last write before that may be a large one."""
+_REMOVED = "removed, with all that was stored"
 _TRIAL_BYTES = 64 * 1024
 # One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
 _OPEN = """
@@ -335,7 +336,7 @@ class Store:
         """With this session's facts in it."""
         if self._db is not None and not self._file.exists():
             self._lose()
-            raise FileNotFoundError(errno.ENOENT, "removed, with all that was stored", str(self._file))
+            raise FileNotFoundError(errno.ENOENT, _REMOVED, str(self._file))
         db = self._ready()
         if self.info_of(self._session_id) is None:
             self._add(BacklogKind.INFO, 0, 0, 0.0, self._info())
@@ -395,10 +396,11 @@ class Store:
                     str(self.path),
                 ) from None
             self._lose()
+            why = str(error) if self._file.exists() else _REMOVED
             if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
                 self._file.replace(self._file.with_suffix(".damaged"))
                 self._note_damaged(f"{self._file} is damaged and is put aside as .damaged")
-            raise OSError(errno.EIO, str(error), str(self.path)) from None
+            raise OSError(errno.EIO, why, str(self._file)) from None
 
     def _note_damaged(self, what: str) -> None:
         self.damaged += 1
