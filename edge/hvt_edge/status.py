@@ -6,7 +6,16 @@ from collections.abc import Callable
 
 from hvt_common import __version__
 from hvt_common.protocol.ledger import Ledger
-from hvt_common.protocol.messages import Health, Info, Status, fitted_class_names
+from hvt_common.protocol.messages import (
+    MOST_FAILED_PARTS,
+    FailedPart,
+    Health,
+    Info,
+    Status,
+    fitted_class_names,
+    fitted_text,
+)
+from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
@@ -20,6 +29,7 @@ from hvt_edge.stills.stage import StillStage
 __all__ = ["InfoReporter", "StatusReporter"]
 
 _MILLION = 1_000_000
+_PART_BYTES, _REASON_BYTES = 24, 160
 
 
 class InfoReporter:
@@ -84,12 +94,14 @@ class StatusReporter:
         transmitter: Transmitter,
         stills: StillStage,
         inbox: FeedbackInbox,
+        failures: Failures,
         clock: Callable[[], int],
         loop_clock: LoopClock,
     ) -> None:
         self._config = config
         self._session_id = session_id
         self._operating = operating
+        self._failures = failures
         self._ledger = ledger
         self._counts = counts
         self._keyframes = keyframes
@@ -102,19 +114,26 @@ class StatusReporter:
 
     def send(self, state: str) -> None:
         """Send the report, made for the moment at which it may go."""
+        self._counts.measure_cpu(perception_ns=self._stills.analyzer.spent_ns)
         self._transmitter.status(lambda at_ns: self._status(state, at_ns), now_ns=self._loop_clock())
         self._sequence += 1
 
     def line(self, link: str) -> str:
         """The status line."""
-        config, now, ledger = self._config, self._operating.now, self._ledger
+        config, now, ledger, counts = self._config, self._operating.now, self._ledger, self._counts
         rate_bps = ledger.window_bytes(None, self._loop_clock()) * 8 * SECOND_NS / ledger.window_ns
-        sent = sum(ledger.outcomes("sent").values())
-        return (
-            f"{config.edge_id} {self._counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "
-            f"{bitrate_text(now.total_bps)}  {now.method}  stills {sent}, {self._stills.pending} pending  "
-            f"tracks {self._stills.analyzer.tracks}  {link}"
-        )
+        parts = [
+            f"{config.edge_id} {counts.duration_s(config.nominal_fps):6.1f} s",
+            f"{bitrate_text(rate_bps)} of {bitrate_text(now.total_bps)}",
+            now.method,
+            f"stills {sum(ledger.outcomes('sent').values())}, {self._stills.pending} pending",
+            f"tracks {self._stills.analyzer.tracks}",
+            link,
+        ]
+        if counts.dropped_cpu:
+            parts.append(f"{counts.dropped_cpu} frames dropped: slow machine")
+        parts += [f"{one.part.upper()} FAILED" for one in self._failures.parts if not one.working]
+        return "  ".join(parts)
 
     def _status(self, state: str, at_ns: int) -> Status:
         """Totals, outcomes and health at ``at_ns``.
@@ -159,5 +178,19 @@ class StatusReporter:
                 encode_ms=counts.encode_ms if measured else 0.0,
                 detect_ms=stills.analyzer.mean_ms if measured else 0.0,
                 feedback_age_ms=age_ms if measured else -1,
+                frames_dropped_cpu=counts.dropped_cpu,
+                frames_unanalyzed=counts.unanalyzed,
+                cores_needed=counts.cpu.now.needed if measured else 0.0,
+                cores_free=counts.cpu.now.free if measured else 0.0,
+            ),
+            failed=tuple(
+                FailedPart(
+                    part=one.part[:_PART_BYTES],
+                    reason=fitted_text(one.reason, _REASON_BYTES),
+                    failures=one.count,
+                    failed_ns=one.failed_ns,
+                    working=one.working,
+                )
+                for one in self._failures.parts[:MOST_FAILED_PARTS]
             ),
         )

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from hvt_common.units import bitrate_text
+from hvt_common.runtime.failures import Failure, Failures
+from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 
-__all__ = ["status_text", "summary", "table"]
+__all__ = ["completed", "status_text", "summary", "table"]
 
 
-def status_text(edges: Iterable[tuple[str, EdgeSessions]]) -> str:
-    """The status line: what comes of each edge now; empty without one."""
+def status_text(edges: Iterable[tuple[str, EdgeSessions]], *, failures: Failures | None = None) -> str:
+    """The status line: what comes of each edge now, and which models fail; empty without any."""
     parts = []
     for edge, sessions in edges:
         session = sessions.session
         if session is None:
-            parts.append(f"{edge}: {'ended' if sessions.done else 'waiting for a keyframe'}")
+            state = "ended" if sessions.ended else "waiting for a keyframe"
+            parts.append("  ".join([f"{edge}: {state}", *failed_texts(sessions.failures)]))
             continue
         latency_ms = session.overlay_latency.percentile(50)
         age = "" if latency_ms is None or session.lockstep else f"  {latency_ms:.0f} ms"
@@ -28,18 +31,13 @@ def status_text(edges: Iterable[tuple[str, EdgeSessions]]) -> str:
             f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
             f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}  tracks "
             f"{session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
+            + "".join(f"  {text}" for text in failed_texts(sessions.failures))
         )
-    return " | ".join(parts)
+    return " | ".join(parts + failed_texts(failures))
 
 
-def summary(
-    session: GroundSession, *, unusable: int, backlog_recordings: Sequence[Path] = ()
-) -> dict[str, Any]:
-    """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do.
-
-    ``unusable`` counts messages of the edge that were skipped, over all its sessions; ``backlog_recordings`` are of
-    former sessions, of which a backlog came.
-    """
+def summary(session: GroundSession) -> dict[str, Any]:
+    """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do."""
     info, pipeline, counters = session.info, session.pipeline, session.counters
     account = session.ledger.summary(session.duration_s)
     worst = account.worst_window_bps
@@ -86,7 +84,6 @@ def summary(
             "frames": backlog.frames,
             "frames_left_out": backlog.left_out,
             "video_s": round(backlog.video_s, 3),
-            "recordings": [str(path) for path in backlog_recordings],
         },
         "tracks": pipeline.tracks,
         "tracks_refined": pipeline.refined,
@@ -96,12 +93,36 @@ def summary(
         "lost": counters.lost,
         "corrupt": counters.corrupt,
         "duplicates": counters.duplicates + counters.replayed,
-        "unusable_messages": unusable,
         "keyframe_requests": counters.keyframe_requests,
         "latency_ms": session.overlay_latency.as_dict(),
         "receive_latency_ms": session.receive_latency.as_dict(),
         "recording": str(session.recording) if session.recording is not None else None,
         "recording_bytes": _size_bytes(session.recording),
+        "failure": session.failure,
+    }
+
+
+def completed(
+    content: dict[str, Any], sessions: EdgeSessions, *, failures: Failures | None = None
+) -> dict[str, Any]:
+    """The summary of a session, with what counts over all sessions of its edge, and the ground's own failures.
+
+    Messages that were skipped, recordings of former sessions, of which a backlog came, and parts that failed.
+    """
+    failed = [*sessions.failures.parts, *(() if failures is None else failures.parts)]
+    return content | {
+        "unusable_messages": sessions.unusable,
+        "backlog": content["backlog"] | {"recordings": [str(path) for path in sessions.backlog.paths]},
+        "failed": [
+            {
+                "part": one.part,
+                "reason": one.reason,
+                "count": one.count,
+                "last": _utc(one),
+                "working": one.working,
+            }
+            for one in failed
+        ],
     }
 
 
@@ -139,7 +160,12 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             ("outages", f"{backlog['stills']} stills and {backlog['video_s']:.1f} s of video came afterwards")
         )
-    rows += [("former session", path) for path in backlog["recordings"]]
+    if content["failure"]:
+        rows.append(("session failed", content["failure"]))
+    for one in content.get("failed", ()):
+        times = "" if one["count"] == 1 else f"{one['count']} times, last "
+        rows.append(("failed", f"{one['part']}, {times}at {one['last']}: {one['reason']}"))
+    rows += [("former session", path) for path in backlog.get("recordings", ())]
     if latency["p50"] is not None:
         since = "receiving" if content["pace"] == "lockstep" else "capture"
         spread = f"p50 {latency['p50']:.0f} ms, p95 {latency['p95']:.0f}, max {latency['max']:.0f}"
@@ -147,6 +173,16 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     if content["recording"]:
         rows.append(("recording", f"{content['recording']}, {content['recording_bytes'] / 1e6:.2f} MB"))
     return rows
+
+
+def failed_texts(failures: Failures | None) -> list[str]:
+    """What does not work now, since when."""
+    parts = () if failures is None else failures.parts
+    return [f"{one.part} FAILED at {_utc(one)[11:19]} UTC" for one in parts if not one.working]
+
+
+def _utc(failure: Failure) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(failure.failed_ns // SECOND_NS))
 
 
 def _size_bytes(path: Path | None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from dataclasses import dataclass
 
@@ -26,13 +27,15 @@ class ClockOffset:
     ``t0``: request sent (local), ``t1``: received and ``t2``: answered (remote), ``t3``: answer received (local).
     The offset is ``((t1 - t0) + (t2 - t3)) / 2``, the round trip ``(t3 - t0) - (t2 - t1)`` (RFC 5905, section 8).
     The true offset lies within half a round trip of it. Two exchanges that exclude each other mean that a clock was
-    set: those before the step are dropped.
+    set: those before the step are dropped. Safe for threads.
     """
 
     def __init__(self, *, window_ns: int = 60_000_000_000, max_samples: int = 64) -> None:
         """Samples older than ``window_ns`` before the newest are dropped, and the oldest beyond ``max_samples``."""
         self._window_ns = window_ns
         self._samples: deque[_Sample] = deque(maxlen=max_samples)
+        self._adding = threading.Lock()
+        self._best: _Sample | None = None
 
     def add(self, *, t0_ns: int, t1_ns: int, t2_ns: int, t3_ns: int) -> bool:
         """Take one exchange; False if its times contradict each other (a stepped or hostile clock)."""
@@ -42,31 +45,33 @@ class ClockOffset:
             return False
         offset_ns = ((t1_ns - t0_ns) + (t2_ns - t3_ns)) // 2
         sample = _Sample(t3_ns, offset_ns, round_trip_ns)
-        while self._samples and not _agree(self._samples[-1], sample):
-            self._samples.pop()
-        self._samples.append(sample)
-        while self._samples[0].at_ns <= t3_ns - self._window_ns:
-            self._samples.popleft()
+        with self._adding:
+            while self._samples and not _agree(self._samples[-1], sample):
+                self._samples.pop()
+            self._samples.append(sample)
+            while self._samples[0].at_ns <= t3_ns - self._window_ns:
+                self._samples.popleft()
+            self._best = min(self._samples, key=lambda one: one.round_trip_ns)
         return True
 
     @property
-    def offset_ns(self) -> int | None:
-        """Remote clock minus ours; None before the first sample."""
-        best = self._best()
-        return None if best is None else best.offset_ns
+    def estimate(self) -> tuple[int, int] | None:
+        """Remote clock minus ours and the largest error of it, both of one exchange; None before the first.
+
+        The error is half the round trip.
+        """
+        best = self._best
+        return None if best is None else (best.offset_ns, (best.round_trip_ns + 1) // 2)
 
     @property
-    def error_ns(self) -> int | None:
-        """Half the round trip of the chosen sample: the largest error of the offset. None before the first."""
-        best = self._best()
-        return None if best is None else (best.round_trip_ns + 1) // 2
+    def offset_ns(self) -> int:
+        """Remote clock minus ours; 0 before the first exchange."""
+        best = self._best
+        return 0 if best is None else best.offset_ns
 
     def to_local_ns(self, remote_ns: int) -> int:
-        """A time of the remote clock as ours would have shown it; unchanged before the first sample."""
-        return remote_ns - (self.offset_ns or 0)
-
-    def _best(self) -> _Sample | None:
-        return min(tuple(self._samples), key=lambda sample: sample.round_trip_ns, default=None)
+        """A time of the remote clock as ours would have shown it; unchanged before the first exchange."""
+        return remote_ns - self.offset_ns
 
 
 def _agree(one: _Sample, other: _Sample) -> bool:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,12 +31,10 @@ def exchange(
 def test_an_even_path_gives_the_exact_offset():
     """Latency in the summary would be wrong by the difference of the clocks."""
     clock = ClockOffset()
-    assert clock.offset_ns is None
-    assert clock.error_ns is None
+    assert clock.estimate is None
     assert clock.to_local_ns(5) == 5
     assert exchange(clock, at_ns=0, offset_ns=-70 * MS, out_ns=4 * MS, held_ns=9 * MS, back_ns=4 * MS)
-    assert clock.offset_ns == -70 * MS
-    assert clock.error_ns == 4 * MS
+    assert clock.estimate == (-70 * MS, 4 * MS)
     assert clock.to_local_ns(1_000 * MS) == 1_070 * MS
 
 
@@ -48,8 +49,9 @@ def test_the_truth_is_within_the_stated_error(offset, paths):
         assert exchange(
             clock, at_ns=number * 10**11, offset_ns=offset, out_ns=out, held_ns=held, back_ns=back
         )
-    assert abs(clock.offset_ns - offset) <= clock.error_ns
-    assert clock.error_ns == (min(out + back for out, _, back in paths) + 1) // 2
+    estimate, error = clock.estimate
+    assert abs(estimate - offset) <= error
+    assert error == (min(out + back for out, _, back in paths) + 1) // 2
 
 
 def test_the_shortest_round_trip_speaks_until_it_is_old():
@@ -67,7 +69,33 @@ def test_contradictory_times_are_left_out():
     clock = ClockOffset()
     assert not clock.add(t0_ns=10, t1_ns=0, t2_ns=100, t3_ns=20)
     assert not clock.add(t0_ns=0, t1_ns=50, t2_ns=40, t3_ns=90)
-    assert clock.offset_ns is None
+    assert clock.estimate is None
+
+
+def test_two_threads_may_use_it():
+    """While one learns that the clock was set, another would take its times for our own: off by the whole offset."""
+    clock, done, seen = ClockOffset(), threading.Event(), set()
+    exchange(clock, at_ns=0, offset_ns=3_600_000 * MS, out_ns=MS, held_ns=0, back_ns=MS)
+
+    def read() -> None:
+        while not done.is_set():
+            seen.update((clock.offset_ns, clock.estimate, clock.to_local_ns(0)))
+
+    reader = threading.Thread(target=read)
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        reader.start()
+        for number in range(1, 20_000):
+            step = 3_600_000 * MS * (1 + number % 2)
+            way = MS * (1 + number % 2)
+            exchange(clock, at_ns=number * MS, offset_ns=step, out_ns=way, held_ns=0, back_ns=way)
+    finally:
+        done.set()
+        reader.join()
+        sys.setswitchinterval(interval_s)
+    hours = {3_600_000 * MS * number for number in (1, 2)}
+    assert seen <= hours | {-one for one in hours} | {(3_600_000 * MS * n, MS * n) for n in (1, 2)}
 
 
 def test_a_clock_that_was_set_is_believed_at_once():
@@ -78,7 +106,7 @@ def test_a_clock_that_was_set_is_believed_at_once():
     assert clock.offset_ns == 3_600_000 * MS
     exchange(clock, at_ns=40_000 * MS, offset_ns=3_600_000 * MS, out_ns=90 * MS, held_ns=0, back_ns=10 * MS)
     assert clock.offset_ns == 3_600_000 * MS  # the better of those after the step
-    assert clock.error_ns == 40 * MS
+    assert clock.estimate == (3_600_000 * MS, 40 * MS)
 
 
 def test_a_clock_that_was_wrong_at_the_start_is_said_once(caplog):
