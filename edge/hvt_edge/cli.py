@@ -22,7 +22,7 @@ _DESCRIPTION = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the edge; return 0, or 2 after a sentence on what is wrong."""
+    """Run the edge; return 0, or 2 (at the start) or 1 (in flight) after a sentence on what is wrong."""
     return exit_with_sentence(_run, program="hvt-edge", argv=argv)
 
 
@@ -37,9 +37,9 @@ def _run(argv: Sequence[str] | None) -> int:
     release_log = start_log("hvt-edge", quiet=config.quiet)
     stop = stop_on_signals()
     content = Edge(config, stop=stop, on_started=release_log).run()
+    print_table(f"{config.edge_id}: sent", table(content))
     if config.summary is not None:
         write_json(config.summary, content)
-    print_table(f"{config.edge_id}: sent", table(content))
     return 0
 
 
