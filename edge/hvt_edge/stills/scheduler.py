@@ -221,7 +221,7 @@ class Chooser:
             return True
         # By track: methods request again at each step, and every new still takes the place of the last.
         since_ns = self._held_up.setdefault(pending.track_id, now_ns)
-        return now_ns - since_ns >= _PATIENCE_SHARE * self.outbox.max_pending_ns
+        return now_ns - since_ns >= _PATIENCE_SHARE * self.outbox.settings.max_pending_ns
 
     def _code(
         self, pending: OutboxStill, job: CropJob, *, now_ns: int, allowance: Allowance, store: bool
