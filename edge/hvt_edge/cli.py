@@ -22,7 +22,7 @@ _DESCRIPTION = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the edge; return 0, or 2 after a sentence on what is wrong."""
+    """Run the edge; return 0, or 2 (at the start) or 1 (in flight) after a sentence on what is wrong."""
     return exit_with_sentence(_run, program="hvt-edge", argv=argv)
 
 
