@@ -41,10 +41,6 @@ def _history_bytes(base_size: tuple[int, int]) -> int:
     return min(_MOST_HISTORY_BYTES, _HISTORY_FRAMES * 3 * base_size[0] * base_size[1])
 
 
-def _release_nothing() -> None:
-    """Models that nobody else takes need no release."""
-
-
 @dataclass(frozen=True, slots=True)
 class DecodedFrame:
     """A decoded base frame."""
@@ -58,7 +54,7 @@ class DecodedFrame:
 
 @dataclass(frozen=True, slots=True)
 class PipelineParts:
-    """What perception of one session are made of; none of it may be shared with another session."""
+    """What perception of one session is made of; but for the detector none of it may be shared with another."""
 
     detector: Detector
     tracker: ByteTracker
@@ -70,8 +66,6 @@ class PipelineParts:
     """The one that ``fusion`` moves boxes by."""
     camera: CameraMotion | None
     """None where the camera's motion is not followed."""
-    release: Callable[[], None] = _release_nothing
-    """Called when the session has ended: its models may serve another."""
 
 
 class Pipeline:
@@ -216,7 +210,6 @@ class Pipeline:
         """
         self._stills.end(self._now)
         self._history.clear()
-        self._parts.release()
 
     # The base stream
 
