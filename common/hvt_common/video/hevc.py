@@ -34,8 +34,8 @@ _BLOCK_PX = 64
 class BaseDecoder:
     """Decodes HEVC access units in order.
 
-    One thread: several lag by a picture or two, or gain nothing (3 ms at 1280x720), and each takes memory. After a loss
-    libavcodec returns nothing, or garbage, without an error: the caller starts again at a keyframe
+    One thread: several lag by a picture or two, or gain nothing (3 ms at 1280x720), and each takes memory. After a
+    loss libavcodec returns nothing, or garbage, without an error: the caller starts again at a keyframe
     (`reset`) and never feeds a unit whose predecessor is missing.
 
     Parameter sets may announce any size. A picture of more pixels than one of ``size`` (width, height) has, or
