@@ -8,8 +8,13 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
-__all__ = ["STOP_SIGNALS", "limit_malloc_arenas", "lower_priority", "stop_on_signals"]
+__all__ = ["STOP_SIGNALS", "limit_malloc_arenas", "lower_priority", "stop_on_signals", "with_lower_priority"]
+
+T = TypeVar("T")
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _NICENESS = 10
@@ -46,6 +51,12 @@ def lower_priority() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+
+
+def with_lower_priority(call: Callable[[], T]) -> T:
+    """Run it in a thread of lower priority; threads that it starts, such as a network's, have that too."""
+    with ThreadPoolExecutor(1, initializer=lower_priority) as pool:
+        return pool.submit(call).result()
 
 
 def limit_malloc_arenas() -> None:

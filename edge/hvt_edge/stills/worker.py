@@ -78,13 +78,13 @@ class StillWorker:
         """Whether the next frame finds no room, or the stage has failed a moment ago."""
         return self._frames.qsize() >= self._most_frames or not self._pause.due(self._clock())
 
-    def take(self, frame: Frame, unit: AccessUnit | None, *, room: bool = True) -> bool:
-        """Queue one frame, in order, with its access unit if it has one; False where there is no room for it."""
+    def take(self, frame: Frame, unit: AccessUnit | None, *, late: bool = False) -> bool:
+        """Queue one frame, in order, with its access unit if it has one; False where it is skipped."""
         # All frames of a source have one size, so a bound in bytes is a bound in frames.
         fitting = self._max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
         self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
         with self._lock:
-            if self.full or not room:
+            if self.full or late:
                 self._skipped.add(unit)
                 return False
             self._frames.put((frame, *self._skipped.take(unit)))
