@@ -60,5 +60,7 @@ class World:
     def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
         """Open the link until ``stack`` closes. Raises `UserError` for a bad port, endpoint or edge id."""
         return stack.enter_context(
-            ZenohLink(make_link_settings(config), edge_id=config.edge_id, clock=self.clock)
+            ZenohLink(
+                make_link_settings(config), edge_id=config.edge_id, failures=self.failures, clock=self.clock
+            )
         )

@@ -139,6 +139,7 @@ def build_stages(
         keyframes=keyframes,
         clock=clock,
         info=info.info,
+        failures=failures,
     )
     if backlog is not None:
         stack.enter_context(backlog)
@@ -148,6 +149,7 @@ def build_stages(
     stack.callback(lambda: still_sender.close(clock()))
     link_control = LinkControl(
         has_ground=link.has_ground,
+        has_subscriber=partial(link.has_subscriber, Channel.BASE),
         session_id=session_id,
         transmitter=transmitter,
         keyframes=keyframes,
@@ -159,6 +161,7 @@ def build_stages(
         outbox=outbox,
         stills=still_sender,
         backlog=backlog,
+        failures=failures,
     )
     base = BaseStage(
         encoder,
@@ -171,7 +174,7 @@ def build_stages(
         reconfigure=reconfiguration,
         admits=link_control.admits,
         backlog=backlog,
-        reopen=None if lockstep else reconfiguration.reopen,
+        open_again=None if lockstep else reconfiguration.open_again,
         failures=failures,
     )
     on_demand = make_on_demand(
