@@ -12,7 +12,7 @@ from hvt_common.units import bitrate_text
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.loop.cpu import Cores
 
-__all__ = ["EdgeRun", "summary", "table"]
+__all__ = ["EdgeRun", "summary", "table", "title"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +46,8 @@ class EdgeRun:
     perception_ms: float
     """Mean of decoding, detection and tracking over all frames."""
     unusable_messages: int
+    unreached: str = ""
+    """Why nobody received anything; empty where somebody did."""
     frames_stored: int = 0
     """Encoded while the link was away, and not sent at once."""
     store: StoreNumbers | None = None
@@ -98,9 +100,16 @@ def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
         "encode_ms": round(run.encode_ms, 2),
         "perception_ms": round(run.perception_ms, 2),
         "unusable_messages": run.unusable_messages,
+        "unreached": run.unreached,
         "store": None if run.store is None else asdict(run.store),
         "failed": [asdict(one) | {"failed_at": _clock_time(one.failed_ns)} for one in run.failed],
     }
+
+
+def title(content: dict[str, Any]) -> str:
+    """Of the table: it counts what would have been sent where nobody took it."""
+    sent = f"NOT SENT ({content['unreached']})" if content["unreached"] else "sent"
+    return f"{content['edge']}: {sent}"
 
 
 def table(content: dict[str, Any]) -> list[tuple[str, str]]:
