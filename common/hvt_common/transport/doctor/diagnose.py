@@ -29,7 +29,7 @@ __all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit"]
 
 _log = logging.getLogger(__name__)
 
-_CHECK_S, _LOOK_S = 1.0, 0.1
+_CHECK_S, _STRANGERS_S = 1.0, 0.1
 PATIENCE_S = 4.0
 _FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
 """From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
@@ -119,9 +119,9 @@ class LinkWatch:
     def _run(self) -> None:
         next_visit_s, pause_s = time.monotonic() + self._patience_s, _FIRST_PAUSE_S
         next_check_s = 0.0
-        while not self._stop.wait(min(_LOOK_S, self._patience_s)):
+        while not self._stop.wait(min(_STRANGERS_S, self._patience_s)):
             now_s = time.monotonic()
-            self._look(now_s)
+            self._check_strangers(now_s)
             if now_s < next_check_s:
                 continue
             next_check_s = now_s + min(_CHECK_S, self._patience_s)
@@ -146,12 +146,12 @@ class LinkWatch:
                 return True
             return bool(links)
 
-    def _look(self, now_s: float) -> None:
+    def _check_strangers(self, now_s: float) -> None:
         with self._using:
             if self._stop.is_set():
                 return
             try:
-                hosts = self._strangers.look(self._far_ends, now_s)
+                hosts = self._strangers.check(self._far_ends, now_s)
             except (OSError, zenoh.ZError):  # the session is closed elsewhere
                 return
         for host in hosts:

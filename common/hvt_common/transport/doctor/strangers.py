@@ -16,7 +16,7 @@ from pathlib import Path
 __all__ = ["Strangers", "listening_ports"]
 
 _TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
-_LISTENS = "0A"
+_LISTEN = "0A"
 _TIMES, _WITHIN_S = 3, 600.0
 """Who is refused tries again each second, and on a quick link is seen now and then only; an own client that comes and
 goes between two looks is not so frequent."""
@@ -25,7 +25,7 @@ _MOST_HOSTS = 256
 
 
 class Strangers:
-    """``ports`` are those that we listen on. For one thread; look several times a second."""
+    """``ports`` are those that we listen on. For one thread; check several times a second."""
 
     def __init__(self, ports: Iterable[int], *, tables: Iterable[Path] = _TABLES) -> None:
         self._ports = frozenset(ports)
@@ -36,7 +36,7 @@ class Strangers:
         """Host → when its connections ended, the last ones."""
         self._said_s: dict[str, float] = {}
 
-    def look(self, links: Callable[[], Iterable[str]], now_s: float) -> list[str]:
+    def check(self, links: Callable[[], Iterable[str]], now_s: float) -> list[str]:
         """Return the hosts to be named now; ``links`` gives the far ends of the links that stand."""
         connected = {one for table in self._tables for one in self._connected(table)}
         if not connected and not self._pending:
@@ -60,7 +60,7 @@ class Strangers:
     def _connected(self, table: Path) -> Iterable[str]:
         for line in table.read_text(encoding="ascii").splitlines()[1:]:
             _, ours, theirs, state = line.split(maxsplit=4)[:4]
-            if state != _LISTENS and int(ours.rpartition(":")[2], 16) in self._ports:
+            if state != _LISTEN and int(ours.rpartition(":")[2], 16) in self._ports:
                 address, _, port = theirs.rpartition(":")
                 yield f"{_address(address)}:{int(port, 16)}"
 

@@ -62,20 +62,20 @@ def test_each_stranger_once_a_minute(tmp_path: Path) -> None:
     table = tmp_path / "tcp"
     table.write_text(header)
 
-    def look(now_s: float, *far_ends: str, links: tuple[str, ...] = ()) -> list[str]:
+    def shown(now_s: float, *far_ends: str, links: tuple[str, ...] = ()) -> list[str]:
         lines = [f"   0: 00000000:1D17 {one} 01 0 0 0 0 0 0 0\n" for one in far_ends]
         lines.append(
             "   1: 00000000:1D17 00000000:0000 0A 0 0 0 0 0 0 0\n   2: 0100007F:0016 0200000A:9999 01 0 0\n"
         )
         table.write_text(header + "".join(lines))
-        return strangers.look(lambda: links, now_s)
+        return strangers.check(lambda: links, now_s)
 
     strangers = Strangers(listening_ports(["tls/0.0.0.0:7447", "udp/0.0.0.0:22"]), tables=[table])
-    told = [(at_s, host) for at_s in range(100) for host in look(at_s, *(["0700000A:A000"] * (at_s % 2)))]
+    told = [(at_s, host) for at_s in range(100) for host in shown(at_s, *(["0700000A:A000"] * (at_s % 2)))]
     assert told == [(6, "10.0.0.7"), (66, "10.0.0.7")]
     for at_s in range(100, 120, 2):
-        assert look(at_s, "0800000A:A001") == []
-        assert look(at_s + 1, "0800000A:A001", links=("10.0.0.8:40961",)) == [], (
+        assert shown(at_s, "0800000A:A001") == []
+        assert shown(at_s + 1, "0800000A:A001", links=("10.0.0.8:40961",)) == [], (
             "it takes its time, and is in"
         )
-        assert look(at_s + 1.5) == []
+        assert shown(at_s + 1.5) == []
