@@ -25,9 +25,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind, BacklogUnit, pack_backlog_units
+from hvt_common.protocol.messages import (
+    MAX_BACKLOG_BYTES,
+    BacklogKind,
+    BacklogUnit,
+    ObjectKey,
+    pack_backlog_units,
+)
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.entry import Entry, Key, OpenSegment, worth
+from hvt_edge.backlog.entry import Entry, OpenSegment, worth
 
 __all__ = ["FILE_NAME", "Store"]
 
@@ -38,6 +44,7 @@ _STILLS_SHARE = 0.25
 _PAGE_BYTES = 4096
 _LOG_BYTES = 2 * 64 * _PAGE_BYTES
 """Of the write-ahead log: 64 pages are moved into the file, and the last write before that may be a large one."""
+_REMOVED = "removed, with all that was stored"
 _TRIAL_BYTES = 64 * 1024
 # One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
 _OPEN = """
@@ -113,6 +120,10 @@ class Store:
         return int(self._open is not None)
 
     @property
+    def _open_row(self) -> int:
+        return -1 if self._open is None else self._open.row
+
+    @property
     def span_ns(self) -> int:
         """Length of the video that is stored."""
         return self._span_ns + (0 if self._open is None else self._open.span_ns)
@@ -162,13 +173,17 @@ class Store:
 
     def end_segment(self) -> None:
         """What was appended is an object now."""
-        segment, self._open = self._open, None
-        if segment is not None and self._db is not None:
-            with self._disk():
-                try:
-                    self._db.executescript(_ADOPT)
-                finally:
-                    self._count()
+        if self._open is None:
+            return
+        try:
+            if self._db is not None:
+                with self._disk():
+                    try:
+                        self._db.executescript(_ADOPT)
+                    finally:
+                        self._count(open_row=-1)
+        finally:
+            self._open = None
 
     def _add(self, kind: BacklogKind, number: int, capture_ns: int, rank: float, data: bytes = b"") -> int:
         assert self._db is not None
@@ -197,7 +212,7 @@ class Store:
         """The facts of a session; None where they are not here."""
         return self.find((session_id, BacklogKind.INFO, 0))
 
-    def find(self, key: Key) -> Entry | None:
+    def find(self, key: ObjectKey) -> Entry | None:
         """The entry of this name, if it is still here."""
         session_id, kind, number = key
         where = f"{_ENTRY} WHERE session = ? AND kind = ? AND number = ?"
@@ -267,8 +282,9 @@ class Store:
         self.close()
 
     def _ranked(self, kind: BacklogKind, order: str = "DESC") -> Iterator[Entry]:
-        opened = -1 if self._open is None else self._open.row
-        return self._entries(f"{_ENTRY} WHERE kind = ? AND id <> ? ORDER BY rank {order}", kind, opened)
+        return self._entries(
+            f"{_ENTRY} WHERE kind = ? AND id <> ? ORDER BY rank {order}", kind, self._open_row
+        )
 
     def _entries(self, select: str, *values: Any) -> Iterator[Entry]:
         if self._db is not None:
@@ -292,12 +308,11 @@ class Store:
             self.evicted_segments += kind is BacklogKind.BASE
             self.remove(least)
 
-    def _count(self) -> None:
+    def _count(self, *, open_row: int | None = None) -> None:
         assert self._db is not None
-        opened = -1 if self._open is None else self._open.row
         counts = {BacklogKind.STILL: (0, 0, 0), BacklogKind.BASE: (0, 0, 0)}
         sums = "SELECT kind, count(*), sum(bytes), sum(span_ns) FROM here WHERE id <> ? GROUP BY kind"
-        for kind, *row in self._db.execute(sums, (opened,)):
+        for kind, *row in self._db.execute(sums, (self._open_row if open_row is None else open_row,)):
             counts[BacklogKind(kind)] = (row[0], row[1], row[2])
         self.stills, self._still_bytes, _ = counts[BacklogKind.STILL]
         self.segments, _, self._span_ns = counts[BacklogKind.BASE]
@@ -321,7 +336,7 @@ class Store:
         """With this session's facts in it."""
         if self._db is not None and not self._file.exists():
             self._lose()
-            raise FileNotFoundError(errno.ENOENT, "removed, with all that was stored", str(self._file))
+            raise FileNotFoundError(errno.ENOENT, _REMOVED, str(self._file))
         db = self._ready()
         if self.info_of(self._session_id) is None:
             self._add(BacklogKind.INFO, 0, 0, 0.0, self._info())
@@ -381,10 +396,11 @@ class Store:
                     str(self.path),
                 ) from None
             self._lose()
+            why = str(error) if self._file.exists() else _REMOVED
             if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
                 self._file.replace(self._file.with_suffix(".damaged"))
                 self._note_damaged(f"{self._file} is damaged and is put aside as .damaged")
-            raise OSError(errno.EIO, str(error), str(self.path)) from None
+            raise OSError(errno.EIO, why, str(self._file)) from None
 
     def _note_damaged(self, what: str) -> None:
         self.damaged += 1

@@ -213,7 +213,7 @@ class BacklogStage:
 
     def _unfinished(self) -> bool:
         """Whether anything was admitted that may not have arrived."""
-        stored = self._worker.queued or not self.numbers.empty
+        stored = not (self._worker.idle and self.numbers.empty)
         return bool(stored or self.state is not State.LIVE or self._unnamed)
 
     @property

@@ -156,6 +156,11 @@ class StoreWorker:
         return len(self._intake)
 
     @property
+    def idle(self) -> bool:
+        """Whether all that came is on disk."""
+        return self._intake.idle
+
+    @property
     def numbers(self) -> StoreNumbers:
         """What is stored and what was done."""
         store = self._store

@@ -114,7 +114,7 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
     eventually(lambda: not worker.queued, within_s=20, what="all is stored")
     link.open = True
     eventually(lambda: link.sent, within_s=20, what="an ended segment is sent")
-    assert link.sent[0][1].kind == "base", "before the still"
+    assert link.sent[0][1].key[1] == "base", "before the still"
     assert not worker.offer(UNITS[0]) or worker.numbers.segments > 1
     worker.close()
     assert len(taken) < len(units)
@@ -235,7 +235,7 @@ def test_a_folder_that_vanishes_in_mid_flight_is_made_again(tmp_path, caplog):
     worker = worker_of(store, link)
     for unit in UNITS[:10]:
         worker.offer(unit)
-    eventually(lambda: worker.numbers.video_s > 0.5, within_s=10, what="they are written")
+    eventually(lambda: worker.idle and worker.numbers.video_s > 0.5, within_s=10, what="they are written")
     shutil.rmtree(store)
     with caplog.at_level(logging.WARNING):
         worker.offer(shifted(UNITS[0], 60))
@@ -271,11 +271,11 @@ def test_a_full_disk_stops_storing_alone_until_there_is_space(small_disk, caplog
             link.now_ns += 100 * S
             time.sleep(0.3)
         link.open = True
-        eventually(lambda: len({chunk.number for _, chunk in link.sent}) >= 2, within_s=10, what="it is sent")
+        eventually(lambda: len({chunk.key for _, chunk in link.sent}) >= 2, within_s=10, what="it is sent")
         link.open = False
         ranges = [
             AcknowledgedRange(session_id=7, kind="base", number=number, acknowledged_bytes=total)
-            for number, total in {(chunk.number, chunk.total_bytes) for _, chunk in link.sent}
+            for number, total in {(chunk.key[2], chunk.total_bytes) for _, chunk in link.sent}
         ]
         worker.on_acknowledged(ranges, receiver_id=1)
         eventually(
@@ -322,7 +322,7 @@ def test_an_error_in_sending_ends_the_process_too():
 
     woken = threading.Event()
     sending = ChunkThread(broken, on_done=woken.set)
-    sending.put(Chunk(7, BacklogKind.STILL, 1, 0, 3, b"abc"))
+    sending.put(Chunk((7, BacklogKind.STILL, 1), 0, 3, b"abc"))
     assert woken.wait(timeout=10)
     with pytest.raises(ZeroDivisionError):
         sending.take()
