@@ -48,6 +48,7 @@ def send_blueprint(recording: rr.RecordingStream, blueprint: rrb.Blueprint) -> N
     """Send the blueprint and make it active: the SDK's own function never frees the stream that it writes it to."""
     try:
         _send_and_let_go(recording, blueprint)
+        release_recordings()
     except (AttributeError, TypeError) as error:
         _log.debug("this Rerun SDK has other names inside (%s): a recording leaves its threads behind", error)
         rr.send_blueprint(blueprint, recording=recording)
