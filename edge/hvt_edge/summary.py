@@ -12,7 +12,7 @@ from hvt_common.units import bitrate_text
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.loop.cpu import Cores
 
-__all__ = ["summary", "table"]
+__all__ = ["summary", "table", "title"]
 
 
 def summary(
@@ -49,6 +49,12 @@ def summary(
         "store": None if store is None else asdict(store),
         "failed": [asdict(one) | {"failed_at": _clock_time(one.failed_ns)} for one in failed],
     }
+
+
+def title(content: dict[str, Any]) -> str:
+    """Of the table: it counts what would have been sent where nobody took it."""
+    sent = f"NOT SENT ({content['unreached']})" if content["unreached"] else "sent"
+    return f"{content['edge']}: {sent}"
 
 
 def table(content: dict[str, Any]) -> list[tuple[str, str]]:
