@@ -330,6 +330,7 @@ class Store:
 
     def _opened(self) -> sqlite3.Connection:
         self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._file.touch(mode=0o600)  # SQLite's log gets the same
         db = sqlite3.connect(self._file, timeout=0, isolation_level=None)
         try:
             db.executescript(_OPEN)
