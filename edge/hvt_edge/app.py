@@ -10,6 +10,7 @@ from typing import Any
 from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.runtime.process import with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
@@ -68,18 +69,19 @@ class Edge:
         config, world = self._config, self._world
         check_files(config)
         check_codecs(config)
-        opened = world.open_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
-            world.warm_up(config, opened, source)
+            background = (lambda call: call()) if self._lockstep else with_lower_priority
+            opened = background(lambda: world.open_detector(config))
+            background(lambda: world.warm_up(config, opened, source))
             detector: FailingDetector = opened
             if not self._lockstep:  # whose result would be of something else
                 detector = GuardedDetector(
                     opened,
-                    reopen=lambda: world.open_detector(config),
+                    open_again=lambda: world.open_detector(config),
                     failures=self._failures,
                     clock=world.clock,
                 )
@@ -234,7 +236,11 @@ class Edge:
             method=now.method,
             frames=counts.encoded - stored,
             frames_stored=stored,
+            frames_captured=counts.captured,
             frames_dropped=counts.dropped,
+            frames_dropped_cpu=counts.dropped_cpu,
+            frames_unanalyzed=counts.unanalyzed,
+            cores=counts.cpu.short,
             duration_s=counts.duration_s(config.nominal_fps),
             budget_bps=now.highest_budget_bps,
             base_bps=now.base_bps,

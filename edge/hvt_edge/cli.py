@@ -37,9 +37,9 @@ def _run(argv: Sequence[str] | None) -> int:
     release_log = start_log("hvt-edge", quiet=config.quiet)
     stop = stop_on_signals()
     content = Edge(config, stop=stop, on_started=release_log).run()
+    print_table(f"{config.edge_id}: sent", table(content))
     if config.summary is not None:
         write_json(config.summary, content)
-    print_table(f"{config.edge_id}: sent", table(content))
     return 0
 
 

@@ -120,14 +120,20 @@ class StatusReporter:
 
     def line(self, link: str) -> str:
         """The status line."""
-        config, now, ledger = self._config, self._operating.now, self._ledger
+        config, now, ledger, counts = self._config, self._operating.now, self._ledger, self._counts
         rate_bps = ledger.window_bytes(None, self._loop_clock()) * 8 * SECOND_NS / ledger.window_ns
-        sent = sum(ledger.outcomes("sent").values())
-        return (
-            f"{config.edge_id} {self._counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "
-            f"{bitrate_text(now.total_bps)}  {now.method}  stills {sent}, {self._stills.pending} pending  "
-            f"tracks {self._stills.analyzer.tracks}  {link}"
-        )
+        parts = [
+            f"{config.edge_id} {counts.duration_s(config.nominal_fps):6.1f} s",
+            f"{bitrate_text(rate_bps)} of {bitrate_text(now.total_bps)}",
+            now.method,
+            f"stills {sum(ledger.outcomes('sent').values())}, {self._stills.pending} pending",
+            f"tracks {self._stills.analyzer.tracks}",
+            link,
+        ]
+        if counts.dropped_cpu:
+            parts.append(f"{counts.dropped_cpu} frames dropped: slow machine")
+        parts += [f"{one.part.upper()} FAILED" for one in self._failures.parts if not one.working]
+        return "  ".join(parts)
 
     def _status(self, state: str, at_ns: int) -> Status:
         """Totals, outcomes and health at ``at_ns``.

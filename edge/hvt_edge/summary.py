@@ -10,6 +10,7 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failure
 from hvt_common.units import bitrate_text
 from hvt_edge.backlog.worker import StoreNumbers
+from hvt_edge.loop.cpu import Cores
 
 __all__ = ["EdgeRun", "summary", "table"]
 
@@ -23,8 +24,15 @@ class EdgeRun:
     method: str
     frames: int
     """Encoded and sent."""
+    frames_captured: int
     frames_dropped: int
     """Given up before encoding because the link or the machine was behind."""
+    frames_dropped_cpu: int
+    """Of these, because the machine was."""
+    frames_unanalyzed: int
+    """Skipped by perception for want of time."""
+    cores: Cores
+    """While frames were dropped or skipped for want of time."""
     duration_s: float
     """From the first frame sent to the last; frames dropped between them count."""
     budget_bps: int
@@ -61,7 +69,12 @@ def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
         "method": run.method,
         "frames": run.frames,
         "frames_stored": run.frames_stored,
+        "frames_captured": run.frames_captured,
         "frames_dropped": run.frames_dropped,
+        "frames_dropped_cpu": run.frames_dropped_cpu,
+        "frames_unanalyzed": run.frames_unanalyzed,
+        "cores_needed": round(run.cores.needed, 2),
+        "cores_free": round(run.cores.free, 2),
         "duration_s": round(run.duration_s, 3),
         "base_bytes": account.base_bytes,
         "roi_bytes": account.roi_bytes,
@@ -95,11 +108,11 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     stills, worst = content["stills"], content["worst_window_bps"]
     total = content["total_bps"]
     share = f"{total / content['budget_bps']:.0%} of {bitrate_text(content['budget_bps'])}"
-    dropped = f", {content['frames_dropped']} dropped before encoding" if content["frames_dropped"] else ""
     sent = f"{stills['sent']}, {stills['per_minute']:.0f} a minute, {stills['mean_bytes']} bytes in the mean"
     rows = [
         ("method", content["method"]),
-        ("frames", f"{content['frames']} in {content['duration_s']:.1f} s{dropped}"),
+        ("frames", f"{content['frames']} in {content['duration_s']:.1f} s"),
+        *_left_out(content),
         ("total", f"{bitrate_text(total)}, {share}; fullest window {bitrate_text(worst['total'])}"),
         ("base", f"{bitrate_text(content['base_bps'])}; fullest window {bitrate_text(worst['base'])}"),
         ("stills", f"{bitrate_text(content['roi_bps'])}; fullest window {bitrate_text(worst['roi'])}"),
@@ -120,6 +133,21 @@ def _failure(one: dict[str, Any]) -> str:
     times = "" if one["count"] == 1 else f", {one['count']} times"
     again = "; works again" if one["working"] else ""
     return f"{one['part']} at {one['failed_at']}{times}: {one['reason']}{again}"
+
+
+def _left_out(content: dict[str, Any]) -> list[tuple[str, str]]:
+    """Why frames were not coded or not analyzed."""
+    captured, cpu, skipped = (content[f"frames_{name}"] for name in ("captured", "dropped_cpu", "unanalyzed"))
+    needed, free = content["cores_needed"], content["cores_free"]
+    cores = f": encoder and detector need {needed:.1f} cores, {free:.1f} were free" if needed else ""
+    rows = []
+    if link := content["frames_dropped"] - cpu:
+        rows.append(("", f"{link} of {captured} frames dropped: the link had no room"))
+    if cpu:
+        rows.append(("", f"{cpu} of {captured} frames dropped{cores}"))
+    if skipped:
+        rows.append(("", f"{skipped} of {captured} frames not analyzed{'' if cpu else cores}"))
+    return rows
 
 
 def _store_rows(store: dict[str, Any] | None) -> list[tuple[str, str]]:

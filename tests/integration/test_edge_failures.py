@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -193,3 +194,23 @@ def test_who_reports_nothing_gets_all_frames_of_a_camera_and_no_backlog(link, fr
     assert len(indices) >= 0.95 * (indices[-1] - indices[0] + 1)
     assert stored <= indices[0] + 1, "nothing but what came before anybody watched"
     assert edge.summary()["total_bps"] <= 400_000
+
+
+@pytest.mark.realtime
+def test_on_a_slow_machine_perception_gives_way_to_video(link, tmp_path):
+    """The picture would stutter because a detector wants the processor."""
+    scene = pictures(tmp_path / "clip", [90] * 100)
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})  # the edge inherits it
+    try:
+        edge = link.edge(
+            *("--source", str(scene), "--wait", "0s", "--store", "0", "--preset", "ultrafast"),
+            *("--size", "1280x720", "--fps", "20", "--detect-every", "1"),
+        )
+    finally:
+        os.sched_setaffinity(0, cores)
+    summary = edge.finish()
+    assert summary["frames"] > 45, "with threads of equal rank it was 15 to 40"
+    assert summary["frames_unanalyzed"] > 5
+    assert summary["cores_needed"] > 0.5
+    assert "of 100 frames not analyzed" in edge.told

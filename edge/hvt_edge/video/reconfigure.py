@@ -127,7 +127,7 @@ class EncoderReconfiguration:
         with self._lock:
             return self._moving and self._split is not None and self._split.wants_keyframe(now_ns)
 
-    def reopen(self) -> BaseEncoder:
+    def open_again(self) -> BaseEncoder:
         """Return another encoder for what the last was opened for."""
         return self._open_encoder(**self._opened)
 
@@ -165,7 +165,7 @@ class EncoderReconfiguration:
         self._opened = {"total_bps": encoder_total_bps, "base_bps": base_bps, "decimation": decimation}
         self._operating.open(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
         self._set_budget(now_ns)
-        return self.reopen()
+        return self.open_again()
 
     def _allow(self, total_bps: int, now_ns: int) -> None:
         if total_bps != self._operating.now.total_bps:

@@ -174,7 +174,7 @@ def build_stages(
         reconfigure=reconfiguration,
         admits=link_control.admits,
         backlog=backlog,
-        reopen=None if lockstep else reconfiguration.reopen,
+        open_again=None if lockstep else reconfiguration.open_again,
         failures=failures,
     )
     on_demand = make_on_demand(

@@ -132,7 +132,10 @@ class EdgeSessions:
     def close(self) -> None:
         """End the session that is open, and close the recordings of former ones."""
         self._end_session()
-        self.backlog.close()
+        try:
+            self.backlog.close()
+        except Exception as error:  # noqa: BLE001 - the summaries are there all the same
+            self.failures.failed(f"recordings of former sessions of {self.port.edge}", reason_of(error))
 
     # What is due
 
