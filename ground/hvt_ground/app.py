@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from typing import Any
 
 from hvt_common.errors import UserError
@@ -19,8 +19,8 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.subscribe import EdgePort, GroundLink
+from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.live_view import LiveView
-from hvt_ground.sinks.timing import TimingTable
 from hvt_ground.status import status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 
@@ -41,6 +41,7 @@ class Ground:
         self._stop = stop
         self._on_started = on_started
         self._clock = SteadyClock()
+        self._outputs = Outputs()
         self._edges: dict[str, EdgeThread] = {}
         self._began_s = time.monotonic()
 
@@ -53,12 +54,15 @@ class Ground:
         check_edge_pattern(config.edges)
         check_writable(config.summary, name="--summary")
         check_writable(config.timing, name="--timing")
+        if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
+            check_writable(config.tracks, name="--tracks")
         self._check_record()
         models = Models(config)
         with ExitStack() as stack:
             view: LiveView | None = None
             if config.view or config.serve:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
+            stack.callback(self._outputs.close)
             settings = LinkSettings(
                 role="ground",
                 listen=config.listen,
@@ -69,11 +73,7 @@ class Ground:
             )
             session = stack.enter_context(open_session(settings))
             self._make_record_folder()
-            timing: TimingTable | None = None
-            if config.timing is not None:
-                timing = stack.enter_context(closing(TimingTable(config.timing)))
-            live_url = None if view is None else view.url
-            factory = SessionFactory(config, models, clock=self._clock, live_url=live_url, timing=timing)
+            factory = SessionFactory(config, models, clock=self._clock, outputs=self._outputs, view=view)
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
@@ -138,7 +138,8 @@ class Ground:
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
                 edges = [(edge, one.sessions) for edge, one in sorted(self._edges.items())]
-                line.show(status_text(edges) or ("no link" if watch.trouble else "no edge yet"))
+                text = status_text(edges) or ("no link" if watch.trouble else "no edge yet")
+                line.show(" | ".join(filter(None, (text, self._outputs.trouble()))))
             if polls % _CLOCK_EVERY_POLLS == 0:
                 self._refresh_clocks()
             if self._config.once and self._all_ended():

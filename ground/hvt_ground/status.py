@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from hvt_common.units import bitrate_text
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import QueuedSink
 
 __all__ = ["status_text", "summary", "table"]
+
+_LOST_S = 3.0
+"""Status comes once a second: nothing for so long is no accident."""
 
 
 def status_text(edges: Iterable[tuple[str, EdgeSessions]]) -> str:
@@ -21,15 +26,25 @@ def status_text(edges: Iterable[tuple[str, EdgeSessions]]) -> str:
         if session is None:
             parts.append(f"{edge}: {'ended' if sessions.done else 'waiting for a keyframe'}")
             continue
+        if sessions.silent_s > _LOST_S and not session.lockstep:
+            parts.append(f"{edge}: {session.duration_s:.1f} s  LINK LOST for {sessions.silent_s:.0f} s")
+            continue
         latency_ms = session.overlay_latency.percentile(50)
         age = "" if latency_ms is None or session.lockstep else f"  {latency_ms:.0f} ms"
         total = session.ledger.summary(session.duration_s).total_bps
         parts.append(
             f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
-            f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}  tracks "
-            f"{session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
+            f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}{_held_back(session)}  "
+            f"tracks {session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
         )
     return " | ".join(parts)
+
+
+def _held_back(session: GroundSession) -> str:
+    """Why there are not more stills: the edge's most frequent reasons."""
+    status = session.last_status
+    most = sorted(status.outcomes.items(), key=itemgetter(1), reverse=True)[:2] if status else ()
+    return f" (not sent: {', '.join(f'{count} {reason}' for reason, count in most)})" if most else ""
 
 
 def summary(
@@ -46,6 +61,8 @@ def summary(
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog.totals
     came = session.stills_received + backlog.stills
+    sinks = [sink for sink in session.sinks if isinstance(sink, QueuedSink)]
+    recordings = [path for sink in sinks for path in sink.files if path.suffix == ".rrd"]
     deferred = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
     return {
         "edge": info.edge,
@@ -76,6 +93,7 @@ def summary(
                 "received": account.outcomes["received"],
                 "dropped": dict(session.stills_dropped),
                 "outcomes": dict(pipeline.outcomes),
+                "not_sent": dict(session.last_status.outcomes) if session.last_status else {},
             },
             "mean_bytes": round(account.roi_bytes / session.stills_received)
             if session.stills_received
@@ -100,8 +118,10 @@ def summary(
         "keyframe_requests": counters.keyframe_requests,
         "latency_ms": session.overlay_latency.as_dict(),
         "receive_latency_ms": session.receive_latency.as_dict(),
-        "recording": str(session.recording) if session.recording is not None else None,
-        "recording_bytes": _size_bytes(session.recording),
+        "recording": str(recordings[0]) if recordings else None,
+        "recordings": [str(path) for path in recordings],
+        "recording_bytes": sum(path.stat().st_size for path in recordings if path.exists()),
+        "failures": [report for sink in sinks if (report := sink.report()) is not None],
     }
 
 
@@ -111,7 +131,10 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     share = (
         f"{content['total_bps'] / max(1, content['budget_bps']):.0%} of {bitrate_text(content['budget_bps'])}"
     )
-    outcomes = ", ".join(f"{name} {count}" for name, count in sorted(stills["reasons"]["outcomes"].items()))
+    outcomes, not_sent = (
+        ", ".join(f"{name} {count}" for name, count in sorted(stills["reasons"][which].items()))
+        for which in ("outcomes", "not_sent")
+    )
     lossless = (
         "no gaps" if not content["gaps"] else f"{content['gaps']} gaps, {content['lost']} messages lost"
     )
@@ -126,7 +149,8 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "stills",
             f"{stills['received']}, {bitrate_text(content['roi_bps'])}"
-            + (f" ({outcomes})" if outcomes else ""),
+            + (f" ({outcomes})" if outcomes else "")
+            + (f"; the edge did not send: {not_sent}" if not_sent else ""),
         ),
         (
             "tracks",
@@ -144,10 +168,19 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         since = "receiving" if content["pace"] == "lockstep" else "capture"
         spread = f"p50 {latency['p50']:.0f} ms, p95 {latency['p95']:.0f}, max {latency['max']:.0f}"
         rows.append(("latency", f"{since} to overlay: {spread}"))
-    if content["recording"]:
-        rows.append(("recording", f"{content['recording']}, {content['recording_bytes'] / 1e6:.2f} MB"))
+    if content["recordings"]:
+        files = ", ".join(content["recordings"])
+        rows.append(("recording", f"{files}, {content['recording_bytes'] / 1e6:.2f} MB"))
+    rows += [("failed", _failure_text(one)) for one in content["failures"]]
     return rows
 
 
-def _size_bytes(path: Path | None) -> int:
-    return path.stat().st_size if path is not None and path.exists() else 0
+def _failure_text(report: dict[str, Any]) -> str:
+    missing = report["lost_events"] + report["dropped_events"]
+    if "reason" not in report:
+        return f"{report['part']} was too slow: {missing} events are missing"
+    end = "it went on later" if report["over"] else "it stayed so"
+    return (
+        f"{report['part']} at {report['since']}: {report['reason']}; {end}, {missing} events are missing, "
+        f"{report['times']} failures in all"
+    )

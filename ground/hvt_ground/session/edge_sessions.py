@@ -97,6 +97,11 @@ class EdgeSessions:
         """Messages that were skipped: damaged, foreign, or of another version."""
         return self._receiver.unusable
 
+    @property
+    def silent_s(self) -> float:
+        """For how long nothing has come."""
+        return self._receiver.silent_ns / _SECOND_NS
+
     def handle(self, item: Received) -> None:
         """Take one message."""
         for packet in self._receiver.receive(item):

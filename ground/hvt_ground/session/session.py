@@ -7,7 +7,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
@@ -56,25 +55,22 @@ class GroundSession:
 
     In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input
     gives the same tracks. ``pipeline_of`` and ``worker_of`` make perception and its worker; without ``reports``
-    nothing is reported, and the edge's clock is this one (Unix nanoseconds without steps). ``recording`` is the
-    recording's file, for the summary.
+    nothing is reported, and the edge's clock is this one (Unix nanoseconds without steps).
     """
 
     def __init__(
         self,
         info: Info,
         *,
-        sinks: Sequence[Sink] = (),
+        sinks: Sequence[Sink[Event]] = (),
         pipeline_of: Callable[[Callable[[Event], None]], Pipeline],
         clock: Callable[[], int],
         reports: ReceiverReports | None = None,
-        recording: Path | None = None,
         backlog_perception: BacklogPerception | None = None,
         worker_of: WorkerFactory | None = None,
     ) -> None:
-        self._sinks = sinks
+        self.sinks = sinks
         self.info = info
-        self.recording = recording
         self.lockstep = info.pace == "lockstep"
         self.ledger = Ledger(window_ns=info.window_ns)
         self.pipeline = pipeline_of(self._emit)
@@ -233,7 +229,7 @@ class GroundSession:
             self._decoder.reset()
             self.note("info", f"session {self.info.session_id:016x} ended")
         finally:
-            for sink in self._sinks:
+            for sink in self.sinks:
                 sink.close()
         self.raise_error()
 
@@ -404,5 +400,5 @@ class GroundSession:
         )
 
     def _emit(self, event: Event) -> None:
-        for sink in self._sinks:
+        for sink in self.sinks:
             sink.log(event)

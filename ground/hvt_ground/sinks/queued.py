@@ -1,0 +1,223 @@
+"""A sink behind a bounded queue, in a thread of its own: what goes wrong or slowly there is felt nowhere else."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from hvt_common.runtime.failure import Backoff, Failure, reason_of
+from hvt_common.units import SECOND_NS
+from hvt_ground.sinks.contract import Sink, size_bytes
+
+__all__ = ["Outputs", "QueuedSink"]
+
+_log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+_MOST_ITEMS = 4096
+_MOST_BYTES = 32 * 2**20
+"""Some minutes of a thin link, or some hundred large stills."""
+_POLL_S = 0.2
+_AT_ONCE = threading.Event()
+_AT_ONCE.set()
+
+
+class QueuedSink(Generic[T]):
+    """Writes in a thread of its own what `log` takes, into a sink that ``open_sink`` makes there.
+
+    A sink that raises is closed and made anew after growing pauses; until then what comes is counted as lost. Where
+    the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as dropped. ``part`` is what
+    the log, the status line and the summary call it.
+    """
+
+    def __init__(self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0) -> None:
+        self.part = part
+        self._open_sink = open_sink
+        self._wait_s = wait_s
+        self._changed = threading.Condition()
+        self._queue: deque[tuple[T, int, int]] = deque()
+        """Items, their sizes, and how many were dropped before each."""
+        self._queued_bytes = 0
+        self._skipped = 0
+        self._ending = False
+        self._hurry = threading.Event()
+        self._backoff = Backoff()
+        self.files: list[Path] = []
+        """In the order of opening."""
+        self.failure: Failure | None = None
+        """The newest."""
+        self._since_ns = 0
+        """Unix time: since when it failed the last time."""
+        self._failing = False
+        self.lost = 0
+        """Items that came while the sink was failing."""
+        self.dropped = 0
+        """Items for which the queue had no room."""
+        self._thread = threading.Thread(target=self._run, name=f"hvt-{part}"[:48], daemon=True)
+        self._thread.start()
+
+    def log(self, item: T) -> None:
+        """Queue an item; for any thread. After `close` nothing is taken."""
+        size = size_bytes(item)
+        with self._changed:
+            if self._wait_s and not self._has_room(size):
+                self._changed.wait_for(lambda: self._has_room(size), self._wait_s)
+            if self._ending:
+                return
+            if self._failing:
+                self.lost += 1
+            elif self._has_room(size):
+                self._queue.append((item, size, self._skipped))
+                self._queued_bytes += size
+                self._skipped = 0
+                self._changed.notify_all()
+            else:
+                self.dropped += 1
+                self._skipped += 1
+                if self.dropped.bit_count() == 1:  # 1, 2, 4, 8 …
+                    _log.warning("%s is too slow: %d events were dropped so far", self.part, self.dropped)
+
+    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - `join` has its own
+        """Take nothing more; what is queued is written and the sink closed in its own time."""
+        with self._changed:
+            self._ending = True
+            self._changed.notify_all()
+
+    def join(self, deadline_s: float) -> bool:
+        """Wait for the end until ``deadline_s`` (monotonic), then for a second more without what only helps."""
+        self.close()
+        self._thread.join(max(0.0, deadline_s - time.monotonic()))
+        self._hurry.set()
+        self._thread.join(1.0)
+        if not self.ended:
+            self._fail(TimeoutError("it did not end in time"))
+        return self.ended
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing is done any more."""
+        return not self._thread.is_alive()
+
+    def trouble(self) -> str:
+        """For the status line: what it is that fails and for how long; empty while all is well."""
+        if not self._failing:
+            return ""
+        return f"{self.part} FAILED for {(time.time_ns() - self._since_ns) / SECOND_NS:.0f} s"
+
+    def report(self) -> dict[str, Any] | None:
+        """For a summary: the newest failure and whether it is over, what is missing; None where all went well."""
+        if self.failure is None and not self.dropped:
+            return None
+        failed: dict[str, Any] = {"part": self.part}
+        if self.failure is not None:
+            since = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self._since_ns // SECOND_NS))
+            failed = {**self.failure.as_dict(), "since": since, "over": not self._failing}
+        return {**failed, "lost_events": self.lost, "dropped_events": self.dropped}
+
+    def _has_room(self, size: int) -> bool:
+        """Or whether there is no need of any."""
+        if self._ending or self._failing or not self._queue:
+            return True
+        return len(self._queue) < _MOST_ITEMS and self._queued_bytes + size <= _MOST_BYTES
+
+    # In its own thread
+
+    def _run(self) -> None:
+        while not self._use():
+            while not self._backoff.ready(time.monotonic_ns()):
+                with self._changed:
+                    if self._changed.wait_for(lambda: self._ending, _POLL_S):
+                        return
+
+    def _use(self) -> bool:
+        """Make the sink and write until the end; False where that failed."""
+        sink: Sink[T] | None = None
+        try:
+            sink = self._open_sink()
+            self._begin(sink)
+            while (taken := self._take()) is not None:
+                item, skipped = taken
+                if skipped:
+                    sink.skipped(skipped)
+                sink.log(item)
+            sink.close(self._hurry)
+        except Exception as error:  # noqa: BLE001 - whatever it is, everything else goes on
+            self._fail(error)
+            if sink is not None:
+                with suppress(Exception):
+                    sink.close(_AT_ONCE)
+            return False
+        return True
+
+    def _begin(self, sink: Sink[T]) -> None:
+        if sink.path is not None:
+            self.files.append(sink.path)
+        if self._failing:
+            _log.warning("%s goes on%s", self.part, "" if sink.path is None else f" in {sink.path}")
+            self._failing = False
+
+    def _take(self) -> tuple[T, int] | None:
+        """The next item, and how many were dropped before it; None at the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._queue or self._ending)
+            if not self._queue:
+                return None
+            item, size, skipped = self._queue.popleft()
+            self._queued_bytes -= size
+            if self._wait_s:
+                self._changed.notify_all()
+            return item, skipped
+
+    def _fail(self, error: BaseException) -> None:
+        """Say so once in a row of failures; what is queued is lost."""
+        reason, now_ns = reason_of(error), time.time_ns()
+        self._backoff.failed(time.monotonic_ns())
+        with self._changed:
+            old = self.failure
+            self.failure = Failure(self.part, reason, now_ns) if old is None else old.again(reason, now_ns)
+            self.lost += len(self._queue)
+            self._queue.clear()
+            self._queued_bytes = self._skipped = 0
+            if not self._failing:
+                self._failing, self._since_ns = True, now_ns
+                _log.warning("%s failed and will be tried again: %s", self.part, reason)
+            self._changed.notify_all()
+        _log.debug("%s failed", self.part, exc_info=error)
+
+
+class Outputs:
+    """All sinks of a ground, for its status line and its end. For any thread."""
+
+    def __init__(self) -> None:
+        self._sinks: list[QueuedSink[Any]] = []
+        self._lock = threading.Lock()
+
+    def open(self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0) -> QueuedSink[T]:
+        """A sink behind a queue (`QueuedSink`)."""
+        sink = QueuedSink(part, open_sink, wait_s=wait_s)
+        with self._lock:
+            self._sinks = [one for one in self._sinks if not one.ended]
+            self._sinks.append(sink)
+        return sink
+
+    def trouble(self) -> str:
+        """For the status line: what fails; empty while all is well."""
+        with self._lock:
+            return ", ".join(text for one in self._sinks if (text := one.trouble()))
+
+    def close(self, *, within_s: float = 8.0) -> None:
+        """End them all, within that time."""
+        with self._lock:
+            sinks = list(self._sinks)
+        for sink in sinks:
+            sink.close()
+        deadline_s = time.monotonic() + within_s
+        for sink in sinks:
+            sink.join(deadline_s)
