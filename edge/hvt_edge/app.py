@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
@@ -52,6 +53,7 @@ class Edge:
         self._lockstep = config.pace == "lockstep"
         self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep)
         self._counts = FrameCounts()
+        self._failures = Failures(self._world.clock)
         self.ledger = Ledger(window_ns=config.window_ns)
         """Every byte that left."""
 
@@ -173,6 +175,7 @@ class Edge:
             transmitter=stages.transmitter,
             stills=stages.stills,
             inbox=self._world.inbox,
+            failures=self._failures,
             clock=self._world.clock,
             loop_clock=self._loop_clock,
         )

@@ -6,7 +6,16 @@ from collections.abc import Callable
 
 from hvt_common import __version__
 from hvt_common.protocol.ledger import Ledger
-from hvt_common.protocol.messages import Health, Info, Status, fitted_class_names
+from hvt_common.protocol.messages import (
+    MOST_FAILED_PARTS,
+    FailedPart,
+    Health,
+    Info,
+    Status,
+    fitted_class_names,
+    fitted_text,
+)
+from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
@@ -20,6 +29,7 @@ from hvt_edge.stills.stage import StillStage
 __all__ = ["InfoReporter", "StatusReporter"]
 
 _MILLION = 1_000_000
+_PART_BYTES, _REASON_BYTES = 24, 160
 
 
 class InfoReporter:
@@ -84,12 +94,14 @@ class StatusReporter:
         transmitter: Transmitter,
         stills: StillStage,
         inbox: FeedbackInbox,
+        failures: Failures,
         clock: Callable[[], int],
         loop_clock: LoopClock,
     ) -> None:
         self._config = config
         self._session_id = session_id
         self._operating = operating
+        self._failures = failures
         self._ledger = ledger
         self._counts = counts
         self._keyframes = keyframes
@@ -102,6 +114,7 @@ class StatusReporter:
 
     def send(self, state: str) -> None:
         """Send the report, made for the moment at which it may go."""
+        self._counts.measure_cpu(perception_ns=self._stills.analyzer.spent_ns)
         self._transmitter.status(lambda at_ns: self._status(state, at_ns), now_ns=self._loop_clock())
         self._sequence += 1
 
@@ -159,5 +172,19 @@ class StatusReporter:
                 encode_ms=counts.encode_ms if measured else 0.0,
                 detect_ms=stills.analyzer.mean_ms if measured else 0.0,
                 feedback_age_ms=age_ms if measured else -1,
+                frames_dropped_cpu=counts.dropped_cpu,
+                frames_unanalyzed=counts.unanalyzed,
+                cores_needed=counts.cpu.now.needed if measured else 0.0,
+                cores_free=counts.cpu.now.free if measured else 0.0,
+            ),
+            failed=tuple(
+                FailedPart(
+                    part=one.part[:_PART_BYTES],
+                    reason=fitted_text(one.reason, _REASON_BYTES),
+                    failures=one.count,
+                    failed_ns=one.failed_ns,
+                    working=one.working,
+                )
+                for one in self._failures.parts[:MOST_FAILED_PARTS]
             ),
         )

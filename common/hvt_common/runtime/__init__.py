@@ -1,1 +1,1 @@
-"""What every process needs: `clock`, `process` (signals, priority, allocator), `reporting`, `statistics`."""
+"""What every process needs: `clock`, `failures`, `process` (signals, priority), `reporting`, `statistics`."""

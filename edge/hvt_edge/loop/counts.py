@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from hvt_edge.loop.cpu import CpuMeter
 
 __all__ = ["FrameCounts"]
 
@@ -13,13 +15,23 @@ class FrameCounts:
 
     captured: int = 0
     encoded: int = 0
-    dropped: int = 0
-    """Before encoding, because the link or the machine was behind."""
+    dropped_link: int = 0
+    """Before encoding: the link had no room."""
+    dropped_cpu: int = 0
+    """Before encoding: the machine was behind."""
     unanalyzed: int = 0
     """Coded, or left out by frame decimation, and skipped by perception, because stills or detection were behind."""
     encode_ns: int = 0
     first_index: int | None = None
     last_index: int = -1
+    cpu: CpuMeter = field(default_factory=CpuMeter)
+    _measured: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
+    """Captured, dropped for want of time, not analyzed, time of encoding and of perception when it was measured."""
+
+    @property
+    def dropped(self) -> int:
+        """Before encoding."""
+        return self.dropped_link + self.dropped_cpu
 
     @property
     def encode_ms(self) -> float:
@@ -33,6 +45,18 @@ class FrameCounts:
         self.last_index = index
         self.encoded += 1
         self.encode_ns += encode_ns
+
+    def measure_cpu(self, *, perception_ns: int) -> None:
+        """About once a second: what all frames would have taken, from what those did that were not left out."""
+        here = (self.captured, self.dropped_cpu, self.unanalyzed, self.encode_ns, perception_ns)
+        captured, dropped, unanalyzed, encode_ns, spent_ns = (
+            new - old for new, old in zip(here, self._measured, strict=True)
+        )
+        self._measured = here
+        video, perception = captured - dropped, captured - dropped - unanalyzed
+        scale = encode_ns * captured / max(1, video) + spent_ns * captured / max(1, perception)
+        scale = scale / (encode_ns + spent_ns) if encode_ns + spent_ns else 1.0
+        self.cpu.measure(scale=scale, short=bool(dropped or unanalyzed))
 
     def duration_s(self, fps: float) -> float:
         """From the first frame sent to the last, with one frame's length."""

@@ -56,7 +56,7 @@ class RealtimePace:
     def step(self, frame: Frame) -> None:
         """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it."""
         if not self._live and not realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop):
-            self._counts.dropped += 1
+            self._counts.dropped_cpu += 1
             return
         now_ns = self._clock()
         self._before_frame(now_ns)
@@ -67,7 +67,7 @@ class RealtimePace:
             self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
             self._base.send(unit, decision, now_ns=self._clock())
         elif decision.action is Action.HOLD:
-            self._counts.dropped += 1
+            self._counts.dropped_link += 1
         self._analyze(frame, unit)
 
     def __enter__(self) -> Self:

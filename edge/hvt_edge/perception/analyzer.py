@@ -73,7 +73,8 @@ class Analyzer:
         self._coded_index: int | None = None
         self._coded_gap = 1
         self._track_ids = DistinctIds()
-        self._spent_ns = 0
+        self.spent_ns = 0
+        """Time to decode, detect and track so far."""
         self.frames = 0
         """How many were analyzed."""
 
@@ -85,7 +86,7 @@ class Analyzer:
     @property
     def mean_ms(self) -> float:
         """Mean time to decode, detect and track, over all frames."""
-        return self._spent_ns / max(1, self.frames) / 1e6
+        return self.spent_ns / max(1, self.frames) / 1e6
 
     def analyze(
         self,
@@ -108,7 +109,7 @@ class Analyzer:
         for one in skipped:
             self._decode(one.frame_index, one)
         analyzed = self._analyze(frame, unit, hurry=hurry)
-        self._spent_ns += time.perf_counter_ns() - began_ns
+        self.spent_ns += time.perf_counter_ns() - began_ns
         self.frames += 1
         self._track_ids.add(analyzed.tracks.ids.tolist())
         return analyzed

@@ -154,7 +154,12 @@ def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
             encode_ms=1000.0,
             detect_ms=1000.0,
             feedback_age_ms=10_000,
+            frames_dropped_cpu=10**6,
+            frames_unanalyzed=10**6,
+            cores_needed=1.6,
+            cores_free=1.1,
         ),
+        failed=(),
     )
 
 

@@ -255,7 +255,12 @@ class Flight:
                 encode_ms=0.0,
                 detect_ms=0.0,
                 feedback_age_ms=-1,
+                frames_dropped_cpu=0,
+                frames_unanalyzed=0,
+                cores_needed=0.0,
+                cores_free=0.0,
             ),
+            failed=(),
         )
         return _received("status", report.pack(), b"", "")
 

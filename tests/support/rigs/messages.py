@@ -12,6 +12,7 @@ from hvt_common.protocol.messages import (
     BaseHeader,
     ControlAnswer,
     ControlRequest,
+    FailedPart,
     Feedback,
     Flags,
     Health,
@@ -72,6 +73,10 @@ HEALTH = Health(
     encode_ms=36.4,
     detect_ms=57.1,
     feedback_age_ms=412,
+    frames_dropped_cpu=66,
+    frames_unanalyzed=14,
+    cores_needed=1.6,
+    cores_free=1.1,
 )
 STATUS = Status(
     session_id=0x1234567890ABCDEF,
@@ -95,6 +100,15 @@ STATUS = Status(
     deferred={"budget": 1_900},
     dropped={"stale": 44, "border": 3, "queue full": 2},
     health=HEALTH,
+    failed=(
+        FailedPart(
+            part="local copy",
+            reason="flight.mkv cannot be written (No space left on device)",
+            failures=3,
+            failed_ns=1_790_000_500_000_000_000,
+            working=False,
+        ),
+    ),
 )
 INFO = Info(
     session_id=7,

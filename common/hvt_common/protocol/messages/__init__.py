@@ -36,7 +36,14 @@ from hvt_common.protocol.messages.envelope import (
     kinds,
 )
 from hvt_common.protocol.messages.fields import WireError, fitted_text
-from hvt_common.protocol.messages.reports import Health, Info, Status, fitted_class_names
+from hvt_common.protocol.messages.reports import (
+    MOST_FAILED_PARTS,
+    FailedPart,
+    Health,
+    Info,
+    Status,
+    fitted_class_names,
+)
 from hvt_common.protocol.messages.stream import MAX_ALSO, AlsoShown, BaseHeader, Flags, RoiHeader
 from hvt_common.protocol.messages.track_step import TrackStep, TrackStepDecoder, TrackStepEncoder
 
@@ -48,6 +55,7 @@ __all__ = [
     "MAX_PAYLOAD_BYTES",
     "MAX_STILL_RESULTS",
     "MAX_TRACKS_NOW",
+    "MOST_FAILED_PARTS",
     "WIRE_VERSION",
     "AcknowledgedRange",
     "AlsoShown",
@@ -60,6 +68,7 @@ __all__ = [
     "ControlAnswer",
     "ControlRequest",
     "CorruptError",
+    "FailedPart",
     "Feedback",
     "Flags",
     "Health",

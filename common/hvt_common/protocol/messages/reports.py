@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -11,6 +12,7 @@ from hvt_common.protocol.messages.fields import (
     I63,
     U32,
     U64,
+    Flag,
     Int,
     ListOf,
     MapOf,
@@ -24,7 +26,7 @@ from hvt_common.protocol.messages.fields import (
 )
 from hvt_common.values import View
 
-__all__ = ["Health", "Info", "Status", "fitted_class_names"]
+__all__ = ["MOST_FAILED_PARTS", "FailedPart", "Health", "Info", "Status", "fitted_class_names"]
 
 _TIME = Int(0, I63)
 _COUNT = Int(0, 2**53 - 1)
@@ -35,6 +37,8 @@ _CLASS_NAMES = 2048
 _CLASS_NAMES_BYTES = 60_000
 _LAST = Int(-1, U32)
 _REASONS = MapOf(Int(0, U32), 24)
+_CORES = Scaled(0, 4096, 100)
+MOST_FAILED_PARTS = 8
 
 
 def fitted_class_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -107,13 +111,35 @@ class Health:
     detect_ms: float = wire_field(Scaled(0, 60_000, 10))
     feedback_age_ms: int = wire_field(Int(-1, U32))
     """Since the last feedback from any ground; -1 for none yet."""
+    frames_dropped_cpu: int = wire_field(_COUNT)
+    """Of `frames_dropped` those for which the machine was too slow; for the others the link had no room."""
+    frames_unanalyzed: int = wire_field(_COUNT)
+    """Skipped by perception for want of time."""
+    cores_needed: float = wire_field(_CORES)
+    """Processor cores that encoder and detector need for every frame; 0 where it is not measured."""
+    cores_free: float = wire_field(_CORES)
+    """Cores that other processes leave."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FailedPart:
+    """A part of the edge that has failed since its start."""
+
+    part: str = wire_field(Text(24))
+    reason: str = wire_field(Text(160))
+    """Of the newest failure, a sentence."""
+    failures: int = wire_field(Int(1, U32))
+    failed_ns: int = wire_field(_TIME)
+    """When it failed last, the edge's clock."""
+    working: bool = wire_field(Flag())
+    """It works again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status(Message):
     """Payload of ``status``: the ledger's totals since the start, the outcomes of candidates, and health."""
 
-    MAX_BYTES: ClassVar[int] = 2048
+    MAX_BYTES: ClassVar[int] = 6144
 
     session_id: int = wire_field(Int(0, U64))
     sequence: int = wire_field(Int(0, U32))
@@ -141,3 +167,9 @@ class Status(Message):
     deferred: Mapping[str, int] = wire_field(_REASONS)
     dropped: Mapping[str, int] = wire_field(_REASONS)
     health: Health = wire_field(Nested(Health))  # noqa: RUF009 - a dataclass field, not a default
+    failed: tuple[FailedPart, ...] = wire_field(ListOf(Nested(FailedPart), MOST_FAILED_PARTS))
+
+    @property
+    def outcomes(self) -> Mapping[str, int]:
+        """Why candidates have no still: how many were deferred or dropped for each reason."""
+        return Counter(self.deferred) + Counter(self.dropped)

@@ -27,6 +27,7 @@ from hvt_common.protocol.messages import (
     ControlAnswer,
     ControlRequest,
     CorruptError,
+    FailedPart,
     Feedback,
     Health,
     Info,
@@ -146,7 +147,7 @@ def test_typical_sizes_are_small():
     assert len(BASE.pack()) <= 40
     assert len(ROI.pack()) <= 150
     assert len(STEP.pack()) <= 45 + len(STEP.boxes)
-    assert len(STATUS.pack()) <= 240
+    assert len(replace(STATUS, failed=()).pack()) <= 180
     assert len(REQUEST.pack()) <= 20
 
 
@@ -438,7 +439,7 @@ def test_a_kept_still_that_cannot_be_one_is_refused(values):
 
 @pytest.mark.parametrize(
     "message",
-    [*MESSAGES, AlsoShown, Health, AcknowledgedRange, StillResult, TrackNow],
+    [*MESSAGES, AlsoShown, Health, FailedPart, AcknowledgedRange, StillResult, TrackNow],
     ids=lambda message: message.__name__,
 )
 def test_the_document_lists_every_field_with_its_bounds(message):

@@ -1,0 +1,92 @@
+"""Parts that fail in flight: said once, counted, tried again with growing pauses, while everything else goes on."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from hvt_common.units import SECOND_NS
+
+__all__ = ["Failure", "Failures", "RetryPause"]
+
+_log = logging.getLogger(__name__)
+
+_STEADY_NS = 60 * SECOND_NS
+"""What fails again after it worked for so long is news, and begins with a short pause."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What became of one part."""
+
+    part: str
+    reason: str
+    """Of the newest failure, a sentence."""
+    count: int
+    failed_ns: int
+    """The newest failure, Unix time."""
+    working: bool = False
+
+
+class Failures:
+    """Which parts of a process have failed since its start. Thread-safe."""
+
+    def __init__(self, clock: Callable[[], int]) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._parts: dict[str, Failure] = {}
+
+    @property
+    def parts(self) -> tuple[Failure, ...]:
+        """In the order of their first failure."""
+        return tuple(self._parts.values())
+
+    def failed(self, part: str, reason: str) -> None:
+        """It has stopped. The log says so once, however often it is tried in vain."""
+        now_ns = self._clock()
+        with self._lock:
+            before = self._parts.get(part)
+            count = 1 if before is None else before.count + 1
+            self._parts[part] = Failure(part, reason, count, now_ns)
+        fresh = before is None or (before.working and now_ns - before.failed_ns > _STEADY_NS)
+        if fresh or (before is not None and before.working and count.bit_count() == 1):
+            times = "" if count == 1 else f" ({count} failures so far)"
+            _log.warning("%s: %s; all else goes on, and it is tried again%s", part, reason, times)
+
+    def works(self, part: str) -> None:
+        """It works, or works again."""
+        with self._lock:
+            before = self._parts.get(part)
+            if before is None or before.working:
+                return
+            self._parts[part] = replace(before, working=True)
+        if before.count == 1 or before.count.bit_count() == 1:
+            _log.warning("%s: works again", part)
+
+
+class RetryPause:
+    """How long to wait before the next try: twice as long after each failure. Time is an argument."""
+
+    def __init__(self, first_ns: int = SECOND_NS, longest_ns: int = 60 * SECOND_NS) -> None:
+        self._first_ns = first_ns
+        self._longest_ns = longest_ns
+        self._pause_ns = 0
+        self._failed_ns = 0
+
+    @property
+    def pause_ns(self) -> int:
+        """From the newest failure to the next try; 0 before the first."""
+        return self._pause_ns
+
+    def failed(self, now_ns: int) -> None:
+        """It failed, at the start or after it had worked for a while."""
+        steady = now_ns - self._failed_ns > self._pause_ns + _STEADY_NS
+        self._pause_ns = self._first_ns if steady else min(2 * self._pause_ns, self._longest_ns)
+        self._pause_ns = max(self._first_ns, self._pause_ns)
+        self._failed_ns = now_ns
+
+    def due(self, now_ns: int) -> bool:
+        """Whether it may be tried."""
+        return now_ns - self._failed_ns >= self._pause_ns

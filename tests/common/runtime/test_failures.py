@@ -1,0 +1,63 @@
+"""Parts that fail: said once, counted, tried again ever more seldom."""
+
+from __future__ import annotations
+
+from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.units import SECOND_NS
+
+
+class Time:
+    """A clock that is set."""
+
+    def __init__(self) -> None:
+        self.now_ns = 100 * SECOND_NS
+
+    def __call__(self) -> int:
+        """Now."""
+        return self.now_ns
+
+
+def test_a_failing_part_is_said_once_and_its_return_once(caplog):
+    """A full card would fill the log too; or nobody would learn that the part has stopped."""
+    clock = Time()
+    failures = Failures(clock)
+    for _ in range(50):
+        failures.failed("local copy", "card.mkv cannot be written")
+        clock.now_ns += SECOND_NS
+    failures.works("local copy")
+    failures.works("local copy")
+    assert [record.message.split(";")[0] for record in caplog.records] == [
+        "local copy: card.mkv cannot be written"
+    ]
+    (part,) = failures.parts
+    assert (part.count, part.working, part.failed_ns) == (50, True, 149 * SECOND_NS)
+
+
+def test_a_part_that_comes_and_goes_does_not_flood_the_log(caplog):
+    """A loose camera cable would write two lines a second for hours."""
+    clock = Time()
+    failures = Failures(clock)
+    for _ in range(1_000):
+        failures.failed("source", "no frame")
+        failures.works("source")
+        clock.now_ns += SECOND_NS
+    assert len(caplog.records) <= 20
+    clock.now_ns += 3600 * SECOND_NS
+    before = len(caplog.records)
+    failures.failed("source", "no frame")
+    assert len(caplog.records) == before + 1, "after an hour without a fault it is news"
+
+
+def test_pauses_grow_to_their_limit_and_begin_anew_after_a_steady_time():
+    """A broken part would be tried for ever at full speed; or one that failed at breakfast wait a minute at noon."""
+    pause, now_ns, pauses = RetryPause(longest_ns=8 * SECOND_NS), 0, []
+    assert pause.due(now_ns)
+    for _ in range(6):
+        pause.failed(now_ns)
+        pauses.append(pause.pause_ns // SECOND_NS)
+        assert not pause.due(now_ns + pause.pause_ns - 1)
+        now_ns += pause.pause_ns
+        assert pause.due(now_ns)
+    assert pauses == [1, 2, 4, 8, 8, 8]
+    pause.failed(now_ns + 600 * SECOND_NS)
+    assert pause.pause_ns == SECOND_NS
