@@ -11,6 +11,7 @@ from hvt_common.units import bitrate_text
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink
+from hvt_ground.sinks.timing import SessionTiming
 
 __all__ = ["status_text", "summary", "table"]
 
@@ -61,7 +62,8 @@ def summary(
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog.totals
     came = session.stills_received + backlog.stills
-    sinks = [sink for sink in session.sinks if isinstance(sink, QueuedSink)]
+    tables = (sink.table if isinstance(sink, SessionTiming) else sink for sink in session.sinks)
+    sinks = [sink for sink in tables if isinstance(sink, QueuedSink)]
     recordings = [path for sink in sinks for path in sink.files if path.suffix == ".rrd"]
     deferred = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
     return {

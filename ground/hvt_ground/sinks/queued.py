@@ -46,6 +46,7 @@ class QueuedSink(Generic[T]):
         """Items, their sizes, and how many were dropped before each."""
         self._queued_bytes = 0
         self._skipped = 0
+        self._in_hand = False
         self._ending = False
         self._hurry = threading.Event()
         self._backoff = Backoff()
@@ -99,6 +100,12 @@ class QueuedSink(Generic[T]):
         if not self.ended:
             self._fail(TimeoutError("it did not end in time"))
         return self.ended
+
+    @property
+    def idle(self) -> bool:
+        """Whether all that could be written is."""
+        with self._changed:
+            return not (self._queue or self._in_hand)
 
     @property
     def ended(self) -> bool:
@@ -166,11 +173,13 @@ class QueuedSink(Generic[T]):
     def _take(self) -> tuple[T, int] | None:
         """The next item, and how many were dropped before it; None at the end."""
         with self._changed:
+            self._in_hand = False
             self._changed.wait_for(lambda: self._queue or self._ending)
             if not self._queue:
                 return None
             item, size, skipped = self._queue.popleft()
             self._queued_bytes -= size
+            self._in_hand = True
             if self._wait_s:
                 self._changed.notify_all()
             return item, skipped
@@ -185,6 +194,7 @@ class QueuedSink(Generic[T]):
             self.lost += len(self._queue)
             self._queue.clear()
             self._queued_bytes = self._skipped = 0
+            self._in_hand = False
             if not self._failing:
                 self._failing, self._since_ns = True, now_ns
                 _log.warning("%s failed and will be tried again: %s", self.part, reason)
@@ -206,6 +216,12 @@ class Outputs:
             self._sinks = [one for one in self._sinks if not one.ended]
             self._sinks.append(sink)
         return sink
+
+    @property
+    def idle(self) -> bool:
+        """Whether all that could be written is."""
+        with self._lock:
+            return all(one.idle for one in self._sinks)
 
     def trouble(self) -> str:
         """For the status line: what fails; empty while all is well."""

@@ -6,7 +6,7 @@ import csv
 import itertools
 import threading
 import time
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -32,9 +32,9 @@ from hvt_ground.perception.worker import Job, RealtimeWorker
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
-from hvt_ground.sinks import Sink
+from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.timing import SessionTiming, TimingTable
+from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.status import summary, table
 from programs.rrd import Recording
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
@@ -106,6 +106,7 @@ class Rig:
         self._timing = timing
         self._worker_of = worker_of
         self._recorder = recorder
+        self.outputs = Outputs()
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
         self.port.flight = flight
@@ -121,13 +122,12 @@ class Rig:
 
     def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         path = self.folder / f"{len(self.opened)}.rrd"
-        sinks: list[Sink] = [Recorder(settings(info, path, **self._recorder))]
+        sinks: list[Sink] = [self._sink(info, path)]
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=info.edge, session_id=info.session_id))
         session = GroundSession(
             info,
             sinks=sinks,
-            recording=path,
             pipeline_of=self._pipeline,
             clock=time.time_ns,
             reports=reports,
@@ -139,9 +139,11 @@ class Rig:
 
     def _open_backlog(self, info: Info) -> BacklogRecording:
         path = self.folder / f"backlog-{next(self._backlog_numbers)}.rrd"
-        return BacklogRecording(
-            info, path=path, sink=Recorder(settings(info, path, **self._recorder)), perception=look_of(info)
-        )
+        return BacklogRecording(info, sink=self._sink(info, path), perception=look_of(info))
+
+    def _sink(self, info: Info, path: Path) -> QueuedSink:
+        made = settings(info, path, **self._recorder)
+        return self.outputs.open("recording", lambda: Recorder(made))
 
     def put(self, *items: Received) -> None:
         """What Zenoh's callback does, and then all of it is handled and seen."""
@@ -154,6 +156,7 @@ class Rig:
         )  # the receiving thread hands boxes on to perception
         for session in self.opened:
             self._wait_for(lambda one=session: one.idle)
+        self._wait_for(lambda: self.outputs.idle)
 
     def _wait_for(self, condition) -> None:
         wait_for(lambda: condition() or self.thread.error is not None)
@@ -187,6 +190,8 @@ class Rig:
 
     def __exit__(self, kind, *_) -> None:
         end(self.thread, failing=kind is not None)
+        self.outputs.close(within_s=60)
+        assert self.outputs.trouble() == ""
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +280,7 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 @pytest.mark.parametrize("compact_bytes", [6_000, 1 << 30])
 def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, compact_bytes):
     """Rows that come late would be lost or doubled where the append log is compacted, or when the file is closed."""
-    with Rig(tmp_path, flight, compact_bytes=compact_bytes, footer_growth=10) as rig:
+    with Rig(tmp_path, flight, compact_bytes=compact_bytes) as rig:
         rig.base(*range(25))
         rig.base(*range(65, 90))
         rig.put(*backlog(flight, "base", 40, video_object(flight, range(40, 65))))
@@ -455,28 +460,15 @@ def received(item: Received) -> ReceivedStill:
     return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload, item.encoding)
 
 
-class Slow(BacklogRecording):
-    """Closing it takes its time; knows who did it."""
+def test_a_recording_in_use_stays_open(flight, tmp_path):
+    """What goes into a file that was pushed out is lost without a word."""
+    formers, made = [Flight(2) for _ in range(4)], []
+    outputs = Outputs()
 
-    def __init__(self, *args, may_end: threading.Event, **kwargs) -> None:
-        super().__init__(*args, **kwargs)
-        self.may_end, self.closed_by = may_end, ""
-
-    def close(self, *, quickly: bool = False) -> None:
-        """Wait."""
-        assert self.may_end.wait(20)
-        self.closed_by = threading.current_thread().name
-        super().close(quickly=quickly)
-
-
-def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp_path):
-    """What goes into a file that was pushed out is lost without a word, or the link waits for another's footer."""
-    formers, made, may_end = [Flight(2) for _ in range(4)], [], threading.Event()
-
-    def open_one(info: Info) -> Slow:
+    def open_one(info: Info) -> BacklogRecording:
         path = tmp_path / f"{len(made)}.rrd"
-        recorder = Recorder(settings(info, path))
-        made.append(Slow(info, path=path, sink=recorder, perception=look_of(info), may_end=may_end))
+        sink = outputs.open("recording", lambda: Recorder(settings(info, path)))
+        made.append(BacklogRecording(info, sink=sink, perception=look_of(info)))
         return made[-1]
 
     recordings = BacklogRecordings(open_one, most=2)
@@ -485,18 +477,12 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
         other = recordings.acquire(former.info())
         assert other is made[-1].backlog
         recordings.release(other)
-    assert [one.closed_by for one in made] == [""] * 4, "closing waits, and nobody waits for it"
     assert recordings.open_sessions == [formers[0].session_id, formers[3].session_id]
     first.read_still(received(formers[0].still(1, 1)))
     recordings.release(first)
-    may_end.set()
     assert recordings.acquire(flight.info()) is made[4].backlog
     assert recordings.open_sessions == [formers[3].session_id, flight.session_id], "done with, it may go"
     recordings.close()
-    assert {one.closed_by.rpartition("_")[0] for one in made} == {"hvt-backlog-close"}
-    assert "1 still of this session arrived after it had ended" in [
-        text for _, _, text in Recording(tmp_path / "0.rrd").events()
-    ]
     assert recordings.acquire(flight.info()) is None
     few = BacklogRecordings(open_one, most_files=1)
     assert few.acquire(formers[0].info()) is made[5].backlog
@@ -504,6 +490,10 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
         "so many came at once that the last could not be refused before"
     )
     few.close()
+    outputs.close(within_s=60)
+    assert "1 still of this session arrived after it had ended" in [
+        text for _, _, text in Recording(tmp_path / "0.rrd").events()
+    ]
 
 
 def test_damaged_and_foreign_pieces_are_counted_and_skipped(flight, tmp_path):
@@ -633,11 +623,13 @@ def test_a_still_of_which_a_part_came_is_missed_until_it_is_whole(flight, tmp_pa
 
 def test_timing_says_of_pieces_what_became_of_them(flight, tmp_path):
     """An object that was refused would count as shown, at once."""
-    with closing(TimingTable(tmp_path / "t.csv")) as lines, Rig(tmp_path, flight, timing=lines) as rig:
+    lines = QueuedSink("timing table", lambda: timing_table(tmp_path / "t.csv"))
+    with Rig(tmp_path, flight, timing=lines) as rig:
         rig.base(*range(5))
         good, bad = still_object(flight, 2, 0), still_object(flight, 3, 1)
         rig.put(*backlog(flight, "still", 0, good, chunk_bytes=len(good) // 2 + 1))
         rig.put(*backlog(flight, "still", 9, bad, chunk_bytes=len(bad) // 2 + 1))  # of another number inside
+    assert lines.join(time.monotonic() + 20)
     with (tmp_path / "t.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["kind"] == "backlog-still"]
     assert [(row["sequence"], int(row["shown_ns"]) > 0) for row in rows] == [
