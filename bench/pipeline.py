@@ -18,6 +18,7 @@ from bench.material import FPS, SIZE, clip, frames, nano
 from hvt_common import __version__
 from hvt_common.inference.detect import open_detector
 from hvt_common.protocol.messages import BaseHeader, Flags, Info
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.values import AccessUnit, View
 from hvt_common.video.hevc import BaseDecoder
@@ -98,7 +99,12 @@ def _ground(units: list[AccessUnit]) -> float:
     items = [_received(sequence, unit) for sequence, unit in enumerate(units)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.rrd"
-        sink = QueuedSink("recording", lambda: Recorder(_recorder_settings(path, info)), wait_s=10.0)
+        sink = QueuedSink(
+            "recording",
+            lambda: Recorder(_recorder_settings(path, info)),
+            failures=Failures(time.time_ns),
+            wait_s=10.0,
+        )
         session = GroundSession(
             info,
             sinks=[sink],

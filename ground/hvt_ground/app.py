@@ -4,31 +4,37 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 from hvt_common.errors import UserError
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import StatusLine, check_writable
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
+from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort, GroundLink
-from hvt_ground.sinks import Outputs
+from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
-from hvt_ground.status import status_text, summary
+from hvt_ground.status import completed, status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 
 __all__ = ["Ground"]
 
 _POLL_S = 0.1
 _STATUS_EVERY_POLLS = 10
-_CLOCK_EVERY_POLLS = 200
+_MOST_SUMMARIES = 256
+"""Of an edge; one that is started again and again for weeks is not to fill the memory."""
 
 
 class Ground:
@@ -41,8 +47,11 @@ class Ground:
         self._stop = stop
         self._on_started = on_started
         self._clock = SteadyClock()
-        self._outputs = Outputs()
         self._edges: dict[str, EdgeThread] = {}
+        self._ended: defaultdict[str, deque[tuple[dict[str, Any], Sequence[Sink[Event]]]]] = defaultdict(
+            partial(deque, maxlen=_MOST_SUMMARIES)
+        )
+        """By edge, the summaries of sessions and what they were written to."""
         self._began_s = time.monotonic()
 
     def run(self) -> list[dict[str, Any]]:
@@ -62,7 +71,8 @@ class Ground:
             view: LiveView | None = None
             if config.view or config.serve:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
-            stack.callback(self._outputs.close)
+            outputs = Outputs(models.failures)
+            stack.callback(outputs.close)
             settings = LinkSettings(
                 role="ground",
                 listen=config.listen,
@@ -73,20 +83,20 @@ class Ground:
             )
             session = stack.enter_context(open_session(settings))
             self._make_record_folder()
-            factory = SessionFactory(config, models, clock=self._clock, outputs=self._outputs, view=view)
+            factory = SessionFactory(config, models, clock=self._clock, outputs=outputs, view=view)
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
             self._say_where(line, page="" if view is None else view.page)
             try:
-                self._serve(link, factory, line, watch)
+                self._serve(link, factory, line, watch, models.failures)
             finally:
                 self._close_edges()
         return [
-            summary(session, unusable=one.sessions.unusable, backlog_recordings=one.sessions.backlog.paths)
-            for _, one in sorted(self._edges.items())
-            for session in one.sessions.done
+            completed(content, one.sessions, sinks=sinks, failures=models.failures)
+            for edge, one in sorted(self._edges.items())
+            for content, sinks in self._ended[edge]
         ]
 
     # Before anything is received
@@ -125,7 +135,14 @@ class Ground:
 
     # Serving
 
-    def _serve(self, link: GroundLink, factory: SessionFactory, line: StatusLine, watch: LinkWatch) -> None:
+    def _serve(
+        self,
+        link: GroundLink,
+        factory: SessionFactory,
+        line: StatusLine,
+        watch: LinkWatch,
+        failures: Failures,
+    ) -> None:
         polls = 0
         while not self._stop.wait(_POLL_S):
             ports = link.ports()
@@ -138,10 +155,8 @@ class Ground:
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
                 edges = [(edge, one.sessions) for edge, one in sorted(self._edges.items())]
-                text = status_text(edges) or ("no link" if watch.trouble else "no edge yet")
-                line.show(" | ".join(filter(None, (text, self._outputs.trouble()))))
-            if polls % _CLOCK_EVERY_POLLS == 0:
-                self._refresh_clocks()
+                text = status_text(edges, failures=failures)
+                line.show(text or ("no link" if watch.trouble else "no edge yet"))
             if self._config.once and self._all_ended():
                 return
 
@@ -150,11 +165,16 @@ class Ground:
             EdgeSessions(
                 port,
                 open_session=factory.open_session,
+                on_ended=self._note_ended,
                 recordings=BacklogRecordings(factory.open_backlog),
                 clock=self._clock,
                 patience_s=self._config.patience_s,
             )
         )
+
+    def _note_ended(self, session: GroundSession) -> None:
+        """In the thread of its edge: a session is not remembered, its numbers are, of the last ones."""
+        self._ended[session.info.edge].append((summary(session), session.sinks))
 
     def _leave_edges(self, ports: list[EdgePort]) -> None:
         """The link has left those that never were more than a name, for others."""
@@ -172,15 +192,10 @@ class Ground:
     def _all_ended(self) -> bool:
         edges = [one.sessions for one in self._edges.values()]
         gone = all(one.idle and not one.port.present.is_set() for one in edges)
-        if not any(one.done for one in edges):  # nobody came, or who came left without a picture
+        if not any(one.ended for one in edges):  # nobody came, or who came left without a picture
             waited_s = time.monotonic() - self._began_s
             return gone and 0 < self._config.wait < waited_s
         return gone
-
-    def _refresh_clocks(self) -> None:
-        for one in self._edges.values():
-            if not one.sessions.idle and one.sessions.port.present.is_set():
-                one.sessions.refresh_clock()
 
     def _close_edges(self) -> None:
         for one in self._edges.values():

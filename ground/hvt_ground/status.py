@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Iterable
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
-from hvt_common.units import bitrate_text
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS, bitrate_text
+from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
-from hvt_ground.sinks import QueuedSink
-from hvt_ground.sinks.timing import SessionTiming
+from hvt_ground.sinks import QueuedSink, Sink
 
-__all__ = ["status_text", "summary", "table"]
+__all__ = ["completed", "status_text", "summary", "table"]
 
 _LOST_S = 3.0
 """Status comes once a second: nothing for so long is no accident."""
 
 
-def status_text(edges: Iterable[tuple[str, EdgeSessions]]) -> str:
-    """The status line: what comes of each edge now; empty without one."""
+def status_text(edges: Iterable[tuple[str, EdgeSessions]], *, failures: Failures | None = None) -> str:
+    """The status line: what comes of each edge now, and which models fail; empty without any."""
     parts = []
     for edge, sessions in edges:
         session = sessions.session
         if session is None:
-            parts.append(f"{edge}: {'ended' if sessions.done else 'waiting for a keyframe'}")
+            state = "ended" if sessions.ended else "waiting for a keyframe"
+            parts.append("  ".join([f"{edge}: {state}", *failed_texts(sessions.failures)]))
             continue
         if sessions.silent_s > _LOST_S and not session.lockstep:
             parts.append(f"{edge}: {session.duration_s:.1f} s  LINK LOST for {sessions.silent_s:.0f} s")
@@ -37,8 +39,9 @@ def status_text(edges: Iterable[tuple[str, EdgeSessions]]) -> str:
             f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
             f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}{_held_back(session)}  "
             f"tracks {session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
+            + "".join(f"  {text}" for text in failed_texts(sessions.failures))
         )
-    return " | ".join(parts)
+    return " | ".join(parts + failed_texts(failures))
 
 
 def _held_back(session: GroundSession) -> str:
@@ -48,23 +51,14 @@ def _held_back(session: GroundSession) -> str:
     return f" (not sent: {', '.join(f'{count} {reason}' for reason, count in most)})" if most else ""
 
 
-def summary(
-    session: GroundSession, *, unusable: int, backlog_recordings: Sequence[Path] = ()
-) -> dict[str, Any]:
-    """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do.
-
-    ``unusable`` counts messages of the edge that were skipped, over all its sessions; ``backlog_recordings`` are of
-    former sessions, of which a backlog came.
-    """
+def summary(session: GroundSession) -> dict[str, Any]:
+    """The JSON summary of a session that has ended; rates count every byte on the line, as the edge's do."""
     info, pipeline, counters = session.info, session.pipeline, session.counters
     account = session.ledger.summary(session.duration_s)
     worst = account.worst_window_bps
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog.totals
     came = session.stills_received + backlog.stills
-    tables = (sink.table if isinstance(sink, SessionTiming) else sink for sink in session.sinks)
-    sinks = [sink for sink in tables if isinstance(sink, QueuedSink)]
-    recordings = [path for sink in sinks for path in sink.files if path.suffix == ".rrd"]
     deferred = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
     return {
         "edge": info.edge,
@@ -106,7 +100,6 @@ def summary(
             "frames": backlog.frames,
             "frames_left_out": backlog.left_out,
             "video_s": round(backlog.video_s, 3),
-            "recordings": [str(path) for path in backlog_recordings],
         },
         "tracks": pipeline.tracks,
         "tracks_refined": pipeline.refined,
@@ -116,14 +109,48 @@ def summary(
         "lost": counters.lost,
         "corrupt": counters.corrupt,
         "duplicates": counters.duplicates + counters.replayed,
-        "unusable_messages": unusable,
         "keyframe_requests": counters.keyframe_requests,
         "latency_ms": session.overlay_latency.as_dict(),
         "receive_latency_ms": session.receive_latency.as_dict(),
+        "failure": session.failure,
+    }
+
+
+def completed(
+    content: dict[str, Any],
+    sessions: EdgeSessions,
+    *,
+    sinks: Iterable[Sink[Event]] = (),
+    failures: Failures | None = None,
+) -> dict[str, Any]:
+    """The summary of a session, with what counts over all sessions of its edge, and the ground's own failures.
+
+    Messages that were skipped, recordings of former sessions, of which a backlog came, parts that failed; and, once
+    they are closed, what became of the session's ``sinks``.
+    """
+    edge = content["edge"]
+    general = () if failures is None else failures.parts
+    failed = [*sessions.failures.parts, *(one for one in general if _concerns(one.part, edge))]
+    queued = [sink for sink in sinks if isinstance(sink, QueuedSink)]
+    recordings = [path for sink in queued for path in sink.files if path.suffix == ".rrd"]
+    return content | {
         "recording": str(recordings[0]) if recordings else None,
         "recordings": [str(path) for path in recordings],
         "recording_bytes": sum(path.stat().st_size for path in recordings if path.exists()),
-        "failures": [report for sink in sinks if (report := sink.report()) is not None],
+        "missing_events": {sink.part: sink.missing for sink in queued if sink.missing},
+        "unusable_messages": sessions.unusable,
+        "backlog": content["backlog"] | {"recordings": [str(path) for path in sessions.backlog.paths]},
+        "failed": [
+            {
+                "part": one.part,
+                "reason": one.reason,
+                "count": one.count,
+                "since": _utc(one.since_ns),
+                "last": _utc(one.failed_ns),
+                "working": one.working,
+            }
+            for one in failed
+        ],
     }
 
 
@@ -165,7 +192,12 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             ("outages", f"{backlog['stills']} stills and {backlog['video_s']:.1f} s of video came afterwards")
         )
-    rows += [("former session", path) for path in backlog["recordings"]]
+    if content["failure"]:
+        rows.append(("session failed", content["failure"]))
+    for one in content.get("failed", ()):
+        times = "" if one["count"] == 1 else f"{one['count']} times, last "
+        rows.append(("failed", f"{one['part']}, {times}at {one['last']}: {one['reason']}"))
+    rows += [("former session", path) for path in backlog.get("recordings", ())]
     if latency["p50"] is not None:
         since = "receiving" if content["pace"] == "lockstep" else "capture"
         spread = f"p50 {latency['p50']:.0f} ms, p95 {latency['p95']:.0f}, max {latency['max']:.0f}"
@@ -173,16 +205,25 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     if content["recordings"]:
         files = ", ".join(content["recordings"])
         rows.append(("recording", f"{files}, {content['recording_bytes'] / 1e6:.2f} MB"))
-    rows += [("failed", _failure_text(one)) for one in content["failures"]]
+    for one in content["failed"]:
+        ends = "works again" if one["working"] else "did not work again"
+        count = "once" if one["count"] == 1 else f"{one['count']} times"
+        rows.append(("failed", f"{one['part']}, {count}, at {one['since']}: {one['reason']}; {ends}"))
+    rows += [("missing", f"{count} events in {part}") for part, count in content["missing_events"].items()]
     return rows
 
 
-def _failure_text(report: dict[str, Any]) -> str:
-    missing = report["lost_events"] + report["dropped_events"]
-    if "reason" not in report:
-        return f"{report['part']} was too slow: {missing} events are missing"
-    end = "it went on later" if report["over"] else "it stayed so"
-    return (
-        f"{report['part']} at {report['since']}: {report['reason']}; {end}, {missing} events are missing, "
-        f"{report['times']} failures in all"
-    )
+def failed_texts(failures: Failures | None) -> list[str]:
+    """What does not work now, since when."""
+    parts = () if failures is None else failures.parts
+    return [f"{one.part} FAILED at {_utc(one.since_ns)[11:19]} UTC" for one in parts if not one.working]
+
+
+def _concerns(part: str, edge: str) -> bool:
+    """Whether a part is this edge's, or nobody's: ``recording of uav-1``, ``timing table``."""
+    _, of, whose = part.rpartition(" of ")
+    return not of or whose == edge
+
+
+def _utc(unix_ns: int) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(unix_ns // SECOND_NS))

@@ -9,6 +9,7 @@ from random import Random
 from typing import NamedTuple
 
 from hvt_common.protocol.messages import Info
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.receiver_report import ReceiverReports
@@ -24,7 +25,7 @@ __all__ = ["TARGETS"]
 _CHANNELS = ("base", "roi", "tracks", "status", "backlog")
 _ATTACHED = ("base", "roi", "backlog")
 _PACES = ("realtime", "lockstep")
-_sinks = Outputs()
+_sinks = Outputs(Failures(time.time_ns))
 _UNHARMED = 2
 """So many access units come unharmed before the rest."""
 
@@ -77,7 +78,8 @@ def _session(data: bytes) -> None:
     pace, *messages = parted(data, least=1)
     port = Port()
     flight = port.flight = _flight(_PACES[len(pace) % len(_PACES)])
-    edge = EdgeSessions(port, open_session=_opened)  # type: ignore[arg-type]
+    ended: list[GroundSession] = []
+    edge = EdgeSessions(port, open_session=_opened, on_ended=ended.append)  # type: ignore[arg-type]
     for index in range(_UNHARMED):
         edge.handle(flight.base(index))
         edge.housekeep(pending=False)
@@ -87,8 +89,9 @@ def _session(data: bytes) -> None:
         edge.housekeep(pending=False)
     edge.close()
     _sinks.close(within_s=0.0)  # without footers
-    assert edge.done, "the unharmed messages alone are a session"
-    assert all(len(session.take_results(10_000)) < 5000 for session in edge.done)
+    assert ended, "the unharmed messages alone are a session"
+    assert not edge.failures.parts
+    assert all(len(session.take_results(10_000)) < 5000 for session in ended)
 
 
 def _changed(data: bytes, rng: Random, raw: Bytes) -> bytes:

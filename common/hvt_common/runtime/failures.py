@@ -7,14 +7,21 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 
-__all__ = ["Failure", "Failures", "RetryPause"]
+__all__ = ["Failure", "Failures", "RetryPause", "reason_of"]
 
 _log = logging.getLogger(__name__)
 
 _STEADY_NS = 60 * SECOND_NS
 """What fails again after it worked for so long is news, and begins with a short pause."""
+
+
+def reason_of(error: BaseException) -> str:
+    """What an error says, in one line: a sentence as it is, anything else after its kind."""
+    text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    return " ".join(text.split())[:300]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +34,8 @@ class Failure:
     count: int
     failed_ns: int
     """The newest failure, Unix time."""
+    since_ns: int
+    """When it stopped, before all tries that were in vain."""
     working: bool = False
 
 
@@ -49,7 +58,8 @@ class Failures:
         with self._lock:
             before = self._parts.get(part)
             count = 1 if before is None else before.count + 1
-            self._parts[part] = Failure(part, reason, count, now_ns)
+            since_ns = now_ns if before is None or before.working else before.since_ns
+            self._parts[part] = Failure(part, reason, count, now_ns, since_ns)
         fresh = before is None or (before.working and now_ns - before.failed_ns > _STEADY_NS)
         if fresh or (before is not None and before.working and count.bit_count() == 1):
             times = "" if count == 1 else f" ({count} failures so far)"

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import zenoh
 
@@ -30,6 +31,7 @@ __all__ = [
     "declare_publisher",
     "open_session",
     "query",
+    "query_later",
     "serve",
     "subscribe",
 ]
@@ -73,11 +75,27 @@ def declare_publisher(session: zenoh.Session, channel: Channel, *, keys: EdgeKey
 
 
 def subscribe(
-    session: zenoh.Session, key_expr: str, *, inbox: ReceivedQueue, clock: Callable[[], int] = time.time_ns
+    session: zenoh.Session,
+    key_expr: str,
+    *,
+    inbox: ReceivedQueue,
+    clock: Callable[[], int] = time.time_ns,
+    on_error: Callable[[str, Exception], None] | None = None,
 ) -> zenoh.Subscriber[None]:
-    """Copy every message of the key expression into the inbox, with its time by ``clock``; deletions are ignored."""
+    """Copy every message of the key expression into the inbox, with its time by ``clock``; deletions are ignored.
+
+    ``on_error(key, error)`` gets what goes wrong with a message, which Zenoh would print and forget.
+    """
 
     def receive(sample: zenoh.Sample) -> None:
+        try:
+            take(sample)
+        except Exception as error:
+            if on_error is None:
+                raise
+            on_error(str(sample.key_expr), error)
+
+    def take(sample: zenoh.Sample) -> None:
         received_ns = clock()
         if sample.kind != zenoh.SampleKind.PUT:
             return
@@ -108,20 +126,46 @@ def query(
 
     Blocks for at most ``timeout_s``. Two edges of one id both answer.
     """
-    delivery = DELIVERIES[channel]
-    replies = session.get(
-        keys.key(channel),
-        payload=question,
-        timeout=timeout_s,
-        target=zenoh.QueryTarget.ALL,
-        consolidation=zenoh.ConsolidationMode.NONE,
-        congestion_control=getattr(zenoh.CongestionControl, delivery.congestion),
-        priority=getattr(zenoh.Priority, delivery.priority),
-    )
+    replies = session.get(keys.key(channel), payload=question, timeout=timeout_s, **_asking(channel))
     for reply in replies:
-        if reply.ok is not None and wanted(data := reply.ok.payload.to_bytes()):
-            return data
+        if reply.ok is not None:
+            data: bytes = reply.ok.payload.to_bytes()
+            if wanted(data):
+                return data
     return None
+
+
+def query_later(
+    session: zenoh.Session,
+    channel: Channel,
+    *,
+    keys: EdgeKeys,
+    question: bytes,
+    timeout_s: float,
+    on_answer: Callable[[bytes], None],
+    on_end: Callable[[], None],
+) -> None:
+    """Ask without waiting: ``on_answer`` gets each answer, ``on_end`` is called after the last or in the end.
+
+    Both run in Zenoh's callbacks.
+    """
+
+    def reply(reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            on_answer(reply.ok.payload.to_bytes())
+
+    handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(reply, on_end)
+    session.get(keys.key(channel), handler, payload=question, timeout=timeout_s, **_asking(channel))
+
+
+def _asking(channel: Channel) -> dict[str, Any]:
+    delivery = DELIVERIES[channel]
+    return {
+        "target": zenoh.QueryTarget.ALL,
+        "consolidation": zenoh.ConsolidationMode.NONE,
+        "congestion_control": getattr(zenoh.CongestionControl, delivery.congestion),
+        "priority": getattr(zenoh.Priority, delivery.priority),
+    }
 
 
 def serve(

@@ -7,6 +7,7 @@ from collections.abc import Set as AbstractSet
 from contextlib import ExitStack
 from dataclasses import dataclass
 
+from hvt_common.errors import UserError
 from hvt_common.protocol.messages import BacklogUnit
 from hvt_common.values import Image
 from hvt_ground.backlog.perception import StretchTracker
@@ -52,6 +53,10 @@ class StillJob(Job):
         self._done(True)
         return True
 
+    def fail(self, error: Exception) -> None:
+        """What the machine may mend, such as a full disk, comes again."""
+        self._done(_usable(error))
+
 
 class VideoJob(Job):
     """Logs those frames of a stretch that are missing and can be decoded; then a job of its own finds their boxes.
@@ -95,6 +100,10 @@ class VideoJob(Job):
                 boxes.close()
         self._done(True)
         return True
+
+    def fail(self, error: Exception) -> None:
+        """As of a `StillJob`."""
+        self._done(_usable(error))
 
     def close(self) -> None:
         """Release the destination."""
@@ -140,3 +149,7 @@ class _BoxesJob(Job):
         self._checkout.close()
         if self._target is not None:
             self._destination.release(self._target)
+
+
+def _usable(error: Exception) -> bool | None:
+    return None if isinstance(error, OSError | UserError) else False

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import Detector, open_detector, warm_up
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
+from hvt_ground.perception.retried import RetriedClassifier, RetriedDetector
 
 __all__ = ["ModelSet", "Models"]
 
@@ -23,6 +27,8 @@ class Models:
 
     def __init__(self, config: GroundConfig) -> None:
         self._config = config
+        self.failures = Failures(SteadyClock())
+        """Models whose run raised."""
         self._ready: list[ModelSet] = [self._open()]
         self._serving: dict[str, ModelSet] = {}
         """By edge, what the session that is open has."""
@@ -65,7 +71,8 @@ class Models:
 
     def _open_detector(self) -> Detector:
         config = self._config
-        return open_detector(
+        open_one = partial(
+            open_detector,
             config.detector,
             labels=config.detector_labels,
             confidence=weak_confidence(config.confidence),
@@ -73,13 +80,20 @@ class Models:
             threads=config.threads,
             provider=config.provider,
         )
+        return RetriedDetector(open_one, "detector", self.failures)
 
     def _open(self) -> ModelSet:
         config = self._config
         detector = self._open_detector()
-        warm_up(detector, _USUAL_SIZE)
+        if config.detector != MOTION:  # it remembers pictures
+            warm_up(detector, _USUAL_SIZE)
         if config.classifier in (None, DETECTOR, NONE):
             return detector, None
-        return detector, open_classifier(
-            config.classifier, labels=config.labels, threads=config.threads, provider=config.provider
+        open_one = partial(
+            open_classifier,
+            config.classifier,
+            labels=config.labels,
+            threads=config.threads,
+            provider=config.provider,
         )
+        return detector, RetriedClassifier(open_one, "classifier", self.failures)

@@ -6,6 +6,7 @@ same: the same input gives the same tracks.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -13,11 +14,14 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
+from hvt_common.runtime.failures import reason_of
 from hvt_common.runtime.process import lower_priority
 from hvt_common.values import Tracks
 from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
 
 __all__ = ["Analyze", "Job", "LockstepWorker", "PerceptionWorker", "Read", "RealtimeWorker", "Step"]
+
+_log = logging.getLogger(__name__)
 
 _MOST_PICTURES = 24
 """How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
@@ -44,14 +48,17 @@ Step = Callable[[Tracks, int], None]
 Read = Callable[[Sequence[ReceivedStill]], None]
 
 
-class Job:
+class Job(ABC):
     """Work that can wait, done step by step while nothing newer is there. For the worker's thread."""
 
+    @abstractmethod
     def step(self) -> bool:
-        """Do one step; True once there is none left."""
-        raise NotImplementedError
+        """Do one step; True once there is none left. Whatever it raises ends this job alone."""
 
-    def close(self) -> None:
+    def fail(self, error: Exception) -> None:  # noqa: B027 - most have nobody to tell
+        """A step has raised: there is no other."""
+
+    def close(self) -> None:  # noqa: B027 - many hold nothing
         """Release what it holds, done or not; called once."""
 
 
@@ -72,6 +79,7 @@ class PerceptionWorker(ABC):
         """Pictures that were passed over."""
         self.dropped: Counter[str] = Counter()
         """Stills that were passed over, by reason."""
+        self.jobs_failed = 0
 
     @property
     @abstractmethod
@@ -105,6 +113,19 @@ class PerceptionWorker(ABC):
     @abstractmethod
     def close(self) -> bool:
         """Finish what is queued, for a second or two; False where the thread did not come back."""
+
+    def _is_done(self, job: Job) -> bool:
+        """Do one step of a job; whether it was the last."""
+        try:
+            return job.step()
+        except Exception as error:  # noqa: BLE001 - the picture of now goes on
+            self.jobs_failed += 1
+            if self.jobs_failed.bit_count() == 1:
+                _log.warning(
+                    "what was stored cannot be worked off (%d so far): %s", self.jobs_failed, reason_of(error)
+                )
+            job.fail(error)
+            return True
 
     def raise_error(self) -> None:  # noqa: B027 - errors may come out of the other methods instead
         """Raise what ended the thread."""
@@ -249,7 +270,7 @@ class RealtimeWorker(PerceptionWorker):
         while (jobs := self._jobs or self._last_jobs) and not self._given_up.is_set():
             if self._has_news() and time.monotonic() - self._job_step_s < _JOB_STEP_S:
                 return
-            if jobs[0].step():
+            if self._is_done(jobs[0]):
                 jobs.popleft().close()
             self._job_step_s = time.monotonic()
 
@@ -296,7 +317,7 @@ class LockstepWorker(PerceptionWorker):
 
     def submit(self, job: Job, *, last: bool = False) -> bool:  # noqa: ARG002 - one after the other
         """Do it after what was handed over before."""
-        self._submit(self._worker.submit(_do, job))
+        self._submit(self._worker.submit(self._do, job))
         return True
 
     def close(self) -> bool:
@@ -319,10 +340,9 @@ class LockstepWorker(PerceptionWorker):
         while len(self._pending) > _AHEAD:
             self._pending.popleft().result()
 
-
-def _do(job: Job) -> None:
-    try:
-        while not job.step():
-            pass
-    finally:
-        job.close()
+    def _do(self, job: Job) -> None:
+        try:
+            while not self._is_done(job):
+                pass
+        finally:
+            job.close()

@@ -6,11 +6,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 
 from hvt_common import __version__
 from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import Info, WireError
 from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.backlog.recordings import BacklogRecordings
@@ -27,7 +29,7 @@ from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.session.receiver import Receiver
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
-from hvt_ground.session.subscribe import EdgePort
+from hvt_ground.session.subscribe import EdgePort, InfoAnswer
 
 __all__ = ["EdgeSessions", "EdgeThread"]
 
@@ -37,20 +39,26 @@ _SECOND_NS = 1_000_000_000
 _INFO_TRIES = 3
 _BACKLOG_PAUSE_NS = 3 * _SECOND_NS
 """After so long without another chunk the recording says how much of the backlog came."""
+_CLOCK_EVERY_NS = 20 * _SECOND_NS
+"""So often the edge is asked for its time."""
 
 
 class EdgeSessions:
     """Routes what comes to the session that is open; requests keyframes and lets the session report.
 
-    For one thread; `EdgeThread` is that of a ground.
+    Whatever goes wrong ends the session that is open, with its recording whole, and nothing else: another begins with
+    the next keyframe, after a pause that grows where it goes wrong again and again. For one thread; `EdgeThread` is
+    that of a ground.
 
     Args:
         port: of the edge.
         open_session: makes what the messages of a session go to.
+        on_ended: takes each session when it is closed; it is not remembered here.
         clock: the port's, Unix nanoseconds without steps; one of its own by default.
         recordings: of sessions that are over, closed with this; without it nothing of one is taken.
         patience_s: an edge whose token is gone and that sends nothing for so long has ended without saying so.
         ended_patience_s: how long the rest of a session may take to arrive after its edge has said that it ended.
+        pause: between a session that failed and the next.
     """
 
     def __init__(
@@ -58,22 +66,29 @@ class EdgeSessions:
         port: EdgePort,
         *,
         open_session: Callable[[Info, ReceiverReports], GroundSession],
+        on_ended: Callable[[GroundSession], None] = lambda _session: None,
         clock: Callable[[], int] | None = None,
         recordings: BacklogRecordings | None = None,
         patience_s: float = 5.0,
         ended_patience_s: float = 2.0,
+        pause: RetryPause | None = None,
     ) -> None:
         self.port = port
         self._open_session = open_session
+        self._on_ended = on_ended
         self._patience_ns = round(patience_s * _SECOND_NS)
         self._ended_patience_ns = round(ended_patience_s * _SECOND_NS)
-        clock = clock or SteadyClock()
+        self._clock = clock or SteadyClock()
+        self._pause = pause or RetryPause()
+        self.failures = Failures(self._clock)
+        """What failed of this edge's reception."""
         self.backlog = EdgeBacklog(port.edge, recordings=recordings)
         """What was stored while the link was down."""
+        self._clock_offset = ClockOffset()
         self._reports = ReceiverReports(
-            port.report, clock=clock, clock_offset=ClockOffset(), backlog=self.backlog
+            port.report, clock=self._clock, clock_offset=self._clock_offset, backlog=self.backlog
         )
-        self._receiver = Receiver(port.edge, clock=clock)
+        self._receiver = Receiver(port.edge, clock=self._clock)
         self._pre_session = PreSessionBuffer()
         self._counted = StreamCounters()
         """When the session before ended."""
@@ -82,10 +97,12 @@ class EdgeSessions:
         self._ended_id: int | None = None
         self._backlog_ns: int | None = None
         """When the last chunk of it came that nothing has been said of."""
+        self._next_clock_ns = 0
         self.session: GroundSession | None = None
         """The one that is open."""
-        self.done: list[GroundSession] = []
-        """Those that have ended."""
+        self.ended = 0
+        """Sessions that have ended."""
+        self._part = f"session of {port.edge}"
 
     @property
     def idle(self) -> bool:
@@ -102,15 +119,32 @@ class EdgeSessions:
         """For how long nothing has come."""
         return self._receiver.silent_ns / _SECOND_NS
 
+    def work(self, item: Received | None, *, pending: bool) -> None:
+        """Take one message, if there is one, and do what is due; ``pending``: more wait. It never raises."""
+        try:
+            self.port.raise_error()
+            if item is not None:
+                self.handle(item)
+            self.housekeep(pending=pending)
+        except Exception as error:  # noqa: BLE001 - it ends one session of one edge, whatever it is
+            self._fail(error)
+
     def handle(self, item: Received) -> None:
-        """Take one message."""
+        """Take one message; raises whatever goes wrong with it."""
         for packet in self._receiver.receive(item):
             self._route(packet)
 
+    def close(self) -> None:
+        """End the session that is open, and close the recordings of former ones."""
+        self._end_session()
+        self.backlog.close()
+
+    # What is due
+
     def housekeep(self, *, pending: bool) -> None:
-        """What is due by now; ``pending``: messages wait. Call it after each message, and when none comes."""
-        session = self.session
-        if self._receiver.take_keyframe_request(pending=pending):
+        """Do what is due by now; raises whatever goes wrong with it."""
+        session, now_ns = self.session, time.monotonic_ns()
+        if self._pause.due(now_ns) and self._receiver.take_keyframe_request(pending=pending):
             self.port.request_keyframe()
             if session is not None:
                 session.note("warning", "keyframe requested")
@@ -118,44 +152,42 @@ class EdgeSessions:
             return
         session.raise_error()
         session.count(self._receiver.counters.since(self._counted))
-        now_ns = time.monotonic_ns()
         paused = self._backlog_ns is not None and now_ns - self._backlog_ns > _BACKLOG_PAUSE_NS
         if paused and not self.backlog.working:
             self._backlog_ns = None
             session.report_backlog()
         session.report_if_due()
+        self._follow_clock(session, now_ns)
         if self._is_over(session, now_ns):
             gone = self._ended_ns is None
             self._end_session()
             if gone:
                 self._receiver.wait_for_keyframe()  # should it come back, it starts with a keyframe
 
-    def refresh_clock(self, session_id: int | None = None) -> Info | None:
-        """Query the edge for its facts and its time; by default those of the session that is open.
+    def _follow_clock(self, session: GroundSession, now_ns: int) -> None:
+        """Ask the edge for its time now and then; nothing waits for the answer."""
+        while (answer := self.port.take_info()) is not None:
+            self._learn(answer)
+        if now_ns >= self._next_clock_ns and self.port.present.is_set():
+            self._next_clock_ns = now_ns + _CLOCK_EVERY_NS
+            self.port.request_info(session.info.session_id)
 
-        Another edge of the same id may run on a machine with another clock.
-        """
-        session = self.session
-        if session_id is None and session is not None:
-            session_id = session.info.session_id
+    def _query_info(self, session_id: int) -> Info | None:
+        """The facts of that session, and the edge's time: another edge of the same id may have another clock."""
         answer = self.port.query_info(session_id)
-        if answer is None:
-            return None
+        return None if answer is None else self._learn(answer)
+
+    def _learn(self, answer: InfoAnswer) -> Info | None:
         info, requested_ns, answered_ns = answer
         if info.edge != self.port.edge:  # it names files and keys: another's name is nobody's
             self._receiver.skip("info", WireError(f"the edge says that it is {info.edge!r:.40}"))
             return None
-        self._reports.clock_offset.add(
+        self._clock_offset.add(
             t0_ns=requested_ns, t1_ns=info.received_ns, t2_ns=info.answered_ns, t3_ns=answered_ns
         )
         if info.software != __version__:
             _log.info("%s runs version %s, this is %s", self.port.edge, info.software, __version__)
         return info
-
-    def close(self) -> None:
-        """End the session that is open, and close the recordings of former ones."""
-        self._end_session()
-        self.backlog.close()
 
     # Routing
 
@@ -193,7 +225,8 @@ class EdgeSessions:
                 self.session.note("warning", text)
         begins = arrival.starts_session and not self._goes_on(packet)
         if begins or (arrival.starts_run and self.session is None and session_id != self._ended_id):
-            self._begin_session(session_id)
+            if self._pause.due(time.monotonic_ns()):
+                self._begin_session(session_id)
             if self.session is None:
                 self._receiver.wait_for_keyframe()  # the next keyframe is the next try
         session = self.session
@@ -236,8 +269,9 @@ class EdgeSessions:
     # Sessions
 
     def _begin_session(self, session_id: int) -> None:
-        info = next((info for _ in range(_INFO_TRIES) if (info := self.refresh_clock(session_id))), None)
-        if info is None and self.session is not None and self.refresh_clock() is not None:
+        info = next((info for _ in range(_INFO_TRIES) if (info := self._query_info(session_id))), None)
+        shown = self.session
+        if info is None and shown is not None and self._query_info(shown.info.session_id) is not None:
             self._receiver.disown()
             self._receiver.skip("base", WireError(f"the edge does not know of a session {session_id:016x}"))
             return
@@ -246,7 +280,9 @@ class EdgeSessions:
             self._receiver.skip("info", WireError("the edge does not say what its session is"))
             return
         self.port.used.set()
+        self._next_clock_ns = time.monotonic_ns() + _CLOCK_EVERY_NS
         self.session = self._open_session(info, self._reports)
+        self.failures.works(self._part)
         for packet in self._pre_session.take():
             self._route(packet)
 
@@ -260,12 +296,33 @@ class EdgeSessions:
         counters = self._receiver.counters
         session.count(counters.since(self._counted))
         self._counted = counters
-        self.done.append(session)
-        session.close()
+        self.ended += 1
+        for step in (session.close, partial(self._report_end, session), partial(self._on_ended, session)):
+            try:
+                step()
+            except Exception as error:  # noqa: BLE001 - the steps after it are due all the same
+                self._say_failed(error, session)
+
+    def _report_end(self, session: GroundSession) -> None:
         session.report()
         while self.backlog.unreported:  # one report names a few
             session.report()
         self.backlog.session_ended(session.info)
+
+    def _fail(self, error: Exception) -> None:
+        """End the session that is open; the next begins with a keyframe, not before the pause is over."""
+        self._pause.failed(time.monotonic_ns())
+        self._say_failed(error, self.session)
+        self._end_session()
+        self._receiver.wait_for_keyframe()
+
+    def _say_failed(self, error: Exception, session: GroundSession | None) -> None:
+        if session is not None:
+            if session.failure:
+                return  # one fault may come to light in several places
+            session.failure = reason_of(error)
+        _log.debug("%s", self._part, exc_info=error)
+        self.failures.failed(self._part, reason_of(error))
 
     def _is_over(self, session: GroundSession, now_ns: int) -> bool:
         if self._ended_ns is None:
@@ -310,9 +367,7 @@ class EdgeThread:
         try:
             while not self._finished():
                 item = self._inbox.get(timeout_s=0.05)
-                if item is not None:
-                    self.sessions.handle(item)
-                self.sessions.housekeep(pending=len(self._inbox) > 0)
+                self.sessions.work(item, pending=len(self._inbox) > 0)
             self.sessions.close()
         except BaseException as error:  # noqa: BLE001 - handed to the app, which ends the process
             self.error = error

@@ -48,7 +48,7 @@ class ReceiverReports:
         stills: tuple[StillResult, ...],
     ) -> None:
         """Report on a session as it is now; ``base`` and ``roi`` are messages and bytes."""
-        delay_ms, error_ns = measured.delay_p50_ms, self.clock_offset.error_ns
+        delay_ms, (offset_ns, error_ns) = measured.delay_p50_ms, self.clock_offset.estimate or (0, -1)
         with self._lock:
             feedback = Feedback(
                 session_id=session_id,
@@ -67,8 +67,8 @@ class ReceiverReports:
                 still_sequence=measured.still_sequence,
                 missing_stills=measured.missing_stills,
                 delay_p50_ms=-1.0 if delay_ms is None else min(delay_ms, _MOST_DELAY_MS),
-                clock_offset_ns=self.clock_offset.offset_ns or 0,
-                clock_error_ns=-1 if error_ns is None else error_ns,
+                clock_offset_ns=offset_ns,
+                clock_error_ns=error_ns,
                 stills=stills,
                 backlog=self._backlog.take_acknowledged_ranges(MAX_ACKNOWLEDGED_RANGES),
             )

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
@@ -83,6 +84,8 @@ class GroundSession:
         """Reports of the edge's tracks."""
         self.last_frame_index = -1
         """The last frame that was decoded, tracked and drawn."""
+        self.failure = ""
+        """What ended it, where that was no regular end."""
         self.counters = StreamCounters()
         """What the reassembly counted in this session."""
         self._clock = clock
@@ -221,17 +224,28 @@ class GroundSession:
         self._emit(Notice(max(0, self._last_index), self._last_capture_ns, level, text))  # type: ignore[arg-type]
 
     def close(self) -> None:
-        """Finish what is queued (for a second or two), close the sinks, raise what ended the worker."""
-        try:
-            if self.worker.close():
-                self.pipeline.end()
-            self.report_backlog()
-            self._decoder.reset()
-            self.note("info", f"session {self.info.session_id:016x} ended")
-        finally:
+        """Finish what is queued (for a second or two) and close the sinks, each whatever the others do.
+
+        Raises what went wrong on the way, or ended the worker.
+        """
+        with ExitStack() as stack:
             for sink in self.sinks:
-                sink.close()
+                stack.callback(sink.close)
+            stack.callback(self._note_end)
+            stack.callback(self._decoder.reset)
+            stack.callback(self.report_backlog)
+            ended = True
+            try:
+                ended = self.worker.close()
+            finally:
+                if ended:
+                    self.pipeline.end()
         self.raise_error()
+
+    def _note_end(self) -> None:
+        if self.failure:
+            self.note("error", f"the session failed: {self.failure}")
+        self.note("info", f"session {self.info.session_id:016x} ended")
 
     # What is known of it
 
@@ -360,7 +374,7 @@ class GroundSession:
         """Give out when a message came; ``handled``: something was made of it, None is said later."""
         size, extra = len(item.payload), len(item.attachment)
         line = size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding)
-        offset_ns = 0 if self._reports is None else self._reports.clock_offset.offset_ns or 0
+        offset_ns = 0 if self._reports is None else self._reports.clock_offset.offset_ns
         frame_index, capture_ns = -1, 0
         if isinstance(header, BaseHeader | RoiHeader | TrackStep):
             frame_index, capture_ns = header.frame_index, header.capture_ns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
@@ -14,10 +15,11 @@ import zenoh
 from hvt_common.protocol.channels import Channel, EdgeKeys, matches, parse_key, selector
 from hvt_common.protocol.messages import Command, ControlRequest, Feedback, Info, WireError
 from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import reason_of
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_common.transport.session import declare_publisher, query, subscribe
+from hvt_common.transport.session import declare_publisher, query, query_later, subscribe
 
 __all__ = ["MAX_EDGES", "EdgePort", "GroundLink"]
 
@@ -33,12 +35,20 @@ _MOST_PER_S = 2000
 """Messages of one row from one edge. A camera has 240 pictures a second at the very most."""
 _SUBSCRIBED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.BACKLOG, Channel.STATUS)
 _ANSWER_S = 1.0
+_MOST_ANSWERS, _MOST_ERRORS = 4, 16
 _UNANSWERED = 3
 """So many questions on control in a row without an answer are no accident."""
 
 
+InfoAnswer = tuple[Info, int, int]
+"""A session's facts with the times of asking and hearing, ns."""
+
+
 class EdgePort:
-    """One edge as the link knows it: its messages in order of arrival, its presence, and a way to talk to it."""
+    """One edge as the link knows it: its messages in order of arrival, its presence, and a way to talk to it.
+
+    ``put`` is for Zenoh's callbacks, all else for the edge's thread, which gets their errors by `raise_error`.
+    """
 
     def __init__(self, session: zenoh.Session, edge: str, *, clock: Callable[[], int]) -> None:
         self.edge = edge
@@ -52,27 +62,22 @@ class EdgePort:
         self._unanswered = 0
         self._session = session
         self._keys = EdgeKeys(edge)
-        self._feedback = declare_publisher(session, Channel.FEEDBACK, keys=self._keys)
+        self._feedback: zenoh.Publisher | None = None
+        self._errors: deque[Exception] = deque(maxlen=_MOST_ERRORS)
+        self._answers: deque[InfoAnswer] = deque(maxlen=_MOST_ANSWERS)
 
-    def query_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
-        """Return the session's facts with the times of asking and hearing (ns); None without an answer in time.
+    def query_info(self, session_id: int | None = None) -> InfoAnswer | None:
+        """Return the session's facts; None without an answer in time.
 
         With ``session_id`` only that one's answer counts: two edges may bear the same id.
         """
         requested_ns = self._clock()
-        answered_ns = 0
-        found: Info | None = None
+        found: list[InfoAnswer] = []
 
         def wanted(data: bytes) -> bool:
-            nonlocal answered_ns, found
-            answered_ns = self._clock()
-            try:
-                info = Info.parse(data)
-            except WireError as error:
-                _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
-                return False
-            found = info if session_id in (None, info.session_id) else None
-            return found is not None
+            answer = self._info_answer(data, session_id, requested_ns)
+            found.extend([] if answer is None else [answer])
+            return answer is not None
 
         try:
             query(
@@ -80,7 +85,40 @@ class EdgePort:
             )
         except zenoh.ZError as error:
             _log.warning("%s: it could not be asked for info: %s", self.edge, error)
-        return None if found is None else (found, requested_ns, answered_ns)
+        return found[0] if found else None
+
+    def request_info(self, session_id: int) -> None:
+        """As `query_info`, without waiting: `take_info` has the answer, if one comes."""
+        requested_ns = self._clock()
+
+        def note(data: bytes) -> None:
+            answer = self._info_answer(data, session_id, requested_ns)
+            if answer is not None:
+                self._answers.append(answer)
+
+        self._ask(Channel.INFO, b"", on_answer=note, on_end=lambda: None)
+
+    def take_info(self) -> InfoAnswer | None:
+        """An answer to `request_info`, once."""
+        return self._answers.popleft() if self._answers else None
+
+    def _info_answer(self, data: bytes, session_id: int | None, requested_ns: int) -> InfoAnswer | None:
+        answered_ns = self._clock()
+        try:
+            info = Info.parse(data)
+        except WireError as error:
+            _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
+            return None
+        return (info, requested_ns, answered_ns) if session_id in (None, info.session_id) else None
+
+    def fail(self, error: Exception) -> None:
+        """Hand over what went wrong in a callback."""
+        self._errors.append(error)
+
+    def raise_error(self) -> None:
+        """Raise what went wrong in a callback, once."""
+        if self._errors:
+            raise self._errors.popleft()
 
     def put(self, item: Received, row: Channel) -> None:
         """Take a message in; what finds no room is dropped."""
@@ -98,15 +136,34 @@ class EdgePort:
         """Ask for a keyframe; does not wait for the answer, which is the keyframe."""
         request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
         answered = threading.Event()
-        handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(
-            lambda _reply: answered.set(), lambda: self._note_control(answered=answered.is_set())
+        self._ask(
+            Channel.CONTROL,
+            request.pack(),
+            on_answer=lambda _answer: answered.set(),
+            on_end=lambda: self._note_control(answered=answered.is_set()),
         )
+
+    def _ask(
+        self, row: Channel, question: bytes, *, on_answer: Callable[[bytes], None], on_end: Callable[[], None]
+    ) -> None:
+        def hear(data: bytes) -> None:
+            try:
+                on_answer(data)
+            except Exception as error:  # noqa: BLE001 - for the edge's thread
+                self.fail(error)
+
         try:
-            self._session.get(
-                self._keys.key(Channel.CONTROL), handler, payload=request.pack(), timeout=_ANSWER_S
+            query_later(
+                self._session,
+                row,
+                keys=self._keys,
+                question=question,
+                timeout_s=_ANSWER_S,
+                on_answer=hear,
+                on_end=on_end,
             )
         except zenoh.ZError as error:
-            _log.debug("%s: keyframe request not sent: %s", self.edge, error)
+            _log.debug("%s: %s was not asked: %s", self.edge, row, error)
 
     def _note_control(self, *, answered: bool) -> None:
         """Say once that nothing is answered: a question without the right to ask is dropped in silence."""
@@ -117,6 +174,8 @@ class EdgePort:
     def report(self, feedback: Feedback) -> None:
         """Publish a receiver report."""
         try:
+            if self._feedback is None:
+                self._feedback = declare_publisher(self._session, Channel.FEEDBACK, keys=self._keys)
             self._feedback.put(feedback.pack())
         except zenoh.ZError as error:
             _log.debug("%s: feedback not sent: %s", self.edge, error)
@@ -124,8 +183,9 @@ class EdgePort:
     def close(self) -> None:
         """No more comes, and nothing goes out."""
         self.inbox.close()
-        with suppress(zenoh.ZError):  # the session may be closed
-            self._feedback.undeclare()  # type: ignore[no-untyped-call]
+        if self._feedback is not None:
+            with suppress(zenoh.ZError):  # the session may be closed
+                self._feedback.undeclare()  # type: ignore[no-untyped-call]
 
 
 class GroundLink:
@@ -141,7 +201,8 @@ class GroundLink:
         """Messages under keys that are none of ours, or of more edges than are served."""
         self._refused = False
         for row in _SUBSCRIBED:
-            subscribe(session, selector(row, edges=edges), inbox=self, clock=self._clock)
+            key_expr = selector(row, edges=edges)
+            subscribe(session, key_expr, inbox=self, clock=self._clock, on_error=self._fail)
         self._presence = session.liveliness().declare_subscriber(
             selector(Channel.ALIVE, edges=edges), self._on_presence, history=True
         )
@@ -210,10 +271,23 @@ class GroundLink:
             )
 
     def _on_presence(self, sample: zenoh.Sample) -> None:
-        port = self._port(str(sample.key_expr), alive=sample.kind == zenoh.SampleKind.PUT)
-        if port is None:
+        key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT  # these enums fail `is`
+        try:
+            port = self._port(key, alive=there)
+        except Exception as error:  # noqa: BLE001 - for the edge's thread
+            self._fail(key, error)
             return
-        if sample.kind == zenoh.SampleKind.PUT:  # the enums of the bindings fail `is`
-            port.present.set()
-        else:
-            port.present.clear()
+        if port is not None:
+            (port.present.set if there else port.present.clear)()
+
+    def _fail(self, key: str, error: Exception) -> None:
+        """Hand over what went wrong in a callback: to the edge's thread, which ends its session for it."""
+        parsed = parse_key(key)
+        with self._lock:
+            port = None if parsed is None else self._ports.get(parsed[0])
+        if port is not None:
+            port.fail(error)
+            return
+        self.foreign += 1
+        if self.foreign.bit_count() == 1:
+            _log.error("a message under %.80s could not be taken in: %s", key, reason_of(error))

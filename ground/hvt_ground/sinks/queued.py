@@ -11,8 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from hvt_common.runtime.failure import Backoff, Failure, reason_of
-from hvt_common.units import SECOND_NS
+from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_ground.sinks.contract import Sink, size_bytes
 
 __all__ = ["Outputs", "QueuedSink"]
@@ -33,11 +32,13 @@ class QueuedSink(Generic[T]):
     """Writes in a thread of its own what `log` takes, into a sink that ``open_sink`` makes there.
 
     A sink that raises is closed and made anew after growing pauses; until then what comes is counted as lost. Where
-    the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as dropped. ``part`` is what
-    the log, the status line and the summary call it.
+    the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as dropped. ``failures``
+    learns of it under the name ``part``.
     """
 
-    def __init__(self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0) -> None:
+    def __init__(
+        self, part: str, open_sink: Callable[[], Sink[T]], *, failures: Failures, wait_s: float = 0.0
+    ) -> None:
         self.part = part
         self._open_sink = open_sink
         self._wait_s = wait_s
@@ -49,18 +50,15 @@ class QueuedSink(Generic[T]):
         self._in_hand = False
         self._ending = False
         self._hurry = threading.Event()
-        self._backoff = Backoff()
+        self._failures = failures
+        self._pause = RetryPause()
         self.files: list[Path] = []
         """In the order of opening."""
-        self.failure: Failure | None = None
-        """The newest."""
-        self._since_ns = 0
-        """Unix time: since when it failed the last time."""
         self._failing = False
-        self.lost = 0
-        """Items that came while the sink was failing."""
-        self.dropped = 0
-        """Items for which the queue had no room."""
+        self.missing = 0
+        """Items that came while the sink was failing, or for which the queue had no room."""
+        self._dropped = 0
+        """The latter."""
         self._thread = threading.Thread(target=self._run, name=f"hvt-{part}"[:48], daemon=True)
         self._thread.start()
 
@@ -73,17 +71,18 @@ class QueuedSink(Generic[T]):
             if self._ending:
                 return
             if self._failing:
-                self.lost += 1
+                self.missing += 1
             elif self._has_room(size):
                 self._queue.append((item, size, self._skipped))
                 self._queued_bytes += size
                 self._skipped = 0
                 self._changed.notify_all()
             else:
-                self.dropped += 1
+                self.missing += 1
+                self._dropped += 1
                 self._skipped += 1
-                if self.dropped.bit_count() == 1:  # 1, 2, 4, 8 …
-                    _log.warning("%s is too slow: %d events were dropped so far", self.part, self.dropped)
+                if self._dropped.bit_count() == 1:  # 1, 2, 4, 8 …
+                    _log.warning("%s is too slow: %d events were dropped so far", self.part, self._dropped)
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - `join` has its own
         """Take nothing more; what is queued is written and the sink closed in its own time."""
@@ -112,22 +111,6 @@ class QueuedSink(Generic[T]):
         """Whether nothing is done any more."""
         return not self._thread.is_alive()
 
-    def trouble(self) -> str:
-        """For the status line: what it is that fails and for how long; empty while all is well."""
-        if not self._failing:
-            return ""
-        return f"{self.part} FAILED for {(time.time_ns() - self._since_ns) / SECOND_NS:.0f} s"
-
-    def report(self) -> dict[str, Any] | None:
-        """For a summary: the newest failure and whether it is over, what is missing; None where all went well."""
-        if self.failure is None and not self.dropped:
-            return None
-        failed: dict[str, Any] = {"part": self.part}
-        if self.failure is not None:
-            since = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self._since_ns // SECOND_NS))
-            failed = {**self.failure.as_dict(), "since": since, "over": not self._failing}
-        return {**failed, "lost_events": self.lost, "dropped_events": self.dropped}
-
     def _has_room(self, size: int) -> bool:
         """Or whether there is no need of any."""
         if self._ending or self._failing or not self._queue:
@@ -138,7 +121,7 @@ class QueuedSink(Generic[T]):
 
     def _run(self) -> None:
         while not self._use():
-            while not self._backoff.ready(time.monotonic_ns()):
+            while not self._pause.due(time.monotonic_ns()):
                 with self._changed:
                     if self._changed.wait_for(lambda: self._ending, _POLL_S):
                         return
@@ -167,8 +150,8 @@ class QueuedSink(Generic[T]):
         if sink.path is not None:
             self.files.append(sink.path)
         if self._failing:
-            _log.warning("%s goes on%s", self.part, "" if sink.path is None else f" in {sink.path}")
             self._failing = False
+            self._failures.works(self.part)
 
     def _take(self) -> tuple[T, int] | None:
         """The next item, and how many were dropped before it; None at the end."""
@@ -185,33 +168,30 @@ class QueuedSink(Generic[T]):
             return item, skipped
 
     def _fail(self, error: BaseException) -> None:
-        """Say so once in a row of failures; what is queued is lost."""
-        reason, now_ns = reason_of(error), time.time_ns()
-        self._backoff.failed(time.monotonic_ns())
+        """What is queued is lost."""
+        self._pause.failed(time.monotonic_ns())
         with self._changed:
-            old = self.failure
-            self.failure = Failure(self.part, reason, now_ns) if old is None else old.again(reason, now_ns)
-            self.lost += len(self._queue)
+            self._failing = True
+            self.missing += len(self._queue) + self._in_hand
             self._queue.clear()
             self._queued_bytes = self._skipped = 0
             self._in_hand = False
-            if not self._failing:
-                self._failing, self._since_ns = True, now_ns
-                _log.warning("%s failed and will be tried again: %s", self.part, reason)
             self._changed.notify_all()
+        self._failures.failed(self.part, reason_of(error))
         _log.debug("%s failed", self.part, exc_info=error)
 
 
 class Outputs:
-    """All sinks of a ground, for its status line and its end. For any thread."""
+    """All sinks of a ground, for its end; ``failures`` learns what becomes of them. For any thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, failures: Failures) -> None:
+        self._failures = failures
         self._sinks: list[QueuedSink[Any]] = []
         self._lock = threading.Lock()
 
     def open(self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0) -> QueuedSink[T]:
         """A sink behind a queue (`QueuedSink`)."""
-        sink = QueuedSink(part, open_sink, wait_s=wait_s)
+        sink = QueuedSink(part, open_sink, failures=self._failures, wait_s=wait_s)
         with self._lock:
             self._sinks = [one for one in self._sinks if not one.ended]
             self._sinks.append(sink)
@@ -222,11 +202,6 @@ class Outputs:
         """Whether all that could be written is."""
         with self._lock:
             return all(one.idle for one in self._sinks)
-
-    def trouble(self) -> str:
-        """For the status line: what fails; empty while all is well."""
-        with self._lock:
-            return ", ".join(text for one in self._sinks if (text := one.trouble()))
 
     def close(self, *, within_s: float = 8.0) -> None:
         """End them all, within that time."""

@@ -55,7 +55,7 @@ class SessionTiming:
     path = None
 
     def __init__(self, table: Sink[str], *, edge: str, session_id: int) -> None:
-        self.table = table
+        self._table = table
         self._whose = (edge, f"{session_id:016x}")
         self._lock = threading.Lock()
         self._unread: dict[int, MessageTiming] = {}
@@ -99,4 +99,4 @@ class SessionTiming:
             message.clock_offset_ns,
             *self._whose,
         )
-        self.table.log(",".join(map(str, values)) + "\n")
+        self._table.log(",".join(map(str, values)) + "\n")

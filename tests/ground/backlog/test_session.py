@@ -23,6 +23,7 @@ from hvt_common.protocol.messages import (
     RoiHeader,
     pack_backlog_units,
 )
+from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
@@ -35,11 +36,11 @@ from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.timing import SessionTiming, timing_table
-from hvt_ground.status import summary, table
+from hvt_ground.status import completed, summary, table
 from programs.rrd import Recording
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
-from rigs.handled import WatchedInbox, end
+from rigs.handled import WatchedInbox, check, end
 
 
 def wait_for(condition, *, timeout_s: float = 30) -> None:
@@ -106,17 +107,23 @@ class Rig:
         self._timing = timing
         self._worker_of = worker_of
         self._recorder = recorder
-        self.outputs = Outputs()
+        self.failures = Failures(time.time_ns)
+        self.outputs = Outputs(self.failures)
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
         self.port.flight = flight
         self.flight = flight
         self.opened: list[GroundSession] = []
+        self.ended: list[GroundSession] = []
         self._backlog_numbers = itertools.count()
         self.live: list[Received] = []
         self.recordings = BacklogRecordings(self._open_backlog, most_files=most_files)
         self.receiver = EdgeSessions(
-            self.port, open_session=self._open, recordings=self.recordings, ended_patience_s=ended_patience_s
+            self.port,
+            open_session=self._open,
+            on_ended=self.ended.append,
+            recordings=self.recordings,
+            ended_patience_s=ended_patience_s,
         )
         self.thread = EdgeThread(self.receiver, drain_s=drain_s)
 
@@ -159,9 +166,8 @@ class Rig:
         self._wait_for(lambda: self.outputs.idle)
 
     def _wait_for(self, condition) -> None:
-        wait_for(lambda: condition() or self.thread.error is not None)
-        if self.thread.error is not None:
-            raise self.thread.error
+        wait_for(lambda: condition() or self.thread.error is not None or bool(self.receiver.failures.parts))
+        check(self.thread)
 
     def base(self, *indices: int) -> None:
         """Access units as they come."""
@@ -191,7 +197,7 @@ class Rig:
     def __exit__(self, kind, *_) -> None:
         end(self.thread, failing=kind is not None)
         self.outputs.close(within_s=60)
-        assert self.outputs.trouble() == ""
+        assert self.failures.parts == ()
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +254,7 @@ def test_the_hole_of_an_outage_is_filled(flight, tmp_path):
     assert decoded(recording) == 80
     texts = [text for _, _, text in recording.events()]
     assert any(text.startswith("3 s of video from the outage at ") for text in texts)
-    content = summary(rig.receiver.done[0], unusable=0)
+    content = summary(rig.ended[0])
     assert content["backlog"]["frames"] == 40
     assert "s of video came afterwards" in dict(table(content))["outages"]
 
@@ -385,8 +391,8 @@ def test_the_end_waits_for_the_last_piece(flight, tmp_path):
         rig.put(one, report)
         assert not rig.receiver.idle
         rig.put(two)
-        wait_for(lambda: rig.receiver.done)
-        assert rig.receiver.done[0].backlog.totals.stills == 1
+        wait_for(lambda: rig.ended)
+        assert rig.ended[0].backlog.totals.stills == 1
 
 
 def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path):
@@ -421,7 +427,7 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
     assert f"uav-1-{sid:016x}".encode() in (tmp_path / "backlog-0.rrd").read_bytes(), (
         "the same recording to Rerun"
     )
-    content = summary(rig.receiver.done[0], unusable=0, backlog_recordings=rig.receiver.backlog.paths)
+    content = completed(summary(rig.ended[0]), rig.receiver)
     assert content["backlog"]["recordings"] == [str(tmp_path / "backlog-0.rrd")]
 
 
@@ -463,7 +469,7 @@ def received(item: Received) -> ReceivedStill:
 def test_a_recording_in_use_stays_open(flight, tmp_path):
     """What goes into a file that was pushed out is lost without a word."""
     formers, made = [Flight(2) for _ in range(4)], []
-    outputs = Outputs()
+    outputs = Outputs(Failures(time.time_ns))
 
     def open_one(info: Info) -> BacklogRecording:
         path = tmp_path / f"{len(made)}.rrd"
@@ -593,7 +599,7 @@ def test_what_a_session_left_unread_comes_again_and_is_shown(flight, tmp_path):
             rig.inbox.put(item)
         wait_for(lambda: rig.receiver.backlog.working == 2)
         rig.inbox.put(flight.status(base=25, state="ended"))
-        wait_for(lambda: rig.receiver.done and not rig.receiver.backlog.working, timeout_s=15)
+        wait_for(lambda: rig.ended and not rig.receiver.backlog.working, timeout_s=15)
         reported = [one for report in rig.port.reports for one in report.backlog]
         assert full(flight, "still", 4, still) not in reported
         may_read.set()
@@ -623,7 +629,9 @@ def test_a_still_of_which_a_part_came_is_missed_until_it_is_whole(flight, tmp_pa
 
 def test_timing_says_of_pieces_what_became_of_them(flight, tmp_path):
     """An object that was refused would count as shown, at once."""
-    lines = QueuedSink("timing table", lambda: timing_table(tmp_path / "t.csv"))
+    lines = QueuedSink(
+        "timing table", lambda: timing_table(tmp_path / "t.csv"), failures=Failures(time.time_ns)
+    )
     with Rig(tmp_path, flight, timing=lines) as rig:
         rig.base(*range(5))
         good, bad = still_object(flight, 2, 0), still_object(flight, 3, 1)
@@ -795,3 +803,21 @@ def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path):
     assert len(Recording(tmp_path / "0.rrd").video()) == 30 + 25
     (last,) = [one for report in rig.port.reports for one in report.backlog if one.acknowledged_bytes][-1:]
     assert last.kind == "base"
+
+
+def test_a_stored_thing_that_cannot_be_worked_off_ends_nothing_else(flight, tmp_path, caplog):
+    """A full disk under an old recording would end the picture of now; or what was stored would be lost with it."""
+    former = Flight(45, keyframes=(40,))
+    with Rig(tmp_path, flight) as rig:
+        rig.base(*range(5))
+        session = rig.session
+        (tmp_path / "backlog-0.rrd").mkdir()  # no file can be made there
+        rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
+        rig.put(*chunks(former.session_id, "still", 0, still_object(former, 12, 0)))
+        wait_for(lambda: session.worker.jobs_failed == 1)
+        still = [one for one in rig.acknowledged_ranges() if one.kind == "still"]
+        assert all(one.acknowledged_bytes == 0 for one in still), "it is to come again"
+        rig.base(*range(5, 25))
+        assert rig.receiver.session is session
+        assert session.frames_decoded == 25
+    assert sum("cannot be worked off" in one.getMessage() for one in caplog.records) == 1

@@ -1,9 +1,12 @@
-"""Which edges a ground serves where more names come than it takes."""
+"""Which edges a ground serves where more names come than it takes; how it talks to them, and hands over errors."""
 
 from __future__ import annotations
 
 import logging
+import threading
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import zenoh
@@ -11,8 +14,9 @@ import zenoh
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_ground.session.subscribe import MAX_EDGES, GroundLink
-from programs.outsider import joined
+from programs.outsider import Tap, joined
 from programs.processes import eventually
+from rigs.messages import FEEDBACK, INFO
 
 
 @pytest.fixture
@@ -76,3 +80,117 @@ def test_edges_that_are_there_or_have_flown_keep_their_place(link):
     assert "late" not in served(ground)
     for token in tokens:
         token.undeclare()
+
+
+class Clock:
+    """The link's, which fails where the test says so."""
+
+    def __init__(self) -> None:
+        self.broken = False
+
+    def __call__(self) -> int:
+        """Now."""
+        if self.broken:
+            raise RuntimeError("the clock is gone")
+        return time.time_ns()
+
+
+def test_an_error_in_a_callback_reaches_the_edges_thread(free_port: int, capfd) -> None:
+    """Zenoh would print a traceback for every message, and nobody would learn that nothing comes in any more."""
+    endpoint, clock = f"tcp/127.0.0.1:{free_port}", Clock()
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,))) as session,
+        GroundLink(session, edges="*", clock=clock) as ground,
+        joined(endpoint) as outsider,
+    ):
+        for edge in ("uav-1", "uav-2"):
+            outsider.put(f"hvt/{edge}/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+        eventually(lambda: len(served(ground)) == 2, within_s=20, what="both are served")
+        one, other = sorted(ground.ports(), key=lambda port: port.edge)
+        clock.broken = True
+        outsider.put("hvt/uav-1/base", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+
+        errors: list[str] = []
+
+        def failed() -> bool:
+            try:
+                one.raise_error()
+            except RuntimeError as error:
+                errors.append(str(error))
+            return bool(errors)
+
+        eventually(failed, within_s=20, what="the error is handed over")
+        assert errors == ["the clock is gone"]
+        one.raise_error()  # once
+        other.raise_error()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+class Declarations:
+    """A session that notes in which thread publishers are declared."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self.threads: list[str] = []
+
+    def declare_publisher(self, *arguments, **named):
+        """As the session does."""
+        self.threads.append(threading.current_thread().name)
+        return self._session.declare_publisher(*arguments, **named)
+
+    def __getattr__(self, name: str):
+        return getattr(self._session, name)
+
+
+def test_nothing_is_declared_in_a_callback(free_port: int) -> None:
+    """Zenoh may wait there for itself: the ground would stand still with the first message of a second edge."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    with open_session(LinkSettings("ground", listen=(endpoint,))) as session, joined(endpoint) as outsider:
+        declarations = Declarations(session)
+        with (
+            GroundLink(declarations, edges="*") as ground,  # type: ignore[arg-type]
+            outsider.liveliness().declare_token("hvt/uav-1/alive"),
+        ):
+            eventually(lambda: "uav-1" in served(ground), within_s=20, what="it is served")
+            assert declarations.threads == []
+            tap = Tap(outsider, "hvt/uav-1/feedback")
+
+            def reported() -> bool:
+                ground.ports()[0].report(FEEDBACK)
+                return bool(tap.messages)
+
+            eventually(reported, within_s=20, what="the edge gets reports all the same")
+            assert declarations.threads == [threading.current_thread().name]
+
+
+def test_silent_edges_hold_up_nobody(free_port: int) -> None:
+    """With eight edges that do not answer, each round of asking for their time would take eight seconds."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    asked: list[zenoh.Query] = []
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,))) as session,
+        GroundLink(session, edges="*") as ground,
+        joined(endpoint) as outsider,
+    ):
+        queryables = [outsider.declare_queryable(f"hvt/uav-{one}/info", asked.append) for one in range(8)]
+        tokens = [outsider.liveliness().declare_token(f"hvt/uav-{one}/alive") for one in range(8)]
+        eventually(lambda: len(served(ground)) == 8, within_s=20, what="all are seen")
+        began_s = time.monotonic()
+        for port in ground.ports():
+            port.request_info(INFO.session_id)
+        took_s = time.monotonic() - began_s
+        eventually(lambda: len(asked) == 8, within_s=20, what="all are asked")
+        assert took_s < 1.0, "one answer is waited for that long"
+        ports = {port.edge: port for port in ground.ports()}
+        assert all(port.take_info() is None for port in ports.values())
+        late = next(one for one in asked if str(one.key_expr) == "hvt/uav-3/info")
+        late.reply("hvt/uav-3/info", replace(INFO, edge="uav-3").pack())
+        eventually(
+            lambda: (answer := ports["uav-3"].take_info()) is not None and answer[0].edge == "uav-3",
+            within_s=20,
+            what="the answer is there when it comes",
+        )
+        for one in asked:
+            one.drop()
+        for one in (*queryables, *tokens):
+            one.undeclare()

@@ -283,6 +283,10 @@ class Port:
         self.requested = 0
         self.keyframe_requests = 0
         self.reports: list[Feedback] = []
+        self.clock_requests: list[int] = []
+        """Sessions that were asked for their time, in passing."""
+        self.broken: Exception | None = None
+        """What a callback hands over."""
 
     def query_info(self, session_id: int | None = None) -> tuple[Info, int, int] | None:
         """The flight's facts, where it is the one that is asked for."""
@@ -299,3 +303,17 @@ class Port:
     def report(self, feedback: Feedback) -> None:
         """Keeps it, as it would be on the wire."""
         self.reports.append(Feedback.parse(feedback.pack()))
+
+    def request_info(self, session_id: int) -> None:
+        """Notes it."""
+        self.clock_requests.append(session_id)
+
+    def take_info(self) -> tuple[Info, int, int] | None:
+        """The answer, as if it had just come."""
+        return self.query_info(self.clock_requests.pop()) if self.clock_requests else None
+
+    def raise_error(self) -> None:
+        """What went wrong in a callback."""
+        broken, self.broken = self.broken, None
+        if broken is not None:
+            raise broken

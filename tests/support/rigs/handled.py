@@ -7,7 +7,7 @@ import threading
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_ground.session.edge_sessions import EdgeThread
 
-__all__ = ["WatchedInbox", "end"]
+__all__ = ["WatchedInbox", "check", "end"]
 
 
 class WatchedInbox(Inbox):
@@ -36,8 +36,15 @@ class WatchedInbox(Inbox):
         return super().get(timeout_s=timeout_s)
 
 
-def end(thread: EdgeThread, *, failing: bool) -> None:
-    """Close it, and raise what ended it; ``failing``: the test has failed already, and that is what is to be seen."""
-    assert thread.close(timeout_s=60), "the thread of the edge did not end"
-    if not failing and thread.error is not None:
+def check(thread: EdgeThread) -> None:
+    """Raise what ended the thread, or one of its sessions."""
+    if thread.error is not None:
         raise thread.error
+    assert not thread.sessions.failures.parts
+
+
+def end(thread: EdgeThread, *, failing: bool) -> None:
+    """Close it, and check it; ``failing``: the test has failed already, and that is what is to be seen."""
+    assert thread.close(timeout_s=60), "the thread of the edge did not end"
+    if not failing:
+        check(thread)

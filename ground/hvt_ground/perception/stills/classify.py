@@ -12,6 +12,7 @@ import numpy.typing as npt
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, OnnxDetector
 from hvt_common.values import Boxes, Detections, Image, Posterior, View, iou
+from hvt_ground.perception.retried import RetriedDetector
 from hvt_ground.perception.stills.composite import composite
 from hvt_ground.perception.stills.decode import Box, DecodedStill
 
@@ -104,7 +105,10 @@ class CropReader:
     def read(self, stills: Sequence[DecodedStill], base_bgr: Image | None) -> FrameReadings:  # noqa: ARG002
         """The classifier's posteriors; it finds neither boxes nor new objects."""
         crops = [crop for still in stills for crop in object_crops(still, view=self._view)]
-        answers = iter(self._classifier.classify(crops))
+        said = self._classifier.classify(crops)
+        if len(said) < len(crops):  # its model fails
+            return _silent(stills)
+        answers = iter(said)
         return FrameReadings(
             tuple(tuple(ObjectReading(next(answers)) for _ in still.boxes_base_px) for still in stills)
         )
@@ -154,9 +158,10 @@ class Redetection:
         Objects keep the size that the network sees on the base stream. To enlarge them beyond it, a part of the
         picture at a time, made classes worse.
         """
-        if not isinstance(self._detector, OnnxDetector):
+        detector = self._detector.model if isinstance(self._detector, RetriedDetector) else self._detector
+        if not isinstance(detector, OnnxDetector):
             return 1.0
-        width, height = self._detector.input_size(base_size)
+        width, height = detector.input_size(base_size)
         return max(1.0, min(width / base_size[0], height / base_size[1], 1 / self._view.scale))
 
     def _readings(self, found: Detections, overlaps: npt.NDArray[np.float64]) -> list[ObjectReading]:

@@ -1,0 +1,141 @@
+"""A model whose run raises: the ground goes on without boxes or names, says so once, and opens it again."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import helper, numpy_helper
+
+from hvt_common.inference.detect import open_detector
+from hvt_common.protocol.messages import RoiHeader
+from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.units import SECOND_NS
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.events import Event, Overlay, Refinement
+from hvt_ground.perception.models import Models
+from hvt_ground.perception.pipeline import DecodedFrame, ReceivedStill
+from hvt_ground.perception.retried import RetriedDetector
+from hvt_ground.wiring import make_pipeline
+from media.onnx_models import colour_classifier, colour_detector
+from rigs.flight import Flight
+
+
+def fragile(path: Path, *, bright: float, dark: bool = False) -> Path:
+    """Have the model's run raise in ONNX Runtime itself where the largest input is ``bright`` or more.
+
+    With ``dark`` where it is less.
+    """
+    model = onnx.load(path)
+    image = model.graph.input[0].name
+    output = model.graph.output[0].name
+    for node in model.graph.node:
+        node.output[:] = ["sound" if name == output else name for name in node.output]
+    constants = {"bright": np.array(float(bright), np.float32), "one": np.zeros(1, np.float32)}
+    model.graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
+    model.graph.node.extend(
+        [
+            helper.make_node("ReduceMax", [image], ["most"], keepdims=0),
+            helper.make_node("Div", ["bright", "most"] if dark else ["most", "bright"], ["share"]),
+            helper.make_node("Cast", ["share"], ["place"], to=onnx.TensorProto.INT64),
+            helper.make_node("Gather", ["one", "place"], ["nothing"]),  # there is no place 1
+            helper.make_node("Add", ["sound", "nothing"], [output]),
+        ]
+    )
+    onnx.checker.check_model(model)
+    onnx.save(model, path)
+    return path
+
+
+def picture(index: int, *, value: int) -> DecodedFrame:
+    """A grey frame with a red square."""
+    image = np.full((192, 320, 3), min(value, 60), np.uint8)
+    image[64:128, 64:128] = (0, 0, value)
+    return DecodedFrame(index, index * 66_000_000, index * 66_000_000, image)
+
+
+def test_the_picture_goes_on_without_boxes_and_they_come_back(tmp_path: Path, caplog) -> None:
+    """A detector that stumbles over one picture would end the flight."""
+    detector = fragile(colour_detector(tmp_path / "d.onnx", "yolox"), bright=220)
+    classifier = fragile(colour_classifier(tmp_path / "c.onnx"), bright=1_000)
+    config = check(
+        GroundConfig(detector=str(detector), classifier=str(classifier), confidence=0.3, provider="cpu")
+    )
+    models, events, flight = Models(config), list[Event](), Flight(1)
+    pipeline = make_pipeline(config, models, info=flight.info(), emit=events.append)
+
+    def boxes(index: int, value: int) -> int:
+        pipeline.analyze(picture(index, value=value), hurry=False)
+        (shown,) = [one for one in events if isinstance(one, Overlay) and one.frame_index == index]
+        return len(shown.track_ids)
+
+    assert boxes(0, 200) >= 1
+    assert [boxes(index, 255) for index in range(1, 12)][-1] == 0
+    (failed,) = models.failures.parts
+    assert (failed.part, failed.working) == ("detector", False)
+    assert "out of data bounds" in failed.reason
+    assert failed.count == 1, "it is left alone for a while"
+    time.sleep(1.05)
+    assert max(boxes(index, 200) for index in range(12, 24)) >= 1, "it was opened again"
+    assert models.failures.parts[0].working
+    lines = [one.getMessage() for one in caplog.records if one.name.endswith("failures")]
+    assert len(lines) == 2
+    assert lines[0].startswith("detector: ")
+    assert lines[1] == "detector: works again"
+    assert caplog.records[0].levelno == logging.WARNING
+    pipeline.end()
+
+
+@pytest.mark.parametrize("classifier", ["file", "detector"])
+def test_a_still_is_shown_though_nobody_can_name_it(tmp_path: Path, classifier: str) -> None:
+    """The look that the operator asked for would be lost with the classifier."""
+    detector = colour_detector(tmp_path / "d.onnx", "yolox")
+    named = "detector"
+    if classifier == "file":
+        named = str(
+            fragile(colour_classifier(tmp_path / "c.onnx"), bright=2.8, dark=True)
+        )  # tried with noise
+    else:
+        fragile(detector, bright=180)  # tried with grey
+    config = check(GroundConfig(detector=str(detector), classifier=named, provider="cpu"))
+    models, events, flight = Models(config), list[Event](), Flight(1)
+    pipeline = make_pipeline(config, models, info=flight.info(), emit=events.append)
+    pipeline.analyze(picture(0, value=200), hurry=False)
+    item = flight.still(0, 0)
+    header = replace(RoiHeader.parse(item.attachment, item.payload), frame_index=0)
+    pipeline.read([ReceivedStill(header, item.payload, "image/jpeg")])
+    (shown,) = [one for one in events if isinstance(one, Refinement)]
+    assert shown.still == item.payload
+    assert pipeline.outcomes == {"unread": 1}
+    assert [one.part for one in models.failures.parts] == [
+        "classifier" if classifier == "file" else "detector"
+    ]
+    pipeline.end()
+
+
+def test_a_model_that_never_works_is_opened_ever_more_seldom(tmp_path: Path) -> None:
+    """A broken model would take the processor from the picture, and fill the log."""
+    path = fragile(colour_detector(tmp_path / "d.onnx", "yolox"), bright=200)
+    opened: list[float] = []
+
+    def open_one():
+        opened.append(time.monotonic())
+        return open_detector(str(path), provider="cpu")
+
+    failures = Failures(time.time_ns)
+    pause = RetryPause(first_ns=SECOND_NS // 20, longest_ns=SECOND_NS)
+    detector = RetriedDetector(open_one, "detector", failures, pause=pause)
+    until = time.monotonic() + 0.7
+    while time.monotonic() < until:
+        assert len(detector.detect(picture(0, value=255).image_bgr)) == 0
+        time.sleep(0.002)
+    assert 3 <= len(opened) <= 6, "after 0, 0.05, 0.15, 0.35 s"
+    path.unlink()
+    time.sleep(pause.pause_ns / SECOND_NS)
+    assert len(detector.detect(picture(0, value=100).image_bgr)) == 0
+    assert "d.onnx" in failures.parts[0].reason, "it cannot be opened either"

@@ -1,0 +1,189 @@
+"""What goes wrong in one session ends that session, with its recording whole; another begins, others go on."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from hvt_common.protocol.messages import Info
+from hvt_common.runtime.failures import RetryPause
+from hvt_common.units import SECOND_NS
+from hvt_ground.events import Event, Overlay
+from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.status import completed, status_text, summary, table
+from programs.processes import eventually
+from programs.rrd import Recording
+from rigs.flight import Flight, Port, pipeline_of
+from rigs.handled import WatchedInbox
+
+
+class Consumer:
+    """A factory of sessions, their clock and who takes their overlays: each fails where the test says so."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.broken = ""
+        self.sessions: list[GroundSession] = []
+        self.tried = 0
+
+    def clock(self) -> int:
+        """What a session reads in the receiving thread."""
+        if self.broken == "clock":
+            raise RuntimeError("the clock is gone")
+        return time.time_ns()
+
+    def taken_by(self, emit: Callable[[Event], None]) -> Callable[[Event], None]:
+        """Who takes events in the worker's thread."""
+
+        def take(event: Event) -> None:
+            if self.broken == "consumer" and isinstance(event, Overlay):
+                raise MemoryError("no room for boxes")
+            emit(event)
+
+        return take
+
+    def open(self, info: Info, reports: ReceiverReports) -> GroundSession:
+        """A session with a recording."""
+        self.tried += 1
+        if self.broken == "opening":
+            raise OSError(28, "No space left on device")
+        path = self.folder / f"{info.edge}-{len(self.sessions)}.rrd"
+        recorder = Recorder(
+            RecorderSettings(
+                path=path,
+                edge_id=info.edge,
+                session=f"{info.session_id:016x}",
+                base_size=info.base_size,
+                fps=info.fps,
+                budget_bps=info.budget_bps,
+            )
+        )
+        session = GroundSession(
+            info,
+            sinks=[recorder],
+            recording=path,
+            pipeline_of=lambda emit: pipeline_of(self.taken_by(emit)),
+            clock=self.clock,
+            reports=reports,
+        )
+        self.sessions.append(session)
+        return session
+
+
+class Rig:
+    """An edge's port, thread and sessions."""
+
+    def __init__(self, flight: Flight, consumer: Consumer, *, pause: RetryPause | None = None) -> None:
+        self.port, self.consumer, self.flight = Port(), consumer, flight
+        self.port.inbox = self.inbox = WatchedInbox()
+        self.port.flight = flight
+        self.summaries: list[dict] = []
+        self.sessions = EdgeSessions(
+            self.port,
+            open_session=consumer.open,
+            on_ended=lambda session: self.summaries.append(summary(session)),
+            pause=pause or RetryPause(first_ns=SECOND_NS // 50, longest_ns=SECOND_NS // 10),
+        )
+        self.thread = EdgeThread(self.sessions)
+
+    def put(self, *indices: int) -> None:
+        """Access units; returns when they are handled and analyzed."""
+        for index in indices:
+            self.inbox.put(self.flight.base(index))
+        eventually(lambda: self.inbox.handled, within_s=30, what="all is handled")
+        session = self.sessions.session
+        if session is not None:
+            eventually(lambda: session.idle or session.failure, within_s=30, what="all is analyzed")
+
+    @property
+    def decoded(self) -> list[int]:
+        """Frames of each session so far."""
+        return [one.frames_decoded for one in self.consumer.sessions]
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """Keyframes at 10, 20, 30 and 36."""
+    return Flight(40, keyframes=(10, 20, 30, 36))
+
+
+CAUSES = {
+    "clock": "RuntimeError: the clock is gone",
+    "consumer": "MemoryError: no room for boxes",
+    "callback": "ValueError: not a message",
+}
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_a_session_that_fails_ends_alone_and_begins_anew(flight, tmp_path, caplog, cause):
+    """One bad frame of one drone would end the picture of all, or leave a recording that opens nowhere."""
+    consumer, other = Consumer(tmp_path), Consumer(tmp_path / "other")
+    other.folder.mkdir()
+    rig, neighbour = Rig(flight, consumer), Rig(flight, other)
+    rig.put(*range(5))
+    neighbour.put(*range(5))
+    if cause == "callback":
+        rig.port.broken = ValueError("not a message")
+    consumer.broken = cause
+    rig.inbox.put(flight.base(5))
+    eventually(lambda: rig.summaries, within_s=30, what="the session has ended")
+    consumer.broken = ""
+    (failed,) = rig.sessions.failures.parts
+    assert (failed.part, failed.reason, failed.working) == ("session of uav-1", CAUSES[cause], False)
+    assert "uav-1: ended  session of uav-1 FAILED at " in status_text([("uav-1", rig.sessions)])
+    neighbour.put(*range(5, 40))
+    time.sleep(0.1)  # the pause is over
+    rig.put(*range(6, 40))
+    assert rig.port.keyframe_requests >= 1, "it asks for a picture to begin with"
+    assert rig.decoded[1] == 30, "from the next keyframe on"
+    assert rig.sessions.failures.parts[0].working
+    for one in (rig, neighbour):
+        assert one.thread.close(timeout_s=60)
+        assert one.thread.error is None
+    lines = [one.getMessage() for one in caplog.records if one.levelno >= logging.WARNING]
+    assert [one for one in lines if "all else goes on" in one] == [
+        f"session of uav-1: {CAUSES[cause]}; all else goes on, and it is tried again"
+    ]
+    first, second = (completed(one, rig.sessions) for one in rig.summaries)
+    assert (first["failure"], second["failure"]) == (CAUSES[cause], "")
+    assert [(one["part"], one["count"]) for one in first["failed"]] == [("session of uav-1", 1)]
+    assert dict(table(first))["session failed"] == CAUSES[cause]
+    before = Recording(Path(first["recording"]))
+    assert [frame for frame, _, _ in before.video()][:5] == list(range(5))
+    texts = [(level, text) for _, level, text in before.events()]
+    assert [level for level, _ in texts[-2:]] == ["ERROR", "INFO"], texts
+    assert texts[-2][1] == f"the session failed: {CAUSES[cause]}"
+    assert texts[-1][1].endswith("ended")
+    assert [frame for frame, _, _ in Recording(Path(second["recording"])).video()] == list(range(10, 40))
+    assert len(neighbour.summaries) == 1
+    assert neighbour.decoded == [40]
+
+
+def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path, caplog):
+    """A full disk would end the ground, or fill the log with a line a keyframe."""
+    consumer = Consumer(tmp_path)
+    consumer.broken = "opening"
+    rig = Rig(flight, consumer, pause=RetryPause(first_ns=SECOND_NS // 5, longest_ns=3600 * SECOND_NS))
+    rig.put(0, 1, 10, 20, 30)  # four keyframes within the first pause
+    assert consumer.tried == 1
+    assert rig.sessions.idle
+    (failed,) = rig.sessions.failures.parts
+    assert failed.reason == "OSError: [Errno 28] No space left on device"
+    assert "waiting for a keyframe  session of uav-1 FAILED at" in status_text([("uav-1", rig.sessions)])
+    requests = rig.port.keyframe_requests
+    assert requests <= 1, "an edge is not asked for keyframes that nobody takes"
+    consumer.broken = ""
+    time.sleep(0.25)
+    rig.put(*range(36, 40))
+    assert consumer.tried == 2
+    assert rig.decoded == [4]
+    assert rig.sessions.failures.parts[0].working
+    assert rig.thread.close(timeout_s=60)
+    assert sum("all else goes on" in one.getMessage() for one in caplog.records) == 1
