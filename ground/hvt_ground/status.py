@@ -113,6 +113,12 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "latency_ms": session.overlay_latency.as_dict(),
         "receive_latency_ms": session.receive_latency.as_dict(),
         "failure": session.failure,
+        # Of these `completed` tells.
+        "recording": None,
+        "recordings": [],
+        "recording_bytes": 0,
+        "missing_events": {},
+        "failed": [],
     }
 
 

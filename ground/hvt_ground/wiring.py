@@ -80,7 +80,9 @@ class SessionFactory:
         wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
         names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
         open_recording = partial(self._opened, _recorder(settings), names)
-        sinks: list[Sink[Event]] = [self._outputs.open(f"recording of {edge}", open_recording, wait_s=wait_s)]
+        sinks: list[Sink[Event]] = [
+            self._outputs.open(f"recording of {edge}", open_recording, wait_s=wait_s, keeps=True)
+        ]
         if self._view is not None:
             open_live = partial(_live_recorder, settings, self._view)
             sinks.append(self._outputs.open(f"live view of {edge}", open_live))

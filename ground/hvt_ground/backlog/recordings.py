@@ -22,6 +22,7 @@ __all__ = ["MOST_FILES", "MOST_OPEN", "BacklogRecording", "BacklogRecordings"]
 
 MOST_OPEN = 4
 MOST_FILES = 32
+_OPEN_S = 0.5
 
 
 class BacklogRecording:
@@ -86,7 +87,10 @@ class BacklogRecordings:
             return not self._closed and (self._left > 0 or session_id in self._open)
 
     def acquire(self, info: Info) -> SessionBacklog | None:
-        """The backlog of that session's recording, which stays open until `release`; None where `takes` says no."""
+        """The backlog of that session's recording, which stays open until `release`.
+
+        None where `takes` says no, or the recording cannot be written now.
+        """
         with self._lock:
             recording = self._open.get(info.session_id)
             if recording is None:
@@ -97,6 +101,8 @@ class BacklogRecordings:
                 recording = self._open[info.session_id] = self._open_one(info)
                 self._sinks.append(recording.sink)
             self._open.move_to_end(info.session_id)
+            if not recording.sink.is_open(within_s=_OPEN_S):
+                return None
             recording.users += 1
             return recording.backlog
 

@@ -73,11 +73,14 @@ class SessionBacklog:
         perception: BacklogPerception | None,
         read: Callable[[ReceivedStill], None],
         stills: StillSequenceWindow | None = None,
+        able: Callable[[], bool] = lambda: True,
     ) -> None:
         self.info = info
         self.perception = perception
         self.video = BacklogVideo(base_size=info.base_size)
         self.log = log
+        self.able = able
+        """Whether what is logged will be written. Otherwise it is to come again, for its edge would forget it."""
         self._read = read
         self._stills = stills or StillSequenceWindow()
         self._frame_ns = round(SECOND_NS / info.fps)

@@ -38,7 +38,7 @@ from hvt_ground.link.statistics import ReceptionStatistics
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.session.receiver_report import ReceiverReports
-from hvt_ground.sinks import Sink
+from hvt_ground.sinks import QueuedSink, Sink
 
 __all__ = ["GroundSession", "WorkerFactory"]
 
@@ -115,6 +115,7 @@ class GroundSession:
             perception=backlog_perception,
             read=lambda still: self._read([still]),
             stills=self._still_window,
+            able=lambda: all(one.is_open() for one in sinks if isinstance(one, QueuedSink) and one.keeps),
         )
         """What of this session was stored at the edge while the link was down."""
 

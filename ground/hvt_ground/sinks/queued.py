@@ -33,13 +33,20 @@ class QueuedSink(Generic[T]):
 
     A sink that raises is closed and made anew after growing pauses; until then what comes is counted as lost. Where
     the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as dropped. ``failures``
-    learns of it under the name ``part``.
+    learns of it under the name ``part``. ``keeps``: what was stored at the edge is to be written there.
     """
 
     def __init__(
-        self, part: str, open_sink: Callable[[], Sink[T]], *, failures: Failures, wait_s: float = 0.0
+        self,
+        part: str,
+        open_sink: Callable[[], Sink[T]],
+        *,
+        failures: Failures,
+        wait_s: float = 0.0,
+        keeps: bool = False,
     ) -> None:
         self.part = part
+        self.keeps = keeps
         self._open_sink = open_sink
         self._wait_s = wait_s
         self._changed = threading.Condition()
@@ -54,7 +61,7 @@ class QueuedSink(Generic[T]):
         self._pause = RetryPause()
         self.files: list[Path] = []
         """In the order of opening."""
-        self._failing = False
+        self._open = self._failing = False
         self.missing = 0
         """Items that came while the sink was failing, or for which the queue had no room."""
         self._dropped = 0
@@ -106,6 +113,12 @@ class QueuedSink(Generic[T]):
         with self._changed:
             return not (self._queue or self._in_hand)
 
+    def is_open(self, *, within_s: float = 0.0) -> bool:
+        """Whether what is logged now will be written, as far as is known; waits so long for the sink to be made."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._open or self._failing, within_s)
+            return self._open
+
     @property
     def ended(self) -> bool:
         """Whether nothing is done any more."""
@@ -149,9 +162,10 @@ class QueuedSink(Generic[T]):
     def _begin(self, sink: Sink[T]) -> None:
         if sink.path is not None:
             self.files.append(sink.path)
-        if self._failing:
-            self._failing = False
-            self._failures.works(self.part)
+        with self._changed:
+            self._open, self._failing = True, False
+            self._changed.notify_all()
+        self._failures.works(self.part)
 
     def _take(self) -> tuple[T, int] | None:
         """The next item, and how many were dropped before it; None at the end."""
@@ -171,7 +185,7 @@ class QueuedSink(Generic[T]):
         """What is queued is lost."""
         self._pause.failed(time.monotonic_ns())
         with self._changed:
-            self._failing = True
+            self._open, self._failing = False, True
             self.missing += len(self._queue) + self._in_hand
             self._queue.clear()
             self._queued_bytes = self._skipped = 0
@@ -189,9 +203,11 @@ class Outputs:
         self._sinks: list[QueuedSink[Any]] = []
         self._lock = threading.Lock()
 
-    def open(self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0) -> QueuedSink[T]:
+    def open(
+        self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0, keeps: bool = False
+    ) -> QueuedSink[T]:
         """A sink behind a queue (`QueuedSink`)."""
-        sink = QueuedSink(part, open_sink, failures=self._failures, wait_s=wait_s)
+        sink = QueuedSink(part, open_sink, failures=self._failures, wait_s=wait_s, keeps=keeps)
         with self._lock:
             self._sinks = [one for one in self._sinks if not one.ended]
             self._sinks.append(sink)
