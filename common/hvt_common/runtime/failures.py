@@ -46,6 +46,8 @@ class Failures:
         self._clock = clock
         self._lock = threading.Lock()
         self._parts: dict[str, Failure] = {}
+        self._said: set[str] = set()
+        """Parts of whose failure the log has said, but not that they work again."""
 
     @property
     def parts(self) -> tuple[Failure, ...]:
@@ -62,6 +64,7 @@ class Failures:
             self._parts[part] = Failure(part, reason, count, now_ns, since_ns)
         fresh = before is None or (before.working and now_ns - before.failed_ns > _STEADY_NS)
         if fresh or (before is not None and before.working and count.bit_count() == 1):
+            self._said.add(part)
             times = "" if count == 1 else f" ({count} failures so far)"
             _log.warning("%s: %s; all else goes on, and it is tried again%s", part, reason, times)
 
@@ -72,7 +75,8 @@ class Failures:
             if before is None or before.working:
                 return
             self._parts[part] = replace(before, working=True)
-        if before.count == 1 or before.count.bit_count() == 1:
+        if part in self._said:
+            self._said.remove(part)
             _log.warning("%s: works again", part)
 
 

@@ -150,6 +150,8 @@ class EdgeSessions:
                 session.note("warning", "keyframe requested")
         if session is None:
             return
+        if session.take_resumed():
+            self.port.request_keyframe()
         session.raise_error()
         session.count(self._receiver.counters.since(self._counted))
         paused = self._backlog_ns is not None and now_ns - self._backlog_ns > _BACKLOG_PAUSE_NS

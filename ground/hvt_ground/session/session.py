@@ -71,6 +71,7 @@ class GroundSession:
         worker_of: WorkerFactory | None = None,
     ) -> None:
         self.sinks = sinks
+        self._queued = [one for one in sinks if isinstance(one, QueuedSink)]
         self.info = info
         self.lockstep = info.pace == "lockstep"
         self.ledger = Ledger(window_ns=info.window_ns)
@@ -115,7 +116,7 @@ class GroundSession:
             perception=backlog_perception,
             read=lambda still: self._read([still]),
             stills=self._still_window,
-            able=lambda: all(one.is_open() for one in sinks if isinstance(one, QueuedSink) and one.keeps),
+            able=lambda: all(one.is_open() for one in self._queued if one.keeps),
         )
         """What of this session was stored at the edge while the link was down."""
 
@@ -291,6 +292,11 @@ class GroundSession:
     def idle(self) -> bool:
         """Nothing waits to be analyzed."""
         return self.worker.idle
+
+    def take_resumed(self) -> bool:
+        """Whether a recording goes on after a gap, and waits for a keyframe; True once."""
+        resumed = [one.take_resumed() for one in self._queued]
+        return any(resumed)
 
     def raise_error(self) -> None:
         """Raise what went wrong while analyzing."""

@@ -61,7 +61,7 @@ class QueuedSink(Generic[T]):
         self._pause = RetryPause()
         self.files: list[Path] = []
         """In the order of opening."""
-        self._open = self._failing = False
+        self._open = self._failing = self._resumed = False
         self.missing = 0
         """Items that came while the sink was failing, or for which the queue had no room."""
         self._dropped = 0
@@ -119,6 +119,11 @@ class QueuedSink(Generic[T]):
             self._changed.wait_for(lambda: self._open or self._failing, within_s)
             return self._open
 
+    def take_resumed(self) -> bool:
+        """Whether it goes on after a gap since the last call: its video does with the next keyframe."""
+        resumed, self._resumed = self._resumed, False
+        return resumed
+
     @property
     def ended(self) -> bool:
         """Whether nothing is done any more."""
@@ -149,6 +154,7 @@ class QueuedSink(Generic[T]):
                 item, skipped = taken
                 if skipped:
                     sink.skipped(skipped)
+                    self._resumed = True
                 sink.log(item)
             sink.close(self._hurry)
         except Exception as error:  # noqa: BLE001 - whatever it is, everything else goes on
@@ -163,6 +169,7 @@ class QueuedSink(Generic[T]):
         if sink.path is not None:
             self.files.append(sink.path)
         with self._changed:
+            self._resumed |= self._failing
             self._open, self._failing = True, False
             self._changed.notify_all()
         self._failures.works(self.part)

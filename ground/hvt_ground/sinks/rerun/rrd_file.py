@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 _STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
 _END = 0
-_ROOM_BYTES = 16 * 2**20
+_ROOM_BYTES = 2 * 2**20
 _filters = threading.Lock()
 """Warning filters are the process's."""
 
