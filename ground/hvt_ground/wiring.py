@@ -81,7 +81,7 @@ class SessionFactory:
         names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
         open_recording = partial(self._opened, _recorder(settings), names)
         sinks: list[Sink[Event]] = [
-            self._outputs.open(f"recording of {edge}", open_recording, wait_s=wait_s, keeps=True)
+            self._outputs.open(f"recording of {edge}", open_recording, wait_s=wait_s, for_backlog=True)
         ]
         if self._view is not None:
             open_live = partial(_live_recorder, settings, self._view)

@@ -116,7 +116,7 @@ class GroundSession:
             perception=backlog_perception,
             read=lambda still: self._read([still]),
             stills=self._still_window,
-            able=lambda: all(one.is_open() for one in self._queued if one.keeps),
+            able=lambda: all(one.is_open() for one in self._queued if one.for_backlog),
         )
         """What of this session was stored at the edge while the link was down."""
 

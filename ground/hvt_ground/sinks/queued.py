@@ -33,7 +33,7 @@ class QueuedSink(Generic[T]):
 
     A sink that raises is closed and made anew after growing pauses; until then what comes is counted as lost. Where
     the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as dropped. ``failures``
-    learns of it under the name ``part``. ``keeps``: what was stored at the edge is to be written there.
+    learns of it under the name ``part``. ``for_backlog``: what was stored at the edge is to be written there.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class QueuedSink(Generic[T]):
         *,
         failures: Failures,
         wait_s: float = 0.0,
-        keeps: bool = False,
+        for_backlog: bool = False,
     ) -> None:
         self.part = part
-        self.keeps = keeps
+        self.for_backlog = for_backlog
         self._open_sink = open_sink
         self._wait_s = wait_s
         self._changed = threading.Condition()
@@ -73,13 +73,13 @@ class QueuedSink(Generic[T]):
         """Queue an item; for any thread. After `close` nothing is taken."""
         size = size_bytes(item)
         with self._changed:
-            if self._wait_s and not self._has_room(size):
-                self._changed.wait_for(lambda: self._has_room(size), self._wait_s)
+            if self._wait_s and not self._fits(size):
+                self._changed.wait_for(lambda: self._fits(size), self._wait_s)
             if self._ending:
                 return
             if self._failing:
                 self.missing += 1
-            elif self._has_room(size):
+            elif self._fits(size):
                 self._queue.append((item, size, self._skipped))
                 self._queued_bytes += size
                 self._skipped = 0
@@ -129,7 +129,7 @@ class QueuedSink(Generic[T]):
         """Whether nothing is done any more."""
         return not self._thread.is_alive()
 
-    def _has_room(self, size: int) -> bool:
+    def _fits(self, size: int) -> bool:
         """Or whether there is no need of any."""
         if self._ending or self._failing or not self._queue:
             return True
@@ -211,10 +211,10 @@ class Outputs:
         self._lock = threading.Lock()
 
     def open(
-        self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0, keeps: bool = False
+        self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0, for_backlog: bool = False
     ) -> QueuedSink[T]:
         """A sink behind a queue (`QueuedSink`)."""
-        sink = QueuedSink(part, open_sink, failures=self._failures, wait_s=wait_s, keeps=keeps)
+        sink = QueuedSink(part, open_sink, failures=self._failures, wait_s=wait_s, for_backlog=for_backlog)
         with self._lock:
             self._sinks = [one for one in self._sinks if not one.ended]
             self._sinks.append(sink)

@@ -27,7 +27,8 @@ def test_a_failing_part_is_said_once_and_its_return_once(caplog):
     failures.works("local copy")
     failures.works("local copy")
     assert [record.message.split(";")[0] for record in caplog.records] == [
-        "local copy: card.mkv cannot be written"
+        "local copy: card.mkv cannot be written",
+        "local copy: works again",
     ]
     (part,) = failures.parts
     assert (part.count, part.working, part.failed_ns) == (50, True, 149 * SECOND_NS)

@@ -17,6 +17,7 @@ from typing import Self
 import numpy as np
 from rerun.chunk import Chunk
 
+from hvt_common.errors import UserError
 from hvt_common.units import bitrate_text
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun import blueprint as names
@@ -99,7 +100,7 @@ class Recorder:
         self._compact_bytes = settings.compact_bytes
         self._pending_bytes = 0
         self._last_sample: int | None = None
-        self._cut = {False: False, True: False}
+        self._awaits_keyframe = {False: False, True: False}
         """Whether live or stored video begins anew at its next keyframe."""
         self._skipped = 0
         self._samples = 0
@@ -125,15 +126,20 @@ class Recorder:
             return
         rows = [*self._gap_rows(item), *self._rows(item)]
         chunks = [one if isinstance(one, Chunk) else self._add(one, item) for one in rows]
-        if chunks:
-            self._output.write(chunks)
+        try:
+            if chunks:
+                self._output.write(chunks)
+        except UserError:
+            if self.path is None:
+                raise
+            self._compact()  # the same in fewer bytes, this event included, may be what the disk has room for
         if self._pending_bytes >= self._compact_bytes:
             self._compact()
 
     def skipped(self, count: int) -> None:
         """Video goes on at its next keyframe, and the log says what is missing."""
         self._skipped += count
-        self._cut = {False: True, True: True}
+        self._awaits_keyframe = {False: True, True: True}
 
     def close(self, hurry: threading.Event | None = None) -> None:
         """Compact what is left and close the file or the viewer's connection; a second call does nothing.
@@ -199,9 +205,9 @@ class Recorder:
                 return [TableRow(names.EVENTS, "text", text, len(event.text))]
 
     def _sample(self, sample: VideoSample) -> list[TableRow]:
-        if self._cut[sample.stored] and not sample.keyframe:
+        if self._awaits_keyframe[sample.stored] and not sample.keyframe:
             return []
-        self._cut[sample.stored] = False
+        self._awaits_keyframe[sample.stored] = False
         if not sample.stored and not self._decodable(sample):
             log.debug("frame %d left out of the recording: not decodable there", sample.frame_index)
             return []

@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 _STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
 _END = 0
-_ROOM_BYTES = 2 * 2**20
+_SPARE_BYTES = 2 * 2**20
 _filters = threading.Lock()
 """Warning filters are the process's."""
 
@@ -97,7 +97,7 @@ class RrdFile:
     def _add_footer(self, hurry: threading.Event | None) -> None:
         """Write all once more through the SDK, which adds a footer; whole or not at all."""
         scratch = self.path.with_name(self.path.name + ".part")
-        if shutil.disk_usage(self.path.parent).free < 2 * self.size_bytes + _ROOM_BYTES:
+        if shutil.disk_usage(self.path.parent).free < 2 * self.size_bytes + _SPARE_BYTES:
             _log.warning("recording %s has no footer: the disk has no room for one", self.path)
             return  # the SDK never returns from a full disk
         recording = new_recording(self._id)
@@ -135,9 +135,10 @@ class RrdFile:
             if end < self.size_bytes:
                 os.ftruncate(self._file, end)
         except OSError as error:
-            with suppress(OSError):  # half a message
-                os.ftruncate(self._file, at)
-                self.size_bytes = at
+            if end > at:  # half a message
+                with suppress(OSError):
+                    os.ftruncate(self._file, at)
+                    self.size_bytes = at
             raise UserError(
                 f"recording {self.path} cannot be written any further: {error.strerror}"
             ) from error
