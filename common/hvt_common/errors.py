@@ -1,4 +1,4 @@
-"""The one error that a user is meant to read."""
+"""The errors that a user is meant to read."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-__all__ = ["UserError", "exit_with_sentence", "needs_extra"]
+__all__ = ["FlightError", "UserError", "exit_with_sentence", "needs_extra"]
 
 
 class UserError(Exception):
@@ -18,15 +18,22 @@ class UserError(Exception):
     """
 
 
+class FlightError(Exception):
+    """Something that went wrong after the start and cannot be put right: one sentence, and exit code 1.
+
+    A supervisor starts the program again, which may help.
+    """
+
+
 def exit_with_sentence(
     run: Callable[[Sequence[str] | None], int], *, program: str, argv: Sequence[str] | None
 ) -> int:
-    """Return the exit code of ``run(argv)``; a `UserError` becomes one sentence on stderr and code 2."""
+    """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError`, said on stderr."""
     try:
         return run(argv)
-    except UserError as error:
+    except (UserError, FlightError) as error:
         print(f"{program}: {error}", file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, UserError) else 1
 
 
 @contextmanager

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from hvt_common.errors import FlightError, UserError
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
-from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
@@ -18,12 +19,14 @@ from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
 from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating.point import LoopClock
+from hvt_edge.perception.analyzer import FailingDetector
+from hvt_edge.perception.guarded_detector import GuardedDetector
 from hvt_edge.source.closing import closing_on
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.status import StatusReporter
 from hvt_edge.summary import EdgeRun, summary
-from hvt_edge.wiring import Stages, build_stages, check_files
+from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store
 from hvt_edge.world import World
 
 __all__ = ["Edge"]
@@ -53,7 +56,7 @@ class Edge:
         self._lockstep = config.pace == "lockstep"
         self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep)
         self._counts = FrameCounts()
-        self._failures = Failures(self._world.clock)
+        self._failures = self._world.failures
         self.ledger = Ledger(window_ns=config.window_ns)
         """Every byte that left."""
 
@@ -64,12 +67,22 @@ class Edge:
         """
         config, world = self._config, self._world
         check_files(config)
-        detector = world.open_detector(config)
+        check_codecs(config)
+        opened = world.open_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
+            check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
-            world.warm_up(config, detector, source)
+            world.warm_up(config, opened, source)
+            detector: FailingDetector = opened
+            if not self._lockstep:  # whose result would be of something else
+                detector = GuardedDetector(
+                    opened,
+                    reopen=lambda: world.open_detector(config),
+                    failures=self._failures,
+                    clock=world.clock,
+                )
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = world.open_link(stack, config)
             stages = build_stages(
@@ -81,6 +94,7 @@ class Edge:
                 session_id=world.session_id,
                 ledger=self.ledger,
                 inbox=world.inbox,
+                failures=self._failures,
                 clock=world.clock,
                 loop_clock=self._loop_clock,
                 wait_until=self._wait_until,
@@ -103,6 +117,10 @@ class Edge:
             stages.operating.start(world.clock())
             try:
                 self._play(source, stages, link, status, line)
+            except UserError as error:
+                if not self._counts.encoded:
+                    raise
+                raise FlightError(str(error)) from error
             finally:
                 stages.stills.close()
                 self._say_goodbye(stages, link, status)
@@ -112,17 +130,19 @@ class Edge:
         self, source: Source, stages: Stages, link: EdgeLink, status: StatusReporter, line: StatusLine
     ) -> None:
         """Take one frame after the other; once a second report."""
-        next_status_ns = 0
+        next_status_ns = restarts = 0
         with ExitStack() as stack:
             if source.live:
                 stack.enter_context(closing_on(self._stop, source))
             pace = self._make_pace(source, stages, link)
             stack.enter_context(pace)
-            for frame in source.frames(start_ns=stages.operating.now.started_ns):
+            for frame in source.steps(start_ns=stages.operating.now.started_ns):
                 if self._stop.is_set():
                     break
-                self._counts.captured += 1
-                pace.step(frame)
+                if source.restarts != restarts:  # another picture than the last
+                    restarts = source.restarts
+                    stages.keyframes.require(self._loop_clock())
+                pace.step(frame, missed=source.missed)
                 now_ns = self._loop_clock()
                 if now_ns >= next_status_ns:
                     next_status_ns = now_ns + SECOND_NS
@@ -156,6 +176,7 @@ class Edge:
             live=source.live,
             counts=self._counts,
             stop=self._stop,
+            failures=self._failures,
             before_frame=stages.link_control.before_frame,
         )
 
@@ -182,9 +203,11 @@ class Edge:
 
     @staticmethod
     def _link_text(stages: Stages, link: EdgeLink) -> str:
-        ground = (
-            "a ground listens" if link.has_ground() else "no link" if link.trouble else "no ground listens"
-        )
+        ground = "no link" if link.trouble else "no ground listens"
+        if link.has_ground():
+            ground = "a ground listens"
+        elif link.has_subscriber(Channel.BASE):
+            ground = "somebody watches who reports nothing"
         return f"{ground}  {'' if stages.backlog is None else stages.backlog.text()}".rstrip()
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink, status: StatusReporter) -> None:
@@ -222,4 +245,5 @@ class Edge:
             perception_ms=stages.stills.analyzer.mean_ms,
             unusable_messages=link.unusable,
             store=None if backlog is None else backlog.numbers,
+            failed=self._failures.parts,
         )

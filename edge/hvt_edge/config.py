@@ -55,6 +55,7 @@ DEFAULT_SIZE = (1280, 720)
 _LEAST_WINDOW_S, _MOST_WINDOW_S = 0.5, 60.0
 _R0_DEPTH = 0.1
 _MIN_BUDGET_BPS = 100_000
+_STORE_BYTES = 200_000_000
 _LEAST_STORE_BYTES = 10_000_000
 LEAST_FPS = 2.0
 """To this ``--fps auto`` may fall: two frames in a window of a second."""
@@ -235,22 +236,33 @@ class EdgeConfig:
     ring_time: float = _FILES_RARE.option(
         DURATION, 5.0, "how far back those go; where memory is short, with frames left out"
     )
-    store: int = _FILES.option(
-        BYTES, 200_000_000, "disk for what is seen while the link is away, and sent afterwards; 0 for none"
+    store: int | None = _FILES.option(
+        BYTES,
+        None,
+        "disk for what is captured while the link is down, and sent afterwards; 0 for none",
+        shown_default="200MB for a camera or stream, or with a folder; else 0",
     )
     store_folder: Path | None = _FILES_RARE.option(
         PATH,
         None,
-        "where that is kept; made when the link first goes",
+        "where that is stored; made when the link first goes down",
         shown_default="~/.local/state/hvt/EDGE_ID",
     )
     store_age: float = _FILES_RARE.option(
-        DURATION, 3600.0, "what an earlier run kept longer ago than this is dropped at the start"
+        DURATION, 3600.0, "what an earlier run stored longer ago than this is dropped at the start"
     )
     record_base: Path | None = _FILES.option(PATH, None, "also keep the base stream in this Matroska file")
     truth: Path | None = _FILES_RARE.option(PATH, None, "write the demo's ground truth, MOTChallenge form")
     summary: Path | None = _FILES.option(PATH, None, "write the summary as JSON")
     quiet: bool = _FILES.switch("no status line")
+
+    def store_bytes(self, *, live: bool) -> int:
+        """Space of the backlog. Unrelated clips share its default folder: they are stored only on request."""
+        if self.pace == "lockstep":
+            return 0
+        if self.store is not None:
+            return self.store
+        return _STORE_BYTES if live or self.store_folder is not None else 0
 
     @property
     def budget_bps(self) -> int:
@@ -348,10 +360,10 @@ def check(config: EdgeConfig) -> EdgeConfig:
             f"--min-budget {bitrate_text(config.min_budget)} is more than --budget "
             f"{bitrate_text(config.budget_bps)}: give less, or the same for a rate that does not change"
         )
-    if 0 < config.store < _LEAST_STORE_BYTES:
+    if config.store and config.store < _LEAST_STORE_BYTES:
         raise UserError(
             f"--store {config.store / 1e6:g}MB does not hold half a minute of video: give "
-            f"{_LEAST_STORE_BYTES // 10**6}MB or more, or 0 to keep nothing"
+            f"{_LEAST_STORE_BYTES // 10**6}MB or more, or 0 to store nothing"
         )
     _check_stills(config)
     if config.fixed_size is not None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 from hvt_common.protocol.ledger import Ledger
+from hvt_common.runtime.failures import Failure
 from hvt_common.units import bitrate_text
 from hvt_edge.backlog.worker import StoreNumbers
 
@@ -40,6 +42,7 @@ class EdgeRun:
     """Encoded while the link was away, and not sent at once."""
     store: StoreNumbers | None = None
     """What was kept while the link was away; None where nothing ever is."""
+    failed: tuple[Failure, ...] = ()
 
 
 def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
@@ -83,6 +86,7 @@ def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
         "perception_ms": round(run.perception_ms, 2),
         "unusable_messages": run.unusable_messages,
         "store": None if run.store is None else asdict(run.store),
+        "failed": [asdict(one) | {"failed_at": _clock_time(one.failed_ns)} for one in run.failed],
     }
 
 
@@ -105,7 +109,17 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         ("tracks", str(content["tracks"])),
         ("keyframes", f"{content['keyframes']}, {content['keyframe_requests']} asked for by a ground"),
     ]
-    return rows + _store_rows(content["store"])
+    return rows + _store_rows(content["store"]) + [("failed", _failure(one)) for one in content["failed"]]
+
+
+def _clock_time(at_ns: int) -> str:
+    return datetime.fromtimestamp(at_ns / 1e9, UTC).isoformat(timespec="seconds")
+
+
+def _failure(one: dict[str, Any]) -> str:
+    times = "" if one["count"] == 1 else f", {one['count']} times"
+    again = "; works again" if one["working"] else ""
+    return f"{one['part']} at {one['failed_at']}{times}: {one['reason']}{again}"
 
 
 def _store_rows(store: dict[str, Any] | None) -> list[tuple[str, str]]:

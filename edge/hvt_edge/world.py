@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from typing import cast
 
 from hvt_common.inference.detect import Detector
 from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import Fit
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
@@ -24,7 +26,9 @@ class World:
 
     def __init__(self) -> None:
         self.session_id = secrets.randbits(64)
-        self.clock = SteadyClock()
+        self.clock: Callable[[], int] = SteadyClock()
+        self.failures = Failures(self.clock)
+        """Which parts have failed in flight."""
         self.inbox = FeedbackInbox()
         """What grounds have answered."""
         self.executor: Executor | None = None
@@ -50,10 +54,13 @@ class World:
             max_frames=config.max_frames,
             source_fps=config.source_fps,
             clock=self.clock,
+            failures=self.failures,
         )
 
     def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
         """Open the link until ``stack`` closes. Raises `UserError` for a bad port, endpoint or edge id."""
         return stack.enter_context(
-            ZenohLink(make_link_settings(config), edge_id=config.edge_id, clock=self.clock)
+            ZenohLink(
+                make_link_settings(config), edge_id=config.edge_id, failures=self.failures, clock=self.clock
+            )
         )

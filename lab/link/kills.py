@@ -3,7 +3,7 @@
 ``PYTHONPATH=.:tests/support python -m lab.link.kills --count 50 --seed 0``. Each flight goes over a link that comes
 and goes (`kills.toml`); one kill in five falls into the ending, when files are closed. Ctrl-C ends the other side,
 which must end well. What should be there is told by ``hvt-ground --timing``, which both sides of a flight are
-compared with, and for the store by the index that grows with each frame.
+compared with, and for the store by the time of the last frame in it.
 """
 
 from __future__ import annotations

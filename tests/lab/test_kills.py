@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
+
 import pytest
 
-from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.disk import FILE_NAME, Store
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from lab.link.kills import (
@@ -87,18 +90,20 @@ def test_a_store_is_read_as_the_next_start_would(tmp_path):
     frames = framed(smooth_pictures(30, size=SIZE), fps=10)
     units = [encoder.encode(frame, keyframe=frame.index % 10 == 0) for frame in frames]
     info = Flight(1).info().pack()
-    with Folder(tmp_path / "store", max_bytes=10**8, session_id=7, info=lambda: info) as folder:
+    with Store(tmp_path / "store", max_bytes=10**8, session_id=7, info=lambda: info) as store:
         for unit in units:
-            folder.add_unit(unit, parameter_sets=units[0].data)
+            store.add_unit(unit)
     whole = store_left(tmp_path / "store")
     assert (whole.objects, whole.unreadable, whole.missing_s) == (1, 0, 0)
-    (video,) = (tmp_path / "store").glob("*/base-*.mkv")
-    video.write_bytes(video.read_bytes()[: video.stat().st_size * 2 // 3])
-    cut = store_left(tmp_path / "store")
-    assert cut.unreadable == 0
-    assert 0.5 < cut.missing_s < 2
-    video.write_bytes(bytes(video.stat().st_size))
-    assert store_left(tmp_path / "store").unreadable == 1
+
+    def damage(frame: int) -> StoreLeft:
+        with contextlib.closing(sqlite3.connect(tmp_path / "store" / FILE_NAME)) as db, db:
+            db.execute("UPDATE part SET crc = 0 WHERE frame_index = ?", (frame,))
+        return store_left(tmp_path / "store")
+
+    cut = damage(20)
+    assert (cut.unreadable, cut.missing_s) == (0, pytest.approx(1.0))
+    assert damage(0).unreadable == 1
 
 
 def test_a_store_that_was_never_needed_is_whole(tmp_path):

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from hvt_common.video.still_codecs.registry import installed_codecs, still_codec
 from hvt_edge.config import EdgeConfig
+from media.third_party_codec import PIXELS, install
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -315,3 +317,18 @@ def test_an_address_that_is_not_this_machines(edge):
     sentence = edge("--listen", "tcp/192.0.2.1:7999", "--insecure")
     assert "tcp/192.0.2.1:7999" in sentence
     assert ".rs" not in sentence
+
+
+def test_a_still_codec_that_does_not_work_here(edge, tmp_path, monkeypatch):
+    """The first still of the flight would find out that its library is another build."""
+    broken = PIXELS.replace("step = 65 -", 'raise RuntimeError("another build")\n        step = 65 -')
+    monkeypatch.syspath_prepend(str(install(tmp_path / "site", {"acme-pixels": "PixelCodec"}, source=broken)))
+    installed_codecs.cache_clear()
+    still_codec.cache_clear()
+    try:
+        assert "--still-codec acme-pixels does not work here (another build)" in edge(
+            "--still-codec", "acme-pixels"
+        )
+    finally:
+        installed_codecs.cache_clear()
+        still_codec.cache_clear()

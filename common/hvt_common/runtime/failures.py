@@ -47,7 +47,7 @@ class Failures:
         self._lock = threading.Lock()
         self._parts: dict[str, Failure] = {}
         self._said: set[str] = set()
-        """Parts of whose failure the log has said, but not that they work again."""
+        """Of which the log says that they do not work."""
 
     @property
     def parts(self) -> tuple[Failure, ...]:
@@ -76,7 +76,7 @@ class Failures:
                 return
             self._parts[part] = replace(before, working=True)
         if part in self._said:
-            self._said.remove(part)
+            self._said.discard(part)
             _log.warning("%s: works again", part)
 
 

@@ -15,7 +15,7 @@ from itertools import chain
 
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
 from hvt_common.units import SECOND_NS
-from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import Entry, Key
 
 __all__ = ["Backfill", "Chunk"]
@@ -65,9 +65,9 @@ class Backfill:
     """For one thread. ``on_done(entry)`` is called for each object that a ground has whole."""
 
     def __init__(
-        self, folder: Folder, *, session_id: int, on_done: Callable[[Entry], None] = lambda _entry: None
+        self, store: Store, *, session_id: int, on_done: Callable[[Entry], None] = lambda _entry: None
     ) -> None:
-        self._folder = folder
+        self._store = store
         self._session_id = session_id
         self._on_done = on_done
         self._line: OrderedDict[Key, _Transfer] = OrderedDict()
@@ -127,18 +127,18 @@ class Backfill:
             elif (
                 key[1:] == (BacklogKind.INFO, 0)
                 and not acknowledged_range.acknowledged_bytes
-                and self._folder.find(key) is not None
+                and self._store.find(key) is not None
             ):
                 self._informed.discard(acknowledged_range.session_id)
                 self._requested.add(acknowledged_range.session_id)
 
     def _late(self, key: Key, acknowledged_bytes: int) -> None:
         """The ground had it after all when it was put aside."""
-        entry = self._folder.find(key)
-        data = None if entry is None else self._folder.read(entry)
+        entry = self._store.find(key)
+        data = None if entry is None else self._store.read(entry)
         if entry is not None and data is not None and acknowledged_bytes == len(data):
             self._refused.discard(key)
-            self._folder.remove(entry)
+            self._store.remove(entry)
             self._on_done(entry)
 
     def interrupt(self) -> None:
@@ -149,11 +149,11 @@ class Backfill:
 
     def _forget(self) -> None:
         """Forget objects that are not here any more."""
-        self._refused = {key for key in self._refused if self._folder.find(key) is not None}
+        self._refused = {key for key in self._refused if self._store.find(key) is not None}
         here = {
             key: acknowledged_range
             for key, acknowledged_range in self._acknowledged.items()
-            if self._folder.find(key) is not None
+            if self._store.find(key) is not None
         }
         self._acknowledged = here
 
@@ -183,7 +183,7 @@ class Backfill:
         if entry.kind is BacklogKind.INFO:
             self._informed.add(entry.session_id)
             return
-        self._folder.remove(entry)
+        self._store.remove(entry)
         self._on_done(entry)
 
     def _leave(self, key: Key) -> None:
@@ -219,7 +219,7 @@ class Backfill:
     def _begin_again(self, before_ns: int, now_ns: int) -> None:
         """Where the ground has not got on for too long."""
         for key, transfer in list(self._line.items()):
-            if self._folder.find(key) is None:  # evicted meanwhile
+            if self._store.find(key) is None:  # evicted meanwhile
                 self._leave(key)
             elif transfer.since_ns < before_ns and transfer.sent_bytes > transfer.acknowledged_bytes:
                 transfer.tries += 1
@@ -234,7 +234,7 @@ class Backfill:
             _log.warning(
                 "no ground takes %s in %d tries (%d objects so far): it stays on disk for another ground, or for "
                 "the next start",
-                transfer.entry.path,
+                transfer.entry,
                 transfer.tries,
                 self.given_up,
             )
@@ -254,7 +254,7 @@ class Backfill:
         if len(self._line) >= _MOST_OBJECTS:
             return None
         while (entry := next(self._open_entries(), None)) is not None:
-            data = self._folder.read(entry)
+            data = self._store.read(entry)
             if data is not None:
                 self._data = (entry.key, data)
                 transfer = self._line[entry.key] = _Transfer(entry, len(data), now_ns)
@@ -264,18 +264,18 @@ class Backfill:
     def _open_entries(self) -> Iterator[Entry]:
         """Those that may begin now, in their order."""
         for session_id in sorted(self._requested - self._informed):
-            info = self._folder.info_of(session_id)
+            info = self._store.info_of(session_id)
             if info is None:
                 self._requested.discard(session_id)
             elif info.key not in self._line:
                 yield info
-        stills, video = self._folder.best_stills(), self._folder.newest_segments()
-        if self.video_first and not self._folder.segments:
+        stills, video = self._store.best_stills(), self._store.newest_segments()
+        if self.video_first and not self._store.segments:
             self.video_first = False
         for entry in chain(video, stills) if self.video_first else chain(stills, video):
             if entry.key in self._line or entry.key in self._refused:
                 continue
-            info = self._folder.info_of(entry.session_id)
+            info = self._store.info_of(entry.session_id)
             if entry.session_id == self._session_id or entry.session_id in self._informed or info is None:
                 yield entry
             elif info.key not in self._line:
@@ -285,7 +285,7 @@ class Backfill:
         """The object's bytes, read again where another was read since; None where they are gone."""
         key = transfer.entry.key
         if self._data is None or self._data[0] != key:
-            data = self._folder.read(transfer.entry)
+            data = self._store.read(transfer.entry)
             if data is None or len(data) != transfer.total_bytes:
                 self._leave(key)
                 return None

@@ -1,142 +1,111 @@
-"""The store on disk: ``FOLDER/<session id>/`` with ``info``, stills one a file, and segments of the base stream.
+"""The store on disk: one SQLite file of objects (`entry`) and of the frames and stills that they are made of.
 
-Stills are written under another name first, segments only grow (`segment`). Nothing is forced to the platter: a kill
-costs nothing of what was written, a power cut what the system had still in memory.
+A write is whole or not at all after a kill, and nothing is forced to disk but the database's own order: a power cut
+costs what the system had still in memory. The file shrinks with what is in it.
 
 What has to go where the store is full, least useful first:
 
-* **Video, oldest first**, as long as it takes more than three quarters of the room. Whoever comes back to the link
+* **Video, oldest first**, as long as stills take less than a quarter of the space. Whoever comes back to the link
   wants to know what happened, and the way to now is closer from a short while ago than from an hour ago.
 * **Stills by their worth**: the utility that their method gave, halved with each ten minutes. They are a hundredth
-  of the video's bytes and most of what it shows of an object, so a quarter of the room holds those of a long time.
+  of the video's bytes and most of what it shows of an object, so a quarter of the space holds those of a long time.
 
-So video takes all of the room while there are few stills, and the best stills outlive the video around them.
+So video takes all of the space while there are few stills, and the best stills outlive the video around them.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
+import errno
 import logging
-import os
-import re
-from bisect import insort
-from collections import Counter
+import sqlite3
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Any, Self
 
-import av.error
-
-from hvt_common.errors import UserError
-from hvt_common.protocol.messages import BacklogKind, WireError
+from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind, BacklogUnit, pack_backlog_units
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.entry import (
-    Entry,
-    Key,
-    base_entry,
-    base_name,
-    found,
-    info_entry,
-    object_of,
-    still_entry,
-    still_name,
-    unlink,
-    write_whole,
-)
-from hvt_edge.backlog.segment import SEGMENT_NS, DamagedError, OpenSegment, blocks
+from hvt_edge.backlog.entry import Entry, Key, OpenSegment, worth
 
-__all__ = ["SEGMENT_NS", "Folder", "check_folder", "default_folder"]
+__all__ = ["FILE_NAME", "Store"]
 
 _log = logging.getLogger(__name__)
 
-_VIDEO_SHARE = 0.75
-_OURS = (".still", ".mkv", ".index", ".part")
-_SESSION = re.compile(r"[0-9a-f]{16}")
+FILE_NAME = "backlog.sqlite"
+_STILLS_SHARE = 0.25
+_PAGE_BYTES = 4096
+_LOG_BYTES = 2 * 64 * _PAGE_BYTES
+"""Of the write-ahead log: 64 pages are moved into the file, and the last write before that may be a large one."""
+_TRIAL_BYTES = 64 * 1024
+# One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
+_OPEN = """
+PRAGMA locking_mode = EXCLUSIVE;
+PRAGMA page_size = 4096;
+PRAGMA auto_vacuum = FULL;
+PRAGMA journal_mode = WAL;
+PRAGMA wal_autocheckpoint = 64;
+PRAGMA synchronous = NORMAL;
+PRAGMA foreign_keys = ON;
+PRAGMA temp_store = MEMORY;
+BEGIN IMMEDIATE;
+CREATE TABLE IF NOT EXISTS object (
+    id INTEGER PRIMARY KEY, session TEXT NOT NULL, kind TEXT NOT NULL, number INTEGER NOT NULL,
+    capture_ns INTEGER NOT NULL, rank REAL NOT NULL, bytes INTEGER NOT NULL, span_ns INTEGER NOT NULL,
+    UNIQUE (session, kind, number) ON CONFLICT REPLACE);
+CREATE INDEX IF NOT EXISTS object_rank ON object (kind, rank, bytes, span_ns);
+CREATE TABLE IF NOT EXISTS part (
+    object INTEGER REFERENCES object ON DELETE CASCADE, frame_index INTEGER, capture_ns INTEGER, keyframe INTEGER,
+    crc INTEGER, data BLOB);
+CREATE INDEX IF NOT EXISTS part_object ON part (object);
+CREATE TEMP TABLE gone (id INTEGER PRIMARY KEY);
+CREATE TEMP VIEW here AS SELECT * FROM object WHERE id NOT IN (SELECT id FROM gone);
+COMMIT;
+"""
+# `gone` is what has arrived and cannot be deleted yet, because a full disk has no space for the log either.
+# After a kill the segment that was open has no size yet.
+_ADOPT = """
+UPDATE object SET
+    bytes = (SELECT total(length(data)) FROM part WHERE object = object.id),
+    span_ns = (SELECT ifnull(max(part.capture_ns) - min(part.capture_ns), 0) FROM part WHERE object = object.id)
+WHERE kind = 'base' AND bytes = 0;
+DELETE FROM object WHERE kind = 'base' AND bytes = 0;
+"""
+_TIDY = """
+DELETE FROM object WHERE kind = 'info' AND session <> ?
+AND session NOT IN (SELECT session FROM object WHERE kind <> 'info')
+"""
+_ENTRY = "SELECT id, session, kind, number, rank, span_ns FROM here"
 
 
-def default_folder(edge_id: str) -> Path:
-    """Where programs keep what outlives them: ``$XDG_STATE_HOME`` or ``~/.local/state``, then ``hvt/<edge>``."""
-    state = os.environ.get("XDG_STATE_HOME", "")
-    if Path(state).is_absolute():
-        return Path(state) / "hvt" / edge_id
-    try:
-        return Path.home() / ".local" / "state" / "hvt" / edge_id
-    except RuntimeError:
-        raise UserError(
-            "what is seen while the link is away has no place, because there is no home folder: give --store-folder, "
-            "or --store 0 to keep nothing"
-        ) from None
+class Store:
+    """The objects of this session and of those before it, in bounded space. For one thread; any may read the counts.
 
-
-def check_folder(path: Path) -> None:
-    """Raise `UserError` now where a store could not be made in mid-flight; makes nothing."""
-    try:
-        there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
-        usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
-    except OSError:  # a part of the path may not be looked into
-        usable, there = False, path
-    if not usable:
-        raise UserError(
-            f"--store-folder {path} cannot be used, because {there} is no folder that can be written: name another, "
-            "or give --store 0 to keep nothing"
-        )
-
-
-class Folder:
-    """The objects of this session and of those before it, in bounded room. For one thread; counts may be read by any.
-
-    ``path`` is made when something is stored for the first time; ``max_bytes`` counts whole blocks. ``info()`` is
-    this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped when the folder is opened.
+    The folder is made when something is stored for the first time; ``max_bytes`` counts the file and its log.
+    ``info()`` is this session's `Info`, packed. What was captured before ``oldest_ns`` is dropped by `enter`.
+    Every method raises `OSError` where the disk refuses, and can be called again.
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        max_bytes: int,
-        session_id: int,
-        info: Callable[[], bytes],
-        oldest_ns: int = 0,
+        self, path: Path, *, max_bytes: int, session_id: int, info: Callable[[], bytes], oldest_ns: int = 0
     ) -> None:
         self.path = path
+        self._file = path / FILE_NAME
         self._max_bytes = max_bytes
+        self._file_bytes = max_bytes - _LOG_BYTES
+        self._session = f"{session_id:016x}"
         self._session_id = session_id
         self._info = info
-        self._lock: BinaryIO | None = None
-        self._ranked: dict[BacklogKind, list[tuple[float, int, int]]] = {kind: [] for kind in BacklogKind}
-        """(`Entry.rank`, session, number) by kind: stills from the least worth, segments from the oldest."""
-        self._entries: dict[Key, Entry] = {}
-        self._disk_bytes = dict.fromkeys(BacklogKind, 0)
-        self._objects: Counter[int] = Counter()
-        """Stills and segments by session."""
-        self._span_ns = 0
-        self._open: OpenSegment | None = None
         self._oldest_ns = oldest_ns
-        self.locked_out = False
-        """Another process has the folder; `enter` tries again."""
-        self.evicted_stills = 0
-        self.evicted_segments = 0
+        self._db: sqlite3.Connection | None = None
+        self._open: OpenSegment | None = None
+        self._still_bytes = self._span_ns = 0
+        self.disk_bytes = self.stills = self.segments = 0
+        """All that is here; the open segment does not count as one."""
+        self.evicted_stills = self.evicted_segments = 0
         self.damaged = 0
-        """Entries that were dropped because they could not be read."""
-        if path.is_dir():
-            self.enter()
-
-    @property
-    def disk_bytes(self) -> int:
-        """All that is here, the open segment included."""
-        return sum(self._disk_bytes.values()) + (0 if self._open is None else self._open.disk_bytes)
-
-    @property
-    def stills(self) -> int:
-        """How many are stored."""
-        return len(self._ranked[BacklogKind.STILL])
-
-    @property
-    def segments(self) -> int:
-        """How many are stored, without the open one."""
-        return len(self._ranked[BacklogKind.BASE])
+        """Objects that were dropped because they could not be read."""
 
     @property
     def open_segments(self) -> int:
@@ -149,126 +118,145 @@ class Folder:
         return self._span_ns + (0 if self._open is None else self._open.span_ns)
 
     def enter(self) -> None:
-        """Take over what earlier runs have stored; where another edge has the folder, it is `locked_out`.
+        """Take over what earlier runs have stored, if they have.
 
-        It may be a predecessor of this one that is about to end, so whoever stores or sends tries again.
-        Raises OSError.
+        Raises `BlockingIOError` where another edge has the folder, which may be a predecessor that is about to end.
         """
-        said = self.locked_out
-        try:
-            self._lock_up()
-        except BlockingIOError as error:
-            self.locked_out = True
-            if not said:
-                _log.warning("%s is in use: %s", self.path, error.strerror)
-            return
-        self.locked_out = False
-        self._take_over(self._oldest_ns)
+        if self._file.exists():
+            self._ready()
 
-    # Keeping
+    def trial(self) -> None:
+        """Write and delete something: whether the disk takes anything again."""
+        with self._disk():
+            db = self._writable()
+            row = db.execute("INSERT INTO part (data) VALUES (zeroblob(?))", (_TRIAL_BYTES,)).lastrowid
+            db.execute("DELETE FROM part WHERE rowid = ?", (row,))
+            self._delete_gone(db)
+
+    # Storing
 
     def add_still(self, number: int, data: bytes, *, utility: float, capture_ns: int) -> None:
-        """Store a still; ``data`` is `pack_backlog_still`'s. Raises OSError where the disk takes it not."""
-        if (self._session_id, BacklogKind.STILL, number) in self._entries:
-            return
-        folder = self._session_folder()
-        path = folder / still_name(number, capture_ns, utility)
-        self._evict_for(blocks(len(data)))
-        write_whole(path, data)
-        self._enter(still_entry(path, self._session_id, number, capture_ns, utility))
+        """Store a still; ``data`` is `pack_backlog_still`'s."""
+        with self._disk():
+            self._writable()
+            if self.find((self._session_id, BacklogKind.STILL, number)) is not None:
+                return
+            self._evict_for(len(data))
+            self._add(BacklogKind.STILL, number, capture_ns, worth(utility, capture_ns), data)
+            self._count()
 
-    def add_unit(self, unit: AccessUnit, *, parameter_sets: bytes) -> None:
-        """Append an access unit to the open segment, or to a new one. Raises OSError where the disk takes it not.
-
-        ``parameter_sets`` is the newest keyframe: a run that does not begin with one still has to be described.
-        """
-        segment = self._open
-        if segment is not None and segment.ends_before(unit):
+    def add_unit(self, unit: AccessUnit) -> None:
+        """Append an access unit to the open segment, or to a new one."""
+        if self._open is not None and self._open.ends_before(unit):
             self.end_segment()
-            segment = None
-        try:
-            if segment is None:
-                folder = self._session_folder()
-                path = folder / base_name(unit.frame_index, unit.capture_ns)
-                self._open = segment = OpenSegment(path, unit, parameter_sets)
-            self._evict_for(blocks(len(unit.data)))
-            segment.write(unit)
-        except av.error.FFmpegError as error:
-            raise OSError(error.errno, error.strerror, str(self.path)) from None
+        with self._disk():
+            db = self._writable()
+            self._evict_for(len(unit.data))
+            if self._open is None:
+                row = self._add(BacklogKind.BASE, unit.frame_index, unit.capture_ns, float(unit.capture_ns))
+                self._open = OpenSegment(row, unit, unit)
+            values = (unit.frame_index, unit.capture_ns, unit.keyframe, zlib.crc32(unit.data), unit.data)
+            db.execute("INSERT INTO part VALUES (?, ?, ?, ?, ?, ?)", (self._open.row, *values))
+            self._open.append(unit)
+            self._measure()
 
     def end_segment(self) -> None:
         """What was appended is an object now."""
         segment, self._open = self._open, None
-        if segment is None:
-            return
-        try:
-            segment.close()
-        except (av.error.FFmpegError, OSError) as error:
-            _log.debug("%s has no end: %s", segment.path, error)
-        first = segment.first
-        try:
-            entry = base_entry(segment.path, self._session_id, first.frame_index, first.capture_ns)
-        except OSError as error:  # the disk was taken out, or somebody has tidied up
-            self._note_damaged(segment.path, error)
-            return
-        self._enter(entry)
+        if segment is not None and self._db is not None:
+            with self._disk():
+                try:
+                    self._db.executescript(_ADOPT)
+                finally:
+                    self._count()
+
+    def _add(self, kind: BacklogKind, number: int, capture_ns: int, rank: float, data: bytes = b"") -> int:
+        assert self._db is not None
+        with self._db:
+            self._db.execute("BEGIN")
+            values = (self._session, kind, number, capture_ns, rank, len(data), 0)
+            insert = "INSERT INTO object VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)"
+            row = self._db.execute(insert, values).lastrowid
+            if data:
+                crc = zlib.crc32(data)
+                self._db.execute("INSERT INTO part (object, crc, data) VALUES (?, ?, ?)", (row, crc, data))
+        assert row is not None
+        return row
 
     # Giving back
 
     def best_stills(self) -> Iterator[Entry]:
         """Most useful first."""
-        return self._best(BacklogKind.STILL)
+        return self._ranked(BacklogKind.STILL)
 
     def newest_segments(self) -> Iterator[Entry]:
-        """Newest first."""
-        return self._best(BacklogKind.BASE)
-
-    def _best(self, kind: BacklogKind) -> Iterator[Entry]:
-        for _, session_id, number in reversed(self._ranked[kind]):
-            yield self._entries[session_id, kind, number]
+        """Newest first, without the open one."""
+        return self._ranked(BacklogKind.BASE)
 
     def info_of(self, session_id: int) -> Entry | None:
         """The facts of a session; None where they are not here."""
-        return self._entries.get((session_id, BacklogKind.INFO, 0))
+        return self.find((session_id, BacklogKind.INFO, 0))
 
     def find(self, key: Key) -> Entry | None:
         """The entry of this name, if it is still here."""
-        return self._entries.get(key)
+        session_id, kind, number = key
+        where = f"{_ENTRY} WHERE session = ? AND kind = ? AND number = ?"
+        return next(self._entries(where, f"{session_id:016x}", kind, number), None)
 
     def read(self, entry: Entry) -> bytes | None:
-        """The object's bytes as they cross the link; one that is damaged is dropped, with a warning, and None."""
-        try:
-            return object_of(entry)
-        except (OSError, WireError, DamagedError, ValueError) as error:
-            self._note_damaged(entry.path, error)
-            self.remove(entry)
-            return None
+        """The object's bytes as they cross the link; one that is damaged is dropped, with a warning, and None.
 
-    def _note_damaged(self, path: Path, error: Exception) -> None:
-        self.damaged += 1
-        if self.damaged.bit_count() == 1:  # 1, 2, 4, 8 …
-            _log.warning(
-                "the store skips what it cannot read (%d so far): %s (%s)", self.damaged, path, error
+        Of a segment: its frames up to the first damaged one.
+        """
+        with self._disk():
+            parts = [] if self._db is None else self._parts(entry)
+        if entry.kind is BacklogKind.BASE and parts:
+            data = pack_backlog_units(
+                [BacklogUnit(part[0], part[1], bool(part[2]), part[3]) for part in parts]
             )
+        else:
+            data = parts[0][3] if parts else b""
+        if 0 < len(data) <= MAX_BACKLOG_BYTES:
+            return data
+        self._note_damaged(f"{entry} cannot be read")
+        self.remove(entry)
+        return None
+
+    def _parts(self, entry: Entry) -> list[tuple[int, int, int, bytes]]:
+        assert self._db is not None
+        parts = []
+        columns = (
+            "SELECT frame_index, capture_ns, keyframe, data, crc FROM part WHERE object = ? ORDER BY rowid"
+        )
+        for *rest, data, crc in self._db.execute(columns, (entry.row,)):
+            if type(data) is not bytes or zlib.crc32(data) != crc:
+                break
+            parts.append((*rest, data))
+        return parts
 
     def remove(self, entry: Entry) -> None:
-        """It has arrived, or has to make room; with the last of a former session its folder goes too."""
-        if self._entries.pop(entry.key, None) is None:
+        """It has arrived, or has to make room; with the last of a former session its facts go too."""
+        if self._db is None:
             return
-        self._disk_bytes[entry.kind] -= entry.disk_bytes
-        self._span_ns -= entry.span_ns
-        self._objects[entry.session_id] -= entry.kind is not BacklogKind.INFO
-        if entry.kind is not BacklogKind.INFO:
-            self._ranked[entry.kind].remove((entry.rank, entry.session_id, entry.number))
-        unlink(entry.path)
-        self._tidy(entry.session_id)
+        with self._disk():
+            self._db.execute("INSERT OR IGNORE INTO gone VALUES (?)", (entry.row,))
+            self._delete_gone(self._db)
+            self._count()
+
+    def _delete_gone(self, db: sqlite3.Connection) -> None:
+        with contextlib.suppress(sqlite3.OperationalError):
+            db.execute("DELETE FROM object WHERE id IN (SELECT id FROM gone)")
+            db.execute("DELETE FROM gone")
+            db.execute(_TIDY, (self._session,))
 
     def close(self) -> None:
-        """End the open segment and let another process have the folder."""
-        self.end_segment()
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+        """End the open segment and let another process have the file; what is left still counts."""
+        try:
+            self.end_segment()
+            if self._db is not None:
+                self._delete_gone(self._db)
+        finally:
+            self._disconnect()
 
     def __enter__(self) -> Self:
         return self
@@ -278,102 +266,127 @@ class Folder:
     ) -> None:
         self.close()
 
-    # Room
+    def _ranked(self, kind: BacklogKind, order: str = "DESC") -> Iterator[Entry]:
+        opened = -1 if self._open is None else self._open.row
+        return self._entries(f"{_ENTRY} WHERE kind = ? AND id <> ? ORDER BY rank {order}", kind, opened)
+
+    def _entries(self, select: str, *values: Any) -> Iterator[Entry]:
+        if self._db is not None:
+            with self._disk():
+                for row, session, kind, *rest in self._db.execute(select, values):
+                    yield Entry(row, int(session, 16), BacklogKind(kind), *rest)
+
+    # Space
 
     def _evict_for(self, needed_bytes: int) -> None:
-        while self.disk_bytes + needed_bytes > self._max_bytes and (least := self._least()) is not None:
-            if least.kind is BacklogKind.STILL:
-                self.evicted_stills += 1
-            else:
-                self.evicted_segments += 1
-            if (self.evicted_stills + self.evicted_segments) == 1:
+        while self.disk_bytes + needed_bytes > self._file_bytes:
+            video_first = self._still_bytes < _STILLS_SHARE * self._file_bytes
+            kind = BacklogKind.BASE if self.segments and video_first else BacklogKind.STILL
+            if (least := next(self._ranked(kind, "ASC"), None)) is None:
+                return
+            if not self.evicted_stills + self.evicted_segments:
                 _log.warning(
                     "the store is full (--store %d MB): the least useful goes", self._max_bytes // 10**6
                 )
+            self.evicted_stills += kind is BacklogKind.STILL
+            self.evicted_segments += kind is BacklogKind.BASE
             self.remove(least)
 
-    def _least(self) -> Entry | None:
-        opened = 0 if self._open is None else self._open.disk_bytes
-        video_bytes = self._disk_bytes[BacklogKind.BASE] + opened
-        video_first = not self.stills or video_bytes > _VIDEO_SHARE * self._max_bytes
-        kind = BacklogKind.BASE if self.segments and video_first else BacklogKind.STILL
-        if not self._ranked[kind]:
-            return None
-        _, session_id, number = self._ranked[kind][0]
-        return self._entries[session_id, kind, number]
+    def _count(self) -> None:
+        assert self._db is not None
+        opened = -1 if self._open is None else self._open.row
+        counts = {BacklogKind.STILL: (0, 0, 0), BacklogKind.BASE: (0, 0, 0)}
+        sums = "SELECT kind, count(*), sum(bytes), sum(span_ns) FROM here WHERE id <> ? GROUP BY kind"
+        for kind, *row in self._db.execute(sums, (opened,)):
+            counts[BacklogKind(kind)] = (row[0], row[1], row[2])
+        self.stills, self._still_bytes, _ = counts[BacklogKind.STILL]
+        self.segments, _, self._span_ns = counts[BacklogKind.BASE]
+        self._measure()
 
-    def _enter(self, entry: Entry) -> None:
-        self._entries[entry.key] = entry
-        self._disk_bytes[entry.kind] += entry.disk_bytes
-        self._span_ns += entry.span_ns
-        self._objects[entry.session_id] += entry.kind is not BacklogKind.INFO
-        if entry.kind is not BacklogKind.INFO:
-            insort(self._ranked[entry.kind], (entry.rank, entry.session_id, entry.number))
+    def _measure(self) -> None:
+        assert self._db is not None
+        pages: int = self._db.execute("PRAGMA page_count").fetchone()[0]
+        self.disk_bytes = pages * _PAGE_BYTES
 
-    # Folders
+    # The file
 
-    def _session_folder(self) -> Path:
-        folder = self.path / f"{self._session_id:016x}"
-        if self._lock is None:
-            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if self.locked_out:
-                self.enter()
-            if self._lock is None:
-                self._lock_up()
-        if (self._session_id, BacklogKind.INFO, 0) not in self._entries:
-            folder.mkdir(mode=0o700, exist_ok=True)
-            write_whole(folder / "info", self._info())
-            self._enter(info_entry(folder / "info", self._session_id))
-        return folder
+    def _ready(self) -> sqlite3.Connection:
+        with self._disk():
+            if self._db is None:
+                self._db = self._opened()
+                self._take_over(self._db)
+            return self._db
 
-    def _lock_up(self) -> None:
-        lock = (self.path / "lock").open("ab")
+    def _writable(self) -> sqlite3.Connection:
+        """With this session's facts in it."""
+        if self._db is not None and not self._file.exists():
+            self._lose()
+            raise FileNotFoundError(errno.ENOENT, "removed, with all that was stored", str(self._file))
+        db = self._ready()
+        if self.info_of(self._session_id) is None:
+            self._add(BacklogKind.INFO, 0, 0, 0.0, self._info())
+        return db
+
+    def _opened(self) -> sqlite3.Connection:
+        self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        db = sqlite3.connect(self._file, timeout=0, isolation_level=None)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            lock.close()
-            raise BlockingIOError(
-                error.errno,
-                "another edge keeps its things there; if it goes on, give this one a --store-folder of its own",
-            ) from None
-        except OSError as error:  # some network disks have no locks
-            _log.debug("%s cannot be locked: %s", self.path, error)
-        self._lock = lock
+            db.executescript(_OPEN)
+        except sqlite3.Error as error:
+            db.close()
+            if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
+                why = "another edge uses it; if that goes on, give this one a --store-folder of its own"
+                raise BlockingIOError(errno.EAGAIN, why, str(self.path)) from None
+            raise
+        return db
 
-    def _take_over(self, oldest_ns: int) -> None:
-        """Find what earlier runs have stored; a half-written file is dropped, and what is too old."""
-        too_old = 0
-        for folder in sorted(self.path.iterdir()):
-            if _SESSION.fullmatch(folder.name) is None or not folder.is_dir():
-                continue
-            for path in sorted(folder.iterdir()):
-                entry = found(path, int(folder.name, 16))
-                if entry is not None and (entry.kind is BacklogKind.INFO or entry.capture_ns >= oldest_ns):
-                    self._enter(entry)
-                    continue
-                too_old += entry is not None
-                if path.suffix in _OURS and not (
-                    path.suffix == ".index" and path.with_suffix(".mkv").exists()
-                ):
-                    unlink(path)
-            self._tidy(int(folder.name, 16))
-        if too_old:
-            _log.warning(
-                "%d stills and stretches of video of an earlier run were never sent and are older than --store-age: "
-                "they are dropped",
-                too_old,
-            )
+    def _take_over(self, db: sqlite3.Connection) -> None:
+        """What earlier runs have stored, but for what is too old. A full disk refuses that, and can still be read."""
+        with contextlib.suppress(sqlite3.OperationalError):
+            db.executescript(_ADOPT)
+            too_old = "DELETE FROM object WHERE kind <> 'info' AND capture_ns < ?"
+            dropped = db.execute(too_old, (self._oldest_ns,)).rowcount
+            if dropped:
+                _log.warning(
+                    "%d stills and stretches of video of an earlier run were never sent and are older than "
+                    "--store-age: they are dropped",
+                    dropped,
+                )
+            db.execute(_TIDY, (self._session,))
+        self._count()
         self._evict_for(0)
 
-    def _tidy(self, session_id: int) -> None:
-        """Remove the folder of a former session that has nothing left to send."""
-        if session_id == self._session_id or self._objects[session_id] > 0:
-            return
-        del self._objects[session_id]
-        info = self._entries.pop((session_id, BacklogKind.INFO, 0), None)
-        if info is not None:
-            self._disk_bytes[BacklogKind.INFO] -= info.disk_bytes
-        folder = self.path / f"{session_id:016x}"
-        unlink(folder / "info")
-        with contextlib.suppress(OSError):
-            folder.rmdir()
+    def _disconnect(self) -> None:
+        db, self._db, self._open = self._db, None, None
+        if db is not None:
+            with contextlib.suppress(sqlite3.Error):
+                db.close()
+
+    def _lose(self) -> None:
+        """What is stored counts no more; `enter` may find it again."""
+        self._disconnect()
+        self._still_bytes = self._span_ns = self.disk_bytes = self.stills = self.segments = 0
+
+    @contextlib.contextmanager
+    def _disk(self) -> Iterator[None]:
+        """Errors of the database are errors of the disk; all but want of space end the connection."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            code = error.sqlite_errorcode & 0xFF
+            if code == sqlite3.SQLITE_FULL:
+                raise OSError(
+                    errno.ENOSPC,
+                    "no space is left: free some, or name another --store-folder",
+                    str(self.path),
+                ) from None
+            self._lose()
+            if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+                self._file.replace(self._file.with_suffix(".damaged"))
+                self._note_damaged(f"{self._file} is damaged and is put aside as .damaged")
+            raise OSError(errno.EIO, str(error), str(self.path)) from None
+
+    def _note_damaged(self, what: str) -> None:
+        self.damaged += 1
+        if self.damaged.bit_count() == 1:  # 1, 2, 4, 8 …
+            _log.warning("the store skips what it cannot read (%d so far): %s", self.damaged, what)

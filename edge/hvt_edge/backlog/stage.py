@@ -14,19 +14,15 @@ from types import TracebackType
 from typing import Self
 
 from hvt_common.protocol.messages import BacklogKind, BacklogStill, Feedback
+from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Chunk
-from hvt_edge.backlog.disk import SEGMENT_NS, Folder
-from hvt_edge.backlog.entry import FIRST_STORED, Entry
+from hvt_edge.backlog.disk import Store
+from hvt_edge.backlog.entry import FIRST_STORED, SEGMENT_NS, Entry
+from hvt_edge.backlog.intake import IntakeStill
 from hvt_edge.backlog.outage import SILENCE_NS, BaseInFlight, Outage
-from hvt_edge.backlog.worker import (
-    ChunkAllowance,
-    IntakeStill,
-    IntakeUnit,
-    StoreNumbers,
-    StoreWorker,
-)
+from hvt_edge.backlog.worker import ChunkAllowance, StoreNumbers, StoreWorker
 from hvt_edge.operating.keyframes import KeyframeRequests
 
 __all__ = ["BacklogLink", "BacklogStage", "State"]
@@ -79,7 +75,7 @@ class BacklogStage:
 
     def __init__(
         self,
-        open_folder: Callable[[], Folder],
+        store: Store,
         *,
         session_id: int,
         live: bool,
@@ -88,6 +84,7 @@ class BacklogStage:
         keyframes: KeyframeRequests,
         clock: Callable[[], int],
         on_outcome: Callable[[str, str], None],
+        failures: Failures,
     ) -> None:
         self._outage = Outage(live=live)
         self._link = link
@@ -100,20 +97,20 @@ class BacklogStage:
         self._linked = self._finishing = False
         self._back_ns = clock()
         self._segment_ns: int | None = None
-        self._keyframe = b""
         self._probed_ns = 0
         self.frames = 0
         """Stored and not sent."""
         self.breaks = 0
         """How often what was in flight has been taken for lost."""
         self._worker = StoreWorker(
-            open_folder,
+            store,
             session_id=session_id,
             clock=clock,
             allowance=self.chunk_allowance,
             send=lambda chunk: link.send(chunk, clock()),
             round_trip_ns=link.round_trip_ns,
             total_bps=link.total_bps,
+            failures=failures,
             on_sent=self._note_sent,
         )
 
@@ -126,7 +123,7 @@ class BacklogStage:
 
     @property
     def failed(self) -> bool:
-        """Whether the disk refuses, and nothing is stored any more."""
+        """Whether the disk refuses, and nothing is stored now."""
         return self._worker.failed
 
     def before_frame(self, now_ns: int, *, linked: bool) -> bool:
@@ -153,9 +150,8 @@ class BacklogStage:
         else:
             self.frames += 1
         if unit.keyframe:
-            self._keyframe = unit.data
             self._segment_ns = now_ns
-        if not self._worker.offer(IntakeUnit(unit, self._keyframe)):
+        if not self._worker.offer(unit):
             self._segment_ns = None  # what follows can be shown from a keyframe on only
 
     def probe_due(self, now_ns: int) -> bool:
@@ -167,11 +163,6 @@ class BacklogStage:
         self._lose_in_flight()  # stills that went out while the link was going, or coming
         self._worker.end_segment()
         self.state = State.LIVE
-
-    def sent(self, unit: AccessUnit) -> None:
-        """A frame is sent."""
-        if unit.keyframe:
-            self._keyframe = unit.data
 
     def _leave(self) -> None:
         """The link has gone: what was in flight is stored first."""
@@ -188,7 +179,7 @@ class BacklogStage:
             self.state is State.LIVE
         ):  # else these were to show whether the link is back, and are stored already
             for unit in units:
-                self._worker.offer(IntakeUnit(unit, self._keyframe))
+                self._worker.offer(unit)
 
     # The end of the run
 

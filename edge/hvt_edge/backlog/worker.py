@@ -1,8 +1,8 @@
 """The thread that the disk belongs to: it writes what is stored, and makes chunks of it when the link allows.
 
 What comes to it waits in a bounded queue (`intake`). Where that is full the disk is too slow: what comes then is not
-stored, and said once. A disk that is full, cannot be written or is taken out costs one warning and all further
-storing; what is there already is sent all the same. Chunks leave in a thread of their own (`ChunkThread`).
+stored, and said once. While a disk is full, cannot be written or is gone, nothing is stored; what is there already is
+sent all the same. Chunks leave in a thread of their own (`ChunkThread`).
 """
 
 from __future__ import annotations
@@ -11,19 +11,24 @@ import logging
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from queue import SimpleQueue
 
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, pack_backlog_still
+from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS
+from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Backfill, Chunk
-from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.entry import Entry
-from hvt_edge.backlog.intake import EndSegment, Intake, IntakeStill, IntakeUnit, News
+from hvt_edge.backlog.intake import EndSegment, Intake, IntakeStill, News
 
-__all__ = ["ChunkAllowance", "ChunkThread", "IntakeStill", "IntakeUnit", "StoreNumbers", "StoreWorker"]
+__all__ = ["ChunkAllowance", "ChunkThread", "StoreNumbers", "StoreWorker"]
 
 _log = logging.getLogger(__name__)
 
+_PART = "store"
+"""Its name among the parts that may fail."""
 _QUEUE = 512
 _BUSY_S = 0.02
 _IDLE_S = 0.25
@@ -67,15 +72,15 @@ class StoreNumbers:
 
 
 class StoreWorker:
-    """Opens the folder, stores, sends, and leaves the folder in order. `check` and `close` raise an error in it.
+    """Stores, sends, and leaves the store in order; everything on disk runs in its thread.
 
-    ``open_folder()`` and everything on disk runs in the thread. ``on_sent(entry)`` is called for each object that a
-    ground has whole. `close` waits ``close_s`` for the disk.
+    `check` and `close` raise a bug in it; a disk that refuses goes to ``failures`` and is tried again.
+    ``on_sent(entry)`` is called for each object that a ground has whole. `close` waits ``close_s`` for the disk.
     """
 
     def __init__(
         self,
-        open_folder: Callable[[], Folder],
+        store: Store,
         *,
         session_id: int,
         clock: Callable[[], int],
@@ -83,27 +88,26 @@ class StoreWorker:
         send: Callable[[Chunk], int],
         round_trip_ns: Callable[[], int],
         total_bps: Callable[[], int],
+        failures: Failures,
         on_sent: Callable[[Entry], None] = lambda _entry: None,
         close_s: float = _CLOSE_S,
     ) -> None:
-        self._open_folder = open_folder
+        self._store = store
         self._allowance = allowance
         self._round_trip_ns = round_trip_ns
         self._total_bps = total_bps
-        self._session_id = session_id
         self._clock = clock
+        self._failures = failures
         self._on_sent = on_sent
         self._close_s = close_s
+        self._backfill = Backfill(store, session_id=session_id, on_done=self._note_done)
         self._intake = Intake(_QUEUE)
-        self._sending = ChunkThread(send, on_done=self._intake.wake)
-        self._folder: Folder | None = None
-        self._backfill: Backfill | None = None
-        self._sent_stills = 0
-        self._sent_ns = 0
-        self._trickle_ns = self._entered_ns = 0
+        self._sending = ChunkThread(send, on_done=self._intake.signal)
+        self._sent_stills = self._sent_ns = self._trickle_ns = 0
         self._slow = False
+        self._retry = RetryPause()
         self.failed = False
-        """Nothing is stored any more, and why has been said."""
+        """The disk refuses: nothing is stored until it takes something again."""
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="hvt-store", daemon=True)
         self._thread.start()
@@ -116,7 +120,7 @@ class StoreWorker:
             error, self._error = self._error, None
             raise error
 
-    def offer(self, item: IntakeUnit | IntakeStill) -> bool:
+    def offer(self, item: AccessUnit | IntakeStill) -> bool:
         """Hand over something to be stored; False where it is not, because the disk is too slow or refuses."""
         self.check()
         if self.failed:
@@ -124,7 +128,9 @@ class StoreWorker:
         if not self._intake.offer(item):
             if not self._slow:
                 self._slow = True
-                _log.warning("the disk of --store-folder is too slow: some of what is seen now is not kept")
+                _log.warning(
+                    "the disk of --store-folder is too slow: some of what is captured now is not stored"
+                )
             return False
         return True
 
@@ -138,11 +144,11 @@ class StoreWorker:
 
     def interrupt(self) -> None:
         """The link is away: what was on its way is not."""
-        self._intake.interrupt()
+        self._intake.signal(interrupted=True)
 
     def video_first(self) -> None:
         """A ground requested the video."""
-        self._intake.request_video()
+        self._intake.signal(video_first=True)
 
     @property
     def queued(self) -> int:
@@ -152,21 +158,19 @@ class StoreWorker:
     @property
     def numbers(self) -> StoreNumbers:
         """What is stored and what was done."""
-        folder, backfill = self._folder, self._backfill
-        if folder is None or backfill is None:
-            return StoreNumbers()
+        store = self._store
         return StoreNumbers(
-            stills=folder.stills,
-            segments=folder.segments + folder.open_segments,
-            video_s=folder.span_ns / SECOND_NS,
-            disk_bytes=folder.disk_bytes,
+            stills=store.stills,
+            segments=store.segments + store.open_segments,
+            video_s=store.span_ns / SECOND_NS,
+            disk_bytes=store.disk_bytes,
             sent_stills=self._sent_stills,
             sent_video_s=self._sent_ns / SECOND_NS,
-            acknowledged_bytes=backfill.acknowledged_bytes,
-            evicted_stills=folder.evicted_stills,
-            evicted_segments=folder.evicted_segments,
-            unreadable=folder.damaged,
-            given_up=backfill.given_up,
+            acknowledged_bytes=self._backfill.acknowledged_bytes,
+            evicted_stills=store.evicted_stills,
+            evicted_segments=store.evicted_segments,
+            unreadable=store.damaged,
+            given_up=self._backfill.given_up,
         )
 
     def send_no_more(self) -> None:
@@ -174,13 +178,13 @@ class StoreWorker:
         self._sending.close(_LAST_CHUNK_S)
 
     def close(self) -> None:
-        """Write what waits, end the files, join the thread. A disk that hangs costs what waits, and a warning."""
-        self._intake.close()
+        """Write what waits, end the file, join the thread. A disk that hangs costs what waits, and a warning."""
+        self._intake.signal(closed=True)
         self._thread.join(timeout=self._close_s)
         if self._thread.is_alive():
             _log.warning(
                 "the disk of --store-folder takes longer than %g s: %d frames and stills that wait for it are not "
-                "kept",
+                "stored",
                 self._close_s,
                 self.queued,
             )
@@ -192,90 +196,56 @@ class StoreWorker:
     def _run(self) -> None:
         lower_priority()
         try:
-            self._open()
-            try:
-                self._work()
-            finally:
-                if self._folder is not None:
-                    self._folder.close()
+            self._attempt(self._store.enter)
+            while not self._intake.ended:
+                self._turn()
+            self._attempt(self._store.close)
         except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
             self._error = error
 
-    def _open(self) -> None:
+    def _turn(self) -> None:
+        busy = self._store.stills or self._store.segments
+        news, item = self._intake.take(_BUSY_S if busy else _IDLE_S)
+        self._attempt(lambda: self._note(news))
+        if self.failed and self._retry.due(self._clock()) and self._attempt(self._store.trial):
+            self.failed = False
+            self._failures.works(_PART)
+        if isinstance(item, EndSegment):
+            self._attempt(self._store.end_segment)
+        elif item is None:
+            self._attempt(self._send_chunk)
+        elif not self.failed and not self._attempt(lambda: self._add(item)):
+            self._attempt(self._store.end_segment)
+
+    def _attempt(self, do: Callable[[], None]) -> bool:
+        """Whether the disk took it; else nothing is stored until a trial succeeds."""
         try:
-            folder = self._open_folder()
+            do()
         except OSError as error:
-            self._fail(error)
-            return
-        self._backfill = Backfill(folder, session_id=self._session_id, on_done=self._note_done)
-        self._folder = folder
+            self.failed = True
+            self._retry.failed(self._clock())
+            self._failures.failed(_PART, f"--store-folder {error.filename or ''}: {error.strerror or error}")
+            return False
+        return True
 
-    def _work(self) -> None:
-        while not self._intake.ended:
-            folder, backfill = self._folder, self._backfill
-            news, item = self._intake.take(self._patience_s())
-            if folder is None or backfill is None:
-                continue
-            self._note(news, backfill)
-            if isinstance(item, EndSegment):
-                folder.end_segment()
-            elif item is not None:
-                self._backlog(folder, item)
-            else:
-                self._enter(folder)
-                self._send_chunk(backfill)
-
-    def _patience_s(self) -> float:
-        busy = self._folder is not None and (self._folder.stills or self._folder.segments)
-        return _BUSY_S if busy else _IDLE_S
-
-    def _note(self, news: News, backfill: Backfill) -> None:
+    def _note(self, news: News) -> None:
         if news.interrupted:
-            backfill.interrupt()
-        if news.video_first:
-            backfill.video_first = True
-        for receiver_id, acknowledged_range in news.acknowledged_ranges:
-            backfill.on_acknowledged([acknowledged_range], receiver_id=receiver_id, now_ns=self._clock())
+            self._backfill.interrupt()
+        self._backfill.video_first |= news.video_first
+        for (receiver_id, _), one in news.acknowledged.items():
+            self._backfill.on_acknowledged([one], receiver_id=receiver_id, now_ns=self._clock())
 
-    def _backlog(self, folder: Folder, item: IntakeUnit | IntakeStill) -> None:
-        if self.failed:
-            return
-        try:
-            if isinstance(item, IntakeUnit):
-                folder.add_unit(item.unit, parameter_sets=item.parameter_sets)
-            else:
-                folder.add_still(
-                    item.number,
-                    pack_backlog_still(item.still),
-                    utility=item.utility,
-                    capture_ns=item.capture_ns,
-                )
-        except OSError as error:
-            self._fail(error)
-            folder.end_segment()
+    def _add(self, item: AccessUnit | IntakeStill) -> None:
+        if isinstance(item, AccessUnit):
+            self._store.add_unit(item)
+        else:
+            data = pack_backlog_still(item.still)
+            self._store.add_still(item.number, data, utility=item.utility, capture_ns=item.capture_ns)
 
-    def _enter(self, folder: Folder) -> None:
-        """Another edge has the folder: it may have been the one before this, which has ended by now."""
-        now_ns = self._clock()
-        if folder.locked_out and now_ns - self._entered_ns >= SECOND_NS:
-            self._entered_ns = now_ns
-            try:
-                folder.enter()
-            except OSError as error:
-                self._fail(error)
-
-    def _fail(self, error: OSError) -> None:
-        self.failed = True
-        _log.warning(
-            "what is seen while the link is away cannot be kept any more (%s): free the disk, name another "
-            "--store-folder, or give --store 0",
-            error.strerror or error,
-        )
-
-    def _send_chunk(self, backfill: Backfill) -> None:
+    def _send_chunk(self) -> None:
         done = self._sending.take()
         if done is not None and not done[1]:
-            backfill.take_back(done[0])  # and wait a moment: others send
+            self._backfill.take_back(done[0])  # and wait a moment: others send
             return
         now_ns = self._clock()
         if done is not None:
@@ -284,13 +254,14 @@ class StoreWorker:
         allowance = None if self._sending.busy else self._allowance(now_ns)
         if allowance is None or (allowance.trickle and now_ns < self._trickle_ns):
             return
-        chunk = backfill.next_chunk(allowance.limit_bytes, now_ns=now_ns, round_trip_ns=self._round_trip_ns())
+        chunk = self._backfill.next_chunk(
+            allowance.limit_bytes, now_ns=now_ns, round_trip_ns=self._round_trip_ns()
+        )
         if chunk is not None:
             self._sending.put(chunk)
 
     def _note_done(self, entry: Entry) -> None:
-        if entry.kind is BacklogKind.STILL:
-            self._sent_stills += 1
+        self._sent_stills += entry.kind is BacklogKind.STILL
         self._sent_ns += entry.span_ns
         self._on_sent(entry)
 
@@ -298,63 +269,47 @@ class StoreWorker:
 class ChunkThread:
     """Sends one chunk at a time in a thread of its own: a link that is full for seconds must not hold up the disk.
 
-    `put` and `take` are for one thread; ``on_done()`` is called in its own after each chunk. ``send(chunk)`` returns
-    the line bytes, 0 where it was not sent; it may block.
+    `put`, `take` and `busy` are for one thread; ``on_done()`` is called in its own after each chunk. ``send(chunk)``
+    returns the line bytes, 0 where it was not sent; it may block.
     """
 
     def __init__(self, send: Callable[[Chunk], int], *, on_done: Callable[[], None]) -> None:
         self._send = send
         self._on_done = on_done
-        self._changed = threading.Condition()
-        self._chunk: Chunk | None = None
-        self._done: tuple[Chunk, int] | None = None
+        self._chunks: SimpleQueue[Chunk | None] = SimpleQueue()
+        self._done: SimpleQueue[tuple[Chunk, int | BaseException]] = SimpleQueue()
         self._closed = False
-        self._error: BaseException | None = None
+        self.busy = False
+        """Whether a chunk is being sent, or was sent and not taken note of."""
         self._thread = threading.Thread(target=self._run, name="hvt-backlog", daemon=True)
         self._thread.start()
 
-    @property
-    def busy(self) -> bool:
-        """Whether a chunk is being sent, or was sent and not taken note of."""
-        return self._chunk is not None or self._done is not None
-
     def put(self, chunk: Chunk) -> None:
         """Send this; only where it is not `busy`."""
-        assert not self.busy, "one at a time"
-        with self._changed:
-            self._chunk = chunk
-            self._changed.notify()
+        self.busy = True
+        self._chunks.put(chunk)
 
     def take(self) -> tuple[Chunk, int] | None:
         """The chunk sent last and its line bytes, once; None until then. Raises whatever ``send`` has raised."""
-        with self._changed:
-            if self._error is not None:
-                raise self._error
-            done, self._done = self._done, None
-        return done
+        if self._done.empty():
+            return None
+        chunk, sent = self._done.get()
+        self.busy = False
+        if isinstance(sent, BaseException):
+            raise sent
+        return chunk, sent
 
     def close(self, timeout_s: float) -> None:
         """Send no more; what is being sent has so long to go."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
+        self._closed = True
+        self._chunks.put(None)
         self._thread.join(timeout=timeout_s)
 
     def _run(self) -> None:
         lower_priority()
-        while (chunk := self._next()) is not None:
+        while (chunk := self._chunks.get()) is not None and not self._closed:
             try:
-                line_bytes = self._send(chunk)
+                self._done.put((chunk, self._send(chunk)))
             except BaseException as error:  # noqa: BLE001 - handed to the disk thread, which hands it on
-                with self._changed:
-                    self._error = error
-                self._on_done()
-                return
-            with self._changed:
-                self._done, self._chunk = (chunk, line_bytes), None
+                self._done.put((chunk, error))
             self._on_done()
-
-    def _next(self) -> Chunk | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._chunk is not None or self._closed)
-            return None if self._closed else self._chunk

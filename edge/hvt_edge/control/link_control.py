@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 
 from hvt_common.protocol.messages import Feedback
+from hvt_common.runtime.failures import Failures
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.link.feedback import FeedbackInbox
@@ -20,6 +21,7 @@ from hvt_edge.video.reconfigure import EncoderReconfiguration
 
 __all__ = ["LinkControl", "wait_for_ground"]
 
+_PART = "reports"
 _MOST_WAIT_NS = 100_000_000
 """A frame that would wait longer for the budget's window is dropped before it is encoded."""
 
@@ -27,13 +29,16 @@ _MOST_WAIT_NS = 100_000_000
 class LinkControl:
     """Applies receiver reports: `on_feedback` in the link's thread, all else in the frame loop.
 
-    ``pacer`` is None without ``--adapt``, ``backlog`` where nothing is stored while the link is offline.
+    ``pacer`` is None without ``--adapt``, ``backlog`` where nothing is stored while the link is offline. Whoever
+    subscribes to the video and is no ground (``has_subscriber``, and not ``has_ground``) reports nothing: it gets all
+    that the budget allows, and is no link of which anything is known.
     """
 
     def __init__(
         self,
         *,
         has_ground: Callable[[], bool],
+        has_subscriber: Callable[[], bool],
         session_id: int,
         transmitter: Transmitter,
         keyframes: KeyframeRequests,
@@ -45,8 +50,12 @@ class LinkControl:
         outbox: Outbox,
         stills: StillSender,
         backlog: BacklogStage | None,
+        failures: Failures,
     ) -> None:
         self._has_ground = has_ground
+        self._has_subscriber = has_subscriber
+        self._failures = failures
+        self._had_ground = False
         self._session_id = session_id
         self._transmitter = transmitter
         self._keyframes = keyframes
@@ -62,13 +71,16 @@ class LinkControl:
 
     def before_frame(self, now_ns: int) -> None:
         """What the link carries decides on budget, base rate, keyframe, and on whether anything is sent at all."""
-        linked = self._has_ground()
+        ground = self._has_ground()
+        # A ground that has left, with somebody there still who reports nothing: what was known of the path is void.
+        linked = ground or (self._has_subscriber() and not self._had_ground)
+        self._had_ground = ground
         offline = self._backlog is not None and self._backlog.before_frame(now_ns, linked=linked)
         if not linked:
             self._primary.forget()
         if self._pacer is None:
             return
-        back = self._pacer.link(linked, now_ns=now_ns)
+        back = self._pacer.link(linked, reports=ground, now_ns=now_ns)
         if offline:  # what is stored has the quality that the link had
             self._reconfiguration.hold(now_ns)
         if offline or not linked:  # nothing is carried anywhere
@@ -93,10 +105,20 @@ class LinkControl:
         self.admits(now_ns)  # which gives up what is lost: nothing else would, without frames
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """A ground reports (any thread); whether its report counts is decided here, once."""
+        """A ground reports (any thread). Where that fails the rate falls to its floor until a report counts again."""
         if feedback.session_id != self._session_id:
             return
-        now_ns = self._clock()
+        try:
+            self._apply(feedback, now_ns=self._clock())
+        except Exception as error:  # noqa: BLE001 - in a thread of the link, where nobody would hear of it
+            self._failures.failed(_PART, f"a report failed ({type(error).__name__}: {error})")
+            if self._pacer is not None:
+                self._pacer.on_fault(self._clock())
+        else:
+            self._failures.works(_PART)
+
+    def _apply(self, feedback: Feedback, *, now_ns: int) -> None:
+        """Whether the report counts is decided here, once."""
         sent = (self._transmitter.base_sequence, self._transmitter.still_sequence)
         report = self._primary.judge(feedback, sent=sent, now_ns=now_ns)
         self._keyframes.report_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)

@@ -158,6 +158,7 @@ class Pacer:
         self._round_trip_ns = SECOND_NS // 2
         self._last_sent_ns = 0
         self._linked: bool | None = None
+        self._reports = True
         self._started_ns: int | None = None
         """When the first keyframe went out since somebody is there."""
         self.ignored = 0
@@ -245,10 +246,17 @@ class Pacer:
             if self.backoffs > backoffs:
                 self._flight.refill()
 
-    def link(self, there: bool, *, now_ns: int) -> bool:  # noqa: FBT001 - it is the news itself
-        """Whether anybody can be reached at all; True where that has just come back."""
+    def on_fault(self, now_ns: int) -> None:
+        """A report came and could not be used: of what is on its way nothing is known, and the least is sent."""
         with self._lock:
-            before, self._linked = self._linked, there
+            self._controller.on_silence(now_ns)
+            self._flight.clear()
+            self._reported_ns = self._progress_ns = now_ns
+
+    def link(self, there: bool, *, now_ns: int, reports: bool = True) -> bool:  # noqa: FBT001 - the news itself
+        """Whether anybody can be reached at all; True where that has just come back. ``reports``: a ground."""
+        with self._lock:
+            before, self._linked, self._reports = self._linked, there, reports
             if there and not before:
                 self._started_ns = None
             if before and not there:
@@ -285,8 +293,8 @@ class Pacer:
             return now_ns - self._reported_ns <= _SILENCE_NS and self._is_open(now_ns, _STILL_BACKLOG_NS)
 
     def _may_start(self, now_ns: int) -> bool:
-        if not self._linked or self._started_ns is None:
-            return True  # nothing is known, or nothing leaves
+        if not self._linked or not self._reports or self._started_ns is None:
+            return True  # nothing is known, nothing leaves, or nobody will say what arrives
         return not _START_NS <= now_ns - self._started_ns < _START_NS + _START_HOLD_NS
 
     def _is_open(self, now_ns: int, most_backlog_ns: int) -> bool:

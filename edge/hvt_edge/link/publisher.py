@@ -12,6 +12,7 @@ import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.protocol.messages import ControlAnswer, ControlRequest, Feedback, WireError
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
 from hvt_common.transport.flood import FloodWatch
@@ -68,7 +69,10 @@ class ZenohLink:
     Raises `UserError` where a port or an endpoint cannot be used, or another edge of that id is on the link.
     """
 
-    def __init__(self, settings: LinkSettings, *, edge_id: str, clock: Callable[[], int]) -> None:
+    def __init__(
+        self, settings: LinkSettings, *, edge_id: str, failures: Failures, clock: Callable[[], int]
+    ) -> None:
+        self._failures = failures
         self._keys = EdgeKeys(edge_id)
         self._clock = clock
         refuse_duplicate_edge(settings, self._keys)
@@ -123,6 +127,7 @@ class ZenohLink:
             info=info,
             control=control,
             on_feedback=on_feedback,
+            failures=self._failures,
             clock=self._clock,
         )
         self._listener = self._stack.enter_context(listener)
@@ -151,8 +156,10 @@ class EdgeListener:
         info: Callable[[int], bytes],
         control: Callable[[ControlRequest], ControlAnswer],
         on_feedback: Callable[[Feedback], None],
+        failures: Failures,
         clock: Callable[[], int],
     ) -> None:
+        self._failures = failures
         self._info = info
         self._control = control
         self._handle_feedback = on_feedback
@@ -177,8 +184,8 @@ class EdgeListener:
     ) -> None:
         self.close()
 
-    def _on_info(self, _query: bytes) -> bytes:
-        return self._info(self._clock())
+    def _on_info(self, _query: bytes) -> bytes | None:
+        return self._answered(Channel.INFO, lambda: self._info(self._clock()))
 
     def _on_control(self, query: bytes) -> bytes | None:
         self._watch(Channel.CONTROL)
@@ -187,7 +194,17 @@ class EdgeListener:
         except WireError as error:
             self._skip("control", error)
             return None
-        return self._control(request).pack()
+        return self._answered(Channel.CONTROL, lambda: self._control(request).pack())
+
+    def _answered(self, channel: Channel, answer: Callable[[], bytes]) -> bytes | None:
+        """None where that fails: an error in Zenoh's thread would be nobody's."""
+        try:
+            data = answer()
+        except Exception as error:  # noqa: BLE001 - see above
+            self._failures.failed(channel, f"a ground got no answer ({type(error).__name__}: {error})")
+            return None
+        self._failures.works(channel)
+        return data
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
         self._watch(Channel.FEEDBACK)

@@ -75,11 +75,15 @@ class LockstepPace:
         self._coded_index = -1
         self._newest_answered = -1
 
-    def step(self, frame: Frame) -> None:
+    def step(self, frame: Frame | None, *, missed: int = 0) -> None:
         """Encode this frame while the one before is analyzed; send that one's stills, then this one's unit.
 
         A frame that is not coded is analyzed all the same: its source may show what no base frame does.
         """
+        del missed  # of a camera, whose frames wait for nobody
+        if frame is None:
+            return
+        self._counts.captured += 1
         now_ns = frame.capture_ns
         began_ns = time.perf_counter_ns()
         decision = self._base.decide(frame.index, now_ns=now_ns)

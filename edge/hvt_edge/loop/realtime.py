@@ -8,7 +8,9 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from hvt_common.values import AccessUnit, Frame
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.source.pacing import realtime_admits
@@ -17,9 +19,10 @@ from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.frame_decision import Action
 from hvt_edge.video.stage import BaseStage
 
-__all__ = ["RealtimePace", "SkippedUnits"]
+__all__ = ["RealtimePace"]
 
-_MOST_SKIPPED_BYTES = 2 * 2**20
+_BEHIND_SHARE = 0.5
+"""Of the time between two frames: later than that the loop is late."""
 
 
 class RealtimePace:
@@ -40,6 +43,7 @@ class RealtimePace:
         live: bool,
         counts: FrameCounts,
         stop: threading.Event,
+        failures: Failures,
         before_frame: Callable[[int], None] = lambda _now_ns: None,
     ) -> None:
         self._base = base
@@ -50,25 +54,44 @@ class RealtimePace:
         self._counts = counts
         self._stop = stop
         self._before_frame = before_frame
-        self._skipped = SkippedUnits()
-        self._worker = StillWorker(stills, results=inbox.take, clock=clock)
+        self._missed: int | None = None
+        self._link_bound = False
+        """Sending the last frame took longer than coding it."""
+        self._worker = StillWorker(stills, results=inbox.take, failures=failures, clock=clock)
 
-    def step(self, frame: Frame) -> None:
-        """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it."""
-        if not self._live and not realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop):
-            self._counts.dropped_cpu += 1
+    def step(self, frame: Frame | None, *, missed: int = 0) -> None:
+        """Encode and send one frame, then hand it to perception, also where it is not coded; or drop it.
+
+        ``missed`` counts frames of a live source that came before this loop took them; None: there is none now.
+        """
+        if frame is None:
+            self._before_frame(self._clock())
             return
+        if self._missed is None:  # before the first frame there was no loop
+            self._missed = missed
+        newly_missed, self._missed = missed - self._missed, missed
+        self._counts.captured += 1 + newly_missed
+        self._drop(newly_missed)
+        behind = newly_missed > 0
+        if not self._live:
+            if not realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop):
+                self._drop(1)
+                return
+            behind = self._clock() - frame.capture_ns > _BEHIND_SHARE * SECOND_NS / self._fps
         now_ns = self._clock()
         self._before_frame(now_ns)
         began_ns = time.perf_counter_ns()
         decision = self._base.decide(frame.index, now_ns=now_ns)
         unit = self._base.encode(frame, decision, now_ns=now_ns, tracks=self._stills.latest_tracks)
+        encoded_ns = time.perf_counter_ns()
         if unit is not None:
-            self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
+            self._counts.note(frame.index, encode_ns=encoded_ns - began_ns)
             self._base.send(unit, decision, now_ns=self._clock())
         elif decision.action is Action.HOLD:
             self._counts.dropped_link += 1
-        self._analyze(frame, unit)
+        self._link_bound = time.perf_counter_ns() - encoded_ns > encoded_ns - began_ns
+        # Video goes first: perception gets no frame while the loop is late.
+        self._counts.unanalyzed += not self._worker.take(frame, unit, room=not behind)
 
     def __enter__(self) -> Self:
         return self
@@ -78,40 +101,9 @@ class RealtimePace:
     ) -> None:
         self._worker.close()
 
-    def _analyze(self, frame: Frame, unit: AccessUnit | None) -> None:
-        if self._worker.full:
-            self._counts.unanalyzed += 1
-            self._skipped.add(unit)
+    def _drop(self, count: int) -> None:
+        """So many frames came while the one before was coded or sent, whichever took longer."""
+        if self._link_bound:
+            self._counts.dropped_link += count
         else:
-            self._worker.offer(frame, *self._skipped.take(unit))
-
-
-class SkippedUnits:
-    """Access units of frames that were not analyzed: the decoder needs them before the next. Bounded in bytes."""
-
-    def __init__(self) -> None:
-        self._units: list[AccessUnit] = []
-        self._whole = True
-        """Whether all since the last keyframe are there."""
-
-    def add(self, unit: AccessUnit | None) -> None:
-        """This frame is not analyzed; ``unit`` is None where it was not coded."""
-        if unit is None:
-            return
-        if unit.keyframe:
-            self._units, self._whole = [], True
-        self._units.append(unit)
-        if not self._whole or sum(len(one.data) for one in self._units) > _MOST_SKIPPED_BYTES:
-            self._units, self._whole = [], False
-
-    def take(self, unit: AccessUnit | None) -> tuple[AccessUnit | None, tuple[AccessUnit, ...]]:
-        """Return what the decoder may be given now: this frame's unit, and those before it.
-
-        Where units are missing it is nothing until a keyframe: the frame is analyzed as one that was not coded.
-        """
-        if unit is None:
-            return None, ()
-        if unit.keyframe:
-            self._units, self._whole = [], True
-        skipped, self._units = tuple(self._units), []
-        return (unit, skipped) if self._whole else (None, ())
+            self._counts.dropped_cpu += count

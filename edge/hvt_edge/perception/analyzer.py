@@ -9,13 +9,12 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from hvt_common.inference.detect import Detector
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
 from hvt_common.video.hevc import BaseDecoder
 
-__all__ = ["AnalyzedFrame", "Analyzer", "AnalyzerSettings"]
+__all__ = ["AnalyzedFrame", "Analyzer", "AnalyzerSettings", "FailingDetector"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +51,26 @@ class _Decoder(Protocol):
     def decode(self, data: bytes) -> Image | None: ...
 
 
+class FailingDetector(Protocol):
+    """A detector, or one that may not work at the moment."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """What ``class_ids`` index."""
+
+    def detect(self, image_bgr: Image) -> Detections | None:
+        """As `Detector.detect`; None while it does not work."""
+
+
 class Analyzer:
-    """Decodes the edge's own access units, detects on every n-th frame and tracks on each."""
+    """Decodes the edge's own access units, detects on every n-th frame and tracks on each.
+
+    While the detector gives None the tracks are carried on.
+    """
 
     def __init__(
         self,
-        detector: Detector,
+        detector: FailingDetector,
         tracker: ByteTracker,
         *,
         view: View,
@@ -117,11 +130,12 @@ class Analyzer:
     def _analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool) -> AnalyzedFrame:
         base_bgr = None if unit is None else self._decode(frame.index, unit)
         pixels = frame.base_bgr if self._settings.candidates == "source" else base_bgr
-        if hurry or not self._due(frame.index, coded=unit is not None):
+        due = not hurry and self._due(frame.index, coded=unit is not None)
+        detections = self._detect(frame, base_bgr) if due else None
+        if detections is None:
             tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
             return AnalyzedFrame(frame, base_bgr, tracks, detected=False)
         self._detected_index = frame.index
-        detections = self._detect(frame, base_bgr)
         tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
         return AnalyzedFrame(frame, base_bgr, tracks, detected=True)
 
@@ -143,13 +157,15 @@ class Analyzer:
             return rested or sparse
         return rested and sparse and self._settings.candidates == "source"
 
-    def _detect(self, frame: Frame, base_bgr: Image | None) -> Detections:
+    def _detect(self, frame: Frame, base_bgr: Image | None) -> Detections | None:
         if self._settings.candidates == "decoded":
             assert base_bgr is not None, "detection on the decoded stream is due on coded frames only"
             return self._detector.detect(base_bgr)
         if self._view.enlarges:
             return self._detector.detect(frame.base_bgr)
         found = self._detector.detect(frame.source_bgr)
+        if found is None:
+            return None
         width, height = self._view.base_size
         boxes = self._view.to_base(found.boxes_xyxy_px)
         # With --fit crop the source shows more than the base does; what lies outside is no candidate.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import stat
+import time
 from pathlib import Path
 
 import cv2
@@ -60,24 +61,29 @@ class CameraGrabber:
             raise SignalLost(str(error)) from error
 
     def grab(self) -> Shot:
-        """The next frame, at most the read timeout from now."""
+        """The next frame, at most the read timeout from now, with the time that the driver gave its buffer."""
         capture = self._capture
         if capture is None or not capture.grab():
             raise SignalLost("the camera delivers no frame")
 
-        def shot() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+        def image() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
             decoded, image = capture.retrieve()
             if not decoded:
                 raise SignalLost("the camera's frame cannot be decoded")
             return np.asarray(image, np.uint8)
 
-        return shot
+        return Shot(image, _taken_ns(capture.get(cv2.CAP_PROP_POS_MSEC)))
 
     def close(self) -> None:
         """Let go of the device."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+
+def _taken_ns(buffer_ms: float) -> int | None:
+    """Unix time of a V4L2 buffer, which is stamped by the monotonic clock; None where the driver does not say."""
+    return round(buffer_ms * 1e6) + time.time_ns() - time.monotonic_ns() if buffer_ms > 0 else None
 
 
 def _quietly_opened(number: int) -> cv2.VideoCapture:

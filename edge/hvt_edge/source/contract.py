@@ -30,6 +30,10 @@ class Source(ABC):
     """How many base frames to expect, where that is known."""
     class_names: tuple[str, ...] = ()
     """Names of the classes in the ground truth; only the demo has any."""
+    missed: int = 0
+    """Frames of a live source for which the reader was too slow."""
+    restarts: int = 0
+    """How often a live source was opened again."""
 
     @abstractmethod
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
@@ -38,6 +42,10 @@ class Source(ABC):
         ``start_ns`` is the Unix time of frame 0 for files, folders and the demo. Live sources ignore it and read
         their clock when a frame is grabbed.
         """
+
+    def steps(self, *, start_ns: int) -> Iterator[Frame | None]:
+        """`frames`, with None for each second in which a live source has none."""
+        yield from self.frames(start_ns=start_ns)
 
     def close(self) -> None:
         """Let go of devices and threads; calling it twice does no harm."""

@@ -5,11 +5,15 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Protocol
 
 from hvt_common.errors import UserError
 from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Fit, Frame, Image
+from hvt_edge.source.camera_clock import CameraClock
 from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.resample import Gate, Resizer
 
@@ -17,11 +21,19 @@ __all__ = ["Grabber", "LiveSource", "Shot", "SignalLost"]
 
 _log = logging.getLogger(__name__)
 
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
+_FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
 _JOIN_S = 1.5
+_IDLE_S = 1.0
+_PART = "source"
 
-Shot = Callable[[], Image]
-"""A grabbed frame that is converted to BGR only if it is wanted."""
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A grabbed frame that is converted to BGR only if it is wanted."""
+
+    image: Callable[[], Image]
+    camera_ns: int | None = None
+    """When it was taken by the camera's own clock, Unix nanoseconds; None where it does not say."""
 
 
 class SignalLost(Exception):  # noqa: N818 - an event, not a fault of the program
@@ -51,8 +63,8 @@ class LiveSource(Source):
     """A camera or stream, resampled to the base rate by `Gate`; slow consumers lose frames, never gain delay.
 
     Frames are not repeated when the camera is slower than the base rate. After a loss of signal the source is
-    opened again, with growing pauses, until it is closed. ``clock`` gives capture times in Unix nanoseconds and
-    must not go back, or the source is silent for as long. ``dropped`` counts what the consumer was too slow for.
+    opened again, with growing pauses, until it is closed. ``clock`` gives Unix nanoseconds and must not go back, or
+    the source is silent for as long.
     """
 
     live = True
@@ -67,19 +79,21 @@ class LiveSource(Source):
         fit: Fit,
         max_frames: int | None = None,
         clock: Callable[[], int] | None = None,
+        failures: Failures | None = None,
     ) -> None:
         self.fps, self._limit = fps, max_frames
         self._clock = clock or SteadyClock()
+        self._failures = failures or Failures(self._clock)
         self._grabber = grabber
         grabber.open()
         try:
-            first = grabber.grab()()
+            first = grabber.grab().image()
         except SignalLost as error:
             grabber.close()
             raise UserError(f"source {grabber.name} opens but delivers no picture ({error})") from error
         self._resizer = Resizer((first.shape[1], first.shape[0]), size, fit=fit)
         self.view = self._resizer.view
-        self.dropped = 0
+        self._pause = RetryPause(_FIRST_WAIT_NS, _LONGEST_WAIT_NS)
         self._news = threading.Condition()
         self._latest: tuple[int, Image] | None = None
         self._failure: BaseException | None = None
@@ -87,17 +101,24 @@ class LiveSource(Source):
         self._thread = threading.Thread(target=self._run, name="hvt-source", daemon=True)
         self._thread.start()
 
-    def frames(self, *, start_ns: int) -> Iterator[Frame]:  # noqa: ARG002 - a camera has its own time
-        """Frames as they come, until the source is closed; ``capture_ns`` is the clock's when one was grabbed."""
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        """Frames as they come, until the source is closed; ``capture_ns`` is when they were taken (`CameraClock`)."""
+        return (frame for frame in self.steps(start_ns=start_ns) if frame is not None)
+
+    def steps(self, *, start_ns: int) -> Iterator[Frame | None]:  # noqa: ARG002 - a camera has its own time
+        """See `Source`."""
         index = 0
         while index != self._limit:
             with self._news:
-                self._news.wait_for(lambda: self._latest or self._stop.is_set())
+                self._news.wait_for(lambda: self._latest or self._stop.is_set(), _IDLE_S)
                 item, self._latest = self._latest, None
             if self._failure is not None:
                 raise self._failure
-            if item is None or self._stop.is_set():
+            if self._stop.is_set():
                 return
+            if item is None:
+                yield None
+                continue
             yield self._resizer.frame(item[1], index=index, capture_ns=item[0])
             index += 1
 
@@ -114,16 +135,18 @@ class LiveSource(Source):
             self._news.notify_all()
 
     def _run(self) -> None:
-        gate = Gate(self.fps)
+        gate, camera_clock = Gate(self.fps), CameraClock()
         try:
             while not self._stop.is_set():
                 try:
                     shot = self._grabber.grab()
-                    capture_ns = self._clock()
+                    capture_ns = camera_clock.capture_ns(shot.camera_ns, now_ns=self._clock())
                     if gate.accept(capture_ns):
-                        self._offer(capture_ns, shot())
+                        self._offer(capture_ns, shot.image())
+                        self._failures.works(_PART)
                 except SignalLost as error:
                     self._recover(error)
+                    camera_clock = CameraClock()
         except BaseException as error:  # noqa: BLE001 - handed to the consumer, which raises it
             self._failure = error
         finally:
@@ -132,20 +155,21 @@ class LiveSource(Source):
 
     def _offer(self, capture_ns: int, image: Image) -> None:
         with self._news:
-            self.dropped += self._latest is not None
+            self.missed += self._latest is not None
             self._latest = (capture_ns, image)
             self._news.notify_all()
 
     def _recover(self, error: SignalLost) -> None:
         """Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop."""
-        wait_s = _FIRST_WAIT_S
-        _log.warning("%s stopped (%s); opening it again", self._grabber.name, error)
-        while not self._stop.wait(wait_s):
+        while True:
+            self._pause.failed(self._clock())
+            self._failures.failed(_PART, f"{self._grabber.name} stopped ({error})")
+            if self._stop.wait(self._pause.pause_ns / SECOND_NS):
+                return
             try:
                 self._grabber.restart()
             except SignalLost as again:
-                wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
-                _log.warning("%s is still away (%s); next try in %g s", self._grabber.name, again, wait_s)
+                error = again
             else:
-                _log.warning("%s is back", self._grabber.name)
+                self.restarts += 1
                 return

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
 from hvt_edge.source.contract import BaseSize, Source, check_shape
@@ -31,30 +33,33 @@ def open_source(
     max_frames: int | None = None,
     source_fps: float | None = None,
     clock: Callable[[], int] | None = None,
+    failures: Failures | None = None,
 ) -> Source:
     """Open a source of base frames: a video file, an image folder, a stream's URL, a V4L2 device, or ``demo``.
 
     ``size`` is (width, height) of the base frames in pixels, even, 64…8192, or how they follow from the source's;
     ``fps`` is above 0 and at most 240; for ``fit`` see `View.fitted`. ``source_fps`` is the rate at which the
     images of a folder were taken (default: the base rate), or overrides a video file's own time stamps. ``clock``
-    gives a live source's capture times, Unix nanoseconds without steps; None for one of its own. Raises `UserError`
-    if nothing usable is there, or size or rate are impossible.
+    is a live source's, Unix nanoseconds without steps, and ``failures`` is told when it is away; None for its own.
+    Raises `UserError` if nothing usable is there, or size or rate are impossible.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
     if spec == "demo":
         return DemoSource(size=size, fps=fps, fit=fit, seed=seed, max_frames=max_frames)
+    live = partial(
+        LiveSource, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock, failures=failures
+    )
     scheme = urlsplit(spec).scheme if "://" in spec else ""
     if scheme in LIVE_SCHEMES:
         stream = StreamGrabber(spec)
         stream.open()
         if not stream.holds_a_clip:
-            return LiveSource(stream, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock)
+            return live(stream)
         stream.close()
     elif scheme:
         raise UserError(f"source {spec!r} has the unknown scheme {scheme!r}; accepted is {_ACCEPTED}")
     if spec.startswith("/dev/"):
-        camera = CameraGrabber(spec, fps=fps)
-        return LiveSource(camera, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock)
+        return live(CameraGrabber(spec, fps=fps))
     if not scheme and not Path(spec).exists():
         raise UserError(f"source {spec!r} does not exist; accepted is {_ACCEPTED}")
     kind = FolderSource if not scheme and Path(spec).is_dir() else VideoSource

@@ -18,6 +18,7 @@ LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "http", "https", "udp", "rtp", "tcp",
 
 _OPEN_S = 10.0
 _RESTART_S = 2.5
+_MOST_TIMES = 64
 _READ_S = 2.0  # also how long closing may take
 
 _OPTIONS = {
@@ -38,7 +39,7 @@ class StreamGrabber:
         self.name = without_password(url)
         self._url, self._open_s = url, open_s
         self._container: Any = None
-        self._frames: Iterator[av.VideoFrame] = iter(())
+        self._frames: Iterator[tuple[av.VideoFrame, int | None]] = iter(())
 
     def open(self) -> None:
         """Open, where it is not open yet. Raises `UserError` if there is no video within ``open_s``."""
@@ -61,12 +62,13 @@ class StreamGrabber:
     def grab(self) -> Shot:
         """The next frame, at most the read timeout from now."""
         try:
-            frame = next(self._frames, None)
+            taken = next(self._frames, None)
         except (av.error.FFmpegError, OSError) as error:
             raise SignalLost(_cause(error)) from error
-        if frame is None:
+        if taken is None:
             raise SignalLost("it ended")
-        return lambda: upright_bgr(frame)
+        frame, camera_ns = taken
+        return Shot(lambda: upright_bgr(frame), camera_ns)
 
     def close(self) -> None:
         """Close the connection."""
@@ -82,7 +84,19 @@ class StreamGrabber:
             container.close()
             raise UserError(f"source {self.name} holds no video stream")
         stream.thread_type = "SLICE"
-        self._container, self._frames = container, container.decode(stream)
+        self._container, self._frames = container, _decoded(container, stream)
+
+
+def _decoded(container: Any, stream: Any) -> Iterator[tuple[av.VideoFrame, int | None]]:
+    """Frames, each with its time by the camera's clock where RTCP sender reports tell it (RFC 3550, 6.4.1)."""
+    times: dict[int, int] = {}
+    for packet in container.demux(stream):
+        if packet.pts is not None and packet.has_sidedata("prft"):
+            times[packet.pts] = 1000 * int.from_bytes(bytes(packet.get_sidedata("prft"))[:8], "little")
+        for frame in packet.decode():
+            yield frame, times.pop(frame.pts, None)
+        if len(times) > _MOST_TIMES:
+            times.clear()
 
 
 def _open(url: str, *, open_s: float) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import queue
 import threading
 import time
@@ -11,26 +12,31 @@ from types import TracebackType
 from typing import Self
 
 from hvt_common.protocol.messages import StillResult
+from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.runtime.process import lower_priority
 from hvt_common.values import AccessUnit, Frame
 from hvt_edge.stills.stage import StillStage
 
-__all__ = ["MAX_QUEUE_BYTES", "StillWorker"]
+__all__ = ["MAX_QUEUE_BYTES", "SkippedUnits", "StillWorker"]
 
+_log = logging.getLogger(__name__)
+
+_PART = "stills"
 _BEHIND_FRAMES = 3
 """With more frames queued than this, detection is put off; decoding never is."""
 _LEAST_FRAMES = 2
 MAX_QUEUE_BYTES = 160 * 2**20
 """Of frames that are queued: 16 of 1280x720 and 1920x1080, 5 of 3840x2160."""
 _RETRY_S = 0.025
+_MOST_SKIPPED_BYTES = 2 * 2**20
 
 
 class StillWorker:
     """Runs a `StillStage` in a thread of its own.
 
-    The queue is bounded in frames and in bytes; where it is `full` the frame loop goes on without
-    analysis. Before each frame the thread takes ``results()``, what grounds have reported of stills. An error in it
-    ends the process: `full`, `offer` and `close` raise it.
+    The queue is bounded in frames and in bytes. Before each frame the thread takes ``results()``, what grounds have
+    reported of stills. An error in it stops stills and perception for a while, never the video: what is queued is
+    given up, and the stage goes on from a keyframe.
     """
 
     def __init__(
@@ -38,21 +44,26 @@ class StillWorker:
         stage: StillStage,
         *,
         results: Callable[[], Sequence[StillResult]],
+        failures: Failures,
         clock: Callable[[], int],
         length: int = 16,
         max_bytes: int = MAX_QUEUE_BYTES,
         finish_s: float = 1.0,
+        pause: RetryPause | None = None,
     ) -> None:
         self._stage = stage
         self._results = results
+        self._failures = failures
         self._clock = clock
+        self._pause = pause or RetryPause()
         self._frames: queue.Queue[tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None] = queue.Queue(
             length
         )
         self._most_frames = length
         self._max_bytes = max_bytes
         self._finish_s = finish_s
-        self._error: BaseException | None = None
+        self._lock = threading.Lock()
+        self._skipped = SkippedUnits()
         self._given_up = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-stills", daemon=True)
         self._thread.start()
@@ -64,17 +75,20 @@ class StillWorker:
 
     @property
     def full(self) -> bool:
-        """Whether the next `offer` would have to wait."""
-        self._raise_error()  # a dead thread leaves a full queue, and `offer` is not called any more
-        return self._frames.qsize() >= self._most_frames
+        """Whether the next frame finds no room, or the stage has failed a moment ago."""
+        return self._frames.qsize() >= self._most_frames or not self._pause.due(self._clock())
 
-    def offer(self, frame: Frame, unit: AccessUnit | None, skipped: Sequence[AccessUnit] = ()) -> None:
-        """Hand over one frame, in order, with its access unit if it has one, and those skipped before it."""
-        self._raise_error()
+    def take(self, frame: Frame, unit: AccessUnit | None, *, room: bool = True) -> bool:
+        """Queue one frame, in order, with its access unit if it has one; False where there is no room for it."""
         # All frames of a source have one size, so a bound in bytes is a bound in frames.
         fitting = self._max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
         self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
-        self._frames.put((frame, unit, skipped))
+        with self._lock:
+            if self.full or not room:
+                self._skipped.add(unit)
+                return False
+            self._frames.put((frame, *self._skipped.take(unit)))
+        return True
 
     def close(self) -> None:
         """Let the thread finish what it has, at most for ``finish_s``, then leave the rest; join it."""
@@ -84,7 +98,6 @@ class StillWorker:
         self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
         self._given_up.set()
         self._thread.join(timeout=self._finish_s)
-        self._raise_error()
 
     def __enter__(self) -> Self:
         return self
@@ -96,14 +109,28 @@ class StillWorker:
 
     def _run(self) -> None:
         lower_priority()
-        try:
-            while (item := self._next()) is not None and not self._given_up.is_set():
+        while not self._given_up.is_set():
+            try:
+                if (item := self._next()) is None:
+                    return
                 behind = self._frames.qsize() >= _BEHIND_FRAMES
                 self._stage.on_results(self._results())
                 analyzed = self._stage.analyze(*item, hurry=behind)
                 self._stage.send(analyzed, now_ns=self._clock())
-        except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
-            self._error = error
+                self._failures.works(_PART)
+            except Exception as error:  # noqa: BLE001 - it ends stills for a while, never the flight
+                self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        _log.debug("stills failed", exc_info=error)
+        with self._lock:
+            self._pause.failed(self._clock())
+            self._skipped.lose()
+            with contextlib.suppress(queue.Empty):
+                while self._frames.get_nowait() is not None:
+                    pass
+                self._given_up.set()  # what was taken away is the sign to end
+        self._failures.failed(_PART, f"perception and stills stopped ({type(error).__name__}: {error})")
 
     def _next(self) -> tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None:
         """Return the next frame; until it comes what is pending is tried again.
@@ -114,10 +141,40 @@ class StillWorker:
             try:
                 return self._frames.get(timeout=_RETRY_S)
             except queue.Empty:
-                if self._stage.any_pending:
+                if self._stage.any_pending and self._pause.due(self._clock()):
                     self._stage.send_pending(now_ns=self._clock())
 
-    def _raise_error(self) -> None:
-        if self._error is not None:
-            error, self._error = self._error, None
-            raise error
+
+class SkippedUnits:
+    """Access units of frames that were not analyzed: the decoder needs them before the next. Bounded in bytes."""
+
+    def __init__(self) -> None:
+        self._units: list[AccessUnit] = []
+        self._whole = True
+        """Whether all since the last keyframe are there."""
+
+    def add(self, unit: AccessUnit | None) -> None:
+        """This frame is not analyzed; ``unit`` is None where it was not coded."""
+        if unit is None:
+            return
+        if unit.keyframe:
+            self._units, self._whole = [], True
+        self._units.append(unit)
+        if not self._whole or sum(len(one.data) for one in self._units) > _MOST_SKIPPED_BYTES:
+            self._units, self._whole = [], False
+
+    def lose(self) -> None:
+        """Units that were handed out did not reach the decoder."""
+        self._units, self._whole = [], False
+
+    def take(self, unit: AccessUnit | None) -> tuple[AccessUnit | None, tuple[AccessUnit, ...]]:
+        """Return what the decoder may be given now: this frame's unit, and those before it.
+
+        Where units are missing it is nothing until a keyframe: the frame is analyzed as one that was not coded.
+        """
+        if unit is None:
+            return None, ()
+        if unit.keyframe:
+            self._units, self._whole = [], True
+        skipped, self._units = tuple(self._units), []
+        return (unit, skipped) if self._whole else (None, ())

@@ -1,66 +1,77 @@
-"""Keep the base stream in a Matroska file that any player opens, also after the process was killed."""
+"""``--record-base``: the base stream in a Matroska file that any player opens, also after the process was killed.
+
+A thread of its own writes, so that a slow or full card never holds up a frame. Where it fails the file ends there,
+and the next keyframe after a pause begins another beside it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import logging
+import os
+import queue
+import threading
+import time
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import IO, Self
 
 import av
 import av.error
 
-from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.values import AccessUnit
 
-__all__ = ["BaseRecorder"]
+__all__ = ["LocalCopy"]
 
 _log = logging.getLogger(__name__)
 
+_PART = "local copy"
+_MOST_QUEUED = 256
+_CLOSE_S = 3.0
+_MOST_NAMES = 10_000
 
-class BaseRecorder:
-    """A remux, no second encode: access units go in as they were sent."""
 
-    def __init__(self, path: Path) -> None:
-        self._time_base = Fraction(1, 1000)
-        self._start_ns: int | None = None
-        self._last_pts = -1
-        # Short clusters, each flushed when the next begins: a kill costs the last fifth of a second at 10 fps, and
-        # the file stays whole.
-        options = {"cluster_time_limit": "100", "flush_packets": "1"}
+class LocalCopy:
+    """Keeps what `write` is handed; never overwrites a file. ``wait``: blocks where the card is slower (lockstep).
+
+    Access units that find no room in the queue are left out up to the next keyframe.
+    """
+
+    def __init__(
+        self, path: Path, *, failures: Failures, wait: bool = False, pause: RetryPause | None = None
+    ) -> None:
         self._path = path
-        self._container = av.open(str(path), "w", format="matroska", options=options)
-        self._stream: av.VideoStream | None = None
+        self._failures = failures
+        self._wait = wait
+        self._pause = pause or RetryPause()
+        self._queue: queue.Queue[AccessUnit | None] = queue.Queue(_MOST_QUEUED)
+        self._whole = False
+        """Whether the queue holds all since a keyframe."""
+        self._file: _MatroskaFile | None = None
+        self._thread = threading.Thread(target=self._run, name="hvt-local-copy", daemon=True)
+        self._thread.start()
 
     def write(self, unit: AccessUnit) -> None:
-        """Append an access unit, a keyframe first. Raises `UserError` where the file cannot be written."""
-        if self._stream is None:
-            self._stream = self._open_stream(unit.data)
-            self._start_ns = unit.capture_ns
-        assert self._start_ns is not None
-        # Matroska counts milliseconds; two frames of a fast camera must not share one.
-        pts = max(self._last_pts + 1, round((unit.capture_ns - self._start_ns) / 1e6))
-        self._last_pts = pts
-        packet = av.Packet(unit.data)
-        packet.stream = self._stream
-        packet.pts = packet.dts = pts
-        packet.time_base = self._time_base
-        packet.is_keyframe = unit.keyframe
+        """Hand over an access unit; returns at once."""
+        self._whole |= unit.keyframe
+        if not self._whole:
+            return
         try:
-            self._container.mux(packet)
-        except (av.error.FFmpegError, OSError) as error:
-            raise UserError(
-                f"--record-base {self._path} cannot be written ({error.strerror}): name a file that can"
-            ) from None
+            self._queue.put(unit, block=self._wait)
+        except queue.Full:
+            self._whole = False
+            self._failures.failed(_PART, f"{self._path} takes no more than {_MOST_QUEUED} frames late")
 
     def close(self) -> None:
-        """Write the index and close the file."""
-        try:
-            self._container.close()
-        except (av.error.FFmpegError, OSError) as error:
-            _log.warning("%s has no index: %s", self._path, error.strerror)
+        """Write what is queued, the index, and end the thread; a card that hangs is left behind."""
+        with contextlib.suppress(queue.Full):
+            self._queue.put(None, timeout=_CLOSE_S)
+        self._thread.join(_CLOSE_S)
+        if self._thread.is_alive():
+            self._failures.failed(_PART, f"{self._path} did not take the last frames within {_CLOSE_S:g} s")
 
     def __enter__(self) -> Self:
         return self
@@ -69,6 +80,99 @@ class BaseRecorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _run(self) -> None:
+        while (unit := self._queue.get()) is not None:
+            try:
+                self._keep(unit)
+            except Exception as error:  # noqa: BLE001 - it ends the copy, never the flight
+                self._fail(error)
+        try:
+            if self._file is not None:
+                self._file.close()
+        except (av.error.FFmpegError, OSError) as error:
+            self._fail(error)
+
+    def _keep(self, unit: AccessUnit) -> None:
+        if self._file is None:
+            if not unit.keyframe or not self._pause.due(time.monotonic_ns()):
+                return
+            self._file = _MatroskaFile(*_opened(self._path))
+            if self._file.path != self._path:
+                _log.warning("--record-base %s is there already: this is %s", self._path, self._file.path)
+        self._file.write(unit)
+        self._failures.works(_PART)
+
+    def _fail(self, error: Exception) -> None:
+        self._pause.failed(time.monotonic_ns())
+        path = self._path if self._file is None else self._file.path
+        self._failures.failed(
+            _PART, f"{path} cannot be written ({getattr(error, 'strerror', None) or error})"
+        )
+        if self._file is not None:
+            self._file.give_up()
+            self._file = None
+
+
+def _opened(path: Path) -> tuple[Path, IO[bytes]]:
+    """The file by this name, or the first of name-2, name-3 … that is not there; a pipe or device as it is."""
+    if path.exists() and not path.is_file():
+        return path, path.open("wb", buffering=0)
+    for number in range(1, _MOST_NAMES):
+        free = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
+        with contextlib.suppress(FileExistsError):
+            return free, free.open("xb", buffering=0)
+    raise FileExistsError(f"there are {_MOST_NAMES} of it")
+
+
+class _MatroskaFile:
+    """One file: a remux, no second encode. Access units go in as they were sent, a keyframe first."""
+
+    def __init__(self, path: Path, file: IO[bytes]) -> None:
+        self.path = path
+        self._file = file
+        # Short clusters, each flushed when the next begins: a kill costs the last fifth of a second at 10 fps, and
+        # the file stays whole.
+        options = {"cluster_time_limit": "100", "flush_packets": "1"}
+        self._container = av.open(file, "w", format="matroska", options=options)
+        self._time_base = Fraction(1, 1000)
+        self._stream: av.VideoStream | None = None
+        self._start_ns = 0
+        self._last_pts = -1
+        self._count = 0
+
+    def write(self, unit: AccessUnit) -> None:
+        """Append an access unit; OSError or FFmpegError where that fails, or somebody has removed the file."""
+        if self._stream is None:
+            self._stream = self._open_stream(unit.data)
+            self._start_ns = unit.capture_ns
+        # Matroska counts milliseconds; two frames of a fast camera must not share one.
+        pts = max(self._last_pts + 1, round((unit.capture_ns - self._start_ns) / 1e6))
+        self._last_pts = pts
+        packet = av.Packet(unit.data)
+        packet.stream = self._stream
+        packet.pts = packet.dts = pts
+        packet.time_base = self._time_base
+        packet.is_keyframe = unit.keyframe
+        self._container.mux(packet)
+        if os.fstat(self._file.fileno()).st_nlink == 0:
+            raise OSError("it was removed")
+        self._count += 1
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        try:
+            self._container.close()
+        finally:
+            self._file.close()
+
+    def give_up(self) -> None:
+        """Close it as it is; one that holds no frame is removed."""
+        with contextlib.suppress(av.error.FFmpegError, OSError, ValueError):
+            self.close()
+        if not self._count:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
 
     def _open_stream(self, keyframe: bytes) -> av.VideoStream:
         # The keyframe itself is the template: its parameter sets become the header of the container. (A stream

@@ -74,6 +74,8 @@ class EncoderReconfiguration:
         self._trigger = ReconfigurationTrigger()
         self._lock = threading.Lock()
         now = operating.now
+        self._opened = {"total_bps": now.budget_bps, "base_bps": now.base_bps, "decimation": now.decimation}
+        """What x265 was last opened for."""
         self._commanded = (now.budget_bps, now.video_share)
         """Budget and share that x265 was last opened under."""
         self.count = 0
@@ -125,6 +127,10 @@ class EncoderReconfiguration:
         with self._lock:
             return self._moving and self._split is not None and self._split.wants_keyframe(now_ns)
 
+    def reopen(self) -> BaseEncoder:
+        """Return another encoder for what the last was opened for."""
+        return self._open_encoder(**self._opened)
+
     def __call__(self, decimation: int, now_ns: int) -> BaseEncoder | None:
         """Return the encoder to go on with from this keyframe, or None for the one there is."""
         changed = self._take_command()
@@ -156,9 +162,10 @@ class EncoderReconfiguration:
         self, total_bps: int, base_bps: int, decimation: int, *, now_ns: int, encoder_total_bps: int
     ) -> BaseEncoder:
         self.count += 1
+        self._opened = {"total_bps": encoder_total_bps, "base_bps": base_bps, "decimation": decimation}
         self._operating.open(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
         self._set_budget(now_ns)
-        return self._open_encoder(total_bps=encoder_total_bps, base_bps=base_bps, decimation=decimation)
+        return self.reopen()
 
     def _allow(self, total_bps: int, now_ns: int) -> None:
         if total_bps != self._operating.now.total_bps:

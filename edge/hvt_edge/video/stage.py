@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
+from hvt_common.errors import FlightError
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.link.transmitter import Transmitter
@@ -11,11 +15,14 @@ from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.video.frame_decision import FrameDecision, FrameInputs, decide
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.keyframes import KeyframePlan
-from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.x265 import BaseEncoder
 
 __all__ = ["BaseStage"]
+
+_PART = "encoder"
+_MOST_FAILURES, _FAILURES_NS = 3, 10 * SECOND_NS
 
 
 class BaseStage:
@@ -24,7 +31,8 @@ class BaseStage:
     ``first_keyframe_bytes`` is the guess until a keyframe has been coded. ``reconfigure(decimation, now_ns)`` runs
     before each keyframe for the link and returns a newly opened encoder, or None where nothing has changed: x265
     takes neither another frame rate nor another bit rate once it is open. ``admits(now_ns)`` says whether pacer and
-    budget have room for a frame.
+    budget have room for a frame. ``reopen()`` gives another encoder where the one there is has failed; without it, as
+    in lockstep, the failure is raised.
     """
 
     def __init__(
@@ -33,25 +41,32 @@ class BaseStage:
         *,
         keyframes: KeyframeRequests,
         transmitter: Transmitter,
-        recorder: BaseRecorder | None,
+        local_copy: LocalCopy | None,
         first_keyframe_bytes: int,
         regions: TrackRegions | None = None,
         frame_skip: FrameSkip | None = None,
         reconfigure: Callable[[int, int], BaseEncoder | None] | None = None,
         admits: Callable[[int], bool] = lambda _now_ns: True,
         backlog: BacklogStage | None = None,
+        reopen: Callable[[], BaseEncoder] | None = None,
+        failures: Failures | None = None,
     ) -> None:
         self._encoder = encoder
         self._requests = keyframes
         self._plan = KeyframePlan(keyframes)
         self._transmitter = transmitter
-        self._recorder = recorder
+        self._local_copy = local_copy
         self._keyframe_bytes = first_keyframe_bytes
         self._regions = regions
         self._frame_skip = frame_skip or FrameSkip()
         self._reconfigure = reconfigure
         self._admits = admits
         self._backlog = backlog
+        self._reopen = reopen
+        self._failures = failures
+        self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
+        self._begins_anew = False
+        """x265 was opened again: its next frame is a keyframe."""
 
     def decide(self, index: int, *, now_ns: int) -> FrameDecision:
         """Decide on the source frame of this index; once for each, in order."""
@@ -60,7 +75,7 @@ class BaseStage:
         return decide(
             FrameInputs(
                 due=self._frame_skip.codes(index),
-                keyframe_due=self._plan.now(now_ns, fits=fits),
+                keyframe_due=self._plan.now(now_ns, fits=fits) or self._begins_anew,
                 admitted=self._admits(now_ns),
                 link=State.LIVE if backlog is None else backlog.state,
                 segment_due=backlog is not None and backlog.segment_due(now_ns),
@@ -71,21 +86,33 @@ class BaseStage:
     def encode(
         self, frame: Frame, decision: FrameDecision, *, now_ns: int, tracks: Tracks | None = None
     ) -> AccessUnit | None:
-        """Encode the frame as decided (None where it is not coded); ``tracks`` are the newest known."""
+        """Encode the frame as decided (None where it is not coded); ``tracks`` are the newest known.
+
+        A frame on which the encoder fails is left out. `FlightError` where it fails again and again.
+        """
         if not decision.codes:
             return None
-        if decision.reconfigures:
-            self._at_keyframe(frame.index, now_ns=now_ns)
-        regions = [] if self._regions is None else self._regions.regions(tracks)
-        unit = self._encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
+        try:
+            if decision.reconfigures:
+                self._at_keyframe(frame.index, now_ns=now_ns)
+            regions = [] if self._regions is None else self._regions.regions(tracks)
+            unit = self._encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
+        except Exception as error:
+            if self._reopen is None:
+                raise
+            self._open_again(error, now_ns=now_ns)
+            return None
         assert unit.keyframe or not decision.keyframe, "x265 makes a keyframe of each frame that is to be one"
+        if self._begins_anew and self._failures is not None:
+            self._failures.works(_PART)
+        self._begins_anew = False
         self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self._encoder.mean_qp)
         if decision.meets_plan:
             self._plan.done(now_ns)
         if decision.resumes and self._backlog is not None:
             self._backlog.resume()
-        if self._recorder is not None:
-            self._recorder.write(unit)
+        if self._local_copy is not None:
+            self._local_copy.write(unit)
         return unit
 
     def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> None:
@@ -97,12 +124,29 @@ class BaseStage:
             else:
                 self._transmitter.store_base(unit, now_ns=now_ns)
             return
-        if self._backlog is not None:
-            self._backlog.sent(unit)
         line_bytes = self._transmitter.base(unit, now_ns=now_ns)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes
             self._requests.note_cost(self._transmitter.takes_ns(line_bytes))
+
+    def _open_again(self, error: Exception, *, now_ns: int) -> None:
+        assert self._reopen is not None, "checked"
+        assert self._failures is not None, "goes with it"
+        while True:
+            self._failures.failed(_PART, f"x265 failed ({error})")
+            self._failed_ns.append(now_ns)
+            if len(self._failed_ns) == _MOST_FAILURES and now_ns - self._failed_ns[0] <= _FAILURES_NS:
+                raise FlightError(
+                    f"x265 failed {_MOST_FAILURES} times within {_FAILURES_NS // SECOND_NS} s ({error}): there is no "
+                    "video without it, and another start may help"
+                ) from error
+            try:
+                self._encoder = self._reopen()
+            except Exception as again:  # noqa: BLE001 - another failure of the same kind
+                error = again
+                continue
+            self._begins_anew = True
+            return
 
     def _at_keyframe(self, index: int, *, now_ns: int) -> None:
         """What may change with a keyframe only."""

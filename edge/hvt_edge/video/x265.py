@@ -35,7 +35,7 @@ from hvt_common.video.hevc import UNBIASED
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.regions import Region, RegionTagger
 
-__all__ = ["BaseEncoder", "EncoderSettings"]
+__all__ = ["BaseEncoder", "EncoderSettings", "encoder_context"]
 
 _QP_TO_LAMBDA = 118
 _WITHOUT_AQ = ("ultrafast", "superfast")
@@ -92,6 +92,18 @@ def _mean_qp(packet: av.Packet[Any]) -> float:
     return int.from_bytes(stats[:4], "little") / _QP_TO_LAMBDA
 
 
+def encoder_context(name: str) -> VideoCodecContext:
+    """An encoder of FFmpeg's; `UserError` where it was built without."""
+    try:
+        context = av.CodecContext.create(name, "w")
+    except (av.error.FFmpegError, ValueError):
+        raise UserError(
+            f"PyAV {av.__version__} has no encoder {name}: install its wheel from PyPI, which brings one"
+        ) from None
+    assert isinstance(context, VideoCodecContext)
+    return context
+
+
 def _open(settings: EncoderSettings) -> VideoCodecContext:
     kbps = max(1, settings.bitrate_bps // 1000)
     parameters = {
@@ -115,7 +127,7 @@ def _open(settings: EncoderSettings) -> VideoCodecContext:
     }
     if settings.side_data and settings.preset in _WITHOUT_AQ:
         parameters |= {"aq-mode": 1, "aq-strength": 0.01}
-    context = av.CodecContext.create("libx265", "w")
+    context = encoder_context("libx265")
     context.width, context.height = settings.size
     context.pix_fmt = "yuv420p"
     context.framerate = Fraction(settings.fps).limit_denominator(100_000)

@@ -3,14 +3,17 @@
 from hvt_edge.wiring.link import make_link_settings
 from hvt_edge.wiring.perception import make_detector, warm_up_for
 from hvt_edge.wiring.stages import Stages, build_stages
-from hvt_edge.wiring.storing import check_files
+from hvt_edge.wiring.stills import check_codecs
+from hvt_edge.wiring.storing import check_files, check_store
 from hvt_edge.wiring.video import base_size
 
 __all__ = [
     "Stages",
     "base_size",
     "build_stages",
+    "check_codecs",
     "check_files",
+    "check_store",
     "make_detector",
     "make_link_settings",
     "warm_up_for",

@@ -9,7 +9,7 @@ from hvt_common.inference.tiles import tiled
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
-from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings
+from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings, FailingDetector
 
 
 def make_detector(config: EdgeConfig) -> Detector:
@@ -33,7 +33,7 @@ def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
         warm_up(detector, view.base_size)
 
 
-def make_analyzer(config: EdgeConfig, *, detector: Detector, view: View) -> Analyzer:
+def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) -> Analyzer:
     """Decoder, detector and tracker of the edge's own stream."""
     settings = TrackerSettings.starting_at(
         config.confidence, camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion)

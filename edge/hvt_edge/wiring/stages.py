@@ -7,9 +7,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 
-from hvt_common.inference.detect import Detector
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
+from hvt_common.runtime.failures import Failures
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.config import EdgeConfig
@@ -21,6 +21,7 @@ from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.point import LoopClock, Operating
+from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
 from hvt_edge.status import InfoReporter
@@ -28,7 +29,7 @@ from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.video.frame_skip import LimitedFrameSkip
-from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.wiring.link import make_budget, make_pacer, make_split
@@ -66,11 +67,12 @@ def build_stages(
     config: EdgeConfig,
     *,
     source: Source,
-    detector: Detector,
+    detector: FailingDetector,
     link: EdgeLink,
     session_id: int,
     ledger: Ledger,
     inbox: FeedbackInbox,
+    failures: Failures,
     clock: Callable[[], int],
     loop_clock: LoopClock,
     wait_until: Callable[[int], None],
@@ -95,7 +97,9 @@ def build_stages(
     budget = make_budget(config, decimation=decimation)
     # Files come after all that may be refused: a failed start leaves nothing behind.
     write_truth_of(source, config.truth, fps=config.nominal_fps)
-    recorder = stack.enter_context(BaseRecorder(config.record_base)) if config.record_base else None
+    local_copy = None
+    if config.record_base:
+        local_copy = stack.enter_context(LocalCopy(config.record_base, failures=failures, wait=lockstep))
     in_flight, outbox = BaseInFlight(), Outbox(reports=not lockstep)
     transmitter = Transmitter(
         link,
@@ -135,6 +139,7 @@ def build_stages(
         keyframes=keyframes,
         clock=clock,
         info=info.info,
+        failures=failures,
     )
     if backlog is not None:
         stack.enter_context(backlog)
@@ -144,6 +149,7 @@ def build_stages(
     stack.callback(lambda: still_sender.close(clock()))
     link_control = LinkControl(
         has_ground=link.has_ground,
+        has_subscriber=partial(link.has_subscriber, Channel.BASE),
         session_id=session_id,
         transmitter=transmitter,
         keyframes=keyframes,
@@ -155,18 +161,21 @@ def build_stages(
         outbox=outbox,
         stills=still_sender,
         backlog=backlog,
+        failures=failures,
     )
     base = BaseStage(
         encoder,
         keyframes=keyframes,
         transmitter=transmitter,
-        recorder=recorder,
+        local_copy=local_copy,
         first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
         regions=make_regions(config, view.base_size),
         frame_skip=LimitedFrameSkip(make_frame_skip(config, decimation), reconfiguration.least_decimation),
         reconfigure=reconfiguration,
         admits=link_control.admits,
         backlog=backlog,
+        reopen=None if lockstep else reconfiguration.reopen,
+        failures=failures,
     )
     on_demand = make_on_demand(
         config, outbox=outbox, view=view, class_names=class_names, most_bytes=transmitter.most_still_bytes

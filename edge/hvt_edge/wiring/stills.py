@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
+from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 from hvt_common.values import View
 from hvt_common.video.still_codecs import still_codec
@@ -17,6 +20,26 @@ from hvt_edge.stills.policy.base import Step
 from hvt_edge.stills.policy.registry import method, tuning
 from hvt_edge.stills.scheduler import Chooser, ChooserSettings
 from hvt_edge.stills.suppression import Gate, Suppression
+
+_TRIAL_PX = 48
+
+
+def check_codecs(config: EdgeConfig) -> None:
+    """Code a picture once: `UserError` where a library behind a codec does not do what it should."""
+    ramp = np.arange(_TRIAL_PX, dtype=np.uint8)
+    crop = np.stack(np.broadcast_arrays(4 * ramp[:, None], 4 * ramp, np.uint8(90)), axis=2)
+    for flag, name in (("still-codec", config.still_codec), ("fallback-codec", config.fallback_codec)):
+        codec = still_codec(name)
+        base = crop // 2 if codec.needs_base else None
+        try:
+            coded = codec.encode(crop, quality_pct=config.jpeg_quality, base_bgr=base)
+            codec.decode(coded.data, size=(_TRIAL_PX, _TRIAL_PX), parameters=coded.parameters, base_bgr=base)
+        except Exception as error:  # the codec may be anybody's
+            raise UserError(
+                f"--{flag} {name} does not work here ({error}): choose another, such as jpeg"
+            ) from error
+        if not still_codec(config.still_codec).needs_base:
+            return  # no fallback is used
 
 
 def make_suppression(config: EdgeConfig) -> Suppression:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 
+from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
 from hvt_common.runtime.reporting import check_writable
 from hvt_common.units import SECOND_NS
-from hvt_edge.backlog.disk import Folder, check_folder, default_folder
+from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig
@@ -23,8 +27,37 @@ def check_files(config: EdgeConfig) -> None:
         (config.record_base, "--record-base"),
     ):
         check_writable(path, name=name)
-    if config.store and config.pace != "lockstep":
-        check_folder(config.store_folder or default_folder(config.edge_id))
+
+
+def default_folder(edge_id: str) -> Path:
+    """Where programs keep what outlives them: ``$XDG_STATE_HOME`` or ``~/.local/state``, then ``hvt/<edge>``."""
+    state = os.environ.get("XDG_STATE_HOME", "")
+    if Path(state).is_absolute():
+        return Path(state) / "hvt" / edge_id
+    try:
+        return Path.home() / ".local" / "state" / "hvt" / edge_id
+    except RuntimeError:
+        raise UserError(
+            "what is captured while the link is down has no place, because there is no home folder: give "
+            "--store-folder, or --store 0 to store nothing"
+        ) from None
+
+
+def check_store(config: EdgeConfig, *, live: bool) -> None:
+    """Raise `UserError` now where a store could not be made in mid-flight; makes nothing."""
+    if not config.store_bytes(live=live):
+        return
+    path = config.store_folder or default_folder(config.edge_id)
+    try:
+        there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+        usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    except OSError:  # a part of the path may not be looked into
+        usable, there = False, path
+    if not usable:
+        raise UserError(
+            f"--store-folder {path} cannot be used, because {there} is no folder that can be written: name another, "
+            "or give --store 0 to store nothing"
+        )
 
 
 def make_backlog(
@@ -39,14 +72,16 @@ def make_backlog(
     keyframes: KeyframeRequests,
     clock: Callable[[], int],
     info: Callable[[], bytes],
+    failures: Failures,
 ) -> BacklogStage | None:
     """Who stores what the link cannot carry away; None where nobody does. Starts a thread: to be closed."""
-    if not config.store or config.pace == "lockstep":
+    max_bytes = config.store_bytes(live=live)
+    if not max_bytes:
         return None
     path = config.store_folder or default_folder(config.edge_id)
     oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
     return BacklogStage(
-        lambda: Folder(path, max_bytes=config.store, session_id=session_id, info=info, oldest_ns=oldest_ns),
+        Store(path, max_bytes=max_bytes, session_id=session_id, info=info, oldest_ns=oldest_ns),
         session_id=session_id,
         live=live,
         link=BacklogLink(
@@ -64,4 +99,5 @@ def make_backlog(
         keyframes=keyframes,
         clock=clock,
         on_outcome=transmitter.outcome,
+        failures=failures,
     )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import json
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -54,7 +56,8 @@ def run(argv: Sequence[str]) -> int:
     else:
         authority.issue(name, hosts=arguments.host)
     after.write(folder)
-    changed = _write_files(after, folder, keys_folder=arguments.keys_folder)
+    keys_folder = None if arguments.command == "remove" else arguments.keys_folder
+    changed = _write_files(after, folder, given={} if keys_folder is None else {name: keys_folder})
     if arguments.command != "remove":
         say(f"{name}: copy ca.pem, {name}.pem, {name}.key and {name}.json5 from {folder} to the machine")
     if others := ", ".join(f"{one}.json5" for one in changed if one != name):
@@ -95,11 +98,18 @@ def _hosts_of(roster: Roster, name: str) -> tuple[str, ...]:
     return next((one.hosts for one in machines if one.name == name), ())
 
 
-def _write_files(roster: Roster, folder: Path, *, keys_folder: str) -> list[str]:
-    """The names of those whose file is new or another than before."""
-    files = {name: edge_file(name, roster, folder=keys_folder) for name in roster.edges}
-    files |= {one.name: ground_file(one, roster, folder=keys_folder) for one in roster.grounds}
-    files |= {one.name: router_file(one, roster, folder=keys_folder) for one in roster.routers}
+def _write_files(roster: Roster, folder: Path, *, given: Mapping[str, str]) -> list[str]:
+    """The names of those whose file is new or another than before.
+
+    The keys of each machine lie where ``given`` says, or where its file has said so far.
+    """
+
+    def where(name: str) -> str:
+        return given.get(name) or _keys_folder(folder / f"{name}.json5")
+
+    files = {name: edge_file(name, roster, folder=where(name)) for name in roster.edges}
+    files |= {one.name: ground_file(one, roster, folder=where(one.name)) for one in roster.grounds}
+    files |= {one.name: router_file(one, roster, folder=where(one.name)) for one in roster.routers}
     changed = []
     for name, text in files.items():
         path = folder / f"{name}.json5"
@@ -111,6 +121,17 @@ def _write_files(roster: Roster, folder: Path, *, keys_folder: str) -> list[str]
             raise UserError(f"{path} cannot be written ({error.strerror})") from None
         changed.append(name)
     return changed
+
+
+def _keys_folder(file: Path) -> str:
+    """Where the keys of a machine lie, as its file says it; the usual folder where there is no file yet."""
+    try:
+        found = re.search(r'"root_ca_certificate": "(.*)/ca\.pem"', file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        found = None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{file} cannot be read ({error}): it says where that machine has its keys") from None
+    return KEYS_FOLDER if found is None else str(json.loads(f'"{found[1]}"'))
 
 
 def _list(roster: Roster, authority: Authority) -> None:
@@ -140,8 +161,9 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--dir", type=Path, default=_DIR, help=f"folder of the fleet's keys [{_DIR}]")
     for one in (add_edge, add_ground, add_router, reissue, remove):
         one.add_argument("name", metavar="NAME")
+    for one in (add_edge, add_ground, add_router):
         one.add_argument(
-            "--keys-folder", default=KEYS_FOLDER, help=f"where the keys lie on the machines [{KEYS_FOLDER}]"
+            "--keys-folder", help=f"where the keys of NAME lie on its machine [{KEYS_FOLDER}, or as before]"
         )
     for one in (add_edge, add_ground, add_router, reissue):
         one.add_argument(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Flags, RoiHeader, parse_backlog_still
 from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.backlog.entry import worth
 from hvt_edge.config import EdgeConfig, check
 from hvt_edge.wiring.storing import make_backlog
 from media.clips import START_NS
@@ -113,7 +115,7 @@ def test_stills_that_the_outage_took_are_known_with_their_worth(tmp_path):
         (entry,) = folder.best_stills()
         kept = parse_backlog_still(folder.read(entry))
         assert (entry.number, kept.payload) == (0, STILL.data)
-        assert entry.path.name.endswith("-2.5.still"), "with its utility"
+        assert entry.rank == worth(2.5, STILL.capture_ns), "with its utility"
 
 
 def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, caplog):
@@ -127,25 +129,47 @@ def test_a_store_that_cannot_be_written_costs_a_warning_and_no_frame(tmp_path, c
         rig.play(25, 60, linked=False)
         rig.play(60, 80, linked=True)
         rig.play(80, 90, linked=False)
+        (tmp_path / "file").unlink()
+        rig.play(90, 150, linked=False)
+        eventually(lambda: not rig.backlog.failed, within_s=10, what="it is tried again")
+        rig.play(150, 170, linked=False)
     rig.backlog.close()
-    assert len(caplog.records) == 1
-    assert "--store-folder" in caplog.text
+    (failed, _works) = caplog.messages
+    assert "--store-folder" in failed
     again = rig.out.base[15:]
     first = again[0].frame_index
     assert 16 <= first <= 25
     assert again[0].keyframe
-    assert [one.frame_index for one in again] == list(range(first, 90)), "from then on as without a store"
+    sent = [one.frame_index for one in again]
+    assert sent == list(range(first, first + len(sent))), "from then on as without a store"
+    assert 90 <= sent[-1] < 150
+    (part,) = rig.failures.parts
+    assert (part.part, part.working) == ("store", True)
+    with opened(tmp_path / "file" / "store", session_id=8) as store:
+        assert store.segments, "stored again"
 
 
-@pytest.mark.parametrize("settings", [{"store": 0}, {"pace": "lockstep"}])
-def test_nobody_keeps_where_nothing_is_to_be_kept(tmp_path, settings):
-    """The same input would not give the same bytes; or a folder would appear that was not wanted."""
-    config = check(EdgeConfig(source="demo", store_folder=tmp_path / "store", **settings))
+@pytest.mark.parametrize(
+    ("settings", "live", "stored"),
+    [
+        ({}, True, True),
+        ({}, False, False),
+        ({"store": 10**7}, False, True),
+        ({"store_folder": Path("store")}, False, True),
+        ({"store_folder": Path("store"), "store": 0}, True, False),
+        ({"store_folder": Path("store"), "pace": "lockstep"}, True, False),
+    ],
+)
+def test_only_live_sources_are_stored_unless_requested(tmp_path, monkeypatch, settings, live, stored):
+    """The next run, of another clip, would send what was left of this one; or the same input give other bytes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    config = check(EdgeConfig(source="demo", **settings))
     rig = Rig(tmp_path / "other")
     backlog = make_backlog(
         config,
         session_id=1,
-        live=True,
+        live=live,
         has_subscriber=lambda: True,
         transmitter=rig.sender,
         in_flight=rig.in_flight,
@@ -153,9 +177,12 @@ def test_nobody_keeps_where_nothing_is_to_be_kept(tmp_path, settings):
         keyframes=rig.keyframes,
         clock=lambda: START_NS,
         info=INFO.pack,
+        failures=rig.failures,
     )
     rig.backlog.close()
-    assert backlog is None
+    assert (backlog is not None) == stored
+    if backlog is not None:
+        backlog.close()
 
 
 def test_asking_for_the_video_of_an_empty_store_is_refused(tmp_path):

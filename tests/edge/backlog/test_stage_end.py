@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hvt_common.protocol.channels import Channel
+from hvt_edge.backlog.entry import worth
 from hvt_edge.backlog.worker import ChunkAllowance
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.outbox import OutboxStill
@@ -23,7 +24,7 @@ def test_what_nobody_acknowledged_is_kept_when_the_run_ends(tmp_path):
     rig.still(0, utility=2.5)
     kept = [unit.frame_index for unit in rig.kept()]
     assert kept == list(range(28, 40))
-    assert rig.stored_stills() == {0: f"still-0-{STILL.capture_ns}-2.5.still"}
+    assert rig.stored_stills() == {0: worth(2.5, STILL.capture_ns)}
 
 
 def test_a_run_that_was_heard_to_its_end_keeps_nothing(tmp_path):
@@ -122,7 +123,7 @@ def test_stills_sent_while_the_link_was_coming_back_are_kept(tmp_path):
     rig.play(30, 31, linked=True)
     assert not rig.backlog.offline
     rig.stills.store_lost(rig.now_ns)
-    assert rig.stored_stills() == {0: f"still-0-{STILL.capture_ns}-1.5.still"}
+    assert rig.stored_stills() == {0: worth(1.5, STILL.capture_ns)}
 
 
 def test_after_frames_that_were_kept_the_link_goes_on_with_a_keyframe(tmp_path):

@@ -13,16 +13,18 @@ import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
+from hvt_common.runtime.failures import Failures
+from hvt_common.values import AccessUnit
 from hvt_edge.backlog.backfill import Chunk
-from hvt_edge.backlog.disk import Folder
-from hvt_edge.backlog.intake import EndSegment, Intake, IntakeUnit
+from hvt_edge.backlog.disk import Store
+from hvt_edge.backlog.intake import EndSegment, Intake
 from hvt_edge.backlog.worker import ChunkAllowance, ChunkThread, StoreWorker
 from media.clips import START_NS
 from programs.processes import eventually
 from rigs.keeping import Rig
 from rigs.kept import INFO, UNITS, S, add_stills, add_units, opened, shifted
 
-UNIT = IntakeUnit(UNITS[0], UNITS[0].data)
+UNIT = UNITS[0]
 
 
 class Link:
@@ -39,6 +41,7 @@ class Link:
         """So many pieces find that their room is gone."""
         self.now_ns = START_NS
         self.sent: list[tuple[int, Chunk]] = []
+        self.failures = Failures(lambda: self.now_ns)
 
     def allowance(self, now_ns: int) -> ChunkAllowance | None:
         """Of a chunk; None while the link is not there."""
@@ -61,13 +64,14 @@ class Link:
 def worker_of(path: Path, link: Link, *, info=INFO.pack, close_s: float = 5.0) -> StoreWorker:
     """A store with its thread."""
     return StoreWorker(
-        lambda: Folder(path, max_bytes=50_000_000, session_id=7, info=info),
+        Store(path, max_bytes=50_000_000, session_id=7, info=info),
         session_id=7,
         clock=lambda: link.now_ns,
         allowance=link.allowance,
         send=link.send,
         round_trip_ns=lambda: S // 10,
         total_bps=lambda: 800_000,
+        failures=link.failures,
         close_s=close_s,
     )
 
@@ -103,7 +107,7 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
         add_stills(folder, {1: 1.0})
     worker = worker_of(tmp_path / "store", link, info=slow)
     units = [shifted(unit, 4 * part) for part in range(10) for unit in UNITS]
-    taken = [unit.frame_index for unit in units if worker.offer(IntakeUnit(unit, UNITS[0].data))]
+    taken = [unit.frame_index for unit in units if worker.offer(unit)]
     worker.end_segment()
     worker.video_first()
     disk.set()
@@ -111,7 +115,7 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
     link.open = True
     eventually(lambda: link.sent, within_s=20, what="an ended segment is sent")
     assert link.sent[0][1].kind == "base", "before the still"
-    assert not worker.offer(IntakeUnit(UNITS[0], b"")) or worker.numbers.segments > 1
+    assert not worker.offer(UNITS[0]) or worker.numbers.segments > 1
     worker.close()
     assert len(taken) < len(units)
     with opened(tmp_path / "store", session_id=8) as folder:
@@ -138,7 +142,7 @@ def test_the_words_of_a_full_line_are_few():
     assert [intake.offer(UNIT) for _ in range(3)] == [True, True, False]
     for number in range(500):
         intake.end_segment()
-        intake.interrupt()
+        intake.signal(interrupted=True)
         acknowledged_range = AcknowledgedRange(
             session_id=7, kind=BacklogKind.BASE, number=number, acknowledged_bytes=5
         )
@@ -146,12 +150,10 @@ def test_the_words_of_a_full_line_are_few():
     assert len(intake) == 2
     news, first = intake.take(0.0)
     assert (news.interrupted, first) == (True, UNIT)
-    assert [acknowledged_range.number for _, acknowledged_range in news.acknowledged_ranges] == list(
-        range(436, 500)
-    ), "the newest"
-    assert [type(intake.take(0.0)[1]) for _ in range(3)] == [IntakeUnit, EndSegment, type(None)]
+    assert [one.number for one in news.acknowledged.values()] == list(range(436, 500)), "the newest"
+    assert [type(intake.take(0.0)[1]) for _ in range(3)] == [AccessUnit, EndSegment, type(None)]
     assert not intake.take(0.0)[0].interrupted
-    intake.close()
+    intake.signal(closed=True)
     assert not intake.offer(UNIT)
     assert intake.ended
 
@@ -165,7 +167,7 @@ def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
     worker = worker_of(tmp_path / "store", link)
     assert link.entered.wait(timeout=10), "a chunk is being sent"
     for unit in UNITS[:10]:
-        worker.offer(IntakeUnit(shifted(unit, 50), UNITS[0].data))
+        worker.offer(shifted(unit, 50))
     eventually(lambda: worker.numbers.segments == 2 and not worker.queued, within_s=10, what="it is kept")
     assert link.sent == []
     link.full.set()
@@ -184,7 +186,7 @@ def test_after_the_last_word_nothing_goes_out(tmp_path):
     worker.send_no_more()
     link.full.set()
     for unit in UNITS[:10]:
-        worker.offer(IntakeUnit(shifted(unit, 50), UNITS[0].data))
+        worker.offer(shifted(unit, 50))
     eventually(lambda: worker.numbers.segments == 2 and not worker.queued, within_s=10, what="it is kept")
     worker.close()
     assert len(link.sent) == 1, "the one that was under way"
@@ -226,25 +228,74 @@ def test_where_live_stills_always_wait_a_trickle_goes_on(tmp_path):
     assert {len(chunk.data) for _, chunk in link.sent} == {1400}
 
 
-@pytest.mark.parametrize("then", ["end", "keep"])
-def test_a_folder_that_vanishes_in_mid_flight_ends_nothing(tmp_path, caplog, then):
-    """A stick that is pulled out would end the flight."""
+def test_a_folder_that_vanishes_in_mid_flight_is_made_again(tmp_path, caplog):
+    """A stick that is pulled out would end the flight, or storing for the rest of it."""
     link, store = Link(), tmp_path / "store"
     link.open = False
     worker = worker_of(store, link)
     for unit in UNITS[:10]:
-        worker.offer(IntakeUnit(unit, UNITS[0].data))
+        worker.offer(unit)
     eventually(lambda: worker.numbers.video_s > 0.5, within_s=10, what="they are written")
     shutil.rmtree(store)
     with caplog.at_level(logging.WARNING):
-        if then == "end":
-            worker.end_segment()
-        worker.offer(IntakeUnit(shifted(UNITS[0], 60), UNITS[0].data))
+        worker.offer(shifted(UNITS[0], 60))
         eventually(lambda: worker.failed, within_s=10, what="it is noticed")
-        worker.close()
-    assert worker.numbers.empty
-    assert worker.numbers.unreadable == 1
-    assert caplog.text.count("cannot be kept any more") == 1
+        assert worker.numbers.empty
+        assert not worker.offer(UNITS[0])
+        assert not store.exists(), "the next try comes after a pause"
+        link.now_ns += 2 * S
+        eventually(lambda: not worker.failed, within_s=10, what="it is tried again")
+    assert [one.partition(": ")[0] for one in caplog.messages] == ["store", "store"], "once that, once this"
+    (part,) = link.failures.parts
+    assert (part.part, part.count, part.working) == ("store", 1, True)
+    worker.offer(shifted(UNITS[0], 70))
+    worker.close()
+    assert worker.numbers.segments == 1
+
+
+def test_a_full_disk_stops_storing_alone_until_there_is_space(small_disk, caplog):
+    """The flight would end for a full card; or what was stored before would not be sent, or be sent for ever."""
+    link = Link()
+    link.open = False
+    worker = worker_of(small_disk / "store", link)
+    units = [shifted(unit, 4 * part) for part in range(30) for unit in UNITS]
+    with caplog.at_level(logging.WARNING):
+        for unit in units:
+            if not worker.offer(unit):
+                break
+            eventually(lambda: not worker.queued, within_s=10, what="it is taken")
+        eventually(lambda: worker.failed, within_s=10, what="the disk is full")
+        stored = worker.numbers
+        assert stored.segments >= 2
+        for _ in range(5):  # in vain: twice as long after each
+            link.now_ns += 100 * S
+            time.sleep(0.3)
+        link.open = True
+        eventually(lambda: len({chunk.number for _, chunk in link.sent}) >= 2, within_s=10, what="it is sent")
+        link.open = False
+        ranges = [
+            AcknowledgedRange(session_id=7, kind="base", number=number, acknowledged_bytes=total)
+            for number, total in {(chunk.number, chunk.total_bytes) for _, chunk in link.sent}
+        ]
+        worker.on_acknowledged(ranges, receiver_id=1)
+        eventually(
+            lambda: worker.numbers.segments == stored.segments - len(ranges),
+            within_s=10,
+            what="it has arrived",
+        )
+        (small_disk / "filler").unlink()
+        link.now_ns += 200 * S
+        eventually(lambda: not worker.failed, within_s=10, what="there is space")
+    (part,) = link.failures.parts
+    assert (part.part, part.working) == ("store", True)
+    assert part.count > 2
+    assert "no space is left" in part.reason
+    assert caplog.text.count("no space is left") == 1, "not at each try"
+    worker.offer(shifted(UNITS[0], 1000))
+    worker.close()
+    with opened(small_disk / "store", session_id=8) as store:
+        assert store.segments == stored.segments - len(ranges) + 1
+        assert all(store.read(entry) for entry in list(store.newest_segments()))
 
 
 def test_what_a_dying_run_had_kept_is_sent_by_the_next(tmp_path, caplog):
@@ -253,7 +304,9 @@ def test_what_a_dying_run_had_kept_is_sent_by_the_next(tmp_path, caplog):
     with opened(store) as dying:
         add_stills(dying, {1: 1.0})
         worker = worker_of(store, link)
-        eventually(lambda: "is in use" in caplog.text, within_s=10, what="it found the folder taken")
+        eventually(
+            lambda: "another edge uses it" in caplog.text, within_s=10, what="it found the folder taken"
+        )
         assert worker.numbers.empty
     link.now_ns += 2 * S
     eventually(lambda: worker.numbers.stills == 1, within_s=10, what="it asked again")

@@ -85,7 +85,7 @@ def test_ticks_that_are_not_coded_are_seen_and_not_waited_for():
             lockstep=True,
             wait_until=lambda _at_ns: None,
         ),
-        recorder=None,
+        local_copy=None,
         first_keyframe_bytes=5000,
         frame_skip=FrameSkip(3),
     )

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.loop.realtime import RealtimePace, SkippedUnits
+from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
@@ -75,13 +78,13 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
             lockstep=False,
             wait_until=lambda _at_ns: None,
         ),
-        recorder=None,
+        local_copy=None,
         first_keyframe_bytes=5000,
     )
     frames = list(framed(smooth_pictures(60, size=SIZE)))
     with RealtimePace(
         base, stills, inbox=FeedbackInbox(), clock=SteadyClock(), fps=15, live=True, counts=counts,
-        stop=threading.Event(),
+        stop=threading.Event(), failures=Failures(time.time_ns),
     ) as pace:  # fmt: skip
         for frame in frames[:50]:  # more than three seconds
             pace.step(frame)

@@ -13,7 +13,10 @@ import pytest
 
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import RoiHeader, StillResult
+from hvt_common.runtime.clock import SteadyClock
+from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame, View
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
@@ -24,6 +27,7 @@ from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.x265 import BaseEncoder, EncoderSettings
 from media.clips import framed, smooth_pictures
+from programs.processes import eventually
 from rigs.flight import CLASSES, SIZE, RedSquares, square_box
 from rigs.still_stage import make_still_stage
 
@@ -290,50 +294,68 @@ def test_the_worker_takes_all_frames_in_order_and_finishes():
     with StillWorker(
         rig.stage,
         results=list,
+        failures=Failures(time.time_ns),
         clock=lambda: FRAMES[0].capture_ns,
         finish_s=30,  # on a busy machine as well
     ) as worker:
         for frame, unit in zip(FRAMES, UNITS, strict=True):
             while worker.queued > 1:  # it is not hurried
                 time.sleep(0.001)
-            worker.offer(frame, unit)
+            worker.take(frame, unit)
     assert rig.stage.analyzer.frames == 30
     assert [one.frame_index for one in rig.out.stills] == [0, 15]
 
 
-def test_an_error_in_the_worker_is_raised_even_when_its_queue_is_full():
-    """The edge would drop every further frame in silence and look alive."""
-    offered = threading.Event()
+def test_stills_that_fail_stop_alone_and_go_on_from_a_keyframe(caplog):
+    """A single bad picture would end the flight's video; or the edge look alive and never send a still again."""
+    broken = threading.Event()
+    broken.set()
 
     class Broken(RedSquares):
         def detect(self, image_bgr):
-            assert offered.wait(30)
-            raise RuntimeError("model is gone")
+            if broken.is_set():
+                raise RuntimeError("no memory")
+            return super().detect(image_bgr)
 
-    rig = Rig(detector=Broken())
-    worker = StillWorker(rig.stage, results=list, clock=lambda: FRAMES[0].capture_ns, length=2)
-    for frame, unit in zip(FRAMES[:3], UNITS, strict=False):
-        worker.offer(frame, unit)
-    offered.set()
-
-    def stays_full() -> None:
-        until_s = time.monotonic() + 30
-        while worker.full and time.monotonic() < until_s:
-            time.sleep(0.001)
-
-    with pytest.raises(RuntimeError, match="model is gone"):
-        stays_full()
-    worker.close()
+    rig, failures, clock = Rig(detector=Broken()), Failures(time.time_ns), SteadyClock()
+    with StillWorker(
+        rig.stage, results=list, failures=failures, clock=clock, pause=RetryPause(SECOND_NS // 5)
+    ) as worker:
+        worker.take(FRAMES[0], UNITS[0])
+        eventually(lambda: failures.parts, within_s=20, what="the failure is noticed")
+        assert not worker.take(FRAMES[1], UNITS[1]), "nothing is analyzed for a while"
+        broken.clear()
+        eventually(lambda: not worker.full, within_s=20, what="the pause is over")
+        assert worker.take(FRAMES[2], UNITS[2]), "and is not decoded: units before it are missing"
+        again = [replace(unit, keyframe=index == 3) for index, unit in enumerate(UNITS)]
+        encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=120_000, preset="ultrafast"))
+        again[3:20] = [encoder.encode(frame, keyframe=frame.index == 3) for frame in FRAMES[3:20]]
+        for index in range(3, 20):
+            eventually(lambda: worker.queued < 2, within_s=20, what="it is not hurried")
+            worker.take(FRAMES[index], again[index])
+    (failed,) = failures.parts
+    assert (failed.part, failed.count, failed.working) == ("stills", 1, True)
+    assert rig.stage.analyzer.tracks == 1, "what is there is tracked again"
+    assert [one.message.split(";")[0] for one in caplog.records] == [
+        "stills: perception and stills stopped (RuntimeError: no memory)",
+        "stills: works again",
+    ]
 
 
 def test_closing_a_busy_worker_is_quick_and_leaves_nothing_running():
     """Ctrl-C would hang behind a slow detector, or two threads would use one queue."""
     rig = Rig(detector=RedSquares(takes_s=1.5))
     before = set(threading.enumerate())
-    worker = StillWorker(rig.stage, results=list, clock=lambda: FRAMES[0].capture_ns, finish_s=1.2)
+    worker = StillWorker(
+        rig.stage,
+        results=list,
+        failures=Failures(time.time_ns),
+        clock=lambda: FRAMES[0].capture_ns,
+        finish_s=1.2,
+    )
     (running,) = set(threading.enumerate()) - before
     for frame, unit in zip(FRAMES[:16], UNITS, strict=False):
-        worker.offer(frame, unit)
+        worker.take(frame, unit)
     worker.close()
     assert running not in threading.enumerate()
     assert rig.stage.analyzer.frames < 16, "what was not in hand was left"

@@ -361,14 +361,14 @@ def test_an_http_stream_plays_live_and_comes_back_after_it_ends(http_stream, cap
         frames = []
         for frame in source.frames(start_ns=0):
             frames.append(frame)
-            if "is back" in caplog.text and len(frames) > 20:
+            if source.restarts and len(frames) > 20:
                 break
     assert [frame.index for frame in frames] == list(range(len(frames)))
     times = [frame.capture_ns for frame in frames]
     assert began < times[0]
     assert times == sorted(times)
     assert frames[0].base_bgr.shape == (180, 320, 3)
-    assert "opening it again" in caplog.text
+    assert "source: http://127.0.0.1" in caplog.text
     assert not [thread for thread in threading.enumerate() if thread.name == "hvt-source"]
 
 
@@ -401,7 +401,7 @@ def test_a_slow_consumer_gets_fresh_frames_and_no_queue(http_stream):
             time.sleep(0.15)
             if len(stale) == 4:
                 break
-        assert source.dropped > 0
+        assert source.missed > 0
 
 
 def test_a_udp_stream_plays(tmp_path):

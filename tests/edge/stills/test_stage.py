@@ -13,6 +13,7 @@ import numpy as np
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import RoiHeader, StillResult
+from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop
@@ -210,21 +211,31 @@ def test_frames_that_wait_are_bounded_in_bytes():
     frame_bytes = FRAMES[0].source_bgr.nbytes + FRAMES[0].base_bgr.nbytes
     rig = Rig(analyzer=make_analyzer(detector=Slow(), every=1))
     worker = StillWorker(
-        rig.stage, results=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=4 * frame_bytes + 1
+        rig.stage,
+        results=list,
+        failures=Failures(time.time_ns),
+        clock=lambda: FRAMES[0].capture_ns,
+        max_bytes=4 * frame_bytes + 1,
     )
-    worker.offer(FRAMES[0], UNITS[0])
+    worker.take(FRAMES[0], UNITS[0])
     while worker.queued:
         time.sleep(0.001)
     offered = 1
     while not worker.full and offered < 16:
-        worker.offer(FRAMES[offered], UNITS[offered])
+        worker.take(FRAMES[offered], UNITS[offered])
         offered += 1
     counted.set()
     assert offered == 5, "four wait, and one is in hand"
     worker.close()
-    roomy = StillWorker(Rig().stage, results=list, clock=lambda: FRAMES[0].capture_ns, max_bytes=1)
+    roomy = StillWorker(
+        Rig().stage,
+        results=list,
+        failures=Failures(time.time_ns),
+        clock=lambda: FRAMES[0].capture_ns,
+        max_bytes=1,
+    )
     assert not roomy.full
-    roomy.offer(FRAMES[0], UNITS[0])
+    roomy.take(FRAMES[0], UNITS[0])
     while roomy.queued:
         time.sleep(0.001)
     assert not roomy.full, "one frame always has its place"

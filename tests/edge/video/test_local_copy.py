@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,12 +15,15 @@ import av
 import numpy as np
 import pytest
 
-from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
+from programs.processes import eventually
+from programs.small_disk import small_disk
 
 SIZE = (320, 192)
 TESTS = Path(__file__).resolve().parents[3] / "tests" / "support"
@@ -30,6 +34,11 @@ def units(count: int, *, fps: float = 15.0) -> list[AccessUnit]:
     encoder = BaseEncoder(EncoderSettings(size=SIZE, fps=fps, bitrate_bps=200_000, preset="ultrafast"))
     frames = framed(smooth_pictures(count, size=SIZE), fps=fps)
     return [encoder.encode(frame, keyframe=frame.index % 10 == 0) for frame in frames]
+
+
+def copy_at(path: Path) -> LocalCopy:
+    """The copy of a run in which nothing fails."""
+    return LocalCopy(path, failures=Failures(time.time_ns))
 
 
 def played(path: Path) -> tuple[list[float], list[np.ndarray], list[bool]]:
@@ -49,7 +58,7 @@ def test_any_player_shows_every_frame_at_its_time(tmp_path):
     """The flight's only video on the drone could not be watched, or at the wrong speed."""
     path = tmp_path / "base.mkv"
     coded = units(24)
-    with BaseRecorder(path) as recorder:
+    with copy_at(path) as recorder:
         for unit in coded:
             recorder.write(unit)
     times, pictures, keyframes = played(path)
@@ -67,7 +76,7 @@ def test_the_bytes_are_those_that_were_sent(tmp_path):
     """The record would be of something else than the ground saw."""
     path = tmp_path / "base.mkv"
     coded = units(5)
-    with BaseRecorder(path) as recorder:
+    with copy_at(path) as recorder:
         for unit in coded:
             recorder.write(unit)
     assert path.stat().st_size < sum(len(unit.data) for unit in coded) + 3_000
@@ -82,7 +91,7 @@ def test_the_bytes_are_those_that_were_sent(tmp_path):
 def test_one_can_jump_into_the_middle(tmp_path):
     """To look at minute 40 one would have to watch 39 others."""
     path = tmp_path / "base.mkv"
-    with BaseRecorder(path) as recorder:
+    with copy_at(path) as recorder:
         for unit in units(30):
             recorder.write(unit)
     with av.open(str(path)) as container:
@@ -98,7 +107,7 @@ def test_dropped_frames_and_equal_times_do_not_spoil_the_file(tmp_path):
         AccessUnit(number, START_NS + 300_000 * number, unit.data, unit.keyframe)
         for number, unit in zip([0, 1, 2, 3, 60, 61, 62, 63, 64, 65], units(10), strict=True)
     ]
-    with BaseRecorder(path) as recorder:
+    with copy_at(path) as recorder:
         for unit in coded:
             recorder.write(unit)
     times, pictures, _ = played(path)
@@ -108,16 +117,94 @@ def test_dropped_frames_and_equal_times_do_not_spoil_the_file(tmp_path):
 
 def test_a_run_without_a_frame_leaves_no_error(tmp_path):
     """Ctrl-C before the first frame would end in a traceback."""
-    with BaseRecorder(tmp_path / "base.mkv"):
+    with copy_at(tmp_path / "base.mkv"):
         pass
 
 
-@pytest.mark.parametrize("name", ["none/base.mkv", "."])
-def test_where_it_cannot_be_written_is_one_sentence(tmp_path, name):
-    """A traceback out of a C library in place of the file's name."""
-    recorder = BaseRecorder(tmp_path / name)
-    with pytest.raises(UserError, match=r"--record-base .* cannot be written"):
-        recorder.write(units(1)[0])
+def test_a_second_run_overwrites_nothing(tmp_path, caplog):
+    """A supervisor that starts the edge again would delete the video of the crash."""
+    path = tmp_path / "base.mkv"
+    for _ in range(3):
+        with copy_at(path) as recorder:
+            for unit in units(3):
+                recorder.write(unit)
+    files = sorted(tmp_path.iterdir())
+    assert [file.name for file in files] == ["base-2.mkv", "base-3.mkv", "base.mkv"]
+    assert [len(played(file)[1]) for file in files] == [3, 3, 3]
+    assert [record.message for record in caplog.records] == [
+        f"--record-base {path} is there already: this is {path.with_name(name)}"
+        for name in ("base-2.mkv", "base-3.mkv")
+    ]
+
+
+def test_a_full_card_stops_the_copy_alone_and_it_goes_on_in_a_new_file(tmp_path, caplog):
+    """The flight's video would end with the card's last byte; or never be kept again after files were moved off."""
+    failures = Failures(time.time_ns)
+    coded = units(60)
+    with small_disk(tmp_path / "card") as card:
+        (card / "old.bin").write_bytes(bytes(990_000))
+        with LocalCopy(card / "base.mkv", failures=failures, pause=RetryPause(SECOND_NS // 10)) as recorder:
+            for unit in coded:
+                recorder.write(unit)
+            eventually(lambda: failures.parts, within_s=20, what="the card is full")
+            (failed,) = failures.parts
+            assert failed.part == "local copy"
+            assert "No space left" in failed.reason
+            assert not failed.working
+            (card / "old.bin").unlink()
+
+            def again() -> bool:
+                for unit in coded:
+                    recorder.write(unit)
+                return failures.parts[0].working
+
+            eventually(again, within_s=20, what="the copy goes on")
+        files = sorted(card.glob("*.mkv"))
+        assert len(files) >= 1
+        assert len(played(files[0])[1]) >= 10, "what follows the pause begins with a keyframe, and plays"
+    assert len([one for one in caplog.records if "cannot be written" in one.message]) == 1
+
+
+def test_a_folder_that_is_removed_stops_the_copy_alone(tmp_path):
+    """Hours of video would be written into a file that has no name any more."""
+    failures, folder = Failures(time.time_ns), tmp_path / "card"
+    folder.mkdir()
+    coded = units(20)
+    with LocalCopy(folder / "base.mkv", failures=failures, pause=RetryPause(SECOND_NS // 10)) as recorder:
+        recorder.write(coded[0])
+        eventually((folder / "base.mkv").exists, within_s=20, what="the file is there")
+        shutil.rmtree(folder)
+        for unit in coded[1:]:
+            recorder.write(unit)
+        eventually(lambda: failures.parts, within_s=20, what="the loss is noticed")
+        folder.mkdir()
+
+        def again() -> bool:
+            for unit in coded:
+                recorder.write(unit)
+            return failures.parts[0].working
+
+        eventually(again, within_s=20, what="the copy goes on")
+    assert len(played(folder / "base.mkv")[1]) >= 10
+
+
+def test_a_card_that_hangs_costs_no_frame(tmp_path):
+    """The picture would freeze for as long as the card does: here a pipe that nobody reads."""
+    pipe, failures = tmp_path / "pipe.mkv", Failures(time.time_ns)
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    coded = units(40)
+    recorder = LocalCopy(pipe, failures=failures)
+    took_s = []
+    for _ in range(40):
+        for unit in coded:
+            began_s = time.perf_counter()
+            recorder.write(unit)
+            took_s.append(time.perf_counter() - began_s)
+    assert "takes no more" in failures.parts[0].reason
+    assert sorted(took_s)[-10] < 0.05
+    os.close(reader)  # which ends the write that hangs
+    recorder.close()
 
 
 def test_a_killed_process_leaves_a_file_that_plays(tmp_path):
@@ -127,10 +214,11 @@ def test_a_killed_process_leaves_a_file_that_plays(tmp_path):
         import sys, time
         sys.path[:0] = [{str(TESTS)!r}, {str(Path(__file__).parent)!r}]
         from pathlib import Path
-        from test_local_copy import BaseRecorder, units
-        recorder = BaseRecorder(Path({str(path)!r}))
+        from test_local_copy import copy_at, units
+        recorder = copy_at(Path({str(path)!r}))
         for unit in units(45):
             recorder.write(unit)
+        time.sleep(1)
         print("written", flush=True)
         time.sleep(60)
     """

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import av
 import numpy as np
 import pytest
 
+from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
+from hvt_common.runtime.failures import Failures
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
-from hvt_edge.video.local_copy import BaseRecorder
+from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.stage import BaseStage
-from hvt_edge.video.x265 import BaseEncoder
+from hvt_edge.video.x265 import BaseEncoder, encoder_context
 from media.clips import START_NS, framed, hard_pictures, smooth_pictures
 from rigs.flight import tracks_at
 
@@ -46,9 +49,16 @@ class Rig:
     """A base stage with all that it needs."""
 
     def __init__(
-        self, *, frame_skip=None, regions=None, recorder=None, interval_s=10.0, reconfigures=True
+        self,
+        *,
+        frame_skip=None,
+        regions=None,
+        recorder=None,
+        interval_s=10.0,
+        reconfigures=True,
+        reopens=True,
     ) -> None:
-        self.kept = Kept()
+        self.kept, self.failures, self.reopened = Kept(), Failures(time.time_ns), 0
         self.opened: list[int] = []
         self.frame_skip = frame_skip or FrameSkip()
         self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=round(interval_s * SECOND_NS)))
@@ -64,12 +74,18 @@ class Rig:
                 lockstep=True,
                 wait_until=lambda _at_ns: None,
             ),
-            recorder=recorder,
+            local_copy=recorder,
             first_keyframe_bytes=5000,
             regions=regions,
             frame_skip=self.frame_skip,
             reconfigure=self._reconfigure if reconfigures else None,
+            reopen=self._reopen if reopens else None,
+            failures=self.failures,
         )
+
+    def _reopen(self) -> BaseEncoder:
+        self.reopened += 1
+        return BaseEncoder(SETTINGS)
 
     def play(self, pictures, *, asks=(), tracks=None) -> list[int]:
         """Indices of the frames that were coded."""
@@ -147,7 +163,7 @@ def test_the_same_frames_give_the_same_bytes():
 def test_a_recording_keeps_its_times_across_a_change(tmp_path):
     """The flight's video on the drone would run at the wrong speed after the first change."""
     path = tmp_path / "base.mkv"
-    with BaseRecorder(path) as recorder:
+    with LocalCopy(path, failures=Failures(time.time_ns)) as recorder:
         rig = Rig(frame_skip=starving(), recorder=recorder, interval_s=2.0)
         coded = rig.play(hard_pictures(90, size=SIZE))
     assert rig.opened
@@ -160,6 +176,61 @@ def test_a_recording_keeps_its_times_across_a_change(tmp_path):
 
 def test_a_change_without_a_new_encoder_is_a_bug_that_shows():
     """x265 would go on as if all frames came, and spend a third of its bits."""
-    rig = Rig(frame_skip=starving(), interval_s=2.0, reconfigures=False)
+    rig = Rig(frame_skip=starving(), interval_s=2.0, reconfigures=False, reopens=False)
     with pytest.raises(AssertionError, match="another encoder"):
         rig.play(hard_pictures(120, size=SIZE))
+
+
+BROKEN = np.zeros((4, 4), np.uint8)
+"""A picture without colours: PyAV refuses it."""
+
+
+def stepped(rig: Rig, frames) -> list[int]:
+    """Indices of the frames that were coded."""
+    coded = []
+    for frame in frames:
+        decision = rig.stage.decide(frame.index, now_ns=frame.capture_ns)
+        if (unit := rig.stage.encode(frame, decision, now_ns=frame.capture_ns)) is not None:
+            rig.stage.send(unit, decision, now_ns=frame.capture_ns)
+            coded.append(frame.index)
+    return coded
+
+
+def test_an_encoder_that_fails_is_opened_again_on_a_keyframe():
+    """One bad picture would end the flight, or leave grounds with frames that nothing they have explains."""
+    rig, frames = Rig(), list(framed(smooth_pictures(12, size=SIZE)))
+    frames[5] = replace(frames[5], base_bgr=BROKEN)
+    assert stepped(rig, frames) == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10, 11]
+    assert rig.reopened == 1
+    decoder = BaseDecoder()
+    assert decoder.decode(rig.kept.units[5]) is not None, "who joins there sees a picture"
+    (failed,) = rig.failures.parts
+    assert (failed.part, failed.count, failed.working) == ("encoder", 1, True)
+    assert rig.keyframes.sent == 2
+
+
+def test_three_failures_in_ten_seconds_end_the_process_with_a_sentence():
+    """An edge without video would look alive for hours."""
+    rig, frames = Rig(), list(framed(smooth_pictures(12, size=SIZE)))
+    for index in (3, 5, 7):
+        frames[index] = replace(frames[index], base_bgr=BROKEN)
+    with pytest.raises(
+        FlightError, match=r"x265 failed 3 times within 10 s .*: there is no video without it"
+    ):
+        stepped(rig, frames)
+    rig = Rig()
+    slow = [replace(frame, capture_ns=START_NS + frame.index * 4 * SECOND_NS) for frame in frames]
+    assert stepped(rig, slow) == [0, 1, 2, 4, 6, 8, 9, 10, 11], "three in a minute do not"
+
+
+def test_in_lockstep_a_failing_encoder_is_an_error():
+    """A study would compare a clip with holes in it."""
+    rig = Rig(reopens=False)
+    with pytest.raises(ValueError, match="ndim"):
+        stepped(rig, [replace(frame, base_bgr=BROKEN) for frame in framed(smooth_pictures(1, size=SIZE))])
+
+
+def test_no_encoder_at_all_is_one_sentence():
+    """A build of PyAV without x265 would end in a traceback."""
+    with pytest.raises(UserError, match=r"PyAV .* has no encoder libx265-lost"):
+        encoder_context("libx265-lost")

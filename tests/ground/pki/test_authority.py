@@ -129,6 +129,34 @@ def test_a_new_machine_names_the_files_that_change(fleet: Fleet, capsys: pytest.
     assert said.endswith("changed with it, copy again and restart what uses them: base.json5, hub.json5\n")
 
 
+def test_each_machine_has_its_keys_where_its_own_file_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A drone with its keys elsewhere would send the ground to look for its own there: it would not start any more."""
+    folder = tmp_path / "keys"
+
+    def keys(command: str, name: str, *words: str) -> None:
+        run([command, name, "--dir", str(folder), *words])
+
+    def where(name: str) -> set[str]:
+        said = json5.loads((folder / f"{name}.json5").read_text())["transport"]["link"]["tls"]
+        return {str(Path(path).parent) for path in said.values() if isinstance(path, str)}
+
+    run(["new-ca", "--dir", str(folder)])
+    keys("add-ground", "base", "--host", "192.0.2.1")
+    keys("add-edge", "uav-1", "--keys-folder", 'drone/"A"')
+    keys("add-edge", "uav-2")
+    keys("add-ground", "ops", "--keys-folder", "/home/ops/keys")
+    keys("remove", "uav-2")
+    assert where("base") == {"/etc/hvt/tls"}
+    assert where("uav-1") == {'drone/"A"'}
+    assert where("ops") == {"/home/ops/keys"}
+    capsys.readouterr()
+    keys("add-edge", "uav-1", "--keys-folder", "/media/card")
+    assert where("uav-1") == {"/media/card"}
+    assert "changed with it" not in capsys.readouterr().out, "the others' files are as they were"
+
+
 def test_list_says_who_may_what_until_when(fleet: Fleet, capsys: pytest.CaptureFixture[str]) -> None:
     """The only place to see the rights of a fleet at a glance."""
     capsys.readouterr()

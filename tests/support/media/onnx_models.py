@@ -14,7 +14,15 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-__all__ = ["STRIDES", "cells", "colour_classifier", "colour_detector", "constant_model", "save"]
+__all__ = [
+    "STRIDES",
+    "cells",
+    "colour_classifier",
+    "colour_detector",
+    "constant_model",
+    "failing_in_the_light",
+    "save",
+]
 
 STRIDES = (8, 16, 32)
 
@@ -150,3 +158,26 @@ def colour_classifier(
         metadata=metadata,
         dtype=dtype,
     )
+
+
+def failing_in_the_light(path: Path, *, size: tuple[int, int] = (320, 192)) -> Path:
+    """A colour detector of the YOLOX kind whose run raises on any picture with a mean of 128 or more (of 255)."""
+    model = onnx.load(colour_detector(path, "yolox", size=size))
+    (output,) = model.graph.output
+    model.graph.node[-1].output[0] = "plain"
+    model.graph.initializer.extend(
+        numpy_helper.from_array(value, name)
+        for name, value in {"half": np.float32(1 / 128), "table": np.zeros(1, np.float32)}.items()
+    )
+    model.graph.node.extend(
+        [
+            helper.make_node("ReduceMean", ["images"], ["mean"], keepdims=0),
+            helper.make_node("Mul", ["mean", "half"], ["brightness"]),
+            helper.make_node("Cast", ["brightness"], ["index"], to=TensorProto.INT64),
+            helper.make_node("Gather", ["table", "index"], ["nothing"]),  # of one place: 1 is outside
+            helper.make_node("Add", ["plain", "nothing"], [output.name]),
+        ]
+    )
+    onnx.checker.check_model(model)
+    path.write_bytes(model.SerializeToString())
+    return path

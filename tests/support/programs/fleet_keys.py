@@ -29,7 +29,8 @@ class Fleet:
 
     def keys(self, command: str, name: str, *arguments: str) -> None:
         """``hvt-ground keys COMMAND NAME …``."""
-        run([command, name, "--dir", str(self.folder), "--keys-folder", str(self.folder), *arguments])
+        where = ["--keys-folder", str(self.folder)] if command.startswith("add-") else []
+        run([command, name, "--dir", str(self.folder), *where, *arguments])
 
     def file(self, name: str) -> Path:
         """The Zenoh configuration of a machine."""

@@ -22,8 +22,9 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
+from hvt_common.runtime.failures import Failures
 from hvt_common.values import AccessUnit, Frame, Still
-from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.disk import Store
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogLink, BacklogStage
 from hvt_edge.config import EdgeConfig, check
@@ -168,6 +169,7 @@ class Rig:
         session_id: int = 7,
         budget: tuple[int, int] = (800_000, 400_000),
         maker: StillMaker | None = None,
+        inbox: FeedbackInbox | None = None,
     ) -> None:
         self.path, self.out, self.now_ns = folder, Out(), START_NS
         self.linked = True
@@ -187,8 +189,9 @@ class Rig:
             in_flight=self.in_flight,
         )
         self.outcomes: list[tuple[str, str]] = []
+        self.failures = Failures(lambda: self.now_ns)
         self.backlog = BacklogStage(
-            lambda: Folder(folder, max_bytes=50_000_000, session_id=session_id, info=info),
+            Store(folder, max_bytes=50_000_000, session_id=session_id, info=info),
             session_id=session_id,
             live=live,
             link=link_of(self.sender, self.outbox),
@@ -196,6 +199,7 @@ class Rig:
             keyframes=self.keyframes,
             clock=lambda: self.now_ns,
             on_outcome=lambda *outcome: self.outcomes.append(outcome),
+            failures=self.failures,
         )
         config = check(EdgeConfig(source="demo", size=SIZE, budget=budget[0], preset="ultrafast"))
         self.stills = StillSender(
@@ -208,12 +212,17 @@ class Rig:
             method=config.method,
             decimation=1,
         )
+        self.failures = Failures(lambda: self.now_ns)
+        self.watched = False
+        """Somebody subscribes to the video who is no ground."""
         self.link_control = LinkControl(
             has_ground=self._has_ground,
+            has_subscriber=lambda: self.watched,
+            failures=self.failures,
             session_id=session_id,
             transmitter=self.sender,
             keyframes=self.keyframes,
-            inbox=FeedbackInbox(),
+            inbox=inbox or FeedbackInbox(),
             reconfiguration=EncoderReconfiguration(
                 self.operating,
                 reconfiguration_settings(config, SIZE),
@@ -238,7 +247,7 @@ class Rig:
             BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=200_000, preset="ultrafast")),
             keyframes=self.keyframes,
             transmitter=self.sender,
-            recorder=None,
+            local_copy=None,
             first_keyframe_bytes=5000,
             admits=self._asked_to_admit,
             backlog=self.backlog,
@@ -321,11 +330,11 @@ class Rig:
                 for unit in parse_backlog_units(folder.read(entry))
             ]
 
-    def stored_stills(self) -> dict[int, str]:
-        """Numbers and file names of the stills that another start of the edge finds."""
+    def stored_stills(self) -> dict[int, float]:
+        """Numbers and worth of the stills that another start of the edge finds."""
         self.close()
         with opened(self.path, session_id=8) as folder:
-            return {entry.number: entry.path.name for entry in folder.best_stills()}
+            return {entry.number: entry.rank for entry in folder.best_stills()}
 
 
 def link_of(sender: Transmitter, outbox: Outbox) -> BacklogLink:

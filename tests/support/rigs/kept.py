@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hvt_common.protocol.messages import BacklogStill, RoiHeader, pack_backlog_still
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.disk import Folder
+from hvt_edge.backlog.disk import Store
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.x265 import BaseEncoder
 from media.clips import START_NS, framed, smooth_pictures
@@ -29,9 +29,11 @@ def coded(count: int, *, keyframe_each: int = 15) -> list[AccessUnit]:
 UNITS = coded(60)
 
 
-def opened(path: Path, *, max_bytes: int = 50_000_000, session_id: int = 7, oldest_ns: int = 0) -> Folder:
-    """The folder, as a run of an edge opens it."""
-    return Folder(path, max_bytes=max_bytes, session_id=session_id, info=INFO.pack, oldest_ns=oldest_ns)
+def opened(path: Path, *, max_bytes: int = 50_000_000, session_id: int = 7, oldest_ns: int = 0) -> Store:
+    """The store, as a run of an edge opens it."""
+    store = Store(path, max_bytes=max_bytes, session_id=session_id, info=INFO.pack, oldest_ns=oldest_ns)
+    store.enter()
+    return store
 
 
 def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int = 7) -> bytes:
@@ -57,16 +59,16 @@ def packed_still(number: int, *, data: bytes = b"\xff" * 1500, session_id: int =
     return pack_backlog_still(BacklogStill(header.pack(data), "image/jpeg", data))
 
 
-def add_stills(folder: Folder, utilities: dict[int, float], *, capture_ns: int = START_NS) -> None:
+def add_stills(folder: Store, utilities: dict[int, float], *, capture_ns: int = START_NS) -> None:
     """One of each number."""
     for number, utility in utilities.items():
         folder.add_still(number, packed_still(number), utility=utility, capture_ns=capture_ns)
 
 
-def add_units(folder: Folder, units: list[AccessUnit]) -> None:
+def add_units(folder: Store, units: list[AccessUnit]) -> None:
     """A run, ended."""
     for unit in units:
-        folder.add_unit(unit, parameter_sets=UNITS[0].data)
+        folder.add_unit(unit)
     folder.end_segment()
 
 

@@ -1,0 +1,40 @@
+"""When a live frame was taken, from the camera's own time stamps where it gives any. Pure."""
+
+from __future__ import annotations
+
+from hvt_common.units import SECOND_NS
+
+__all__ = ["CameraClock"]
+
+_MOST_DELAY_NS = 5 * SECOND_NS
+"""A frame that seems older when it comes shows that the camera's clock is not set as ours is."""
+_MEMORY_NS = 60 * SECOND_NS
+"""The least delay of the last one to two of these counts: two clocks drift apart."""
+
+
+class CameraClock:
+    """Turns a camera's time stamps into this process's time; one for each time that the camera was opened.
+
+    A clock that is set as ours is (NTP) is taken at its word. Of any other only the differences count: the frame
+    that came quickest is taken to have come at once. Times never go back.
+    """
+
+    def __init__(self) -> None:
+        self._least_ns: int | None = None
+        self._former_ns: int | None = None
+        self._since_ns = 0
+        self._last_ns = 0
+
+    def capture_ns(self, camera_ns: int | None, *, now_ns: int) -> int:
+        """When the frame that has just come was taken; ``camera_ns`` is None where the camera does not say."""
+        taken_ns = now_ns if camera_ns is None else camera_ns + self._ahead_ns(now_ns - camera_ns, now_ns)
+        self._last_ns = max(self._last_ns + 1, min(taken_ns, now_ns))
+        return self._last_ns
+
+    def _ahead_ns(self, delay_ns: int, now_ns: int) -> int:
+        """What to add to the camera's time."""
+        if self._least_ns is None or now_ns - self._since_ns > _MEMORY_NS:
+            self._former_ns, self._least_ns, self._since_ns = self._least_ns, delay_ns, now_ns
+        self._least_ns = min(self._least_ns, delay_ns)
+        least_ns = self._least_ns if self._former_ns is None else min(self._least_ns, self._former_ns)
+        return 0 if 0 <= least_ns <= _MOST_DELAY_NS else least_ns

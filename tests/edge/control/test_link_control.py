@@ -1,0 +1,74 @@
+"""What reports of grounds decide, and what happens without any."""
+
+from __future__ import annotations
+
+from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.pacer import Pacer
+from hvt_edge.link.rate_control import RateController, RateSettings
+from rigs.keeping import Rig
+
+SECOND_NS = 1_000_000_000
+
+
+def test_who_reports_nothing_is_not_waited_for():
+    """A plain Zenoh program would see half a second of video, and then nothing for two."""
+    pacer = Pacer(RateController(RateSettings(ceiling_bps=800_000, floor_bps=100_000)))
+    pacer.link(True, reports=False, now_ns=0)
+    for frame in range(60):
+        now_ns = frame * SECOND_NS // 15
+        assert pacer.admits_base(now_ns)
+        pacer.sent_base(frame, 3_000, now_ns=now_ns, keyframe=frame == 0)
+    assert pacer.rate_bps == 800_000
+
+
+class Faulty(FeedbackInbox):
+    """Fails on every report while it is broken."""
+
+    broken = False
+
+    def on_report(self, report):
+        """As it is, or not at all."""
+        if self.broken:
+            raise OverflowError("too much")
+        super().on_report(report)
+
+
+def test_a_watcher_that_stays_after_the_ground_has_left_is_served(tmp_path):
+    """A plain Zenoh program would get a frame a second for a quarter of a minute, and the store fill for nobody."""
+    rig = Rig(tmp_path / "store")
+    try:
+        rig.play(0, 45, reports=True)
+        rig.watched = True
+        rig.play(45, 120, linked=False)
+        shown = {one.frame_index for one in rig.out.base}
+        assert len(shown & set(range(47, 120))) >= 70
+        assert rig.backlog.frames <= 2
+        rig.watched = False
+        rig.play(120, 135, linked=False)
+        assert rig.backlog.frames >= 14, "with nobody there the flight is stored again"
+    finally:
+        rig.backlog.close()
+
+
+def test_a_report_that_cannot_be_used_lowers_the_rate_and_video_goes_on(tmp_path, caplog):
+    """An error in a thread of the link is nobody's: the edge would wait for ever for what never arrives."""
+    inbox = Faulty()
+    rig = Rig(tmp_path / "store", adapt=True, inbox=inbox)
+    try:
+        rig.play(0, 45, reports=True)
+        assert rig.pacer.rate_bps > 100_000
+        before = len(rig.out.base)
+        inbox.broken = True
+        rig.play(45, 105, reports=True)
+        assert rig.pacer.rate_bps == 100_000, "the floor"
+        assert len(rig.out.base) >= before + 4, "a frame a second at the least"
+        (failed,) = rig.failures.parts
+        assert (failed.part, failed.working) == ("reports", False)
+        assert "OverflowError: too much" in failed.reason
+        inbox.broken = False
+        rig.play(105, 205, reports=True)
+        assert rig.pacer.rate_bps > 100_000, "it grows again"
+        assert rig.failures.parts[0].working
+    finally:
+        rig.backlog.close()
+    assert len(caplog.records) == 2

@@ -1,0 +1,42 @@
+"""A detector whose model fails in flight."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hvt_common.inference.detect import open_detector
+from hvt_common.runtime.failures import Failures, RetryPause
+from hvt_common.units import SECOND_NS
+from hvt_edge.perception.guarded_detector import GuardedDetector
+from media.onnx_models import failing_in_the_light
+
+DARK, BRIGHT = np.full((192, 320, 3), 20, np.uint8), np.full((192, 320, 3), 250, np.uint8)
+
+
+def test_a_model_whose_run_raises_is_opened_again_with_growing_pauses(tmp_path, caplog):
+    """The flight would end with the model; or each frame wait for it to be opened in vain."""
+    path = failing_in_the_light(tmp_path / "model.onnx")
+    opened, now_ns = [], [0]
+    failures = Failures(lambda: now_ns[0])
+
+    def reopen():
+        opened.append(now_ns[0] // SECOND_NS)
+        return open_detector(str(path))
+
+    detector = GuardedDetector(
+        open_detector(str(path)), reopen=reopen, failures=failures, clock=lambda: now_ns[0],
+        pause=RetryPause(),
+    )  # fmt: skip
+    assert detector.detect(DARK) is not None
+    for second in range(1, 21):
+        now_ns[0] = second * SECOND_NS
+        assert detector.detect(BRIGHT) is None
+    assert opened == [2, 4, 8, 16]
+    (failed,) = failures.parts
+    assert failed.part == "detector"
+    assert failed.count == 5
+    assert not failed.working
+    now_ns[0] = 40 * SECOND_NS
+    assert detector.detect(DARK) is not None
+    assert failures.parts[0].working
+    assert len(caplog.records) <= 2, "said once"

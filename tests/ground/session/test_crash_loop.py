@@ -1,0 +1,193 @@
+"""An edge that is started again and again, as a supervisor does with one that crashes: its ground stays as it is."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from hvt_common.transport.inbox import Received
+from hvt_common.transport.session import open_session
+from hvt_common.transport.zenoh_config import LinkSettings
+from hvt_ground.backlog.recordings import BacklogRecordings
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
+from hvt_ground.session.session import GroundSession
+from hvt_ground.session.subscribe import EdgePort, GroundLink
+from hvt_ground.status import status_text, summary
+from hvt_ground.wiring import Models, SessionFactory
+from programs.outsider import joined
+from programs.processes import Link, eventually
+from rigs.flight import Flight
+
+SESSIONS, WARM = 200, 59
+FRAMES = 6
+MOST_GROWTH_BYTES = 24 * 2**20
+"""Between the 60th and the 200th session: what one session leaves behind would be 140 times as much."""
+
+
+def fast_clock() -> int:
+    """Runs 120 times as fast: between two sessions an edge has to be silent for some seconds."""
+    return time.time_ns() + 119 * time.monotonic_ns()
+
+
+class Use:
+    """What a process holds."""
+
+    def __init__(self, pid: int | str = "self") -> None:
+        status = Path(f"/proc/{pid}/status").read_text().splitlines()
+        fields = dict(line.split(":", 1) for line in status)
+        self.rss_bytes = int(fields["VmRSS"].split()[0]) * 1024
+        self.threads = int(fields["Threads"])
+        self.files = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+
+
+class Restarted:
+    """An edge on the link: one session after the other, each of a few real access units."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self.flight = Flight(FRAMES)
+        self._info = session.declare_queryable("hvt/uav-1/info", self._answer)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query:
+            query.reply("hvt/uav-1/info", self.flight.info().pack())
+
+    def begin(self, number: int) -> None:
+        """The pictures of another session."""
+        self.flight.session_id = 1_000_000 + number
+        self._put(*(self.flight.base(index) for index in range(FRAMES)))
+
+    def end(self, *, crashes: bool) -> None:
+        """A still and a report; one that crashes says nothing of an end."""
+        state = "running" if crashes else "ended"
+        self._put(self.flight.still(1, 0), self.flight.status(base=FRAMES, roi=1, state=state))
+
+    def _put(self, *items: Received) -> None:
+        for item in items:
+            self._session.put(
+                item.key,
+                item.payload,
+                attachment=item.attachment or None,
+                encoding=item.encoding or None,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+
+
+@contextmanager
+def served(link: GroundLink, folder: Path, ended: list[str]) -> Iterator[tuple[EdgePort, EdgeSessions]]:
+    """The edge's thread with sessions as `hvt-ground` makes them; ``ended`` gets one word a session."""
+    config = check(GroundConfig(record=folder, tracks=folder, detector="motion", classifier="none"))
+    factory = SessionFactory(config, Models(config), clock=fast_clock, live_url=None, timing=None)
+
+    def note(session: GroundSession) -> None:
+        assert summary(session)["frames_decoded"] == FRAMES, summary(session)
+        ended.append(session.failure)
+
+    eventually(link.ports, within_s=20, what="the edge is seen")
+    (port,) = link.ports()
+    sessions = EdgeSessions(
+        port,
+        open_session=factory.open_session,
+        on_ended=note,
+        recordings=BacklogRecordings(factory.open_backlog),
+        clock=fast_clock,
+    )
+    thread = EdgeThread(sessions)
+    try:
+        yield port, sessions
+    finally:
+        assert thread.close(timeout_s=60)
+    assert thread.error is None
+
+
+def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Path) -> None:
+    """After a night with a drone that restarts every minute the ground would be killed for its memory."""
+    endpoint, ended = f"tcp/127.0.0.1:{free_port}", list[str]()
+    watching = threading.Event()
+
+    def watch() -> None:
+        while not watching.wait(0.001):
+            status_text([("uav-1", sessions)])
+
+    with (
+        open_session(LinkSettings("ground", listen=(endpoint,))) as session,
+        GroundLink(session, edges="*", clock=fast_clock) as link,
+        joined(endpoint) as outsider,
+        outsider.liveliness().declare_token("hvt/uav-1/alive"),
+        served(link, tmp_path, ended) as (_, sessions),
+    ):
+        edge = Restarted(outsider)
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        before = None
+        try:
+            for number in range(SESSIONS):
+                crashes = number % 2 == 1
+                edge.begin(number)
+                eventually(lambda: is_open(sessions, edge), within_s=60, what=f"{number} has begun")
+                edge.end(crashes=crashes)
+                if crashes:
+                    eventually(lambda: sessions.session.is_whole, within_s=60, what=f"{number} has come")
+                else:
+                    eventually(
+                        lambda before=number: len(ended) > before, within_s=60, what=f"{number} has ended"
+                    )
+                time.sleep(0.06)  # seven seconds of silence, by the fast clock
+                if number == WARM:
+                    gc.collect()
+                    before = Use()
+            gc.collect()
+            after = Use()
+            alive = sum(isinstance(one, GroundSession) for one in gc.get_objects())
+        finally:
+            watching.set()
+            watcher.join()
+    assert before is not None
+    assert len(ended) == SESSIONS
+    assert not any(ended)
+    assert len(list(tmp_path.glob("*.rrd"))) == SESSIONS
+    assert alive <= 2, "the one that is open, and the one before it in the edge's hands"
+    stays(before, after)
+
+
+def stays(before: Use, after: Use) -> None:
+    """Memory, threads and files are what they were."""
+    grown = after.rss_bytes - before.rss_bytes
+    assert grown < MOST_GROWTH_BYTES, f"{grown / 2**20:.1f} MiB"
+    assert after.threads <= before.threads + 2
+    assert after.files <= before.files + 2
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(3600)
+def test_two_hundred_flights_of_two_seconds(tmp_path: Path) -> None:
+    """The same with real edges, as processes that are started and end."""
+    with Link(tmp_path) as link:
+        ground = link.ground("--record", "recordings", "--detector", "motion", "--classifier", "none")
+        before = None
+        for number in range(SESSIONS):
+            edge = link.edge("--source", "demo", "--max-frames", "30", name=f"edge-{number}")
+            assert edge.finish()["frames"] > 0
+            if number == WARM:
+                before = Use(ground.process.pid)
+        after = Use(ground.process.pid)
+        ground.stop()
+        sessions = ground.finish()
+    assert before is not None
+    assert len(sessions) == SESSIONS
+    assert not any(one["failure"] for one in sessions)
+    stays(before, after)
+
+
+def is_open(sessions: EdgeSessions, edge: Restarted) -> bool:
+    """Whether the edge's session has begun."""
+    session = sessions.session
+    return session is not None and session.info.session_id == edge.flight.session_id

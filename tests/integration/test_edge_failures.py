@@ -1,0 +1,162 @@
+"""An edge as a real process, whose parts fail in flight; whoever listens is plain Zenoh."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.protocol.messages import BaseHeader, FailedPart, Flags, Status
+from media.onnx_models import failing_in_the_light
+from programs.outsider import Tap, joined
+from programs.processes import Link, Running, eventually
+from programs.rtsp_camera import RtspCamera
+from programs.small_disk import small_disk
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(240)]
+
+SOON_S = 60.0
+SMALL = ("--size", "320x192", "--fps", "10", "--preset", "ultrafast", "--budget", "400kbps")
+
+
+class Watcher:
+    """A program that subscribes to the video, and by the way to status, and never reports anything."""
+
+    def __init__(self, session) -> None:
+        self._base = Tap(session, "hvt/edge-1/base")
+        self._status = Tap(session, "hvt/edge-1/status")
+
+    @property
+    def units(self) -> list[BaseHeader]:
+        """Headers of the access units that came."""
+        return [BaseHeader.parse(one.attachment, one.payload) for one in self._base.messages]
+
+    @property
+    def times_s(self) -> list[float]:
+        """When they came."""
+        return [one.received_s for one in self._base.messages]
+
+    @property
+    def status(self) -> Status:
+        """The newest."""
+        return Status.parse(self._status.messages[-1].payload)
+
+    def failed(self, name: str) -> FailedPart | None:
+        """What the newest status says of a part."""
+        parts = self.status.failed if self._status.messages else ()
+        return next((one for one in parts if one.part == name), None)
+
+    def goes_on(self, *, frames: int = 15) -> None:
+        """So many more frames come."""
+        before = len(self._base.messages)
+        eventually(lambda: len(self._base.messages) >= before + frames, within_s=SOON_S, what="video goes on")
+
+
+@contextmanager
+def watched(link: Link, *settings: str) -> Iterator[tuple[Running, Watcher]]:
+    """An edge with these settings, and its watcher."""
+    edge = link.edge("--wait", "0s", "--store", "0", *SMALL, *settings, listens=True)
+    with joined(link.edge_endpoint) as session:
+        watcher = Watcher(session)
+        eventually(lambda: watcher.units or not edge.alive, within_s=SOON_S, what="video")
+        yield edge, watcher
+
+
+def pictures(folder: Path, levels: list[int]) -> Path:
+    """A folder of textured pictures, each of its own brightness."""
+    folder.mkdir()
+    noise = np.random.default_rng(1).integers(0, 40, (192, 320, 3))
+    for index, level in enumerate(levels):
+        picture = np.roll(noise, 3 * index, axis=1) + level
+        cv2.imwrite(str(folder / f"{index:04d}.png"), np.clip(picture, 0, 255).astype(np.uint8))
+    return folder
+
+
+def test_a_full_card_ends_the_local_copy_and_nothing_else(link, tmp_path):
+    """The operator would lose the picture because a card is full."""
+    scene = pictures(tmp_path / "clip", [int(90 + 80 * np.sin(index)) for index in range(600)])
+    with small_disk(tmp_path / "card") as card:
+        (card / "old.bin").write_bytes(bytes(900_000))
+        copy = ("--record-base", str(card / "base.mkv"), "--keyframe-interval", "1s")
+        with watched(link, "--source", str(scene), "--detector", "motion", *copy) as (edge, watcher):
+            eventually(lambda: watcher.failed("local copy"), within_s=SOON_S, what="status says so")
+            part = watcher.failed("local copy")
+            assert "No space left" in part.reason
+            assert abs(part.failed_ns / 1e9 - time.time()) < SOON_S
+            watcher.goes_on()
+            (card / "old.bin").unlink()
+            eventually(lambda: watcher.failed("local copy").working, within_s=SOON_S, what="it works again")
+            watcher.goes_on()
+            edge.stop()
+        (failed,) = edge.summary()["failed"]
+        assert failed["part"] == "local copy"
+        assert failed["failed_at"].startswith("20")
+        assert "local copy at 20" in edge.told
+        with av.open(str(max(card.glob("*.mkv"), key=lambda file: file.stat().st_mtime))) as container:
+            assert len(list(container.decode(video=0))) > 5
+    said = [line for line in edge.said.splitlines() if "local copy" in line]
+    assert len(said) <= 4, said
+    assert "Traceback" not in edge.said
+
+
+def test_a_model_that_fails_leaves_the_video(link, tmp_path):
+    """The flight would end in the first bright minute of a model that cannot bear light."""
+    model = failing_in_the_light(tmp_path / "model.onnx")
+    scene = pictures(tmp_path / "clip", [30] * 40 + [200] * 60 + [30] * 500)
+    with watched(link, "--source", str(scene), "--detector", str(model), "--provider", "cpu") as (
+        edge,
+        watcher,
+    ):
+        eventually(lambda: watcher.failed("detector"), within_s=SOON_S, what="status says so")
+        assert not watcher.failed("detector").working
+        watcher.goes_on()
+        eventually(lambda: watcher.failed("detector").working, within_s=SOON_S, what="it is opened again")
+        watcher.goes_on()
+        edge.stop()
+    sequences = [one.sequence for one in watcher.units]
+    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+    assert edge.summary()["failed"][0]["working"]
+    assert "Traceback" not in edge.said
+
+
+def test_a_camera_that_comes_back_begins_with_a_keyframe(link, free_port):
+    """The operator would look at smear after each loose contact, or never learn why the picture stands."""
+    camera = RtspCamera(free_port)
+    try:
+        with watched(link, "--source", camera.url, "--detector", "motion") as (edge, watcher):
+            watcher.goes_on(frames=5)
+            camera.close()
+            eventually(
+                lambda: watcher.failed("source"), within_s=SOON_S, what="status says so, without a frame"
+            )
+            assert not watcher.failed("source").working
+            count = len(watcher.units)
+            camera = RtspCamera(free_port)
+            eventually(lambda: len(watcher.units) > count + 5, within_s=SOON_S, what="video comes back")
+            eventually(lambda: watcher.failed("source").working, within_s=SOON_S, what="status says so")
+            assert watcher.units[count].flags & Flags.KEYFRAME
+            edge.stop()
+    finally:
+        camera.close()
+    assert edge.summary()["failed"][0]["part"] == "source"
+
+
+@pytest.mark.realtime
+def test_who_reports_nothing_gets_all_frames_of_a_camera_and_no_backlog(link, free_port, tmp_path):
+    """A plain Zenoh program would see nothing, while the edge stores the flight for nobody."""
+    store = ("--store", "20MB", "--store-folder", str(tmp_path / "store"))
+    with RtspCamera(free_port) as camera:
+        settings = ("--source", camera.url, "--detector", "motion", *store)
+        with watched(link, *settings) as (edge, watcher):
+            eventually(lambda: len(watcher.units) > 60, within_s=SOON_S, what="six seconds of video")
+            indices = [one.frame_index for one in watcher.units]
+            stored = edge.stop() and edge.summary()["frames_stored"]
+    assert len(indices) >= 0.95 * (indices[-1] - indices[0] + 1)
+    assert stored <= indices[0] + 1, "nothing but what came before anybody watched"
+    assert edge.summary()["total_bps"] <= 400_000
