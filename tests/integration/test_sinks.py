@@ -37,7 +37,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def edges(link: Link, scene: Path) -> list[Running]:
-    """Two that play the scene in real time at little cost, and end by themselves should the test not end them."""
+    """Two that play the scene in real time at little cost."""
     cheap = ("--size", "640x360", "--fps", "10", "--preset", "ultrafast", "--budget", "600kbps")
     source = ("--source", str(scene), "--source-fps", "10", "--detector", "motion", *cheap)
     return [link.edge(*source, "--edge-id", name, name=name) for name in EDGES]
@@ -55,21 +55,19 @@ def verified(path: Path) -> bool:
     return subprocess.run(command, check=False, capture_output=True, env=viewer_environment()).returncode == 0
 
 
-def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, scene, link):
+def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, long_scene, link):
     """It ended the whole ground with the code that keeps systemd from starting it again."""
     ground = link.ground(
         *ANALYSES, "--once", "--record", str(small_disk), "--tracks", ".", "--timing", "timing.csv"
     )
-    flown = edges(link, scene)
+    flown = edges(link, long_scene)
     for name in EDGES:
         ground.until(f"recording of {name} FAILED at", within_s=120)
-        assert ground.said.count(f"hvt-ground: recording of {name}: recording {small_disk}") == 1, "said once"
-    before = {path: path.read_bytes() for path in small_disk.glob("*.rrd")}
-    assert len(before) == 2
+    firsts = [min(small_disk.glob(f"hvt-{name}-*.rrd"), key=lambda one: len(one.name)) for name in EDGES]
+    before = {path: path.read_bytes() for path in firsts}
     (small_disk / "ballast").unlink()
     for name in EDGES:
         ground.until(f"recording of {name}: works again", within_s=60)
-    eventually(lambda: len(list(small_disk.glob("*.rrd"))) == 4, within_s=20, what="each has a second file")
     told = len(columns(link.folder / "timing.csv", "kind"))
     eventually(
         lambda: len(columns(link.folder / "timing.csv", "kind")) > told + 40, within_s=30, what="it flies on"
@@ -82,8 +80,10 @@ def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, scene, l
         assert (failed["part"], failed["working"]) == (f"recording of {name}", True)
         assert "No space left on device" in failed["reason"]
         assert failed["since"] <= failed["last"]
+        said = ground.said.count(f"hvt-ground: recording of {name}: recording {small_disk}")
+        assert 1 <= said <= 3, "once, or twice where it had found some room between"
         assert summary["missing_events"][f"recording of {name}"] > 0
-        first, second = map(Path, summary["recordings"])
+        first, *_, second = map(Path, summary["recordings"])
         assert first.read_bytes() == before[first], "what was recorded stays as it was"
         frames = [{frame for frame, *_ in Recording(path).video()} for path in (first, second)]
         assert len(frames[0]) > 10
@@ -96,12 +96,12 @@ def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, scene, l
     assert len(shown) == sum(summary["frames"] for summary in summaries), "no line of any message is missing"
 
 
-def test_a_folder_that_goes_in_flight_costs_what_is_written_there(scene, link):
+def test_a_folder_that_goes_in_flight_costs_what_is_written_there(long_scene, link):
     """A stick that was pulled out would end the flight, or all would be written to a file that is in no folder."""
     folder = link.folder / "tables"
     folder.mkdir()
     ground = link.ground(*ANALYSES, "--once", "--record", "flights", "--tracks", str(folder))
-    flown = edges(link, scene)
+    flown = edges(link, long_scene)
     eventually(lambda: len(list(folder.iterdir())) == 2, within_s=60, what="both tables are there")
     shutil.rmtree(folder)
     for name in EDGES:
@@ -114,7 +114,7 @@ def test_a_folder_that_goes_in_flight_costs_what_is_written_there(scene, link):
     for name, summary in zip(EDGES, ground.finish(within_s=30), strict=True):
         (failed,) = summary["failed"]
         assert (failed["part"], failed["working"]) == (f"tracks table of {name}", True)
-        assert "it was removed" in failed["reason"]
+        assert "cannot be written any further: it was removed" in ground.said
         (recording,) = summary["recordings"]
         assert len(Recording(link.folder / recording).video()) == summary["frames_decoded"], "all of it"
         assert verified(link.folder / recording)

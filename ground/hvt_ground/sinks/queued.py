@@ -158,10 +158,10 @@ class QueuedSink(Generic[T]):
                 sink.log(item)
             sink.close(self._hurry)
         except Exception as error:  # noqa: BLE001 - whatever it is, everything else goes on
-            self._fail(error)
             if sink is not None:
                 with suppress(Exception):
                     sink.close(_AT_ONCE)
+            self._fail(error)
             return False
         return True
 

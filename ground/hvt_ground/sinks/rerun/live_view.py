@@ -57,6 +57,11 @@ class LiveView:
         self._lock = threading.Lock()
         self._process = self._start()
 
+    @property
+    def pid(self) -> int:
+        """The viewer's process."""
+        return self._process.pid
+
     def start_again(self) -> None:
         """Start the web viewer where it has ended; a native window is its user's to open."""
         with self._lock:
