@@ -30,7 +30,7 @@ from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetect
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
-from hvt_ground.sinks import Outputs, QueuedSink, Sink
+from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.timing import SessionTiming, timing_table
@@ -38,7 +38,7 @@ from hvt_ground.sinks.tracks_table import TrackTable
 
 __all__ = ["Models", "SessionFactory", "make_backlog_perception", "make_pipeline", "output_path"]
 
-S = TypeVar("S", bound=Sink[Any])
+S = TypeVar("S", bound=SinkWriter[Any])
 
 _LOCKSTEP_WAIT_S = 10.0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvt_ground.sinks.contract import Sink
+from hvt_ground.sinks.contract import Sink, SinkWriter
 from hvt_ground.sinks.queued import Outputs, QueuedSink
 
-__all__ = ["Outputs", "QueuedSink", "Sink"]
+__all__ = ["Outputs", "QueuedSink", "Sink", "SinkWriter"]

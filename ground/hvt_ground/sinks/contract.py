@@ -1,4 +1,4 @@
-"""What a sink is. Each is used by one thread, that of its `QueuedSink`."""
+"""What a sink is, for those that log, and what a `QueuedSink` writes to in its own thread."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 from hvt_ground.events import Refinement, VideoSample
 
-__all__ = ["Sink", "size_bytes"]
+__all__ = ["Sink", "SinkWriter", "size_bytes"]
 
 T_contra = TypeVar("T_contra", contravariant=True)
 
@@ -16,20 +16,24 @@ _SMALL_BYTES = 512
 
 
 class Sink(Protocol[T_contra]):
-    """Takes the events of one session, or other items, and uses those that it knows. What it raises ends it."""
+    """Takes the events of one session, or other items, and uses those that it knows."""
+
+    def log(self, item: T_contra) -> None:
+        """Take an item."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Write what is buffered; what only helps and may take seconds is left out once ``hurry`` is set."""
+
+
+class SinkWriter(Sink[T_contra], Protocol[T_contra]):
+    """A sink that one thread uses. What it raises ends it."""
 
     @property
     def path(self) -> Path | None:
         """The file; None without one."""
 
-    def log(self, item: T_contra) -> None:
-        """Write an item."""
-
     def skipped(self, count: int) -> None:
         """So many items were left out before the next one."""
-
-    def close(self, hurry: threading.Event | None = None) -> None:
-        """Write what is buffered; what only helps and may take seconds is left out once ``hurry`` is set."""
 
 
 def size_bytes(item: object) -> int:

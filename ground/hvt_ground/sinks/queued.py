@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
-from hvt_ground.sinks.contract import Sink, size_bytes
+from hvt_ground.sinks.contract import SinkWriter, size_bytes
 
 __all__ = ["Outputs", "QueuedSink"]
 
@@ -39,7 +39,7 @@ class QueuedSink(Generic[T]):
     def __init__(
         self,
         part: str,
-        open_sink: Callable[[], Sink[T]],
+        open_sink: Callable[[], SinkWriter[T]],
         *,
         failures: Failures,
         wait_s: float = 0.0,
@@ -146,7 +146,7 @@ class QueuedSink(Generic[T]):
 
     def _use(self) -> bool:
         """Make the sink and write until the end; False where that failed."""
-        sink: Sink[T] | None = None
+        sink: SinkWriter[T] | None = None
         try:
             sink = self._open_sink()
             self._begin(sink)
@@ -165,7 +165,7 @@ class QueuedSink(Generic[T]):
             return False
         return True
 
-    def _begin(self, sink: Sink[T]) -> None:
+    def _begin(self, sink: SinkWriter[T]) -> None:
         if sink.path is not None:
             self.files.append(sink.path)
         with self._changed:
@@ -211,7 +211,12 @@ class Outputs:
         self._lock = threading.Lock()
 
     def open(
-        self, part: str, open_sink: Callable[[], Sink[T]], *, wait_s: float = 0.0, for_backlog: bool = False
+        self,
+        part: str,
+        open_sink: Callable[[], SinkWriter[T]],
+        *,
+        wait_s: float = 0.0,
+        for_backlog: bool = False,
     ) -> QueuedSink[T]:
         """A sink behind a queue (`QueuedSink`)."""
         sink = QueuedSink(part, open_sink, failures=self._failures, wait_s=wait_s, for_backlog=for_backlog)

@@ -52,8 +52,6 @@ class SessionTiming:
     ``table`` takes them; it is not closed with this.
     """
 
-    path = None
-
     def __init__(self, table: Sink[str], *, edge: str, session_id: int) -> None:
         self._table = table
         self._whose = (edge, f"{session_id:016x}")
@@ -75,9 +73,6 @@ class SessionTiming:
                 self._unread[item.sequence] = item
                 if len(self._unread) > _MOST_UNREAD:
                     self._write(self._unread.pop(next(iter(self._unread))), handled_ns=0)
-
-    def skipped(self, count: int) -> None:
-        """Others' lines."""
 
     def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
         """What was not read, never will be."""
