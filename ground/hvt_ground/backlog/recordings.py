@@ -44,7 +44,11 @@ class BacklogRecording:
         self.sink.close()
 
     def _read(self, still: ReceivedStill) -> None:
-        self._perception.read(still, emit=self.sink.log)
+        self._perception.read(still, emit=self._emit)
+
+    def _emit(self, event: Event) -> None:
+        self.backlog.note(event)
+        self.sink.log(event)
 
 
 class BacklogRecordings:

@@ -421,5 +421,6 @@ class GroundSession:
         )
 
     def _emit(self, event: Event) -> None:
+        self.backlog.note(event)
         for sink in self.sinks:
             sink.log(event)

@@ -42,6 +42,8 @@ from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
 
+FIRST_STORED = 2**31
+
 
 def wait_for(condition, *, timeout_s: float = 30) -> None:
     """Poll until true; a test that waits in vain fails here."""
@@ -338,6 +340,33 @@ def test_a_still_on_both_ways_is_shown_once(flight, tmp_path):
         assert rig.reported().missing_stills == ()
     texts = [text for _, _, text in Recording(tmp_path / "0.rrd").events() if text.startswith("still #")]
     assert sorted(text[:8] for text in texts) == ["still #0", "still #1", "still #2"]
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["open session", "former session"])
+def test_stills_of_an_outage_name_the_tracks_of_its_video(flight, tmp_path, own):
+    """They "matched no track", although the boxes of the outage stand beside them in the recording."""
+    stored = flight if own else Flight(80, keyframes=(40,))
+    with Rig(tmp_path, flight) as rig:
+        rig.base(*range(25))
+        if own:
+            rig.base(*range(65, 75))
+        rig.put(*chunks(stored.session_id, "info", 0, info_object(stored)))
+        still = still_object(stored, 45, FIRST_STORED + 3)
+        rig.put(*chunks(stored.session_id, "still", FIRST_STORED + 3, still))
+        video = video_object(stored, range(40, 60))
+        rig.put(*chunks(stored.session_id, "base", 40, video))
+    recording = Recording(tmp_path / ("0.rrd" if own else "backlog-0.rrd"))
+    texts = [(frame, text) for frame, _, text in recording.events() if "late still #3" in text]
+    assert [frame for frame, _ in texts] == [45, 45]
+    assert "late still #3 of edge track 1: car → bus .90" in texts[0][1]
+    assert f"late still #3 → track {FIRST_TRACK_ID}: car → bus .90" in texts[1][1]
+    before, after = (recording.boxes(frame)[FIRST_TRACK_ID] for frame in (43, 50))
+    assert (before.class_after, before.refined) == ("car", False)
+    assert (after.class_after, after.refined, after.label) == (
+        "bus",
+        True,
+        f"{FIRST_TRACK_ID} car → bus .90",
+    )
 
 
 def test_a_still_at_a_frame_that_is_known_speaks_on_its_track(flight, tmp_path):
