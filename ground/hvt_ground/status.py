@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from operator import itemgetter
 from typing import Any
 
 from hvt_common.runtime.failures import Failures
-from hvt_common.units import SECOND_NS, bitrate_text
+from hvt_common.units import SECOND_NS, bitrate_text, counts_text
 from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
@@ -35,20 +34,14 @@ def status_text(edges: Iterable[tuple[str, EdgeSessions]], *, failures: Failures
         latency_ms = session.overlay_latency.percentile(50)
         age = "" if latency_ms is None or session.lockstep else f"  {latency_ms:.0f} ms"
         total = session.ledger.summary(session.duration_s).total_bps
+        not_sent = f" (not sent: {counts_text(session.not_sent, most=2)})" if session.not_sent else ""
         parts.append(
             f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
-            f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}{_held_back(session)}  "
+            f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}{not_sent}  "
             f"tracks {session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
             + "".join(f"  {text}" for text in failed_texts(sessions.failures))
         )
     return " | ".join(parts + failed_texts(failures))
-
-
-def _held_back(session: GroundSession) -> str:
-    """Why there are not more stills: the edge's most frequent reasons."""
-    status = session.last_status
-    most = sorted(status.outcomes.items(), key=itemgetter(1), reverse=True)[:2] if status else ()
-    return f" (not sent: {', '.join(f'{count} {reason}' for reason, count in most)})" if most else ""
 
 
 def summary(session: GroundSession) -> dict[str, Any]:
@@ -89,7 +82,7 @@ def summary(session: GroundSession) -> dict[str, Any]:
                 "received": account.outcomes["received"],
                 "dropped": dict(session.stills_dropped),
                 "outcomes": dict(pipeline.outcomes),
-                "not_sent": dict(session.last_status.outcomes) if session.last_status else {},
+                "not_sent": dict(session.not_sent),
             },
             "mean_bytes": round(account.roi_bytes / session.stills_received)
             if session.stills_received
@@ -166,10 +159,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     share = (
         f"{content['total_bps'] / max(1, content['budget_bps']):.0%} of {bitrate_text(content['budget_bps'])}"
     )
-    outcomes, not_sent = (
-        ", ".join(f"{name} {count}" for name, count in sorted(stills["reasons"][which].items()))
-        for which in ("outcomes", "not_sent")
-    )
+    outcomes, not_sent = (counts_text(stills["reasons"][which]) for which in ("outcomes", "not_sent"))
     lossless = (
         "no gaps" if not content["gaps"] else f"{content['gaps']} gaps, {content['lost']} messages lost"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 
@@ -25,7 +25,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.runtime.statistics import LatencyStats
 from hvt_common.transport.inbox import Received
-from hvt_common.units import SECOND_NS
+from hvt_common.units import SECOND_NS, counts_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
@@ -247,6 +247,8 @@ class GroundSession:
     def _note_end(self) -> None:
         if self.failure:
             self.note("error", f"the session failed: {self.failure}")
+        if self.not_sent:
+            self.note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}")
         self.note("info", f"session {self.info.session_id:016x} ended")
 
     # What is known of it
@@ -255,6 +257,11 @@ class GroundSession:
     def newest_index(self) -> int:
         """Frame index of the newest access unit; -1 before the first."""
         return self._last_index
+
+    @property
+    def not_sent(self) -> Mapping[str, int]:
+        """Why candidates have no still: the edge's counts, by reason."""
+        return {} if self.last_status is None else self.last_status.outcomes
 
     @property
     def duration_s(self) -> float:
