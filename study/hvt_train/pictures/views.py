@@ -26,6 +26,8 @@ _DAMAGE = {
     "thermal": (0.5, 0.15),
 }
 """Strength and how often the codec is bad. Base pictures have been through x265 already."""
+_SPECKLED = 0.3
+"""How often small blobs lie about: stones, litter, chipped paint, which are no people."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +83,14 @@ class ViewSource:
         view = _turned(view, rng)
         if kind == "thermal" and rng.random() < 0.4:  # cameras show heat black or white
             view = View(255 - view.image_bgr, view.boxes_px, view.class_ids)
+        if kind != "thermal" and rng.random() < _SPECKLED:
+            view = View(_speckled(view.image_bgr, rng), view.boxes_px, view.class_ids)
         strength, compress = _DAMAGE[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
+        if (
+            kind == "thermal"
+        ):  # the only pictures without colour: a white blob is a person there, and a stone elsewhere
+            image = np.repeat(image[..., 1:2], 3, axis=2)
         return View(image, view.boxes_px, view.class_ids)
 
     def _cropped(self, picture: Picture, scale: float) -> View:
@@ -216,7 +224,7 @@ def _lit(image: Image, rng: _Rng, strength: float) -> Image:
     image = np.asarray(cv2.LUT(image, table), np.uint8)
     if rng.random() < 0.5:
         grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
-        colour = 0.0 if rng.random() < 0.08 else float(rng.uniform(0.3, 1.5))
+        colour = float(rng.uniform(0.3, 1.5))
         image = np.asarray(cv2.addWeighted(image, colour, grey, 1 - colour, 0), np.uint8)
     if rng.random() < 0.2 * strength:  # light that falls off across the picture
         side = len(image)
@@ -233,6 +241,19 @@ def _noisy(image: Image, rng: _Rng) -> Image:
     if rng.random() < 0.3:
         grain = np.asarray(cv2.GaussianBlur(grain, (0, 0), 0.8), np.float32).reshape(side, side, -1) * 2
     return np.asarray((image + grain).clip(0, 255), np.uint8)
+
+
+def _speckled(image: Image, rng: _Rng) -> Image:
+    """Blobs of 1 to 6 pixels, lighter or darker than the ground, without a shadow."""
+    side, layer = len(image), np.zeros(image.shape[:2], np.float32)
+    bright = rng.random() < 0.75
+    for _ in range(int(rng.integers(4, 60))):
+        middle = (int(rng.integers(0, side)), int(rng.integers(0, side)))
+        axes = (int(rng.integers(0, 4)), int(rng.integers(0, 4)))
+        depth = float(rng.uniform(15, 120)) * (1 if bright or rng.random() < 0.2 else -1)
+        cv2.ellipse(layer, middle, axes, float(rng.uniform(0, 180)), 0, 360, depth, -1)
+    soft = np.asarray(cv2.GaussianBlur(layer, (0, 0), float(rng.uniform(0.4, 1.0))), np.float32)
+    return np.asarray((image + soft[..., None]).clip(0, 255), np.uint8)
 
 
 def _lettered(image: Image, rng: _Rng) -> Image:
