@@ -130,7 +130,7 @@ def _thermal(data: Path) -> Iterator[_Labelled]:
 
 
 def _road(data: Path) -> Iterator[_Labelled]:
-    """Madison: vehicles, of which the small ones count as cars, and the people that we marked (``madison_people.csv``).
+    """Madison: vehicles, the small ones as cars, and the people that we marked (``madison_people.csv``).
 
     Only pictures of views that hover long enough to tell what moves are taken: there, who walks is marked.
     """

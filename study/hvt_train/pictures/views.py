@@ -89,7 +89,7 @@ class ViewSource:
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
         if (
             kind == "thermal"
-        ):  # the only pictures without colour: a white blob is a person there, and a stone elsewhere
+        ):  # alone without colour: a white blob is a person there, a stone elsewhere
             image = np.repeat(image[..., 1:2], 3, axis=2)
         return View(image, view.boxes_px, view.class_ids)
 
