@@ -147,11 +147,11 @@ def _scale(kind: str, rng: _Rng) -> float:
     if kind == "demo" and draw < 0.45:
         return float(rng.uniform(0.8, 1.25))
     low, high = {
-        "demo": (0.3, 1.6),
+        "demo": (0.3, 2.6),
         "base": (0.35, 1.3),
         "place": (0.26, 1.2),
         "kit": (0.6, 2.6),
-        "road": (0.25, 1.7),
+        "road": (0.25, 3.2),
         "thermal": (0.6, 1.9),
     }[kind]
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
