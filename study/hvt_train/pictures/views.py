@@ -149,7 +149,7 @@ def _scale(kind: str, rng: _Rng) -> float:
     low, high = {
         "demo": (0.3, 2.6),
         "base": (0.35, 1.3),
-        "place": (0.26, 1.2),
+        "place": (0.26, 2.2),
         "kit": (0.6, 2.6),
         "road": (0.25, 3.2),
         "thermal": (0.6, 1.9),
