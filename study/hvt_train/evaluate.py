@@ -26,6 +26,7 @@ __all__ = [
     "evaluate_drawn",
     "evaluate_real",
     "overlaps",
+    "well_visible",
 ]
 
 CLEAN = 0
@@ -107,12 +108,17 @@ def evaluate_drawn(detector: Detector, pictures: Sequence[Picture]) -> DrawnResu
     return DrawnResult(by_class, count)
 
 
+def well_visible(picture: Picture) -> npt.NDArray[np.bool_]:
+    """(N,) which objects are asked for; the others count neither for nor against."""
+    sides = (picture.boxes_px[:, 2:] - picture.boxes_px[:, :2]).max(1, initial=0)
+    return np.asarray((picture.visible >= _LEAST_VISIBLE) & (sides >= _LEAST_SIDE_PX))
+
+
 def _matches(
     picture: Picture, found: Detections, kind: int, kind_found: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_], int]:
     """Scores, hits and number of objects of one class in one picture; greedy, best first, each object once."""
-    sides = (picture.boxes_px[:, 2:] - picture.boxes_px[:, :2]).max(1)
-    counts = (picture.visible >= _LEAST_VISIBLE) & (sides >= _LEAST_SIDE_PX)
+    counts = well_visible(picture)
     mine = picture.class_ids == kind
     wanted, ignored = picture.boxes_px[mine & counts], picture.boxes_px[~counts]
     rows = found.class_ids == kind_found

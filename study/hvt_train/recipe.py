@@ -20,14 +20,16 @@ from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_common.inference.store import embedded_models
 from hvt_scene.drawing.vehicles import CLASS_NAMES
-from hvt_train.evaluate import CLEAN, drawn_pictures, evaluate_drawn
+from hvt_train.evaluate import CLEAN, drawn_pictures, evaluate_drawn, well_visible
+from hvt_train.learning.calibration import fit_calibration
 from hvt_train.learning.classifier import export_classifier, train_classifier
+from hvt_train.learning.detector import DetectorNet
 from hvt_train.learning.export import metadata
 from hvt_train.learning.loop import LoopSettings
 from hvt_train.learning.train_detector import export_detector, train_detector
 from hvt_train.pictures.crops import CropSource, held_out_crops, pool_crops, real_crops, scene_crops
 from hvt_train.pictures.pool import PoolPlan, fill_pool
-from hvt_train.pictures.real import fill_real
+from hvt_train.pictures.real import HeldOut, fill_real, held_out_pictures
 from hvt_train.pictures.views import ViewSettings
 
 __all__ = ["run_recipe"]
@@ -85,6 +87,28 @@ def _detector(arguments: argparse.Namespace, pool: list[Path]) -> None:
         check=best.check,
         start=_started(arguments, DETECTOR),
     )
+    if arguments.real is not None:
+        _calibrate(arguments)
+
+
+def _calibrate(arguments: argparse.Namespace) -> None:
+    """Export the best weights again, with scores that say how often a box is right on what was held out."""
+    path = (arguments.out / DETECTOR).with_suffix(".onnx")
+    net = DetectorNet(len(CLASS_NAMES))
+    net.load_state_dict(torch.load(path.with_suffix(".pt")))
+    detector = open_detector(str(path), confidence=0.02, threads=arguments.threads)
+    drawn = drawn_pictures(_VALIDATION, moments=1, bitrates_bps=(CLEAN, 400_000)).values()
+    scenes = (
+        HeldOut(one.image_bgr, one.boxes_px[clear], one.boxes_px[~clear], frozenset(CLASS_NAMES))
+        for group in drawn
+        for one in group
+        for clear in [well_visible(one)]
+    )
+    found = fit_calibration(detector, [*held_out_pictures(arguments.real), *scenes])
+    properties = _properties(DETECTOR, arguments.seed) | {
+        "hvt.calibration": f"{found.slope:.4f} {found.shift:.4f}"
+    }
+    export_detector(net, path, properties=properties, calibration=found)
 
 
 def _classifier(arguments: argparse.Namespace, pool: list[Path]) -> None:

@@ -90,16 +90,24 @@ class DetectorNet(nn.Module):
 
 
 class ExportedDetector(nn.Module):
-    """What goes into the ONNX file: the maps as YOLOX's raw head (N, A, 5 + C), scores as probabilities."""
+    """What goes into the ONNX file: the maps as YOLOX's raw head (N, A, 5 + C), scores as probabilities.
 
-    def __init__(self, net: DetectorNet) -> None:
+    ``slope`` and ``shift`` are those of a `calibration.Calibration`: objectness times the likeliest class is the
+    calibrated score.
+    """
+
+    def __init__(self, net: DetectorNet, *, slope: float = 1.0, shift: float = 0.0) -> None:
         super().__init__()
-        self.net = net
+        self.net, self.slope, self.shift = net, slope, shift
 
     def forward(self, images: Tensor) -> Tensor:
         """(N, 3, H, W) to (N, A, 5 + C), stride by stride, row by row."""
         rows = torch.cat([level.flatten(2) for level in self.net(images)], dim=2).transpose(1, 2)
-        return torch.cat([rows[..., :4], rows[..., 4:].sigmoid()], dim=2)
+        objectness, classes = rows[..., 4:5].sigmoid(), rows[..., 5:].sigmoid()
+        best = classes.amax(dim=2, keepdim=True)
+        score = (objectness * best).clamp(1e-6, 1 - 1e-6)
+        true = (self.slope * (score / (1 - score)).log() + self.shift).sigmoid()
+        return torch.cat([rows[..., :4], (true / best).clamp(max=1.0), classes], dim=2)
 
 
 def _doubled(x: Tensor) -> Tensor:

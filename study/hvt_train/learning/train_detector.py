@@ -12,6 +12,7 @@ from torch import nn
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from hvt_scene.drawing.vehicles import CLASS_NAMES
+from hvt_train.learning.calibration import NONE, Calibration
 from hvt_train.learning.detector import DetectorNet, ExportedDetector
 from hvt_train.learning.export import export_onnx
 from hvt_train.learning.loop import LoopSettings, Loss, train
@@ -94,10 +95,12 @@ def train_detector(
     return trained
 
 
-def export_detector(net: DetectorNet, path: Path, *, properties: dict[str, str]) -> None:
+def export_detector(
+    net: DetectorNet, path: Path, *, properties: dict[str, str], calibration: Calibration = NONE
+) -> None:
     """Write the ONNX file: (1, 3, H, W) BGR 0…255 in, YOLOX's raw head out, H and W free multiples of 32."""
     export_onnx(
-        ExportedDetector(net),
+        ExportedDetector(net, slope=calibration.slope, shift=calibration.shift),
         path,
         example=torch.zeros(1, 3, 256, 320),
         free={"images": {2: "height", 3: "width"}, "output": {1: "cells"}},

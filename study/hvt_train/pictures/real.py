@@ -11,6 +11,7 @@ import csv
 import json
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import BASE_SIZE, save_picture
 
-__all__ = ["LARGE_VEHICLE", "SETS", "fill_real"]
+__all__ = ["LARGE_VEHICLE", "SETS", "HeldOut", "fill_real", "held_out_pictures"]
 
 LARGE_VEHICLE = -2
 _ID = {name: number for number, name in enumerate(CLASS_NAMES)}
@@ -39,6 +40,20 @@ _FPS, _CODED_FRAMES = 15.0, 6
 _CODED_SHARE = 0.65
 _BORDER_PX = 26  # Madison leaves out vehicles that the border cuts
 _LARGE_PX = 128  # a car is 96 pixels long there, one in twenty vehicles longer than 118
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """A picture as the detector gets it, with its labels."""
+
+    image_bgr: Image
+    boxes_px: npt.NDArray[np.float32]
+    """(N, 4) x1 y1 x2 y2."""
+    ignored_px: npt.NDArray[np.float32]
+    """(M, 4); boxes on them count neither way."""
+    judged: frozenset[str]
+    """Class names that the picture labels; boxes of others count neither way."""
+
 
 _Labelled = tuple[Path, npt.NDArray[np.float32], npt.NDArray[np.int32]]
 
@@ -106,14 +121,14 @@ def _pairs(root: Path) -> Iterator[tuple[Path, npt.NDArray[np.float64]]]:
             yield path, _yolo(label, (image.shape[1], image.shape[0]))
 
 
-def _kit(data: Path) -> Iterator[_Labelled]:
+def _kit(data: Path, *, held_out: bool = False) -> Iterator[_Labelled]:
     """KIT AIS: all vehicles. A person there is three pixels long, too small to be asked for."""
     for path, rows in _pairs(data / "kit_ais"):
-        if not path.name.startswith(_KIT_HELD_OUT):
+        if path.name.startswith(_KIT_HELD_OUT) == held_out:
             yield path, rows[:, 1:].astype(np.float32), np.array([_KIT[int(k)] for k in rows[:, 0]], np.int32)
 
 
-def _thermal(data: Path) -> Iterator[_Labelled]:
+def _thermal(data: Path, *, held_out: bool = False) -> Iterator[_Labelled]:
     """HIT-UAV: everything is labelled. The flights that judge, and those held out, are left out by date."""
     for part in ("train", "val", "test"):
         about = json.loads((data / "hit_uav" / "annotations" / f"{part}.json").read_text())
@@ -121,7 +136,8 @@ def _thermal(data: Path) -> Iterator[_Labelled]:
         for row in about["annotation"]:
             boxes.setdefault(row["image_id"], []).append([row["category_id"], *row["bbox"]])
         for picture in about["images"]:
-            if picture["date_captured"] in _HIT_JUDGES | _HIT_HELD_OUT:
+            date = picture["date_captured"]
+            if date in _HIT_JUDGES or (date in _HIT_HELD_OUT) != held_out:
                 continue
             rows = np.array(boxes.get(picture["id"], []), np.float32).reshape(-1, 5)
             corners = np.hstack([rows[:, 1:3], rows[:, 1:3] + rows[:, 3:5]])
@@ -152,6 +168,20 @@ def _road(data: Path) -> Iterator[_Labelled]:
         edge += [[0, 0, _BORDER_PX, high], [wide - _BORDER_PX, 0, wide, high]]
         boxes = np.array([*vehicles.tolist(), *[box for _, box in people], *edge], np.float32)
         yield path, boxes, np.array([*kinds, *[kind for kind, _ in people], -1, -1, -1, -1], np.int32)
+
+
+def held_out_pictures(data: Path) -> Iterator[HeldOut]:
+    """Flights and sequences that training never sees, as the base stream would show them."""
+    vehicles = frozenset({"car", "van", "truck", "bus"})
+    sets = ((_kit, vehicles, 3), (_thermal, vehicles | {"pedestrian", "motor"}, 4))
+    for read, judged, every in sets:
+        for path, boxes, kinds in list(read(data, held_out=True))[::every]:
+            image = cv2.imread(str(path))
+            assert image is not None, path
+            scale = min(BASE_SIZE[0] / image.shape[1], BASE_SIZE[1] / image.shape[0])
+            how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+            base = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=how), np.uint8)
+            yield HeldOut(base, boxes[kinds != -1] * scale, boxes[kinds == -1] * scale, judged)
 
 
 SETS: dict[str, Callable[[Path], Iterator[_Labelled]]] = {"kit": _kit, "thermal": _thermal, "road": _road}

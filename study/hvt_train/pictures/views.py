@@ -87,9 +87,7 @@ class ViewSource:
             view = View(_speckled(view.image_bgr, rng), view.boxes_px, view.class_ids)
         strength, compress = _DAMAGE[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
-        if (
-            kind == "thermal"
-        ):  # alone without colour: a white blob is a person there, a stone elsewhere
+        if kind == "thermal":  # alone without colour: a white blob is a person there, a stone elsewhere
             image = np.repeat(image[..., 1:2], 3, axis=2)
         return View(image, view.boxes_px, view.class_ids)
 
