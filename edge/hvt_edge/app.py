@@ -22,11 +22,11 @@ from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating.point import LoopClock
 from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.perception.guarded_detector import GuardedDetector
-from hvt_edge.source.closing import closing_on
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
+from hvt_edge.source.live import closing_on
 from hvt_edge.status import StatusReporter
-from hvt_edge.summary import EdgeRun, summary
+from hvt_edge.summary import summary
 from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store
 from hvt_edge.world import World
 
@@ -128,7 +128,7 @@ class Edge:
             finally:
                 stages.stills.close()
                 self._say_goodbye(stages, link, status)
-        return summary(self._facts(stages, link), self.ledger)
+        return self._summary(stages, link)
 
     def _play(
         self, source: Source, stages: Stages, link: EdgeLink, status: StatusReporter, line: StatusLine
@@ -231,10 +231,11 @@ class Edge:
                 timeout_s=_GOODBYE_S,
             )
 
-    def _facts(self, stages: Stages, link: EdgeLink) -> EdgeRun:
+    def _summary(self, stages: Stages, link: EdgeLink) -> dict[str, Any]:
         counts, config, backlog, now = self._counts, self._config, stages.backlog, stages.operating.now
         stored = 0 if backlog is None else backlog.frames
-        return EdgeRun(
+        return summary(
+            self.ledger,
             edge=config.edge_id,
             session=f"{self._world.session_id:016x}",
             method=now.method,
@@ -247,7 +248,7 @@ class Edge:
             cores=counts.cpu.short,
             duration_s=counts.duration_s(config.nominal_fps),
             budget_bps=now.highest_budget_bps,
-            base_bps=now.base_bps,
+            budget_base_bps=now.base_bps,
             keyframes=stages.keyframes.sent,
             keyframe_requests=stages.keyframes.served,
             tracks=stages.stills.analyzer.tracks,

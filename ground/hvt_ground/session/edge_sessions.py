@@ -114,6 +114,11 @@ class EdgeSessions:
         """Messages that were skipped: damaged, foreign, or of another version."""
         return self._receiver.unusable
 
+    @property
+    def silent_s(self) -> float:
+        """For how long nothing has come."""
+        return self._receiver.silent_ns / _SECOND_NS
+
     def work(self, item: Received | None, *, pending: bool) -> None:
         """Take one message, if there is one, and do what is due; ``pending``: more wait. It never raises."""
         try:
@@ -148,6 +153,8 @@ class EdgeSessions:
                 session.note("warning", "keyframe requested")
         if session is None:
             return
+        if session.take_resumed():
+            self.port.request_keyframe()
         session.raise_error()
         session.count(self._receiver.counters.since(self._counted))
         paused = self._backlog_ns is not None and now_ns - self._backlog_ns > _BACKLOG_PAUSE_NS

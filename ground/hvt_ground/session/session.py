@@ -5,10 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.clock_offset import ClockOffset
@@ -26,7 +25,7 @@ from hvt_common.protocol.messages import (
     TrackStepDecoder,
 )
 from hvt_common.transport.inbox import Received
-from hvt_common.units import SECOND_NS
+from hvt_common.units import SECOND_NS, counts_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
@@ -39,7 +38,7 @@ from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.session.receiver_report import ReceiverReports
-from hvt_ground.sinks import Sink
+from hvt_ground.sinks import QueuedSink, Sink
 
 __all__ = ["GroundSession", "WorkerFactory"]
 
@@ -57,25 +56,23 @@ class GroundSession:
 
     In real time the worker passes over what comes too fast. In lockstep nothing is skipped, and the same input
     gives the same tracks. ``pipeline_of`` and ``worker_of`` make perception and its worker; without ``reports``
-    nothing is reported, and the edge's clock is this one (Unix nanoseconds without steps). ``recording`` is the
-    recording's file, for the summary.
+    nothing is reported, and the edge's clock is this one (Unix nanoseconds without steps).
     """
 
     def __init__(
         self,
         info: Info,
         *,
-        sinks: Sequence[Sink] = (),
+        sinks: Sequence[Sink[Event]] = (),
         pipeline_of: Callable[[Callable[[Event], None]], Pipeline],
         clock: Callable[[], int],
         reports: ReceiverReports | None = None,
-        recording: Path | None = None,
         backlog_perception: BacklogPerception | None = None,
         worker_of: WorkerFactory | None = None,
     ) -> None:
-        self._sinks = sinks
+        self.sinks = sinks
+        self._queued = [one for one in sinks if isinstance(one, QueuedSink)]
         self.info = info
-        self.recording = recording
         self.lockstep = info.pace == "lockstep"
         self._clock_offset = ClockOffset() if reports is None else reports.clock_offset
         self._account = SessionAccount(info, clock=clock, clock_offset=self._clock_offset, emit=self._emit)
@@ -119,6 +116,7 @@ class GroundSession:
             perception=backlog_perception,
             read=lambda still: self._read([still]),
             stills=self._still_window,
+            able=lambda: all(one.is_open() for one in self._queued if one.for_backlog),
         )
         """What of this session was stored at the edge while the link was down."""
 
@@ -238,7 +236,7 @@ class GroundSession:
         Raises what went wrong on the way, or ended the worker.
         """
         with ExitStack() as stack:
-            for sink in self._sinks:
+            for sink in self.sinks:
                 stack.callback(sink.close)
             stack.callback(self._note_end)
             stack.callback(self._decoder.reset)
@@ -254,6 +252,8 @@ class GroundSession:
     def _note_end(self) -> None:
         if self.failure:
             self.note("error", f"the session failed: {self.failure}")
+        if self.not_sent:
+            self.note("info", f"stills that the edge did not send: {counts_text(self.not_sent)}")
         self.note("info", f"session {self.info.session_id:016x} ended")
 
     # What is known of it
@@ -262,6 +262,11 @@ class GroundSession:
     def newest_index(self) -> int:
         """Frame index of the newest access unit; -1 before the first."""
         return self._last_index
+
+    @property
+    def not_sent(self) -> Mapping[str, int]:
+        """Why candidates have no still: the edge's counts, by reason."""
+        return {} if self.last_status is None else self.last_status.outcomes
 
     @property
     def duration_s(self) -> float:
@@ -299,6 +304,11 @@ class GroundSession:
     def idle(self) -> bool:
         """Nothing waits to be analyzed."""
         return self.worker.idle
+
+    def take_resumed(self) -> bool:
+        """Whether a recording goes on after a gap, and waits for a keyframe; True once."""
+        resumed = [one.take_resumed() for one in self._queued]
+        return any(resumed)
 
     def raise_error(self) -> None:
         """Raise what went wrong while analyzing."""
@@ -360,5 +370,6 @@ class GroundSession:
     # Events
 
     def _emit(self, event: Event) -> None:
-        for sink in self._sinks:
+        self.backlog.note(event)
+        for sink in self.sinks:
             sink.log(event)
