@@ -36,12 +36,12 @@ def summary(
     stills["reasons"] = reasons
     stills["mean_bytes"] = round(account.roi_bytes / on_roi) if on_roi else 0
     stills["per_minute"] = round(60 * stills["sent"] / duration_s, 2) if duration_s else 0.0
-    rates = ("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes")
-    rates += ("total_bps", "base_bps", "roi_bps")
+    totals = [f"{name}_bytes" for name in ("base", "roi", "backlog", "meta", "overhead")]
+    totals += ["total_bps", "base_bps", "roi_bps"]
     return {
         **{name: round(fact, 2) if isinstance(fact, float) else fact for name, fact in facts.items()},
         "duration_s": round(duration_s, 3),
-        **{name: getattr(account, name) for name in rates},
+        **{name: getattr(account, name) for name in totals},
         "worst_window_bps": asdict(account.worst_window_bps),
         "stills": stills,
         "cores_needed": round(cores.needed, 2),
