@@ -58,6 +58,8 @@ class Edge:
         self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep)
         self._counts = FrameCounts()
         self._failures = self._world.failures
+        self._reached = False
+        """Whether anybody has subscribed to the video."""
         self.ledger = Ledger(window_ns=config.window_ns)
         """Every byte that left."""
 
@@ -69,13 +71,13 @@ class Edge:
         config, world = self._config, self._world
         check_files(config)
         check_codecs(config)
-        background = (lambda call: call()) if self._lockstep else with_lower_priority
-        opened = background(lambda: world.open_detector(config))
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
+            background = (lambda call: call()) if self._lockstep else with_lower_priority
+            opened = background(lambda: world.open_detector(config))
             background(lambda: world.warm_up(config, opened, source))
             detector: FailingDetector = opened
             if not self._lockstep:  # whose result would be of something else
@@ -149,6 +151,7 @@ class Edge:
                 if now_ns >= next_status_ns:
                     next_status_ns = now_ns + SECOND_NS
                     status.send("running")
+                    self._reached |= link.has_subscriber(Channel.BASE)
                     line.show(status.line(self._link_text(stages, link)))
                     if stages.reconfiguration.wants_keyframe(now_ns):
                         stages.keyframes.require(now_ns)
@@ -218,6 +221,7 @@ class Edge:
         if stages.backlog is not None:
             stages.backlog.send_no_more()
         status.send("ended")
+        self._reached |= link.has_subscriber(Channel.BASE)
         if link.has_ground():  # what is still in a queue would be lost with the session
             self._world.inbox.wait_for_end(
                 base=self.ledger.messages(Account.BASE),
@@ -251,6 +255,7 @@ class Edge:
             encode_ms=counts.encode_ms,
             perception_ms=stages.stills.analyzer.mean_ms,
             unusable_messages=link.unusable,
+            unreached="" if self._reached else link.trouble or "nobody subscribed to its video",
             store=None if backlog is None else backlog.numbers,
             failed=self._failures.parts,
         )

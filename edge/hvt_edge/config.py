@@ -225,7 +225,7 @@ class EdgeConfig:
     )
 
     ring: int = _FILES_RARE.option(
-        BYTES, 256_000_000, "memory for source frames, from which stills are served on demand; 0 for none"
+        BYTES, 24_000_000, "memory for source frames, from which stills are served on demand; 0 for none"
     )
     ring_time: float = _FILES_RARE.option(
         DURATION, 5.0, "how far back those go; where memory is short, with frames left out"

@@ -12,7 +12,13 @@ from hvt_common.units import bitrate_text
 from hvt_edge.backlog.worker import StoreNumbers
 from hvt_edge.loop.cpu import Cores
 
-__all__ = ["summary", "table"]
+__all__ = ["summary", "table", "title"]
+
+
+_RATES = (
+    *("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes"),
+    *("total_bps", "base_bps", "roi_bps"),
+)
 
 
 def summary(
@@ -36,12 +42,10 @@ def summary(
     stills["reasons"] = reasons
     stills["mean_bytes"] = round(account.roi_bytes / on_roi) if on_roi else 0
     stills["per_minute"] = round(60 * stills["sent"] / duration_s, 2) if duration_s else 0.0
-    totals = [f"{name}_bytes" for name in ("base", "roi", "backlog", "meta", "overhead")]
-    totals += ["total_bps", "base_bps", "roi_bps"]
     return {
         **{name: round(fact, 2) if isinstance(fact, float) else fact for name, fact in facts.items()},
         "duration_s": round(duration_s, 3),
-        **{name: getattr(account, name) for name in totals},
+        **{name: getattr(account, name) for name in _RATES},
         "worst_window_bps": asdict(account.worst_window_bps),
         "stills": stills,
         "cores_needed": round(cores.needed, 2),
@@ -49,6 +53,12 @@ def summary(
         "store": None if store is None else asdict(store),
         "failed": [asdict(one) | {"failed_at": _clock_time(one.failed_ns)} for one in failed],
     }
+
+
+def title(content: dict[str, Any]) -> str:
+    """Of the table: it counts what would have been sent where nobody took it."""
+    sent = f"NOT SENT ({content['unreached']})" if content["unreached"] else "sent"
+    return f"{content['edge']}: {sent}"
 
 
 def table(content: dict[str, Any]) -> list[tuple[str, str]]:

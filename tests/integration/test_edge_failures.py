@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -103,6 +104,38 @@ def test_a_full_card_ends_the_local_copy_and_nothing_else(link, tmp_path):
             assert len(list(container.decode(video=0))) > 5
     said = [line for line in edge.said.splitlines() if "local copy" in line]
     assert len(said) <= 4, said
+    assert "Traceback" not in edge.said
+
+
+@pytest.mark.parametrize("how", ["full", "removed"])
+def test_a_store_that_fails_in_an_outage_costs_what_it_would_have_stored(link, tmp_path, how):
+    """A full card, or one that is pulled out while the link is down, would end the flight, or storing for good."""
+    scene = pictures(tmp_path / "clip", [int(90 + 80 * np.sin(index)) for index in range(1200)])
+    with small_disk(tmp_path / "card") as card:
+        (card / "old.bin").write_bytes(bytes(400_000))
+        store = ("--store", "10MB", "--store-folder", str(card / "store"))
+        settings = ("--wait", "0s", *SMALL, "--source", str(scene), "--detector", "motion", *store)
+        edge = link.edge(*settings, listens=True)
+        with joined(link.edge_endpoint) as session:
+            watcher = Watcher(session)
+            eventually(lambda: watcher.units or not edge.alive, within_s=SOON_S, what="video")
+        if how == "removed":
+            eventually((card / "store").exists, within_s=SOON_S, what="nobody watches: it is stored")
+            shutil.rmtree(card / "store")
+        edge.until("store: --store-folder")
+        with joined(link.edge_endpoint) as session:
+            watcher = Watcher(session)
+            eventually(lambda: watcher.failed("store"), within_s=SOON_S, what="status says so")
+            watcher.goes_on()
+            (card / "old.bin").unlink()
+            eventually(lambda: watcher.failed("store").working, within_s=SOON_S, what="it works again")
+            watcher.goes_on()
+        edge.stop()
+        (failed,) = edge.summary()["failed"]
+    assert failed["part"] == "store"
+    assert {"full": "no space is left", "removed": "removed, with all"}[how] in failed["reason"]
+    assert f"store at {failed['failed_at']}" in edge.told
+    assert edge.said.count("store: ") <= 3, edge.said
     assert "Traceback" not in edge.said
 
 

@@ -249,10 +249,11 @@ class Transmitter:
 
         0: another thread has taken the allowance since, and it was not sent.
         """
+        session_id, kind, number = chunk.key
         header = BacklogHeader(
-            session_id=chunk.session_id,
-            kind=chunk.kind,
-            number=chunk.number,
+            session_id=session_id,
+            kind=kind,
+            number=number,
             offset=chunk.offset,
             total_bytes=chunk.total_bytes,
             send_ns=now_ns,
