@@ -6,7 +6,6 @@ import csv
 import itertools
 import threading
 import time
-from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Self
