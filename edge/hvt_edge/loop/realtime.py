@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from types import TracebackType
 from typing import Self
 
 from hvt_common.runtime.failures import Failures
@@ -96,9 +95,7 @@ class RealtimePace:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._worker.close()
 
     def _drop(self, count: int) -> None:
