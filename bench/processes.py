@@ -44,7 +44,7 @@ class Peaks:
     def look(self) -> None:
         # Not ru_maxrss of a child, which begins with this process's own.
         for index, process in enumerate(self._processes):
-            with contextlib.suppress(OSError, AttributeError):  # it has ended
+            with contextlib.suppress(OSError, TypeError):  # it has ended
                 text = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii")
                 self.mb[index] = int(re.search(r"VmHWM:\s+(\d+)", text)[1]) / 1024
                 self.threads[index] = max(self.threads[index], int(re.search(r"Threads:\s+(\d+)", text)[1]))
