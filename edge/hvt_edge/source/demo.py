@@ -58,7 +58,7 @@ class DemoSource(Source):
     def __init__(self, *, size: BaseSize, fps: float, fit: Fit, seed: int, max_frames: int | None) -> None:
         if not entry_points(**_ENTRY):
             raise UserError("--source demo: no package installed here draws a scene; install hvt whole")
-        self._drawing = subprocess.Popen(
+        self._drawing = subprocess.Popen(  # noqa: S603 - our own module
             [sys.executable, "-m", __name__, str(seed)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
