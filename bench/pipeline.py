@@ -19,6 +19,7 @@ from bench.material import FPS, SIZE, clip, frames, nano
 from hvt_common import __version__
 from hvt_common.inference.detect import open_detector
 from hvt_common.protocol.messages import BaseHeader, Flags, Info
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_common.values import AccessUnit, View
 from hvt_common.video.hevc import BaseDecoder
@@ -28,6 +29,7 @@ from hvt_ground.config import GroundConfig
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import Arrival
 from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.wiring import Models, make_pipeline
 
@@ -94,9 +96,15 @@ def _ground(units: list[AccessUnit]) -> float:
     items = [_received(sequence, unit) for sequence, unit in enumerate(units)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.rrd"
+        sink = QueuedSink(
+            "recording",
+            lambda: Recorder(_recorder_settings(path, info)),
+            failures=Failures(time.time_ns),
+            wait_s=10.0,
+        )
         session = GroundSession(
             info,
-            sinks=[Recorder(_recorder_settings(path, info))],
+            sinks=[sink],
             pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
             clock=time.time_ns,
         )
@@ -106,6 +114,7 @@ def _ground(units: list[AccessUnit]) -> float:
             session.base(BasePacket(unit, item, on_time=True))
         took = time.perf_counter() - began
         session.close()
+        sink.join(time.monotonic() + 10.0)
     return took / len(items)
 
 

@@ -53,7 +53,7 @@ class Peaks:
         until_s = time.monotonic() + patience_s
         while process.poll() is None:
             if time.monotonic() > until_s:
-                raise RuntimeError(f"{process.args} has not ended within {patience_s:.0f} s")
+                raise RuntimeError(f"{process.args!r} has not ended within {patience_s:.0f} s")
             self.look()
             time.sleep(0.1)
 

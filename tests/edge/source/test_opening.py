@@ -291,6 +291,20 @@ def test_hidden_files_are_not_frames(tmp_path):
     assert [file.name for file in sequence_files(tmp_path)] == ["1.png"]
 
 
+def test_a_picture_that_goes_while_the_folder_plays_is_skipped(tmp_path):
+    """Somebody who tidies up would end the flight in a traceback."""
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), painted(number, size=(96, 64)))
+    with open_source(str(tmp_path), size=(96, 64), fps=10) as source:
+        frames = source.frames(start_ns=0)
+        first = next(frames)
+        (tmp_path / "2.png").unlink()
+        rest = list(frames)
+    means = [round(float(frame.source_bgr.mean())) for frame in (first, *rest)]
+    assert means[1] == means[2], "the one before is shown"
+    assert len(set(means)) == 3
+
+
 # -- demo ------------------------------------------------------------
 
 
