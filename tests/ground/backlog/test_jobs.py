@@ -36,7 +36,7 @@ def test_work_that_was_never_begun_lets_its_recording_go():
 
     perception = BacklogPerception(
         info,
-        checkout=models,
+        take_models=models,
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,
