@@ -37,7 +37,8 @@ class LineFile:
             self.log(",".join(columns) + "\n")
         except UserError:
             self.close()
-            path.unlink(missing_ok=True)
+            if path.is_file():  # a device stays
+                path.unlink(missing_ok=True)
             raise
 
     def log(self, item: str) -> None:

@@ -32,9 +32,7 @@ def test_all_sessions_take_turns_with_the_same_models():
     (detector, classifier), other = models.take(), models.take()
     assert (detector, classifier) == other
     inside, most = [], []
-    assert isinstance(detector, RetriedDetector)
-    model = detector.model
-    found = model.detect
+    model, found = detector.part, detector.part.detect
 
     def watched(image):
         inside.append(1)

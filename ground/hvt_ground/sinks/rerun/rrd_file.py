@@ -67,7 +67,8 @@ class RrdFile:
             self._write(stream[:_STREAM_HEADER_BYTES] + _messages(stream), at=0)
         except UserError:
             self._release()
-            path.unlink(missing_ok=True)
+            if path.is_file():  # a device stays
+                path.unlink(missing_ok=True)
             raise
         self._compacted_bytes = self.size_bytes
 
