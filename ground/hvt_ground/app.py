@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -20,11 +20,12 @@ from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
+from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort, GroundLink
+from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
-from hvt_ground.sinks.timing import TimingTable
 from hvt_ground.status import completed, status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 
@@ -47,10 +48,10 @@ class Ground:
         self._on_started = on_started
         self._clock = SteadyClock()
         self._edges: dict[str, EdgeThread] = {}
-        self._ended: defaultdict[str, deque[dict[str, Any]]] = defaultdict(
+        self._ended: defaultdict[str, deque[tuple[dict[str, Any], Sequence[Sink[Event]]]]] = defaultdict(
             partial(deque, maxlen=_MOST_SUMMARIES)
         )
-        """By edge, the summaries of sessions."""
+        """By edge, the summaries of sessions and what they were written to."""
         self._began_s = time.monotonic()
 
     def run(self) -> list[dict[str, Any]]:
@@ -63,12 +64,16 @@ class Ground:
         check_edge_pattern(config.edges)
         check_writable(config.summary, name="--summary")
         check_writable(config.timing, name="--timing")
+        if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
+            check_writable(config.tracks, name="--tracks")
         self._check_record()
         models = Models(config)
         with ExitStack() as stack:
             view: LiveView | None = None
             if config.view or config.serve:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
+            outputs = Outputs(models.failures)
+            stack.callback(outputs.close)
             settings = LinkSettings(
                 role="ground",
                 listen=config.listen,
@@ -79,11 +84,7 @@ class Ground:
             )
             session = stack.enter_context(open_session(settings))
             self._make_record_folder()
-            timing: TimingTable | None = None
-            if config.timing is not None:
-                timing = stack.enter_context(closing(TimingTable(config.timing)))
-            live_url = None if view is None else view.url
-            factory = SessionFactory(config, models, clock=self._clock, live_url=live_url, timing=timing)
+            factory = SessionFactory(config, models, clock=self._clock, outputs=outputs, view=view)
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
@@ -97,9 +98,9 @@ class Ground:
             finally:
                 self._stop_edges()
         return [
-            completed(content, one.sessions, failures=models.failures)
+            completed(content, one.sessions, sinks=sinks, failures=models.failures)
             for edge, one in sorted(self._edges.items())
-            for content in self._ended[edge]
+            for content, sinks in self._ended[edge]
         ]
 
     # Before anything is received
@@ -158,9 +159,8 @@ class Ground:
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
                 edges = [(edge, one.sessions) for edge, one in sorted(self._edges.items())]
-                line.show(
-                    status_text(edges, failures=failures) or ("no link" if watch.trouble else "no edge yet")
-                )
+                text = status_text(edges, failures=failures)
+                line.show(text or ("no link" if watch.trouble else "no edge yet"))
             if self._config.once and self._all_ended():
                 return
 
@@ -178,7 +178,7 @@ class Ground:
 
     def _note_ended(self, session: GroundSession) -> None:
         """In the thread of its edge: a session is not remembered, its numbers are, of the last ones."""
-        self._ended[session.info.edge].append(summary(session))
+        self._ended[session.info.edge].append((summary(session), session.sinks))
 
     def _leave_edges(self, ports: list[EdgePort]) -> None:
         """The link has left those that never were more than a name, for others."""

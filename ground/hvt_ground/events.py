@@ -103,6 +103,8 @@ class Refinement:
     clipped; None leaves it out of the enhanced picture."""
     stored: bool = False
     """It was stored at the edge while the link was down: its frame is the one that it shows, long ago."""
+    unread: bool = False
+    """Nothing could read it: both classes are the edge's word."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
-from hvt_common.runtime.failures import Failure, Failures
-from hvt_common.units import SECOND_NS, bitrate_text
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS, bitrate_text, counts_text
+from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import QueuedSink, Sink
 
 __all__ = ["completed", "status_text", "summary", "table"]
+
+_LOST_S = 3.0
+"""Status comes once a second: nothing for so long is no accident."""
 
 
 def status_text(edges: Iterable[tuple[str, EdgeSessions]], *, failures: Failures | None = None) -> str:
@@ -24,13 +28,17 @@ def status_text(edges: Iterable[tuple[str, EdgeSessions]], *, failures: Failures
             state = "ended" if sessions.ended else "waiting for a keyframe"
             parts.append("  ".join([f"{edge}: {state}", *failed_texts(sessions.failures)]))
             continue
+        if sessions.silent_s > _LOST_S and not session.lockstep:
+            parts.append(f"{edge}: {session.duration_s:.1f} s  LINK LOST for {sessions.silent_s:.0f} s")
+            continue
         latency_ms = session.overlay_latency.percentile(50)
         age = "" if latency_ms is None or session.lockstep else f"  {latency_ms:.0f} ms"
         total = session.ledger.summary(session.duration_s).total_bps
+        not_sent = f" (not sent: {counts_text(session.not_sent, most=2)})" if session.not_sent else ""
         parts.append(
             f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
-            f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}  tracks "
-            f"{session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
+            f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}{not_sent}  "
+            f"tracks {session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
             + "".join(f"  {text}" for text in failed_texts(sessions.failures))
         )
     return " | ".join(parts + failed_texts(failures))
@@ -74,6 +82,7 @@ def summary(session: GroundSession) -> dict[str, Any]:
                 "received": account.outcomes["received"],
                 "dropped": dict(session.stills_dropped),
                 "outcomes": dict(pipeline.outcomes),
+                "not_sent": dict(session.not_sent),
             },
             "mean_bytes": round(account.roi_bytes / session.stills_received)
             if session.stills_received
@@ -96,21 +105,38 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "keyframe_requests": counters.keyframe_requests,
         "latency_ms": session.overlay_latency.as_dict(),
         "receive_latency_ms": session.receive_latency.as_dict(),
-        "recording": str(session.recording) if session.recording is not None else None,
-        "recording_bytes": _size_bytes(session.recording),
         "failure": session.failure,
+        # Of these `completed` tells.
+        "recording": None,
+        "recordings": [],
+        "recording_bytes": 0,
+        "missing_events": {},
+        "failed": [],
     }
 
 
 def completed(
-    content: dict[str, Any], sessions: EdgeSessions, *, failures: Failures | None = None
+    content: dict[str, Any],
+    sessions: EdgeSessions,
+    *,
+    sinks: Iterable[Sink[Event]] = (),
+    failures: Failures | None = None,
 ) -> dict[str, Any]:
     """The summary of a session, with what counts over all sessions of its edge, and the ground's own failures.
 
-    Messages that were skipped, recordings of former sessions, of which a backlog came, and parts that failed.
+    Messages that were skipped, recordings of former sessions, of which a backlog came, parts that failed; and, once
+    they are closed, what became of the session's ``sinks``.
     """
-    failed = [*sessions.failures.parts, *(() if failures is None else failures.parts)]
+    edge = content["edge"]
+    general = () if failures is None else failures.parts
+    failed = [*sessions.failures.parts, *(one for one in general if _concerns(one.part, edge))]
+    queued = [sink for sink in sinks if isinstance(sink, QueuedSink)]
+    recordings = [path for sink in queued for path in sink.files if path.suffix == ".rrd"]
     return content | {
+        "recording": str(recordings[0]) if recordings else None,
+        "recordings": [str(path) for path in recordings],
+        "recording_bytes": sum(path.stat().st_size for path in recordings if path.exists()),
+        "missing_events": {sink.part: sink.missing for sink in queued if sink.missing},
         "unusable_messages": sessions.unusable,
         "backlog": content["backlog"] | {"recordings": [str(path) for path in sessions.backlog.paths]},
         "failed": [
@@ -118,7 +144,8 @@ def completed(
                 "part": one.part,
                 "reason": one.reason,
                 "count": one.count,
-                "last": _utc(one),
+                "since": _utc(one.since_ns),
+                "last": _utc(one.failed_ns),
                 "working": one.working,
             }
             for one in failed
@@ -132,7 +159,7 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     share = (
         f"{content['total_bps'] / max(1, content['budget_bps']):.0%} of {bitrate_text(content['budget_bps'])}"
     )
-    outcomes = ", ".join(f"{name} {count}" for name, count in sorted(stills["reasons"]["outcomes"].items()))
+    outcomes, not_sent = (counts_text(stills["reasons"][which]) for which in ("outcomes", "not_sent"))
     lossless = (
         "no gaps" if not content["gaps"] else f"{content['gaps']} gaps, {content['lost']} messages lost"
     )
@@ -147,7 +174,8 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "stills",
             f"{stills['received']}, {bitrate_text(content['roi_bps'])}"
-            + (f" ({outcomes})" if outcomes else ""),
+            + (f" ({outcomes})" if outcomes else "")
+            + (f"; the edge did not send: {not_sent}" if not_sent else ""),
         ),
         (
             "tracks",
@@ -170,20 +198,28 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         since = "receiving" if content["pace"] == "lockstep" else "capture"
         spread = f"p50 {latency['p50']:.0f} ms, p95 {latency['p95']:.0f}, max {latency['max']:.0f}"
         rows.append(("latency", f"{since} to overlay: {spread}"))
-    if content["recording"]:
-        rows.append(("recording", f"{content['recording']}, {content['recording_bytes'] / 1e6:.2f} MB"))
+    if content["recordings"]:
+        files = ", ".join(content["recordings"])
+        rows.append(("recording", f"{files}, {content['recording_bytes'] / 1e6:.2f} MB"))
+    for one in content["failed"]:
+        ends = "works again" if one["working"] else "did not work again"
+        count = "once" if one["count"] == 1 else f"{one['count']} times"
+        rows.append(("failed", f"{one['part']}, {count}, at {one['since']}: {one['reason']}; {ends}"))
+    rows += [("missing", f"{count} events in {part}") for part, count in content["missing_events"].items()]
     return rows
 
 
 def failed_texts(failures: Failures | None) -> list[str]:
     """What does not work now, since when."""
     parts = () if failures is None else failures.parts
-    return [f"{one.part} FAILED at {_utc(one)[11:19]} UTC" for one in parts if not one.working]
+    return [f"{one.part} FAILED at {_utc(one.since_ns)[11:19]} UTC" for one in parts if not one.working]
 
 
-def _utc(failure: Failure) -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(failure.failed_ns // SECOND_NS))
+def _concerns(part: str, edge: str) -> bool:
+    """Whether a part is this edge's, or nobody's: ``recording of uav-1``, ``timing table``."""
+    _, of, whose = part.rpartition(" of ")
+    return not of or whose == edge
 
 
-def _size_bytes(path: Path | None) -> int:
-    return path.stat().st_size if path is not None and path.exists() else 0
+def _utc(unix_ns: int) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(unix_ns // SECOND_NS))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +10,7 @@ from functools import partial
 from itertools import chain
 from itertools import count as count_from
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, TypeVar, cast
 
 from hvt_common.camera_motion import CameraMotion
 from hvt_common.inference.classify import Classifier
@@ -29,18 +30,23 @@ from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetect
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
-from hvt_ground.sinks import Sink
+from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
+from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.timing import SessionTiming, TimingTable
+from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.sinks.tracks_table import TrackTable
 
 __all__ = ["Models", "SessionFactory", "make_backlog_perception", "make_pipeline", "output_path"]
+
+S = TypeVar("S", bound=SinkWriter[Any])
+
+_LOCKSTEP_WAIT_S = 10.0
 
 
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
-    ``live_url`` is of a viewer, None shows nothing live; ``timing`` is the table of ``--timing``.
+    All that they write to is of ``outputs``; ``view`` is a viewer, None shows nothing live.
     """
 
     def __init__(
@@ -49,35 +55,46 @@ class SessionFactory:
         models: Models,
         *,
         clock: Callable[[], int],
-        live_url: str | None,
-        timing: TimingTable | None,
+        outputs: Outputs,
+        view: LiveView | None,
     ) -> None:
         self._config = config
         self._models = models
         self._clock = clock
-        self._live_url = live_url
-        self._timing = timing
+        self._outputs = outputs
+        self._view = view
         self._paths: set[Path] = set()
         """Taken by this process."""
+        self._naming = threading.Lock()
+        self._timing: QueuedSink[str] | None = None
+        if config.timing is not None:
+            names = partial(_take, [config.timing], number=2, may_exist=config.timing)
+            self._timing = outputs.open("timing table", partial(self._opened, timing_table, names))
 
     def open_session(self, info: Info, reports: ReceiverReports) -> GroundSession:
         """A session with its perception and its sinks."""
-        config, models = self._config, self._models
+        config, models, edge = self._config, self._models, info.edge
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        path = output_path(config.record, suffix=".rrd", edge=info.edge, stamp=stamp, taken=self._paths)
-        settings = self._recorder_settings(info, path)
-        sinks: list[Sink] = [Recorder(settings)]
-        if self._live_url is not None:
-            sinks.append(Recorder(replace(settings, path=None, live_url=self._live_url)))
+        settings = self._recorder_settings(info)
+        # In lockstep the edge waits, so that nothing need be lost to a slow disk.
+        wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
+        names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
+        open_recording = partial(self._opened, _recorder(settings), names)
+        sinks: list[Sink[Event]] = [
+            self._outputs.open(f"recording of {edge}", open_recording, wait_s=wait_s, for_backlog=True)
+        ]
+        if self._view is not None:
+            open_live = partial(_live_recorder, settings, self._view)
+            sinks.append(self._outputs.open(f"live view of {edge}", open_live))
         if config.tracks is not None:
-            table = output_path(config.tracks, suffix=".csv", edge=info.edge, stamp=stamp, taken=self._paths)
-            sinks.append(TrackTable(table))
+            names = partial(output_path, config.tracks, suffix=".csv", edge=edge, stamp=stamp)
+            open_table = partial(self._opened, TrackTable, names)
+            sinks.append(self._outputs.open(f"tracks table of {edge}", open_table, wait_s=wait_s))
         if self._timing is not None:
-            sinks.append(SessionTiming(self._timing, edge=info.edge, session_id=info.session_id))
+            sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
         return GroundSession(
             info,
             sinks=sinks,
-            recording=path,
             pipeline_of=lambda emit: make_pipeline(config, models, info=info, emit=emit),
             clock=self._clock,
             reports=reports,
@@ -86,16 +103,28 @@ class SessionFactory:
 
     def open_backlog(self, info: Info) -> BacklogRecording:
         """The recording of a session that is over; not shown live, for the viewer shows what is now."""
+        settings = replace(self._recorder_settings(info), clocked=False)
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        path = _backlog_path(self._config.record, edge=info.edge, stamp=stamp, taken=self._paths)
-        sink = Recorder(replace(self._recorder_settings(info, path), clocked=False))
+        names = partial(_backlog_path, self._config.record, edge=info.edge, stamp=stamp)
+        part = f"backlog recording of {info.edge}"
+        sink = self._outputs.open(part, partial(self._opened, _recorder(settings), names))
         perception = make_backlog_perception(self._config, self._models, info=info)
-        return BacklogRecording(info, path=path, sink=sink, perception=perception)
+        return BacklogRecording(info, sink=sink, perception=perception)
 
-    def _recorder_settings(self, info: Info, path: Path) -> RecorderSettings:
+    def _opened(self, make: Callable[[Path], S], name: Callable[..., Path]) -> S:
+        """A sink with a file; a name that could not be used is free again."""
+        with self._naming:
+            path = name(taken=self._paths)
+        try:
+            return make(path)
+        except Exception:
+            self._paths.discard(path)
+            raise
+
+    def _recorder_settings(self, info: Info) -> RecorderSettings:
         config = self._config
         return RecorderSettings(
-            path=path,
+            path=None,
             edge_id=info.edge,
             session=f"{info.session_id:016x}",
             base_size=info.base_size,
@@ -105,7 +134,6 @@ class SessionFactory:
                 "method": info.method,
                 "budget": f"{bitrate_text(info.budget_bps)}, {bitrate_text(info.base_bps)} of it for video",
                 "source": f"{info.source_size[0]}x{info.source_size[1]}",
-                "base": f"{info.base_size[0]}x{info.base_size[1]} at {info.fps:g} fps, {info.codec}",
                 "detector": Path(config.detector).name,
                 "classifier": Path(config.classifier or "none").name,
             },
@@ -113,11 +141,20 @@ class SessionFactory:
         )
 
 
+def _recorder(settings: RecorderSettings) -> Callable[[Path], Recorder]:
+    return lambda path: Recorder(replace(settings, path=path))
+
+
+def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:
+    view.start_again()
+    return Recorder(replace(settings, live_url=view.url))
+
+
 def make_pipeline(
     config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]
 ) -> Pipeline:
     """The pipeline of one session."""
-    detector, classifier = models.take(info.edge)
+    detector, classifier = models.take()
     reader = _reader(config, detector, classifier, info=info)
     motion = cast('Literal["off", "flow", "ecc"]', config.camera_motion)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
@@ -135,7 +172,6 @@ def make_pipeline(
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
         path=path,
         camera=None if motion == "off" else CameraMotion(motion, scale=None),
-        release=lambda: models.give_back(detector, classifier),
     )
     return Pipeline(
         parts,
@@ -151,7 +187,7 @@ def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info)
     """What analyzes the stored video and stills of a session."""
     return BacklogPerception(
         info,
-        checkout=partial(models.checkout, info.edge),
+        take_models=models.take,
         tracker_of=lambda: _tracker(config, info),
         reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
         detect_every=config.detect_every,

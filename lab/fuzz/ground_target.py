@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from functools import cache
 from random import Random
 from typing import NamedTuple
-from unittest.mock import patch
 
 from hvt_common.protocol.messages import Info
+from hvt_common.runtime.failures import Failures
 from hvt_common.transport.inbox import Received
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from lab.fuzz.contract import Target, scratch
 from lab.fuzz.mutate import Bytes, changed_values, joined, parted, with_checksum
@@ -24,6 +25,7 @@ __all__ = ["TARGETS"]
 _CHANNELS = ("base", "roi", "tracks", "status", "backlog")
 _ATTACHED = ("base", "roi", "backlog")
 _PACES = ("realtime", "lockstep")
+_sinks = Outputs(Failures(time.time_ns))
 _UNHARMED = 2
 """So many access units come unharmed before the rest."""
 
@@ -65,7 +67,7 @@ def _opened(info: Info, reports: ReceiverReports) -> GroundSession:
     )
     return GroundSession(
         info,
-        sinks=[Recorder(settings)],
+        sinks=[_sinks.open("recording", lambda: Recorder(settings))],
         pipeline_of=pipeline_of,
         clock=time.time_ns,
         reports=reports,
@@ -85,8 +87,8 @@ def _session(data: bytes) -> None:
         key = f"hvt/uav-1/{one.channel}"
         edge.handle(Received(key, one.payload, one.attachment, "", time.time_ns()))
         edge.housekeep(pending=False)
-    with patch("hvt_ground.sinks.rerun.rrd_file.add_footer"):  # a process of its own for each input
-        edge.close()
+    edge.close()
+    _sinks.close(within_s=0.0)  # without footers
     assert ended, "the unharmed messages alone are a session"
     assert not edge.failures.parts
     assert all(len(session.take_results(10_000)) < 5000 for session in ended)

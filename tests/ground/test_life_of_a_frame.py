@@ -29,7 +29,7 @@ class Events:
         """Add it."""
         self.all.append(event)
 
-    def close(self, *, quickly: bool = False) -> None:
+    def close(self, hurry=None) -> None:
         """Nothing."""
 
 

@@ -28,6 +28,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def long_scene(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pictures of the scene over and over, for five minutes."""
+    folder, pictures = tmp_path_factory.mktemp("long"), sorted(scene.iterdir())
+    for number in range(3000):
+        (folder / f"{number:06d}.jpg").symlink_to(pictures[number % len(pictures)])
+    return folder
+
+
+@pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     """Edges ``uav-1`` and ``uav-2``; grounds ``base`` and ``ops`` that command, ``guest`` that watches.
 

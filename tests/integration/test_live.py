@@ -36,15 +36,6 @@ def arguments(scene: Path, edge_id: str, *more: str) -> list[str]:
     return ["--source", str(scene), "--source-fps", "10", "--edge-id", edge_id, *CHEAP, *more]
 
 
-@pytest.fixture(scope="module")
-def long_scene(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pictures of the scene over and over."""
-    folder, pictures = tmp_path_factory.mktemp("long"), sorted(scene.iterdir())
-    for number in range(LONG):
-        (folder / f"{number:06d}.jpg").symlink_to(pictures[number % len(pictures)])
-    return folder
-
-
 def count_frames(file: Path) -> int:
     """How many frames of a video file a player shows."""
     with av.open(str(file)) as container:

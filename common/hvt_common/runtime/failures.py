@@ -34,6 +34,8 @@ class Failure:
     count: int
     failed_ns: int
     """The newest failure, Unix time."""
+    since_ns: int
+    """When it stopped, before all tries that were in vain."""
     working: bool = False
 
 
@@ -58,7 +60,8 @@ class Failures:
         with self._lock:
             before = self._parts.get(part)
             count = 1 if before is None else before.count + 1
-            self._parts[part] = Failure(part, reason, count, now_ns)
+            since_ns = now_ns if before is None or before.working else before.since_ns
+            self._parts[part] = Failure(part, reason, count, now_ns, since_ns)
         fresh = before is None or (before.working and now_ns - before.failed_ns > _STEADY_NS)
         if fresh or (before is not None and before.working and count.bit_count() == 1):
             self._said.add(part)

@@ -166,15 +166,14 @@ def check_writable(path: Path | None, *, name: str) -> None:
 
 
 def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:
-    """Write a summary; into a file whole or not at all. Raises `FlightError` where it cannot be written."""
+    """Write the summary; into a file whole or not at all. Raises `FlightError` where it cannot be written."""
     text = json.dumps(content, indent=2) + "\n"
-    device = (
-        path.exists() and not path.is_file()
-    )  # /dev/stdout or a pipe: to be written to, not to be replaced
-    scratch = path if device else path.with_name(path.name + ".part")
+    # /dev/stdout or a pipe is to be written to, not to be replaced.
+    replaces = path.is_file() or not path.exists()
+    scratch = path.with_name(path.name + ".part") if replaces else path
     try:
         scratch.write_text(text, encoding="utf-8")
-        if not device:
+        if replaces:
             scratch.replace(path)
     except OSError as error:
-        raise FlightError(f"{path} cannot be written ({error.strerror})") from None
+        raise FlightError(f"{path} cannot be written ({error.strerror})") from error

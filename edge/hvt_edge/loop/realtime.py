@@ -13,7 +13,6 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.source.pacing import realtime_admits
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.frame_decision import Action
@@ -78,8 +77,7 @@ class RealtimePace:
         self._drop(newly_missed)
         behind = newly_missed > 0
         if not self._live:
-            due = realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop)
-            if not due and frame.capture_ns < self._must_code_ns:
+            if not self._in_time(frame) and frame.capture_ns < self._must_code_ns:
                 self._drop(1)
                 return
             self._must_code_ns = frame.capture_ns + _MOST_GAP_NS
@@ -114,3 +112,10 @@ class RealtimePace:
             self._counts.dropped_link += count
         else:
             self._counts.dropped_cpu += count
+
+    def _in_time(self, frame: Frame) -> bool:
+        """Wait until the frame of a clip is due; False where it is so late that the next is due already."""
+        early_ns = frame.capture_ns - self._clock()
+        if early_ns > 0:
+            self._stop.wait(early_ns / SECOND_NS)
+        return -early_ns < SECOND_NS / self._fps

@@ -68,6 +68,7 @@ class BaseEncoder:
             src_color_range=ColorRange.JPEG,
             dst_color_range=ColorRange.MPEG,
             interpolation=UNBIASED,
+            threads=1,
         )
         if self._tagger is not None:
             picture = self._tagger.tag(picture, regions)

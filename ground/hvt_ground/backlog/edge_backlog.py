@@ -130,7 +130,9 @@ class EdgeBacklog:
                 self._assembly.settle(key, usable=True)
             return
         destination = (
-            Destination(lambda: own, _release_nothing) if is_own else self._former(self._infos[key[0]])
+            Destination(lambda: own if own.able() else None, _release_nothing)
+            if is_own
+            else self._former(self._infos[key[0]])
         )
         with self._lock:
             self._working += 1

@@ -133,7 +133,7 @@ class _BoxesJob(Job):
         if target is None or target.perception is None:
             return True
         if self._tracker is None:
-            self._tracker = self._checkout.enter_context(target.perception.track(target.log))
+            self._tracker = self._checkout.enter_context(target.perception.track(target.log_boxes))
             self._pictures = target.video.pictures(self._units)
         for shown in self._pictures:
             if shown is not None and shown[1] is not None and shown[0].frame_index in self._frames:

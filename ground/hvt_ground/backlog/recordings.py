@@ -7,57 +7,56 @@ over and over, or somebody in its name, would fill the disk with them.
 from __future__ import annotations
 
 import threading
-import time
 from collections import OrderedDict
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from hvt_common.protocol.messages import Info
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Notice
+from hvt_ground.events import Event, Notice
 from hvt_ground.perception.stills.decode import ReceivedStill
-from hvt_ground.sinks import Sink
+from hvt_ground.sinks import QueuedSink
 
 __all__ = ["MOST_FILES", "MOST_OPEN", "BacklogRecording", "BacklogRecordings"]
 
 MOST_OPEN = 4
 MOST_FILES = 32
-_CLOSE_S = 1.0
-"""For so long the end of the ground waits for footers; a file without one opens just as well."""
+_OPEN_S = 0.5
 
 
 class BacklogRecording:
     """The recording of one session that is over."""
 
-    def __init__(self, info: Info, *, path: Path | None, sink: Sink, perception: BacklogPerception) -> None:
-        self.path = path
+    def __init__(self, info: Info, *, sink: QueuedSink[Event], perception: BacklogPerception) -> None:
         self.users = 0
         """Jobs that have it in hand, or wait to."""
-        self._sink = sink
+        self.sink = sink
         self._perception = perception
         self.backlog = SessionBacklog(info, log=sink.log, perception=perception, read=self._read)
 
-    def close(self, *, quickly: bool = False) -> None:
-        """Say what has come and close the file; ``quickly`` without its footer."""
+    def close(self) -> None:
+        """Say what has come and close the file, without waiting for it."""
         totals = self.backlog.totals
         if totals.first is not None:
             text = f"{totals.amount()} of this session arrived after it had ended"
-            self._sink.log(Notice(*totals.first, "info", text))
-        self._sink.close(quickly=quickly)
+            self.sink.log(Notice(*totals.first, "info", text))
+        self.sink.close()
 
     def _read(self, still: ReceivedStill) -> None:
-        self._perception.read(still, emit=self._sink.log)
+        self._perception.read(still, emit=self._emit)
+
+    def _emit(self, event: Event) -> None:
+        self.backlog.note(event)
+        self.sink.log(event)
 
 
 class BacklogRecordings:
     """Of one edge: opened when something comes of a session. Safe for threads.
 
-    Where more than ``most`` are open, the one that nothing came for the longest is closed, in a thread of its own,
-    for a footer may take seconds. One that is in use is not: should all be, one more is open for the time being.
-    When more comes of a session whose recording is closed, it gets another file; at most ``most_files`` are made in
-    all.
+    Where more than ``most`` are open, the one that nothing came for the longest is closed. One that is in use is not:
+    should all be, one more is open for the time being. When more comes of a session whose recording is closed, it
+    gets another file; at most ``most_files`` are made in all.
     """
 
     def __init__(
@@ -72,12 +71,13 @@ class BacklogRecordings:
         self._left = most_files
         self._lock = threading.Lock()
         self._open: OrderedDict[int, BacklogRecording] = OrderedDict()
-        self._closer = ThreadPoolExecutor(1, thread_name_prefix="hvt-backlog-close")
-        self._closing: list[Future[None]] = []
-        self._stop_ns: int | None = None
-        """When the time for footers is over; None while more may come."""
-        self.paths: list[Path] = []
+        self._closed = False
+        self._sinks: list[QueuedSink[Event]] = []
+
+    @property
+    def paths(self) -> list[Path]:
         """All files, in the order of opening."""
+        return [path for sink in self._sinks for path in sink.files]
 
     @property
     def open_sessions(self) -> list[int]:
@@ -88,25 +88,25 @@ class BacklogRecordings:
     def takes(self, session_id: int) -> bool:
         """Whether there is a recording for this session, or may be one."""
         with self._lock:
-            return self._stop_ns is None and (self._left > 0 or session_id in self._open)
+            return not self._closed and (self._left > 0 or session_id in self._open)
 
     def acquire(self, info: Info) -> SessionBacklog | None:
-        """The backlog of that session's recording, which stays open until `release`; None where `takes` says no.
+        """The backlog of that session's recording, which stays open until `release`.
 
-        Raises `UserError` where its file cannot be made, or another could not be closed as it should.
+        None where `takes` says no, or the recording cannot be written now.
         """
-        self._raise_error()
         with self._lock:
             recording = self._open.get(info.session_id)
             if recording is None:
-                if self._stop_ns is not None or self._left <= 0:
+                if self._closed or self._left <= 0:
                     return None
                 self._close_surplus()
                 self._left -= 1
                 recording = self._open[info.session_id] = self._open_one(info)
-                if recording.path is not None:
-                    self.paths.append(recording.path)
+                self._sinks.append(recording.sink)
             self._open.move_to_end(info.session_id)
+            if not recording.sink.is_open(within_s=_OPEN_S):
+                return None
             recording.users += 1
             return recording.backlog
 
@@ -120,24 +120,11 @@ class BacklogRecordings:
     def close(self) -> None:
         """Close all that are open."""
         with self._lock:
-            self._stop_ns = time.monotonic_ns() + round(_CLOSE_S * 1e9)
+            self._closed = True
             while self._open:
-                self._close_later(self._open.popitem()[1])
-        self._closer.shutdown()
-        self._raise_error(wait=True)
+                self._open.popitem()[1].close()
 
     def _close_surplus(self) -> None:
         unused = [session_id for session_id, recording in self._open.items() if not recording.users]
         for session_id in unused[: max(0, len(self._open) + 1 - self._most)]:
-            self._close_later(self._open.pop(session_id))
-
-    def _close_later(self, recording: BacklogRecording) -> None:
-        self._closing.append(self._closer.submit(self._close, recording))
-
-    def _close(self, recording: BacklogRecording) -> None:
-        recording.close(quickly=self._stop_ns is not None and time.monotonic_ns() >= self._stop_ns)
-
-    def _raise_error(self, *, wait: bool = False) -> None:
-        for closing in self._closing:
-            if wait or closing.done():
-                closing.result()
+            self._open.pop(session_id).close()

@@ -11,9 +11,10 @@ import numpy as np
 from hvt_common.protocol.messages import BacklogUnit, Info
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image
+from hvt_ground.backlog.late_stills import LateStills
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.video import BacklogVideo
-from hvt_ground.events import Event, Overlay, VideoSample
+from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.link.sequence_window import SequenceWindow, StillSequenceWindow
 from hvt_ground.perception.stills.decode import ReceivedStill
 
@@ -73,16 +74,20 @@ class SessionBacklog:
         perception: BacklogPerception | None,
         read: Callable[[ReceivedStill], None],
         stills: StillSequenceWindow | None = None,
+        able: Callable[[], bool] = lambda: True,
     ) -> None:
         self.info = info
         self.perception = perception
         self.video = BacklogVideo(base_size=info.base_size)
         self.log = log
+        self.able = able
+        """Whether what is logged will be written. Otherwise it is to come again, for its edge would forget it."""
         self._read = read
         self._stills = stills or StillSequenceWindow()
         self._frame_ns = round(SECOND_NS / info.fps)
         self._lock = threading.Lock()
         self._frames = SequenceWindow()
+        self._late = LateStills()
         self.totals = BacklogTotals()
         """Since the start."""
         self._news = BacklogTotals()
@@ -104,6 +109,16 @@ class SessionBacklog:
         with self._lock:
             for totals in (self.totals, self._news):
                 totals.add_still(header.frame_index, header.capture_ns)
+
+    def note(self, event: Event) -> None:
+        """Note what became of a stored still; other events pass by."""
+        if isinstance(event, Refinement):
+            self._late.take(event)
+
+    def log_boxes(self, event: Event) -> None:
+        """Log boxes of stored video, named by the stills."""
+        for named in self._late.named(event) if isinstance(event, Overlay) else (event,):
+            self.log(named)
 
     def show(self, unit: BacklogUnit, image: Image | None, *, after: BacklogUnit | None) -> bool:
         """Log a frame that is missing; False where it is not, or cannot be shown (``image`` is None)."""

@@ -114,6 +114,11 @@ class EdgeSessions:
         """Messages that were skipped: damaged, foreign, or of another version."""
         return self._receiver.unusable
 
+    @property
+    def silent_s(self) -> float:
+        """For how long nothing has come."""
+        return self._receiver.silent_ns / _SECOND_NS
+
     def work(self, item: Received | None, *, pending: bool) -> None:
         """Take one message, if there is one, and do what is due; ``pending``: more wait. It never raises."""
         try:
@@ -148,6 +153,8 @@ class EdgeSessions:
                 session.note("warning", "keyframe requested")
         if session is None:
             return
+        if session.take_resumed():
+            self.port.request_keyframe()
         session.raise_error()
         session.count(self._receiver.counters.since(self._counted))
         paused = self._backlog_ns is not None and now_ns - self._backlog_ns > _BACKLOG_PAUSE_NS
@@ -155,14 +162,14 @@ class EdgeSessions:
             self._backlog_ns = None
             session.report_backlog()
         session.report_if_due()
-        self._follow_clock(session, now_ns)
+        self._refresh_clock(session, now_ns)
         if self._is_over(session, now_ns):
             gone = self._ended_ns is None
             self._end_session()
             if gone:
                 self._receiver.wait_for_keyframe()  # should it come back, it starts with a keyframe
 
-    def _follow_clock(self, session: GroundSession, now_ns: int) -> None:
+    def _refresh_clock(self, session: GroundSession, now_ns: int) -> None:
         """Ask the edge for its time now and then; nothing waits for the answer."""
         while (answer := self.port.take_info()) is not None:
             self._learn(answer)
@@ -171,7 +178,6 @@ class EdgeSessions:
             self.port.request_info(session.info.session_id)
 
     def _query_info(self, session_id: int) -> Info | None:
-        """The facts of that session, and the edge's time: another edge of the same id may have another clock."""
         answer = self.port.query_info(session_id)
         return None if answer is None else self._learn(answer)
 

@@ -1,21 +1,8 @@
-"""Where events go: recordings, live views, tables. A sink takes every event and uses those that it knows."""
+"""Where events go: recordings, live views, tables; each behind a queue, so that its failure is its own."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from hvt_ground.sinks.contract import Sink, SinkWriter
+from hvt_ground.sinks.queued import Outputs, QueuedSink
 
-from hvt_ground.events import Event
-
-__all__ = ["Sink"]
-
-
-class Sink(Protocol):
-    """Takes the events of one session."""
-
-    def log(self, event: Event) -> None:
-        """Take an event; may be called by any thread."""
-        ...
-
-    def close(self, *, quickly: bool = False) -> None:
-        """Write what is buffered; ``quickly`` leaves out what only helps and may take seconds."""
-        ...
+__all__ = ["Outputs", "QueuedSink", "Sink", "SinkWriter"]

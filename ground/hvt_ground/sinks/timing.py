@@ -15,15 +15,14 @@ The columns, in this order (times are Unix nanoseconds, 0 where there is none):
 
 from __future__ import annotations
 
-import os
 import threading
-from collections.abc import Iterable
 from pathlib import Path
 
-from hvt_common.errors import UserError
 from hvt_ground.events import Event, MessageTiming, StillsRead
+from hvt_ground.sinks.contract import Sink
+from hvt_ground.sinks.line_file import LineFile
 
-__all__ = ["COLUMNS", "SessionTiming", "TimingTable"]
+__all__ = ["COLUMNS", "SessionTiming", "timing_table"]
 
 COLUMNS = (
     "kind",
@@ -42,71 +41,40 @@ _MOST_UNREAD = 512
 """Stills whose line waits until they are read; more than the session's own queue holds."""
 
 
-class TimingTable:
-    """The file, for all sessions of this ground. Any thread may write; killing the process loses no line.
-
-    Raises `UserError` where it cannot be created, or (from `line`) written any further.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._lock = threading.Lock()
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
-        try:
-            self._file: int | None = os.open(path, flags, 0o644)
-        except OSError as error:
-            raise UserError(
-                f"--timing {path} cannot be written ({error.strerror}): name a file that can"
-            ) from None
-        self.line(COLUMNS)
-
-    def line(self, values: Iterable[object]) -> None:
-        """Append one line; after `close` nothing."""
-        text = ",".join(map(str, values)) + "\n"
-        with self._lock:
-            if self._file is None:  # a receiver that did not end in time still writes
-                return
-            try:
-                os.write(self._file, text.encode("ascii"))
-            except OSError as error:
-                raise UserError(
-                    f"--timing {self._path} cannot be written any further: {error.strerror}"
-                ) from error
-
-    def close(self) -> None:
-        """After the last session has ended."""
-        with self._lock:
-            if self._file is not None:
-                os.close(self._file)
-                self._file = None
+def timing_table(path: Path) -> LineFile:
+    """The file, for all sessions of a ground."""
+    return LineFile(path, COLUMNS)
 
 
 class SessionTiming:
-    """The lines of one session, of its `MessageTiming` and `StillsRead` events."""
+    """Makes the lines of one session, of its `MessageTiming` and `StillsRead` events, for any thread.
 
-    def __init__(self, table: TimingTable, *, edge: str, session_id: int) -> None:
+    ``table`` takes them; it is not closed with this.
+    """
+
+    def __init__(self, table: Sink[str], *, edge: str, session_id: int) -> None:
         self._table = table
         self._whose = (edge, f"{session_id:016x}")
         self._lock = threading.Lock()
         self._unread: dict[int, MessageTiming] = {}
 
-    def log(self, event: Event) -> None:
+    def log(self, item: Event) -> None:
         """Write a message that has been dealt with; a still's line is written when it has been read."""
-        if not isinstance(event, MessageTiming | StillsRead):
+        if not isinstance(item, MessageTiming | StillsRead):
             return
         with self._lock:
-            if isinstance(event, StillsRead):
-                for sequence in event.sequences:
+            if isinstance(item, StillsRead):
+                for sequence in item.sequences:
                     if (still := self._unread.pop(sequence, None)) is not None:
-                        self._write(still, handled_ns=event.at_ns)
-            elif event.handled_ns is not None:
-                self._write(event, handled_ns=event.handled_ns)
+                        self._write(still, handled_ns=item.at_ns)
+            elif item.handled_ns is not None:
+                self._write(item, handled_ns=item.handled_ns)
             else:
-                self._unread[event.sequence] = event
+                self._unread[item.sequence] = item
                 if len(self._unread) > _MOST_UNREAD:
                     self._write(self._unread.pop(next(iter(self._unread))), handled_ns=0)
 
-    def close(self, *, quickly: bool = False) -> None:  # noqa: ARG002 - it is always quick
+    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
         """What was not read, never will be."""
         with self._lock:
             for still in self._unread.values():
@@ -114,17 +82,16 @@ class SessionTiming:
             self._unread.clear()
 
     def _write(self, message: MessageTiming, *, handled_ns: int) -> None:
-        self._table.line(
-            (
-                message.kind,
-                message.sequence,
-                message.frame_index,
-                message.capture_ns,
-                message.send_ns,
-                message.received_ns,
-                handled_ns,
-                message.line_bytes,
-                message.clock_offset_ns,
-                *self._whose,
-            )
+        values = (
+            message.kind,
+            message.sequence,
+            message.frame_index,
+            message.capture_ns,
+            message.send_ns,
+            message.received_ns,
+            handled_ns,
+            message.line_bytes,
+            message.clock_offset_ns,
+            *self._whose,
         )
+        self._table.log(",".join(map(str, values)) + "\n")

@@ -3,56 +3,74 @@
 from __future__ import annotations
 
 import csv
+import io
+import threading
+from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
-from hvt_common.errors import UserError
+from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay
+from hvt_ground.sinks.line_file import LineFile
 
 __all__ = ["COLUMNS", "TrackTable"]
 
-COLUMNS = ("frame", "id", "x", "y", "w", "h", "confidence", "base_class", "class", "refined", "origin")
-"""``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``base_class`` is what the detectors
-say without stills, ``class`` the same after refinement, ``refined`` 1 once a still has refined it; ``origin``:
-``base``, ``edge``, ``edge+base`` or ``still``. A source frame that the base stream left out has lines too where the
-edge reported it."""
+COLUMNS = (
+    *("frame", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
+    *("base_class", "class", "refined", "origin", "late"),
+)
+"""``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``capture_utc`` is the time at the
+camera by the edge's clock; ``base_class`` is what the detectors say without stills, ``class`` the same after
+refinement, ``refined`` 1 once a still has refined it; ``origin``: ``base``, ``edge``, ``edge+base`` or ``still``;
+``late``: 1 where it is of stored video that came after an outage, behind later frames. A source frame that the base
+stream left out has lines too where the edge reported it."""
 
 
 class TrackTable:
     """A CSV file that grows with the stream; other events than overlays pass it by."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            self._file = path.open("w", encoding="utf-8", newline="")
-        except OSError as error:
-            raise UserError(
-                f"--tracks {path} cannot be written ({error.strerror}): name a file that can"
-            ) from None
-        self._writer = csv.writer(self._file)
-        self._writer.writerow(COLUMNS)
+        self._file = LineFile(path, COLUMNS)
+        self.path = path
 
-    def log(self, event: Event) -> None:
-        """Append the tracks of an overlay; one of the backlog would not be in the order of frames."""
-        if not isinstance(event, Overlay) or event.stored:
+    def log(self, item: Event) -> None:
+        """Append the tracks of an overlay."""
+        if not isinstance(item, Overlay) or not len(item.track_ids):
             return
-        origins = event.origins or ("base",) * len(event.track_ids)
-        for row, track_id in enumerate(event.track_ids.tolist()):
-            x1, y1, x2, y2 = event.boxes_base_px[row].tolist()
-            self._writer.writerow(
-                (
-                    event.frame_index + 1,
-                    track_id,
-                    f"{x1:.1f}",
-                    f"{y1:.1f}",
-                    f"{x2 - x1:.1f}",
-                    f"{y2 - y1:.1f}",
-                    f"{event.confidences[row]:.3f}",
-                    event.base_classes[row],
-                    event.classes[row],
-                    int(event.refined[row]),
-                    origins[row],
-                )
-            )
+        text = io.StringIO(newline="")
+        csv.writer(text, lineterminator="\n").writerows(_rows(item))
+        self._file.log(text.getvalue())
 
-    def close(self, *, quickly: bool = False) -> None:  # noqa: ARG002 - it is always quick
-        """Write what is buffered."""
-        self._file.close()
+    def skipped(self, count: int) -> None:
+        """Their lines are missing."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Close the file."""
+        self._file.close(hurry)
+
+
+def _rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
+    origins = overlay.origins or ("base",) * len(overlay.track_ids)
+    for row, track_id in enumerate(overlay.track_ids.tolist()):
+        x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
+        yield (
+            overlay.frame_index + 1,
+            _utc_text(overlay.capture_ns),
+            track_id,
+            *(f"{value:.1f}" for value in (x1, y1, x2 - x1, y2 - y1)),
+            f"{overlay.confidences[row]:.3f}",
+            overlay.base_classes[row],
+            overlay.classes[row],
+            int(overlay.refined[row]),
+            origins[row],
+            int(overlay.stored),
+        )
+
+
+def _utc_text(unix_ns: int) -> str:
+    """``2026-11-22T13:01:02.345Z``; empty where no calendar has the time, which comes from the wire."""
+    try:
+        time = datetime.fromtimestamp(unix_ns // SECOND_NS, UTC)
+    except (ValueError, OverflowError, OSError):
+        return ""
+    return time.strftime("%Y-%m-%dT%H:%M:%S.") + f"{unix_ns // 1_000_000 % 1000:03d}Z"

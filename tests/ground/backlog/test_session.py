@@ -6,7 +6,6 @@ import csv
 import itertools
 import threading
 import time
-from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -23,6 +22,7 @@ from hvt_common.protocol.messages import (
     RoiHeader,
     pack_backlog_units,
 )
+from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.perception import FIRST_TRACK_ID, BacklogPerception
@@ -32,14 +32,16 @@ from hvt_ground.perception.worker import Job, RealtimeWorker
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
-from hvt_ground.sinks import Sink
+from hvt_ground.sinks import Outputs, QueuedSink, Sink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
-from hvt_ground.sinks.timing import SessionTiming, TimingTable
+from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.status import completed, summary, table
 from programs.rrd import Recording
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
+
+FIRST_STORED = 2**31
 
 
 def wait_for(condition, *, timeout_s: float = 30) -> None:
@@ -53,10 +55,9 @@ def wait_for(condition, *, timeout_s: float = 30) -> None:
 class Models:
     """Gives red-square detectors."""
 
-    @contextmanager
-    def checkout(self):
+    def take(self):
         """One for each."""
-        yield RedSquares(), None
+        return RedSquares(), None
 
 
 def settings(info: Info, path: Path, **changes) -> RecorderSettings:
@@ -76,7 +77,7 @@ def look_of(info: Info, models=None) -> BacklogPerception:
     """What looks at kept things."""
     return BacklogPerception(
         info,
-        checkout=(models or Models()).checkout,
+        take_models=(models or Models()).take,
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,
@@ -106,6 +107,8 @@ class Rig:
         self._timing = timing
         self._worker_of = worker_of
         self._recorder = recorder
+        self.failures = Failures(time.time_ns)
+        self.outputs = Outputs(self.failures)
         self.port = Port()
         self.port.inbox = self.inbox = WatchedInbox()
         self.port.flight = flight
@@ -126,13 +129,12 @@ class Rig:
 
     def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         path = self.folder / f"{len(self.opened)}.rrd"
-        sinks: list[Sink] = [Recorder(settings(info, path, **self._recorder))]
+        sinks: list[Sink] = [self._sink(info, path)]
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=info.edge, session_id=info.session_id))
         session = GroundSession(
             info,
             sinks=sinks,
-            recording=path,
             pipeline_of=self._pipeline,
             clock=time.time_ns,
             reports=reports,
@@ -144,9 +146,11 @@ class Rig:
 
     def _open_backlog(self, info: Info) -> BacklogRecording:
         path = self.folder / f"backlog-{next(self._backlog_numbers)}.rrd"
-        return BacklogRecording(
-            info, path=path, sink=Recorder(settings(info, path, **self._recorder)), perception=look_of(info)
-        )
+        return BacklogRecording(info, sink=self._sink(info, path), perception=look_of(info))
+
+    def _sink(self, info: Info, path: Path) -> QueuedSink:
+        made = settings(info, path, **self._recorder)
+        return self.outputs.open("recording", lambda: Recorder(made))
 
     def put(self, *items: Received) -> None:
         """What Zenoh's callback does, and then all of it is handled and seen."""
@@ -159,6 +163,7 @@ class Rig:
         )  # the receiving thread hands boxes on to perception
         for session in self.opened:
             self._wait_for(lambda one=session: one.idle)
+        self._wait_for(lambda: self.outputs.idle)
 
     def _wait_for(self, condition) -> None:
         wait_for(lambda: condition() or self.thread.error is not None or bool(self.receiver.failures.parts))
@@ -191,6 +196,8 @@ class Rig:
 
     def __exit__(self, kind, *_) -> None:
         end(self.thread, failing=kind is not None)
+        self.outputs.close(within_s=60)
+        assert all(one.working for one in self.failures.parts)
 
 
 @pytest.fixture(scope="module")
@@ -279,7 +286,7 @@ def test_boxes_stand_in_the_hole_and_end_with_it(flight, tmp_path):
 @pytest.mark.parametrize("compact_bytes", [6_000, 1 << 30])
 def test_a_filled_hole_survives_folding_and_the_footer(flight, tmp_path, compact_bytes):
     """Rows that come late would be lost or doubled where the append log is compacted, or when the file is closed."""
-    with Rig(tmp_path, flight, compact_bytes=compact_bytes, footer_growth=10) as rig:
+    with Rig(tmp_path, flight, compact_bytes=compact_bytes) as rig:
         rig.base(*range(25))
         rig.base(*range(65, 90))
         rig.put(*backlog(flight, "base", 40, video_object(flight, range(40, 65))))
@@ -331,6 +338,33 @@ def test_a_still_on_both_ways_is_shown_once(flight, tmp_path):
         assert rig.reported().missing_stills == ()
     texts = [text for _, _, text in Recording(tmp_path / "0.rrd").events() if text.startswith("still #")]
     assert sorted(text[:8] for text in texts) == ["still #0", "still #1", "still #2"]
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["open session", "former session"])
+def test_stills_of_an_outage_name_the_tracks_of_its_video(flight, tmp_path, own):
+    """They "matched no track", although the boxes of the outage stand beside them in the recording."""
+    stored = flight if own else Flight(80, keyframes=(40,))
+    with Rig(tmp_path, flight) as rig:
+        rig.base(*range(25))
+        if own:
+            rig.base(*range(65, 75))
+        rig.put(*chunks(stored.session_id, "info", 0, info_object(stored)))
+        still = still_object(stored, 45, FIRST_STORED + 3)
+        rig.put(*chunks(stored.session_id, "still", FIRST_STORED + 3, still))
+        video = video_object(stored, range(40, 60))
+        rig.put(*chunks(stored.session_id, "base", 40, video))
+    recording = Recording(tmp_path / ("0.rrd" if own else "backlog-0.rrd"))
+    texts = [(frame, text) for frame, _, text in recording.events() if "late still #3" in text]
+    assert [frame for frame, _ in texts] == [45, 45]
+    assert "late still #3 of edge track 1: car → bus .90" in texts[0][1]
+    assert f"late still #3 → track {FIRST_TRACK_ID}: car → bus .90" in texts[1][1]
+    before, after = (recording.boxes(frame)[FIRST_TRACK_ID] for frame in (43, 50))
+    assert (before.class_after, before.refined) == ("car", False)
+    assert (after.class_after, after.refined, after.label) == (
+        "bus",
+        True,
+        f"{FIRST_TRACK_ID} car → bus .90",
+    )
 
 
 def test_a_still_at_a_frame_that_is_known_speaks_on_its_track(flight, tmp_path):
@@ -459,28 +493,15 @@ def received(item: Received) -> ReceivedStill:
     return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload, item.encoding)
 
 
-class Slow(BacklogRecording):
-    """Closing it takes its time; knows who did it."""
+def test_a_recording_in_use_stays_open(flight, tmp_path):
+    """What goes into a file that was pushed out is lost without a word."""
+    formers, made = [Flight(2) for _ in range(4)], []
+    outputs = Outputs(Failures(time.time_ns))
 
-    def __init__(self, *args, may_end: threading.Event, **kwargs) -> None:
-        super().__init__(*args, **kwargs)
-        self.may_end, self.closed_by = may_end, ""
-
-    def close(self, *, quickly: bool = False) -> None:
-        """Wait."""
-        assert self.may_end.wait(20)
-        self.closed_by = threading.current_thread().name
-        super().close(quickly=quickly)
-
-
-def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp_path):
-    """What goes into a file that was pushed out is lost without a word, or the link waits for another's footer."""
-    formers, made, may_end = [Flight(2) for _ in range(4)], [], threading.Event()
-
-    def open_one(info: Info) -> Slow:
+    def open_one(info: Info) -> BacklogRecording:
         path = tmp_path / f"{len(made)}.rrd"
-        recorder = Recorder(settings(info, path))
-        made.append(Slow(info, path=path, sink=recorder, perception=look_of(info), may_end=may_end))
+        sink = outputs.open("recording", lambda: Recorder(settings(info, path)))
+        made.append(BacklogRecording(info, sink=sink, perception=look_of(info)))
         return made[-1]
 
     recordings = BacklogRecordings(open_one, most=2)
@@ -489,18 +510,12 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
         other = recordings.acquire(former.info())
         assert other is made[-1].backlog
         recordings.release(other)
-    assert [one.closed_by for one in made] == [""] * 4, "closing waits, and nobody waits for it"
     assert recordings.open_sessions == [formers[0].session_id, formers[3].session_id]
     first.read_still(received(formers[0].still(1, 1)))
     recordings.release(first)
-    may_end.set()
     assert recordings.acquire(flight.info()) is made[4].backlog
     assert recordings.open_sessions == [formers[3].session_id, flight.session_id], "done with, it may go"
     recordings.close()
-    assert {one.closed_by.rpartition("_")[0] for one in made} == {"hvt-backlog-close"}
-    assert "1 still of this session arrived after it had ended" in [
-        text for _, _, text in Recording(tmp_path / "0.rrd").events()
-    ]
     assert recordings.acquire(flight.info()) is None
     few = BacklogRecordings(open_one, most_files=1)
     assert few.acquire(formers[0].info()) is made[5].backlog
@@ -508,6 +523,10 @@ def test_a_recording_in_use_stays_open_and_no_other_holds_anybody_up(flight, tmp
         "so many came at once that the last could not be refused before"
     )
     few.close()
+    outputs.close(within_s=60)
+    assert "1 still of this session arrived after it had ended" in [
+        text for _, _, text in Recording(tmp_path / "0.rrd").events()
+    ]
 
 
 def test_damaged_and_foreign_pieces_are_counted_and_skipped(flight, tmp_path):
@@ -637,11 +656,15 @@ def test_a_still_of_which_a_part_came_is_missed_until_it_is_whole(flight, tmp_pa
 
 def test_timing_says_of_pieces_what_became_of_them(flight, tmp_path):
     """An object that was refused would count as shown, at once."""
-    with closing(TimingTable(tmp_path / "t.csv")) as lines, Rig(tmp_path, flight, timing=lines) as rig:
+    lines = QueuedSink(
+        "timing table", lambda: timing_table(tmp_path / "t.csv"), failures=Failures(time.time_ns)
+    )
+    with Rig(tmp_path, flight, timing=lines) as rig:
         rig.base(*range(5))
         good, bad = still_object(flight, 2, 0), still_object(flight, 3, 1)
         rig.put(*backlog(flight, "still", 0, good, chunk_bytes=len(good) // 2 + 1))
         rig.put(*backlog(flight, "still", 9, bad, chunk_bytes=len(bad) // 2 + 1))  # of another number inside
+    assert lines.join(time.monotonic() + 20)
     with (tmp_path / "t.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["kind"] == "backlog-still"]
     assert [(row["sequence"], int(row["shown_ns"]) > 0) for row in rows] == [
@@ -668,9 +691,8 @@ def test_a_still_is_read_in_the_middle_of_a_stretch(flight, tmp_path):
             return super().read(stills, base_bgr)
 
     class Stepped:
-        @contextmanager
-        def checkout(self):
-            yield Stepwise(), None
+        def take(self):
+            return Stepwise(), None
 
     with Rig(
         tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), models=Stepped()
@@ -818,10 +840,15 @@ def test_a_stored_thing_that_cannot_be_worked_off_ends_nothing_else(flight, tmp_
         (tmp_path / "backlog-0.rrd").mkdir()  # no file can be made there
         rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
         rig.put(*chunks(former.session_id, "still", 0, still_object(former, 12, 0)))
-        wait_for(lambda: session.worker.jobs_failed == 1)
         still = [one for one in rig.acknowledged_ranges() if one.kind == "still"]
         assert all(one.acknowledged_bytes == 0 for one in still), "it is to come again"
         rig.base(*range(5, 25))
         assert rig.receiver.session is session
         assert session.frames_decoded == 25
-    assert sum("cannot be worked off" in one.getMessage() for one in caplog.records) == 1
+        assert [one.working for one in rig.failures.parts] == [False]
+        (tmp_path / "backlog-0.rrd").rmdir()
+        wait_for(lambda: rig.failures.parts[0].working)
+        rig.put(*chunks(former.session_id, "still", 0, still_object(former, 12, 0)))
+        still = [one for one in rig.acknowledged_ranges() if one.kind == "still"]
+        assert any(one.acknowledged_bytes > 0 for one in still), "now it can be written"
+    assert len(Recording(tmp_path / "backlog-0.rrd").stills()) == 1

@@ -32,7 +32,7 @@ class Events(list):
 
     log = list.append
 
-    def close(self, *, quickly: bool = False) -> None:
+    def close(self, hurry=None) -> None:
         """Nothing."""
 
 

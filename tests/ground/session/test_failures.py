@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 from hvt_common.protocol.messages import Info
-from hvt_common.runtime.failures import RetryPause
+from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.status import completed, status_text, summary, table
 from programs.processes import eventually
@@ -55,20 +56,18 @@ class Consumer:
         if self.broken == "opening":
             raise OSError(28, "No space left on device")
         path = self.folder / f"{info.edge}-{len(self.sessions)}.rrd"
-        recorder = Recorder(
-            RecorderSettings(
-                path=path,
-                edge_id=info.edge,
-                session=f"{info.session_id:016x}",
-                base_size=info.base_size,
-                fps=info.fps,
-                budget_bps=info.budget_bps,
-            )
+        settings = RecorderSettings(
+            path=path,
+            edge_id=info.edge,
+            session=f"{info.session_id:016x}",
+            base_size=info.base_size,
+            fps=info.fps,
+            budget_bps=info.budget_bps,
         )
+        sink = QueuedSink("recording", lambda: Recorder(settings), failures=Failures(time.time_ns))
         session = GroundSession(
             info,
-            sinks=[recorder],
-            recording=path,
+            sinks=[sink],
             pipeline_of=lambda emit: pipeline_of(self.taken_by(emit)),
             clock=self.clock,
             reports=reports,
@@ -151,7 +150,11 @@ def test_a_session_that_fails_ends_alone_and_begins_anew(flight, tmp_path, caplo
     assert [one for one in lines if "all else goes on" in one] == [
         f"session of uav-1: {CAUSES[cause]}; all else goes on, and it is tried again"
     ]
-    first, second = (completed(one, rig.sessions) for one in rig.summaries)
+    sinks = [one.sinks for one in consumer.sessions if one.info.session_id == flight.session_id]
+    assert all(one.join(time.monotonic() + 20) for both in sinks for one in both)
+    first, second = (
+        completed(one, rig.sessions, sinks=written) for one, written in zip(rig.summaries, sinks, strict=True)
+    )
     assert (first["failure"], second["failure"]) == (CAUSES[cause], "")
     assert [(one["part"], one["count"]) for one in first["failed"]] == [("session of uav-1", 1)]
     assert dict(table(first))["session failed"] == CAUSES[cause]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def test_each_line_says_who_knows_of_the_track(tmp_path, origins, expected):
     table = TrackTable(path)
     overlay = Overlay(
         frame_index=4,
-        capture_ns=0,
+        capture_ns=1_700_000_000_123_456_789,
         track_ids=np.array([3, 9]),
         boxes_base_px=np.array([[1, 2, 11, 22], [5, 5, 6, 7]], np.float32),
         base_classes=("car", "van"),
@@ -28,8 +29,12 @@ def test_each_line_says_who_knows_of_the_track(tmp_path, origins, expected):
         origins=origins,
     )
     table.log(overlay)
+    table.log(replace(overlay, frame_index=2, stored=True))  # of an outage, behind its time
     table.close()
-    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    every = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    assert {row["capture_utc"] for row in every} == {"2023-11-14T22:13:20.123Z"}
+    assert [(row["frame"], row["late"]) for row in every] == [("5", "0"), ("5", "0"), ("3", "1"), ("3", "1")]
+    rows = every[:2]
     assert [row["origin"] for row in rows] == list(expected)
     assert [(row["frame"], row["id"], row["class"], row["refined"]) for row in rows] == [
         ("5", "3", "car", "0"),

@@ -184,7 +184,8 @@ class StillStage:
             if reading.posterior is None:
                 self.outcomes["unread"] += 1
                 name = header.class_name
-                self._emit(self._refinement(context, now, None, name, name, header.confidence))
+                unread = self._refinement(context, now, None, name, name, header.confidence)
+                self._emit(replace(unread, unread=True))
                 continue
             seen = StillSeen(
                 sequence=header.sequence,

@@ -5,26 +5,29 @@ One viewer serves every recorder of a process: open it once, give its ``url`` to
 
 from __future__ import annotations
 
-import logging
 import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Literal, Self
 
-import rerun as rr
 import rerun.blueprint as rrb
 from rerun.chunk import Chunk
 
 from hvt_common.errors import UserError
-from hvt_ground.sinks.rerun.sdk import new_recording, send_blueprint, viewer_environment, viewer_program
+from hvt_ground.sinks.rerun.sdk import (
+    RecordingId,
+    new_recording,
+    send_blueprint,
+    viewer_environment,
+    viewer_program,
+)
 
 __all__ = ["LiveRecording", "LiveView", "free_port", "listening"]
-
-log = logging.getLogger(__name__)
 
 _HOST = "127.0.0.1"
 _START_S = 15.0
@@ -50,20 +53,29 @@ class LiveView:
         for taken in (port, web_port) if kind == "serve" else (port,):
             if listening(taken):
                 raise UserError(f"port {taken} of {_HOST} is in use: the viewer needs a free one")
-        command = [
-            str(viewer_program()),
-            "--bind",
-            _HOST,
-            "--port",
-            str(port),
-            "--server-memory-limit",
-            _MEMORY_LIMIT,
-        ]
-        if kind == "serve":
-            command += ["--serve-web", "--web-viewer-port", str(web_port)]
+        self._port, self._web_port = port, web_port
+        self._lock = threading.Lock()
+        self._process = self._start()
+
+    @property
+    def pid(self) -> int:
+        """The viewer's process."""
+        return self._process.pid
+
+    def start_again(self) -> None:
+        """Start the web viewer where it has ended; a native window is its user's to open."""
+        with self._lock:
+            if self.kind == "serve" and self._process.poll() is not None:
+                self._process = self._start()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        command = [str(viewer_program()), "--bind", _HOST, "--port", str(self._port)]
+        command += ["--server-memory-limit", _MEMORY_LIMIT]
+        if self.kind == "serve":
+            command += ["--serve-web", "--web-viewer-port", str(self._web_port)]
         else:
             command += ["--memory-limit", "50%", "--hide-welcome-screen"]
-        self._process = subprocess.Popen(  # noqa: S603  # the SDK's own program, no shell
+        process = subprocess.Popen(  # noqa: S603  # the SDK's own program, no shell
             command,
             env=viewer_environment(),
             stdin=subprocess.DEVNULL,
@@ -71,7 +83,16 @@ class LiveView:
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C is for us
         )
-        self._wait_until_listening(port)
+        deadline = time.monotonic() + _START_S
+        while not listening(self._port):
+            if process.poll() is not None or time.monotonic() > deadline:
+                process.kill()
+                process.wait()
+                raise UserError(
+                    f"the Rerun viewer did not start ({viewer_program()}): it needs a display for --view; try --serve"
+                )
+            time.sleep(0.05)
+        return process
 
     def close(self) -> None:
         """End the web viewer; leave a native window to its user."""
@@ -91,69 +112,52 @@ class LiveView:
     ) -> None:
         self.close()
 
-    def _wait_until_listening(self, port: int) -> None:
-        deadline = time.monotonic() + _START_S
-        while not listening(port):
-            if self._process.poll() is not None or time.monotonic() > deadline:
-                self._process.kill()
-                raise UserError(
-                    f"the Rerun viewer did not start ({viewer_program()}): it needs a display for --view; try --serve"
-                )
-            time.sleep(0.05)
-
 
 class LiveRecording:
-    """One recording in a viewer. Trouble there costs one warning, then nothing is sent any more."""
+    """One recording in the viewer at ``url``. Raises `UserError` where that is not there, or no more."""
 
-    live = True
+    path = None
     size_bytes = 0
 
-    def __init__(self, url: str, *, recording_id: str, name: str) -> None:
+    def __init__(
+        self, url: str, recording_id: RecordingId, screen: rrb.Blueprint, chunks: Sequence[Chunk]
+    ) -> None:
         self._url = url
         self._port = int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
         self._next_check_s = 0.0
-        self._recording: rr.RecordingStream | None = new_recording(recording_id)
+        self._check()
+        self._recording = new_recording(recording_id)
         self._recording.connect_grpc(url)
-        self._recording.send_recording_name(name)
-
-    def open(self, screen: rrb.Blueprint, chunks: Sequence[Chunk]) -> None:
-        """Show the recording on this screen."""
-        if self._recording is not None:
-            send_blueprint(self._recording, screen)
-        self.write(chunks)
+        self._recording.send_recording_name(recording_id.edge)
+        send_blueprint(self._recording, recording_id, screen)
+        self._recording.send_chunks(chunks)
 
     def write(self, chunks: Sequence[Chunk]) -> None:
-        """Send, while the viewer is there."""
-        if self._recording is not None and self._viewer_there():
-            self._recording.send_chunks(chunks)
+        """Send."""
+        self._check()
+        self._recording.send_chunks(chunks)
 
     def compact(self, chunks: Sequence[Chunk]) -> None:
         """A viewer has them already."""
 
-    def close(self, *, quickly: bool) -> None:  # noqa: ARG002 - a viewer that is gone is not waited for
+    def close(self, hurry: threading.Event | None) -> None:
         """Send what is under way and disconnect."""
-        recording, self._recording = self._recording, None
-        if recording is None:
-            return
         try:
-            recording.flush(timeout_sec=2.0)
+            if not (hurry and hurry.is_set()):
+                self._recording.flush(timeout_sec=2.0)
         except (RuntimeError, ValueError, OSError) as error:
-            log.warning("live view at %s: the last events were not sent: %s", self._url, error)
-        recording.disconnect()
+            raise UserError(f"live view at {self._url}: the last events were not sent: {error}") from error
+        finally:
+            self._recording.disconnect()
 
-    def _viewer_there(self) -> bool:
-        """Check once a second: the SDK would keep what it cannot send, and slow every call."""
+    def _check(self) -> None:
+        """Look for the viewer once a second: the SDK would keep what it cannot send, and slow every call."""
         now_s = time.monotonic()
         if now_s < self._next_check_s:
-            return True
+            return
         self._next_check_s = now_s + 1.0
-        if listening(self._port):
-            return True
-        log.warning("live view at %s is gone; the recording goes on", self._url)
-        recording, self._recording = self._recording, None
-        if recording is not None:
-            recording.disconnect()
-        return False
+        if not listening(self._port):
+            raise UserError(f"the viewer at {self._url} is gone")
 
 
 def listening(port: int) -> bool:

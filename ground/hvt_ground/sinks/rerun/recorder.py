@@ -17,6 +17,7 @@ from typing import Self
 import numpy as np
 from rerun.chunk import Chunk
 
+from hvt_common.errors import UserError
 from hvt_common.units import bitrate_text
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun import blueprint as names
@@ -30,8 +31,9 @@ from hvt_ground.sinks.rerun.overlays import (
     OverlayEncoder,
 )
 from hvt_ground.sinks.rerun.palette import AMBER, GREY, VERMILLION, Rgb
-from hvt_ground.sinks.rerun.rrd_file import FOOTER_GROWTH, RrdFile
-from hvt_ground.sinks.rerun.static_data import class_chunk, static_chunks
+from hvt_ground.sinks.rerun.rrd_file import RrdFile
+from hvt_ground.sinks.rerun.sdk import RecordingId
+from hvt_ground.sinks.rerun.static_data import class_chunk, session_chunk, static_chunks
 from hvt_ground.sinks.rerun.stills import StillRows
 from hvt_ground.sinks.rerun.tables import TABLE_BYTES, CodedIdentity, LogText, SizeLimit, Table, TableRow
 
@@ -39,6 +41,8 @@ __all__ = ["Recorder", "RecorderSettings"]
 
 log = logging.getLogger(__name__)
 
+_PLOT_GAP_NS = 2_500_000_000
+"""Plots have a hole where nothing was measured for longer."""
 DIMMED = 0.75
 """Brightness of the boxes that no still has spoken on, beside those one has."""
 
@@ -58,7 +62,7 @@ class RecorderSettings:
     """What a recording is of, and where it goes."""
 
     path: Path | None
-    """The file."""
+    """The file; None shows it live only."""
     edge_id: str
     session: str
     """The edge's session id, hexadecimal."""
@@ -74,75 +78,85 @@ class RecorderSettings:
     """Where a viewer listens (`LiveView.url`) that shows it in place of a file."""
     compact_bytes: int = 3 << 19
     """Payload of the append log at which it is compacted: that costs some 50 kB, and this much is in memory."""
-    footer_growth: float = FOOTER_GROWTH
-    """How large the file may become by a footer, over what it is; where it takes more there is none."""
 
 
 class Recorder:
-    """Records the events of one edge's session. Several may run in one process; `log` may be called by any thread.
+    """Records the events of one edge's session. Several may run in one process, each in one thread.
 
-    When `log` returns, the event is in the file: killing the process loses nothing that was logged. A live
-    viewer that goes away is left behind with one warning. Raises `UserError` where the file cannot be
-    created, or (from `log` and `close`) written any further.
+    When `log` returns, the event is in the file: killing the process loses nothing that was logged. Raises
+    `UserError` where the file cannot be created or, later, written any further, or where the viewer is gone.
     """
 
     def __init__(self, settings: RecorderSettings) -> None:
-        self._lock = threading.Lock()
         self._overlays = OverlayEncoder()
         self._backlog_overlays = BacklogOverlays(fps=settings.fps)
         self._size_limit = SizeLimit()
         self._stills = StillRows(self._size_limit)
         self._class_ids: dict[str, int] = {}
         self._classes_written: dict[Layer, int] = dict.fromkeys(LAYERS, 0)
-        self._contexts: dict[Layer, Chunk] = {}
+        self._contexts: dict[str, Chunk] = {}
+        """Static values since the last compaction, by what they are."""
         self._tables: dict[tuple[str, str], Table] = {}
         self._compact_bytes = settings.compact_bytes
         self._pending_bytes = 0
         self._last_sample: int | None = None
+        self._awaits_keyframe = {False: False, True: False}
+        """Whether live or stored video begins anew at its next keyframe."""
+        self._skipped = 0
+        self._samples = 0
+        self._first_sample = 0
+        self._settings = settings
+        self._traffic_end: tuple[int, int] | None = None
+        """Where the plots would end, had no more come."""
         self._closed = False
         self._output = _output(settings)
-        if self._output is not None:
-            screen = names.screen(
-                base_size=settings.base_size,
-                fps=settings.fps,
-                budget_bps=settings.budget_bps,
-                clocked=settings.clocked,
-                live=self._output.live,
-            )
-            self._output.open(screen, static_chunks(title=settings.edge_id, facts=_facts(settings)))
+        self.path = settings.path
 
     @property
     def size_bytes(self) -> int:
         """The size of the file so far; 0 without one."""
-        return 0 if self._output is None else self._output.size_bytes
+        return self._output.size_bytes
 
-    def log(self, event: Event) -> None:
+    def log(self, item: Event) -> None:
         """Record an event. An access unit that no decoder could use at its place is left out.
 
         What was ``stored`` may lie before what was logged already: whoever logs it vouches for its place.
         """
-        with self._lock:
-            if self._closed or self._output is None or not isinstance(event, FrameEvent):
-                return
-            chunks = [one if isinstance(one, Chunk) else self._add(one, event) for one in self._rows(event)]
+        if self._closed or not isinstance(item, FrameEvent):
+            return
+        rows = [*self._gap_rows(item), *self._rows(item)]
+        chunks = [one if isinstance(one, Chunk) else self._add(one, item) for one in rows]
+        try:
             if chunks:
                 self._output.write(chunks)
-            if self._pending_bytes >= self._compact_bytes:
-                self._compact(self._output)
+        except UserError:
+            if self.path is None:
+                raise
+            self._compact()  # the same in fewer bytes, this event included, may be what the disk has room for
+        if self._pending_bytes >= self._compact_bytes:
+            self._compact()
 
-    def close(self, *, quickly: bool = False) -> None:
+    def skipped(self, count: int) -> None:
+        """Video goes on at its next keyframe, and the log says what is missing."""
+        self._skipped += count
+        self._awaits_keyframe = {False: True, True: True}
+
+    def close(self, hurry: threading.Event | None = None) -> None:
         """Compact what is left and close the file or the viewer's connection; a second call does nothing.
 
-        ``quickly`` adds no footer, which may take seconds.
+        Once ``hurry`` is set no footer is added, which may take seconds.
         """
-        with self._lock:
-            if self._closed or self._output is None:
-                return
-            self._closed = True
-            try:
-                self._compact(self._output)
-            finally:
-                self._output.close(quickly=quickly)
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            if self._samples:  # what came may be less than the edge had in mind
+                came = session_chunk(self._settings.edge_id, _facts(self._settings, self._came()))
+                self._output.write([came])
+                self._contexts["session"] = came
+            self._compact()
+        finally:
+            self._output.close(hurry)
 
     def __enter__(self) -> Self:
         return self
@@ -152,12 +166,12 @@ class Recorder:
     ) -> None:
         self.close()
 
-    def _compact(self, output: RrdFile | LiveRecording) -> None:
+    def _compact(self) -> None:
         chunks = [*self._contexts.values(), *(table.take() for table in self._tables.values() if table)]
         self._contexts.clear()
         self._pending_bytes = 0
         if chunks:
-            output.compact(chunks)
+            self._output.compact(chunks)
 
     def _add(self, row: TableRow, event: FrameEvent) -> Chunk:
         """Add a row to its table."""
@@ -170,6 +184,12 @@ class Recorder:
 
     # What each event writes
 
+    def _gap_rows(self, event: FrameEvent) -> list[TableRow]:
+        if not self._skipped or (isinstance(event, VideoSample | Refinement) and event.stored):
+            return []
+        text, self._skipped = f"{self._skipped} events are missing here: writing was too slow", 0
+        return [TableRow(names.EVENTS, "text", LogText(text, "WARN", AMBER), len(text))]
+
     def _rows(self, event: FrameEvent) -> Iterable[TableRow | Chunk]:
         match event:
             case VideoSample():
@@ -179,12 +199,15 @@ class Recorder:
             case Refinement():
                 return self._refinement(event)
             case Traffic():
-                return _traffic(event)
+                return self._traffic(event)
             case Notice():
                 text = LogText(event.text, _NOTICE_LEVELS[event.level], _NOTICE_COLOURS[event.level])
                 return [TableRow(names.EVENTS, "text", text, len(event.text))]
 
     def _sample(self, sample: VideoSample) -> list[TableRow]:
+        if self._awaits_keyframe[sample.stored] and not sample.keyframe:
+            return []
+        self._awaits_keyframe[sample.stored] = False
         if not sample.stored and not self._decodable(sample):
             log.debug("frame %d left out of the recording: not decodable there", sample.frame_index)
             return []
@@ -193,7 +216,10 @@ class Recorder:
         if sample.stored:
             self._backlog_overlays.earn(size)
         else:
+            if self._last_sample is None:
+                self._first_sample = sample.frame_index
             self._last_sample = sample.frame_index
+            self._samples += 1
             self._overlays.earn(size)
         return [TableRow(names.VIDEO, "video", sample.data, size)]
 
@@ -259,40 +285,54 @@ class Recorder:
         self._overlays.earn(self._size_limit.received_bytes - before)
         return rows
 
+    def _traffic(self, traffic: Traffic) -> list[TableRow]:
+        rates = (traffic.total_bps, traffic.base_bps, traffic.roi_bps, traffic.budget_bps)
+        latencies = (traffic.receive_latency_ms, traffic.overlay_latency_ms)
+        plots = {
+            names.BITRATE: tuple(bps / 1000 for bps in rates),
+            names.TRACK_COUNT: (float(traffic.tracks), float(traffic.tracks_refined)),
+        }
+        if any(latency is not None for latency in latencies):
+            plots[names.LATENCY] = tuple(np.nan if latency is None else latency for latency in latencies)
+        rows = [TableRow(path, "lines", values) for path, values in plots.items()]
+        end, after_ns = self._traffic_end, traffic.capture_ns + _PLOT_GAP_NS
+        self._traffic_end = traffic.frame_index + 1, after_ns
+        if end is None or end[1] >= traffic.capture_ns or end[0] >= traffic.frame_index:
+            return rows
+        # A line through the outage would say that something came.
+        return [
+            *(TableRow(path, "lines", (np.nan,) * len(values), at=end) for path, values in plots.items()),
+            *rows,
+        ]
 
-def _output(settings: RecorderSettings) -> RrdFile | LiveRecording | None:
-    recording_id = f"{settings.edge_id}-{settings.session}"
+    def _came(self) -> str:
+        frames = (self._last_sample or 0) - self._first_sample + 1
+        return f"{self._samples / frames * self._settings.fps:.3g} of {self._settings.fps:g} fps came"
+
+
+def _output(settings: RecorderSettings) -> RrdFile | LiveRecording:
+    """The file, or the viewer, that opens as a screen."""
+    screen = names.screen(
+        base_size=settings.base_size,
+        fps=settings.fps,
+        budget_bps=settings.budget_bps,
+        clocked=settings.clocked,
+        live=settings.path is None,
+    )
+    chunks = static_chunks(settings.edge_id, _facts(settings, f"up to {settings.fps:g} fps"))
+    recording_id = RecordingId(settings.edge_id, settings.session)
     if settings.path is not None:
-        return RrdFile(
-            settings.path,
-            recording_id=recording_id,
-            name=settings.edge_id,
-            footer_growth=settings.footer_growth,
-        )
-    if settings.live_url is not None:
-        return LiveRecording(settings.live_url, recording_id=recording_id, name=settings.edge_id)
-    return None
+        return RrdFile(settings.path, recording_id, screen, chunks)
+    assert settings.live_url is not None, "a recording goes into a file or a viewer"
+    return LiveRecording(settings.live_url, recording_id, screen, chunks)
 
 
-def _traffic(traffic: Traffic) -> list[TableRow]:
-    rates = (traffic.total_bps, traffic.base_bps, traffic.roi_bps, traffic.budget_bps)
-    latencies = (traffic.receive_latency_ms, traffic.overlay_latency_ms)
-    rows = [
-        TableRow(names.BITRATE, "lines", tuple(bps / 1000 for bps in rates)),
-        TableRow(names.TRACK_COUNT, "lines", (float(traffic.tracks), float(traffic.tracks_refined))),
-    ]
-    if any(latency is not None for latency in latencies):
-        values = tuple(np.nan if latency is None else latency for latency in latencies)
-        rows.append(TableRow(names.LATENCY, "lines", values))
-    return rows
-
-
-def _facts(settings: RecorderSettings) -> dict[str, str]:
+def _facts(settings: RecorderSettings, frames: str) -> dict[str, str]:
     width, height = settings.base_size
     return {
         "edge": settings.edge_id,
         "session": settings.session,
-        "base": f"{width}x{height} at {settings.fps:g} fps, HEVC",
+        "base": f"{width}x{height} HEVC, {frames}",
         "budget": bitrate_text(settings.budget_bps),
         **settings.facts,
     }

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import rerun as rr
@@ -23,7 +24,7 @@ except ImportError:
     bindings = None  # type: ignore[assignment]
 
 __all__ = [
-    "APPLICATION_ID",
+    "RecordingId",
     "new_recording",
     "release_recordings",
     "send_blueprint",
@@ -33,31 +34,45 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-APPLICATION_ID = "hvt"
+
+@dataclass(frozen=True, slots=True)
+class RecordingId:
+    """Which edge and session a recording is of: files with the same are shown as one."""
+
+    edge: str
+    session: str
+
+    @property
+    def application(self) -> str:
+        """The viewer has one screen for each application: one for all edges would be the last one's."""
+        return f"hvt-{self.edge}"
 
 
-def new_recording(recording_id: str) -> rr.RecordingStream:
+def new_recording(one: RecordingId) -> rr.RecordingStream:
     """A recording without the SDK's own two timelines, which would cost bytes and mean nothing here."""
-    recording = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id, send_properties=False)
+    recording = rr.RecordingStream(
+        one.application, recording_id=f"{one.edge}-{one.session}", send_properties=False
+    )
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     return recording
 
 
-def send_blueprint(recording: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+def send_blueprint(recording: rr.RecordingStream, one: RecordingId, blueprint: rrb.Blueprint) -> None:
     """Send the blueprint and make it active: the SDK's own function never frees the stream that it writes it to."""
     try:
-        _send_and_let_go(recording, blueprint)
+        _send_and_let_go(recording, one.application, blueprint)
+        release_recordings()
     except (AttributeError, TypeError) as error:
         _log.debug("this Rerun SDK has other names inside (%s): a recording leaves its threads behind", error)
         rr.send_blueprint(blueprint, recording=recording)
 
 
-def _send_and_let_go(recording: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+def _send_and_let_go(recording: rr.RecordingStream, application: str, blueprint: rrb.Blueprint) -> None:
     # As rerun.sinks.send_blueprint has it, but for the last line: stream and storage hold each other until then.
     stream = rr.RecordingStream._from_native(  # noqa: SLF001
         bindings.new_blueprint(
-            application_id=APPLICATION_ID, make_default=False, make_thread_default=False, default_enabled=True
+            application_id=application, make_default=False, make_thread_default=False, default_enabled=True
         )
     )
     stream.set_time("blueprint", sequence=0)

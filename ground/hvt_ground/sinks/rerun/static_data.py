@@ -22,7 +22,7 @@ from hvt_ground.sinks.rerun.palette import (
 )
 from hvt_ground.sinks.rerun.tables import static_chunk
 
-__all__ = ["class_chunk", "static_chunks"]
+__all__ = ["class_chunk", "session_chunk", "static_chunks"]
 
 _BITRATE = (
     ("total", TOTAL_LINE, 1.5),
@@ -39,7 +39,7 @@ _LEGEND = (
 )
 
 
-def static_chunks(*, title: str, facts: Mapping[str, str]) -> list[Chunk]:
+def static_chunks(title: str, facts: Mapping[str, str]) -> list[Chunk]:
     """All static chunks of a recording whose session panel shows ``title`` and ``facts``."""
     return [
         static_chunk(names.VIDEO, rr.VideoStream.from_fields(codec=rr.VideoCodec.H265)),
@@ -50,8 +50,15 @@ def static_chunks(*, title: str, facts: Mapping[str, str]) -> list[Chunk]:
         static_chunk(names.BITRATE, _lines(_BITRATE)),
         static_chunk(names.LATENCY, _lines(_LATENCY)),
         static_chunk(names.TRACK_COUNT, _lines(_TRACKS)),
-        static_chunk(names.SESSION, rr.TextDocument(_facts(title, facts), media_type=rr.MediaType.MARKDOWN)),
+        session_chunk(title, facts),
     ]
+
+
+def session_chunk(title: str, facts: Mapping[str, str]) -> Chunk:
+    """The session panel; the last one written holds."""
+    return static_chunk(
+        names.SESSION, rr.TextDocument(_facts(title, facts), media_type=rr.MediaType.MARKDOWN)
+    )
 
 
 def class_chunk(path: str, class_ids: Mapping[str, int], *, share: float) -> Chunk:

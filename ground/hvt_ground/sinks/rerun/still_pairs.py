@@ -14,6 +14,8 @@ __all__ = ["BLANK", "Coded", "base_picture", "caption", "event_text", "still_pic
 Coded = tuple[bytes, tuple[int, int]]
 """A JPEG and its (width, height) in pixels."""
 
+_FIRST_STORED = 2**31
+"""Stills that were stored at the edge are numbered from here on."""
 _QUALITIES_PCT = (75, 65, 55)
 _STILL_QUALITY_PCT = 85
 
@@ -21,17 +23,24 @@ _STILL_QUALITY_PCT = 85
 def caption(refinement: Refinement) -> str:
     """``17  car → van .93``, under the pair; the track is the ground's own where one matched."""
     whose = str(refinement.track_id) if refinement.track_id is not None else "no track"
+    if refinement.stored and refinement.track_id is None:
+        whose = "late"
     return f"{whose}  {_verdict(refinement)}"
 
 
 def event_text(refinement: Refinement) -> str:
     """The refinement and the still that caused it, for the event log."""
-    if refinement.track_id is None:
-        outcome = f"matches no track (edge track {refinement.edge_track_id}): {refinement.class_after}"
+    verdict = _verdict(refinement)
+    if refinement.track_id is not None:
+        outcome = f"→ track {refinement.track_id}: {verdict}"
+    elif refinement.stored or refinement.unread:
+        outcome = f"of edge track {refinement.edge_track_id}: {verdict}"
     else:
-        outcome = f"→ track {refinement.track_id}: {_verdict(refinement)}"
+        outcome = f"matches no track (edge track {refinement.edge_track_id}): {refinement.class_after}"
     size = f"{len(refinement.still) / 1000:.1f} kB, q{refinement.quality_pct}"
-    return f"still #{refinement.still_sequence} {outcome}  ({refinement.reason}; {size})"
+    number = refinement.still_sequence
+    name = f"still #{number}" if number < _FIRST_STORED else f"late still #{number - _FIRST_STORED}"
+    return f"{name} {outcome}  ({refinement.reason}; {size})"
 
 
 def still_picture(refinement: Refinement) -> Coded | None:
@@ -79,6 +88,8 @@ def base_picture(refinement: Refinement, *, still_size: tuple[int, int], limit_b
 
 
 def _verdict(refinement: Refinement) -> str:
+    if refinement.unread:
+        return f"{refinement.class_after} unread".strip()
     certainty = confidence_text(round(refinement.confidence * 100))
     if refinement.class_before == refinement.class_after:
         return f"{refinement.class_after} ✓ {certainty}"

@@ -23,7 +23,7 @@ PAIR_RATIO = 1.3
 PATCH_RATIO = 1.25
 """A patch that repeats a picture of the gallery, or follows its track, is written below this ratio."""
 
-_REMEMBERED_STILLS = 64
+_REMEMBERED_STILLS = 1024
 _MOVE_BYTES = 30
 _PATCH_BYTES = 100
 

@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
+import threading
 from pathlib import Path
 
 import av
@@ -18,7 +18,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun.gallery import CANVAS, SLOTS, Gallery, frame_of, placed
-from hvt_ground.sinks.rerun.live_view import LiveView, free_port, listening
+from hvt_ground.sinks.rerun.live_view import LiveView, free_port, viewer_program
 from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
 from hvt_ground.sinks.rerun.palette import class_colour
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
@@ -259,13 +259,6 @@ def test_closing_twice_is_fine_and_nothing_is_written_after(events: list[Event],
     assert path.stat().st_size == size
 
 
-def test_without_a_file_nothing_is_written(events: list[Event]) -> None:
-    """Looking on without recording must not leave files behind."""
-    with Recorder(settings(None)) as recorder:
-        recorder.log(events[0])
-        assert recorder.size_bytes == 0
-
-
 @pytest.mark.parametrize(("name", "said"), [("no/such/f.rrd", "does not exist"), ("", "is a folder")])
 def test_a_path_that_cannot_be_written_is_one_sentence(tmp_path: Path, name: str, said: str) -> None:
     """The user mistyped --record and should read what to mend."""
@@ -321,20 +314,85 @@ def test_a_killed_process_leaves_all_that_was_logged(events: list[Event], tmp_pa
     assert len(read.boxes(last)) == TRACKS
 
 
-def test_a_footer_makes_a_recording_that_verifies(recording: Recording, tmp_path: Path) -> None:
-    """Tools that index recordings refuse a file without a footer; a short flight must not grow by one."""
-    from hvt_ground.sinks.rerun.live_view import viewer_program
-    from hvt_ground.sinks.rerun.rrd_file import add_footer
-
-    path = tmp_path / "copy.rrd"
-    path.write_bytes(Path(recording.reader.path).read_bytes())
-    plain_bytes = path.stat().st_size
-    assert not add_footer(path)
-    assert path.stat().st_size == plain_bytes
-    assert add_footer(path, growth=10)
+@pytest.mark.parametrize("frames", [1, 30, 45])
+def test_a_recording_that_ended_verifies(events: list[Event], tmp_path: Path, frames: int) -> None:
+    """Tools that index recordings refuse a file without a footer, and the shortest flights have none."""
+    path = tmp_path / "a.rrd"
+    with Recorder(settings(path, compact_bytes=20_000)) as recorder:
+        for event in events:
+            if event.frame_index < frames:
+                recorder.log(event)
+    assert recorder.size_bytes == path.stat().st_size
     subprocess.run([viewer_program(), "rrd", "verify", path], check=True, capture_output=True)
-    assert Recording(path).video() == recording.video()
+    recording = Recording(path)
+    assert len(recording.video()) == frames
+    assert recording.blueprints == 1
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_in_a_hurry_the_footer_is_left_out(events: list[Event], tmp_path: Path) -> None:
+    """Ctrl-C would wait for an hour's recording to be written once more."""
+    path, hurry = tmp_path / "a.rrd", threading.Event()
+    recorder = Recorder(settings(path))
+    for event in events:
+        recorder.log(event)
+    hurry.set()
+    recorder.close(hurry)
+    assert len(Recording(path).video()) == FRAMES
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_recording_that_was_removed_is_noticed(events: list[Event], tmp_path: Path) -> None:
+    """A flight would be written for hours into a file that nobody will find."""
+    path = tmp_path / "a.rrd"
+    recorder = Recorder(settings(path))
+    recorder.log(events[0])
+    path.unlink()
+    with pytest.raises(UserError, match="it was removed"):
+        recorder.log(events[1])
+    with pytest.raises(UserError, match="it was removed"):
+        recorder.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_each_edge_has_a_screen_of_its_own(tmp_path: Path) -> None:
+    """A viewer that shows two edges would show both with the size, budget and plots of the one that came last."""
+    stores = []
+    for edge in ("uav-1", "uav-2"):
+        path = tmp_path / f"{edge}.rrd"
+        with Recorder(settings(path, edge_id=edge)):
+            pass
+        reader = Recording(path).reader
+        (recording,), (blueprint,) = reader.recordings(), reader.blueprints()
+        assert recording.application_id == blueprint.application_id
+        assert recording.recording_id == f"{edge}-00ff", "a backlog of the session is shown with it"
+        stores.append(recording.application_id)
+    assert len(set(stores)) == 2
+
+
+def test_plots_have_a_hole_where_nothing_came(tmp_path: Path) -> None:
+    """A line through an outage says that the link carried something."""
+    path = tmp_path / "a.rrd"
+    with Recorder(settings(path)) as recorder:
+        for second in (0, 1, 2, 9, 10):
+            at = START_NS + second * 1_000_000_000
+            recorder.log(Traffic(15 * second, at, 3e5, 1e5, 4e5, 4e5, 20.0, 40.0, 7, 2))
+    recording = Recording(path)
+    for entity in ("/link/bitrate", "/link/latency", "/link/tracks"):
+        rows = recording.lines(entity)
+        assert [frame for frame, _ in rows] == [0, 15, 30, 31, 135, 150]
+        assert [bool(np.isnan(values).all()) for _, values in rows] == [False] * 3 + [True] + [False] * 2
+
+
+def test_the_session_panel_says_what_came(units: list[tuple[bytes, bool]], tmp_path: Path) -> None:
+    """It said "at 15 fps" of a flight of which 3 came."""
+    path = tmp_path / "a.rrd"
+    recorder = Recorder(settings(path))
+    assert "up to 15 fps" in Recording(path).rows("/session", "TextDocument:text")[-1][2][0]
+    for index in range(5):  # every fifth frame; each is a keyframe to the decoder
+        recorder.log(VideoSample(5 * index, START_NS + 5 * index * STEP_NS, *units[0]))
+    recorder.close()
+    assert "3.57 of 15 fps came" in Recording(path).rows("/session", "TextDocument:text")[-1][2][0]
 
 
 @pytest.mark.realdata
@@ -366,26 +424,6 @@ def _carpark(data: Path, count: int) -> list[np.ndarray]:
             if len(frames) == count:
                 break
     return frames
-
-
-def test_a_dead_viewer_does_not_stop_the_recording(
-    events: list[Event], tmp_path: Path, free_port: int
-) -> None:
-    """Closing the window must not cost the flight."""
-    path = tmp_path / "a.rrd"
-    with LiveView("serve", port=free_port, web_port=_another(free_port)) as view:
-        recorder, live = Recorder(settings(path)), Recorder(settings(None, live_url=view.url))
-        for event in events[:30]:
-            recorder.log(event)
-            live.log(event)
-    time.sleep(1.1)  # the recorder looks once a second
-    assert not listening(free_port)
-    for event in events[30:]:
-        recorder.log(event)
-        live.log(event)
-    live.close()
-    recorder.close()
-    assert len(Recording(path).video()) == FRAMES
 
 
 def test_a_taken_port_is_one_sentence(free_port: int) -> None:

@@ -1,0 +1,47 @@
+"""What a sink is, for those that log, and what a `QueuedSink` writes to in its own thread."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from hvt_ground.events import Refinement, VideoSample
+
+__all__ = ["Sink", "SinkWriter", "size_bytes"]
+
+T_contra = TypeVar("T_contra", contravariant=True)
+
+_SMALL_BYTES = 512
+
+
+class Sink(Protocol[T_contra]):
+    """Takes the events of one session, or other items, and uses those that it knows."""
+
+    def log(self, item: T_contra) -> None:
+        """Take an item."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Write what is buffered; what only helps and may take seconds is left out once ``hurry`` is set."""
+
+
+class SinkWriter(Sink[T_contra], Protocol[T_contra]):
+    """A sink that one thread uses. What it raises ends it."""
+
+    @property
+    def path(self) -> Path | None:
+        """The file; None without one."""
+
+    def skipped(self, count: int) -> None:
+        """So many items were left out before the next one."""
+
+
+def size_bytes(item: object) -> int:
+    """About what an item takes in memory."""
+    match item:
+        case VideoSample():
+            return len(item.data) + _SMALL_BYTES
+        case Refinement():
+            pictures = (item.still_bgr, item.base_crop_bgr)
+            return len(item.still) + sum(one.nbytes for one in pictures if one is not None) + _SMALL_BYTES
+    return _SMALL_BYTES

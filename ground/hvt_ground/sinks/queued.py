@@ -1,0 +1,242 @@
+"""A sink behind a bounded queue, in a thread of its own: what goes wrong or slowly there is felt nowhere else."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from hvt_common.runtime.failures import Failures, RetryPause, reason_of
+from hvt_ground.sinks.contract import SinkWriter, size_bytes
+
+__all__ = ["Outputs", "QueuedSink"]
+
+_log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+_MOST_ITEMS = 4096
+_MOST_BYTES = 32 * 2**20
+"""Some minutes of a thin link, or some hundred large stills."""
+_POLL_S = 0.2
+_AT_ONCE = threading.Event()
+_AT_ONCE.set()
+
+
+class QueuedSink(Generic[T]):
+    """Writes in a thread of its own what `log` takes, into a sink that ``open_sink`` makes there.
+
+    A sink that raises is closed and made anew after growing pauses; until then what comes is counted as lost. Where
+    the queue is full `log` waits up to ``wait_s`` for room, then what comes is counted as dropped. ``failures``
+    learns of it under the name ``part``. ``for_backlog``: what was stored at the edge is to be written there.
+    """
+
+    def __init__(
+        self,
+        part: str,
+        open_sink: Callable[[], SinkWriter[T]],
+        *,
+        failures: Failures,
+        wait_s: float = 0.0,
+        for_backlog: bool = False,
+    ) -> None:
+        self.part = part
+        self.for_backlog = for_backlog
+        self._open_sink = open_sink
+        self._wait_s = wait_s
+        self._changed = threading.Condition()
+        self._queue: deque[tuple[T, int, int]] = deque()
+        """Items, their sizes, and how many were dropped before each."""
+        self._queued_bytes = 0
+        self._skipped = 0
+        self._in_hand = False
+        self._ending = False
+        self._hurry = threading.Event()
+        self._failures = failures
+        self._pause = RetryPause()
+        self.files: list[Path] = []
+        """In the order of opening."""
+        self._open = self._failing = self._resumed = False
+        self.missing = 0
+        """Items that came while the sink was failing, or for which the queue had no room."""
+        self._dropped = 0
+        """The latter."""
+        self._thread = threading.Thread(target=self._run, name=f"hvt-{part}"[:48], daemon=True)
+        self._thread.start()
+
+    def log(self, item: T) -> None:
+        """Queue an item; for any thread. After `close` nothing is taken."""
+        size = size_bytes(item)
+        with self._changed:
+            if self._wait_s and not self._fits(size):
+                self._changed.wait_for(lambda: self._fits(size), self._wait_s)
+            if self._ending:
+                return
+            if self._failing:
+                self.missing += 1
+            elif self._fits(size):
+                self._queue.append((item, size, self._skipped))
+                self._queued_bytes += size
+                self._skipped = 0
+                self._changed.notify_all()
+            else:
+                self.missing += 1
+                self._dropped += 1
+                self._skipped += 1
+                if self._dropped.bit_count() == 1:  # 1, 2, 4, 8 …
+                    _log.warning("%s is too slow: %d events were dropped so far", self.part, self._dropped)
+
+    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - `join` has its own
+        """Take nothing more; what is queued is written and the sink closed in its own time."""
+        with self._changed:
+            self._ending = True
+            self._changed.notify_all()
+
+    def join(self, deadline_s: float) -> bool:
+        """Wait for the end until ``deadline_s`` (monotonic), then for a second more without what only helps."""
+        self.close()
+        self._thread.join(max(0.0, deadline_s - time.monotonic()))
+        self._hurry.set()
+        self._thread.join(1.0)
+        if not self.ended:
+            self._fail(TimeoutError("it did not end in time"))
+        return self.ended
+
+    @property
+    def idle(self) -> bool:
+        """Whether all that could be written is."""
+        with self._changed:
+            return not (self._queue or self._in_hand)
+
+    def is_open(self, *, within_s: float = 0.0) -> bool:
+        """Whether what is logged now will be written, as far as is known; waits so long for the sink to be made."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._open or self._failing, within_s)
+            return self._open
+
+    def take_resumed(self) -> bool:
+        """Whether it goes on after a gap since the last call: its video does with the next keyframe."""
+        resumed, self._resumed = self._resumed, False
+        return resumed
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing is done any more."""
+        return not self._thread.is_alive()
+
+    def _fits(self, size: int) -> bool:
+        """Or whether there is no need of any."""
+        if self._ending or self._failing or not self._queue:
+            return True
+        return len(self._queue) < _MOST_ITEMS and self._queued_bytes + size <= _MOST_BYTES
+
+    # In its own thread
+
+    def _run(self) -> None:
+        while not self._use():
+            while not self._pause.due(time.monotonic_ns()):
+                with self._changed:
+                    if self._changed.wait_for(lambda: self._ending, _POLL_S):
+                        return
+
+    def _use(self) -> bool:
+        """Make the sink and write until the end; False where that failed."""
+        sink: SinkWriter[T] | None = None
+        try:
+            sink = self._open_sink()
+            self._begin(sink)
+            while (taken := self._take()) is not None:
+                item, skipped = taken
+                if skipped:
+                    sink.skipped(skipped)
+                    self._resumed = True
+                sink.log(item)
+            sink.close(self._hurry)
+        except Exception as error:  # noqa: BLE001 - whatever it is, everything else goes on
+            if sink is not None:
+                with suppress(Exception):
+                    sink.close(_AT_ONCE)
+            self._fail(error)
+            return False
+        return True
+
+    def _begin(self, sink: SinkWriter[T]) -> None:
+        if sink.path is not None:
+            self.files.append(sink.path)
+        with self._changed:
+            self._resumed |= self._failing
+            self._open, self._failing = True, False
+            self._changed.notify_all()
+        self._failures.works(self.part)
+
+    def _take(self) -> tuple[T, int] | None:
+        """The next item, and how many were dropped before it; None at the end."""
+        with self._changed:
+            self._in_hand = False
+            self._changed.wait_for(lambda: self._queue or self._ending)
+            if not self._queue:
+                return None
+            item, size, skipped = self._queue.popleft()
+            self._queued_bytes -= size
+            self._in_hand = True
+            if self._wait_s:
+                self._changed.notify_all()
+            return item, skipped
+
+    def _fail(self, error: BaseException) -> None:
+        """What is queued is lost."""
+        self._pause.failed(time.monotonic_ns())
+        with self._changed:
+            self._open, self._failing = False, True
+            self.missing += len(self._queue) + self._in_hand
+            self._queue.clear()
+            self._queued_bytes = self._skipped = 0
+            self._in_hand = False
+            self._changed.notify_all()
+        self._failures.failed(self.part, reason_of(error))
+        _log.debug("%s failed", self.part, exc_info=error)
+
+
+class Outputs:
+    """All sinks of a ground, for its end; ``failures`` learns what becomes of them. For any thread."""
+
+    def __init__(self, failures: Failures) -> None:
+        self._failures = failures
+        self._sinks: list[QueuedSink[Any]] = []
+        self._lock = threading.Lock()
+
+    def open(
+        self,
+        part: str,
+        open_sink: Callable[[], SinkWriter[T]],
+        *,
+        wait_s: float = 0.0,
+        for_backlog: bool = False,
+    ) -> QueuedSink[T]:
+        """A sink behind a queue (`QueuedSink`)."""
+        sink = QueuedSink(part, open_sink, failures=self._failures, wait_s=wait_s, for_backlog=for_backlog)
+        with self._lock:
+            self._sinks = [one for one in self._sinks if not one.ended]
+            self._sinks.append(sink)
+        return sink
+
+    @property
+    def idle(self) -> bool:
+        """Whether all that could be written is."""
+        with self._lock:
+            return all(one.idle for one in self._sinks)
+
+    def close(self, *, within_s: float = 8.0) -> None:
+        """End them all, within that time."""
+        with self._lock:
+            sinks = list(self._sinks)
+        for sink in sinks:
+            sink.close()
+        deadline_s = time.monotonic() + within_s
+        for sink in sinks:
+            sink.join(deadline_s)

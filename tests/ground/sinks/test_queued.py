@@ -1,0 +1,153 @@
+"""Sinks that are slow, gone or dead: whoever logs is not held up, and what is missing is known."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from hvt_common.runtime.failures import Failures
+from hvt_ground.events import Event, Notice, VideoSample
+from hvt_ground.sinks import Outputs, QueuedSink
+from hvt_ground.sinks.line_file import LineFile
+from hvt_ground.sinks.rerun.live_view import LiveView, listening
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames
+from programs.processes import eventually, free_ports
+from programs.rrd import Recording
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[VideoSample]:
+    """Three seconds of real x265 access units, a keyframe every 20."""
+    units = coded(drawn_frames(45), kbps=300, keyint=20)
+    return [VideoSample(i, START_NS + i * STEP_NS, *unit) for i, unit in enumerate(units)]
+
+
+def settings(path: Path | None, **changes: object) -> RecorderSettings:
+    """A small recording."""
+    return RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0, **changes)
+
+
+def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path, caplog):
+    """The picture would stand still until a slow card has written, or the memory fill with what it is to write."""
+    pipe = tmp_path / "table.csv"
+    os.mkfifo(pipe)  # opening it waits for a reader, writing for room
+    failures = Failures(time.time_ns)
+    sink = QueuedSink("tracks table", lambda: LineFile(pipe, ("a",)), failures=failures)
+    began_s = time.monotonic()
+    for _ in range(10_000):
+        sink.log("x" * 100 + "\n")
+    assert time.monotonic() - began_s < 5
+    assert sink.missing == 10_000 - 4096
+    assert "tracks table is too slow: 4096 events were dropped so far" in caplog.messages
+    assert not sink.idle
+    with pipe.open() as reader:
+        sink.close()
+        lines = reader.read().splitlines()
+    assert sink.join(time.monotonic() + 20)
+    assert lines == ["a", *["x" * 100] * 4096], "what was taken is written, in whole lines"
+    assert failures.parts == (), "slow is not broken"
+
+
+def test_one_that_never_answers_does_not_keep_the_ground_from_ending(tmp_path):
+    """Ctrl-C would be answered with kill -9."""
+    pipe = tmp_path / "table.csv"
+    os.mkfifo(pipe)
+    failures = Failures(time.time_ns)
+    outputs = Outputs(failures)
+    sink = outputs.open("tracks table", lambda: LineFile(pipe, ("a",)))
+    outputs.close(within_s=0.1)
+    assert not sink.ended
+    assert [(one.part, one.working) for one in failures.parts] == [("tracks table", False)]
+    with pipe.open():  # so that the test's own process has no thread left
+        eventually(lambda: sink.ended, within_s=20, what="the thread ends")
+
+
+def test_in_lockstep_a_full_queue_is_waited_for(tmp_path):
+    """Two runs of one input would leave two different tables, by the speed of the disk."""
+    pipe = tmp_path / "table.csv"
+    os.mkfifo(pipe)
+    sink = QueuedSink("table", lambda: LineFile(pipe, ("a",)), failures=Failures(time.time_ns), wait_s=30.0)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    read = b""
+    for number in range(6000):
+        sink.log(f"{number}\n" * 20)
+        if number % 50 == 49:
+            read += _all_of(reader)
+    sink.close()
+    while not sink.ended:
+        read += _all_of(reader)
+    read += _all_of(reader)
+    os.close(reader)
+    assert sink.missing == 0
+    assert read.split()[1:] == [b"%d" % number for number in range(6000) for _ in range(20)]
+
+
+def _all_of(reader: int) -> bytes:
+    try:
+        return os.read(reader, 1 << 20)
+    except BlockingIOError:
+        return b""
+
+
+def test_video_goes_on_at_a_keyframe_after_a_gap(samples, tmp_path):
+    """A viewer would show garbage for what refers to frames that were dropped."""
+    path = tmp_path / "a.rrd"
+    with Recorder(settings(path)) as recorder:
+        for sample in samples:
+            if sample.frame_index == 10:
+                recorder.skipped(3)
+            if not 10 <= sample.frame_index < 13:
+                recorder.log(sample)
+    recording = Recording(path)
+    assert [frame for frame, _, _ in recording.video()] == [*range(10), *range(20, 45)]
+    assert (13, "WARN", "3 events are missing here: writing was too slow") in recording.events()
+
+
+def test_a_viewer_that_is_killed_is_told_of_and_started_again(samples, tmp_path, caplog):
+    """Closing the window must not cost the flight, and a web viewer that has crashed come back for the next look."""
+    port, web_port = free_ports(2)
+    failures = Failures(time.time_ns)
+    outputs = Outputs(failures)
+    with LiveView("serve", port=port, web_port=web_port) as view:
+
+        def shown() -> Recorder:
+            view.start_again()
+            return Recorder(settings(None, live_url=view.url))
+
+        recording = outputs.open("recording", lambda: Recorder(settings(tmp_path / "a.rrd")))
+        live = outputs.open("live view", shown)
+        feed(samples[:20], recording, live)
+        eventually(lambda: live.is_open() and live.idle, within_s=30, what="it is shown")
+        os.kill(view.pid, signal.SIGKILL)
+        eventually(lambda: not listening(port), within_s=20, what="the viewer is dead")
+        eventually(lambda: _told(failures, live), within_s=20, what="that is noticed")
+        (failed,) = failures.parts
+        assert (failed.part, failed.reason) == ("live view", f"the viewer at {view.url} is gone")
+        feed(samples[20:], recording, live)
+        eventually(live.is_open, within_s=30, what="it is started again")
+        assert live.take_resumed(), "which asks for a keyframe"
+        assert listening(port)
+        assert failures.parts[0].working
+        outputs.close(within_s=20)
+    assert live.missing > 0
+    assert recording.missing == 0
+    assert len(Recording(tmp_path / "a.rrd").video()) == len(samples)
+    assert [one.split(":")[0] for one in caplog.messages] == ["live view", "live view"], "once each way"
+
+
+def feed(events: list[Event], *sinks: QueuedSink[Event]) -> None:
+    """Log them to all."""
+    for event in events:
+        for sink in sinks:
+            sink.log(event)
+
+
+def _told(failures: Failures, live: QueuedSink[Event]) -> bool:
+    live.log(Notice(0, START_NS, "info", "still there?"))
+    time.sleep(0.05)
+    return bool(failures.parts)

@@ -1,0 +1,109 @@
+"""What a ground says of its sessions while they fly and when they have ended."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hvt_common.protocol.messages import Info, Status
+from hvt_common.runtime.failures import Failures
+from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.receiver_report import ReceiverReports
+from hvt_ground.session.session import GroundSession
+from hvt_ground.sinks import Outputs
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.status import completed, status_text, summary, table
+from programs.rrd import Recording
+from rigs.flight import Flight, Port, pipeline_of
+
+
+class Ground:
+    """One edge at a ground, in this thread, with a recording and one that cannot be made."""
+
+    def __init__(self, folder: Path, flight: Flight) -> None:
+        self.port, self.path = Port(), folder / "a.rrd"
+        self.port.flight = flight
+        self.failures = Failures(time.time_ns)
+        self.outputs = Outputs(self.failures)
+        self.ended: list[GroundSession] = []
+        self.sessions = EdgeSessions(self.port, open_session=self._open, on_ended=self.ended.append)
+
+    def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
+        settings = RecorderSettings(self.path, info.edge, "1", info.base_size, info.fps, info.budget_bps)
+        gone = replace(settings, path=self.path / "no" / "folder.rrd")
+        sinks = [
+            self.outputs.open("recording of uav-1", lambda: Recorder(settings), for_backlog=True),
+            self.outputs.open("second recording of uav-1", lambda: Recorder(gone)),
+            self.outputs.open("recording of uav-10", lambda: Recorder(gone)),
+        ]
+        return GroundSession(info, sinks=sinks, pipeline_of=pipeline_of, clock=time.time_ns, reports=reports)
+
+    def line(self) -> str:
+        """The status line."""
+        return status_text([("uav-1", self.sessions)], failures=self.failures)
+
+
+@pytest.fixture
+def ground(tmp_path: Path) -> Ground:
+    """After five frames and a report of the edge."""
+    flight = Flight(8)
+    ground = Ground(tmp_path, flight)
+    for index in range(5):
+        ground.sessions.handle(flight.base(index))
+    item = flight.status(base=5)
+    report = replace(
+        Status.parse(item.payload), deferred={"cooldown": 3}, dropped={"base_good": 49, "too_large": 1}
+    )
+    ground.sessions.handle(replace(item, payload=report.pack()))
+    return ground
+
+
+def test_who_gets_no_stills_reads_why(ground):
+    """49 stills that the base made needless looked like a fault of the link."""
+    assert "stills 0 (not sent: 49 base_good, 3 cooldown)" in ground.line()
+    ground.sessions.close()
+    ground.outputs.close()
+    content = summary(ground.ended[0])
+    assert content["stills"]["reasons"]["not_sent"] == {"base_good": 49, "cooldown": 3, "too_large": 1}
+    said = "49 base_good, 3 cooldown, 1 too_large"
+    assert said in dict(table(content))["stills"]
+    assert f"stills that the edge did not send: {said}" in [
+        text for _, _, text in Recording(ground.path).events()
+    ]
+
+
+def test_a_link_that_carries_nothing_is_lost_in_the_line(ground):
+    """It said "244 kbps … 53 ms" throughout an outage."""
+    assert " kbps of " in ground.line()
+    time.sleep(3.2)
+    line = ground.line()
+    assert "LINK LOST for 3 s" in line
+    assert "kbps" not in line
+    ground.sessions.handle(ground.port.flight.base(5))
+    assert "LINK LOST" not in ground.line()
+    ground.sessions.close()
+    ground.outputs.close()
+
+
+def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
+    """Whoever looks for a recording after the flight would learn only then that there is none, and never why."""
+    ground.sessions.close()
+    assert "second recording of uav-1 FAILED at " in ground.line()
+    ground.outputs.close()
+    content = completed(
+        summary(ground.ended[0]), ground.sessions, sinks=ground.ended[0].sinks, failures=ground.failures
+    )
+    assert content["recordings"] == [str(ground.path)]
+    assert content["recording_bytes"] == ground.path.stat().st_size
+    (failed,) = content["failed"]
+    assert (failed["part"], failed["working"]) == ("second recording of uav-1", False)
+    assert "does not exist" in failed["reason"]
+    assert content["missing_events"] == {
+        part: content["missing_events"][part] for part in ("second recording of uav-1", "recording of uav-10")
+    }
+    rows = [text for name, text in table(content) if name in ("failed", "missing")]
+    assert any("second recording of uav-1" in row and "did not work again" in row for row in rows)
+    assert any("events in second recording of uav-1" in row for row in rows)

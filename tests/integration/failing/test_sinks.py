@@ -1,0 +1,121 @@
+"""Disks that fill and folders that go while a ground writes there: only what is written there suffers."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
+from programs.processes import Link, Running, eventually
+from programs.rrd import Recording
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(300)]
+
+EDGES = ("uav-1", "uav-2")
+ANALYSES = ("--detector", "motion", "--classifier", "none")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 8 MB, of which 1 MB is free."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = shutil.which("mount")
+    options = ["-t", "tmpfs", "-o", "size=8m", "hvt-test", str(disk)]
+    if mount is None or subprocess.run([mount, *options], check=False, capture_output=True).returncode:
+        pytest.skip("this user may not mount a small file system")
+    try:
+        (disk / "ballast").write_bytes(bytes(7 << 20))
+        yield disk
+    finally:
+        subprocess.run(["umount", "--lazy", str(disk)], check=True)
+
+
+def edges(link: Link, scene: Path) -> list[Running]:
+    """Two that play the scene in real time at little cost."""
+    cheap = ("--size", "640x360", "--fps", "10", "--preset", "ultrafast", "--budget", "600kbps")
+    source = ("--source", str(scene), "--source-fps", "10", "--detector", "motion", *cheap)
+    return [link.edge(*source, "--edge-id", name, name=name) for name in EDGES]
+
+
+def columns(path: Path, name: str) -> list[str]:
+    """A column of a table."""
+    with path.open(newline="") as file:
+        return [row[name] for row in csv.DictReader(file)]
+
+
+def verified(path: Path) -> bool:
+    """Whether Rerun's own tool finds the recording whole, its footer included."""
+    command = [viewer_program(), "rrd", "verify", path]
+    return subprocess.run(command, check=False, capture_output=True, env=viewer_environment()).returncode == 0
+
+
+def test_a_full_disk_under_the_recordings_ends_nothing_else(small_disk, long_scene, link):
+    """It ended the whole ground with the code that keeps systemd from starting it again."""
+    ground = link.ground(
+        *ANALYSES, "--once", "--record", str(small_disk), "--tracks", ".", "--timing", "timing.csv"
+    )
+    flown = edges(link, long_scene)
+    for name in EDGES:
+        ground.until(f"recording of {name} FAILED at", within_s=120)
+    firsts = [min(small_disk.glob(f"hvt-{name}-*.rrd"), key=lambda one: len(one.name)) for name in EDGES]
+    before = {path: path.read_bytes() for path in firsts}
+    (small_disk / "ballast").unlink()
+    for name in EDGES:
+        ground.until(f"recording of {name}: works again", within_s=60)
+    told = len(columns(link.folder / "timing.csv", "kind"))
+    eventually(
+        lambda: len(columns(link.folder / "timing.csv", "kind")) > told + 40, within_s=30, what="it flies on"
+    )
+    for edge in flown:
+        edge.stop()
+    summaries = ground.finish(within_s=30)
+    for name, summary in zip(EDGES, summaries, strict=True):
+        (failed,) = summary["failed"]
+        assert (failed["part"], failed["working"]) == (f"recording of {name}", True)
+        assert "No space left on device" in failed["reason"]
+        assert failed["since"] <= failed["last"]
+        said = ground.said.count(f"hvt-ground: recording of {name}: recording {small_disk}")
+        assert 1 <= said <= 3, "once, or twice where it had found some room between"
+        assert summary["missing_events"][f"recording of {name}"] > 0
+        first, *_, second = map(Path, summary["recordings"])
+        assert first.read_bytes() == before[first], "what was recorded stays as it was"
+        frames = [{frame for frame, *_ in Recording(path).video()} for path in (first, second)]
+        assert len(frames[0]) > 10
+        assert min(frames[1]) > max(frames[0])
+        assert verified(second)
+        assert f"recording of {name}" in ground.told
+        table = next(link.folder.glob(f"hvt-{name}-*.csv"))
+        assert max(map(int, columns(table, "frame"))) > min(frames[1]), "the table went on"
+    shown = [kind for kind in columns(link.folder / "timing.csv", "kind") if kind == "base"]
+    assert len(shown) == sum(summary["frames"] for summary in summaries), "no line of any message is missing"
+
+
+def test_a_folder_that_goes_in_flight_costs_what_is_written_there(long_scene, link):
+    """A stick that was pulled out would end the flight, or all would be written to a file that is in no folder."""
+    folder = link.folder / "tables"
+    folder.mkdir()
+    ground = link.ground(*ANALYSES, "--once", "--record", "flights", "--tracks", str(folder))
+    flown = edges(link, long_scene)
+    eventually(lambda: len(list(folder.iterdir())) == 2, within_s=60, what="both tables are there")
+    shutil.rmtree(folder)
+    for name in EDGES:
+        ground.until(f"tracks table of {name} FAILED at", within_s=60)
+    folder.mkdir()
+    for name in EDGES:
+        ground.until(f"tracks table of {name}: works again", within_s=60)
+    for edge in flown:
+        edge.stop()
+    for name, summary in zip(EDGES, ground.finish(within_s=30), strict=True):
+        (failed,) = summary["failed"]
+        assert (failed["part"], failed["working"]) == (f"tracks table of {name}", True)
+        assert "cannot be written any further: it was removed" in ground.said
+        (recording,) = summary["recordings"]
+        assert len(Recording(link.folder / recording).video()) == summary["frames_decoded"], "all of it"
+        assert verified(link.folder / recording)
+    assert len(list(folder.iterdir())) == 2
