@@ -9,7 +9,6 @@ import numpy as np
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.pipeline import DecodedFrame
-from hvt_ground.perception.retried import RetriedDetector
 from hvt_ground.wiring import Models
 from rigs.flight import Flight, pipeline_of
 
