@@ -59,7 +59,7 @@ format: setup    ## write what `make check` wants to see
 	@$(BIN)/ruff format
 	@$(BIN)/ruff check --fix
 
-bench: setup     ## speed and memory as ratios against a peer or a floor, measured in one run
+bench: setup     ## memory, and speed as ratios against a peer or a floor; fails where a bar of bench/bars.py is missed
 	@$(BIN)/python -m bench
 
 bench-stills: setup ## still codecs on real crops: bytes at equal quality, time to encode and decode
@@ -83,8 +83,8 @@ fuzz: setup      ## coverage-guided fuzzing of all that comes from outside: RUNS
 
 bench-peers: setup ## the tracker beside roboflow trackers, which get an environment of their own (they are large)
 	@test -x build/peers/bin/python || $(PYTHON) -m venv build/peers
-	@build/peers/bin/python -m pip install --quiet numpy scipy trackers
-	@PYTHONPATH=common build/peers/bin/python bench/tracker.py
+	@build/peers/bin/python -m pip install --quiet numpy lapx trackers
+	@PYTHONPATH=common:. build/peers/bin/python -m bench.tracker
 
 docs: setup      ## write docs/options.md from the settings
 	@$(BIN)/python docs/options.py

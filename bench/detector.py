@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from bench.bars import measured
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import OnnxDetector
 from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 
 DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
-BAR = 1.10
 MODELS = (
     ("yolox_nano", (416, 416), 150),
     ("yolov5su_visdrone_640", (640, 640), 15),
@@ -30,17 +30,16 @@ MODELS = (
 
 
 def rows() -> list[dict]:
-    """One row a measure: measure, value, bar, holds (bar and holds are None where there is none)."""
     picture = cv2.imread(str(DATA / "visdrone/0000001_02999_d_0000005.jpg"))
     image = cv2.resize(picture, (1280, 720), interpolation=cv2.INTER_AREA)
     result = []
     for name, size, rounds in MODELS:
         ratio, bare_ms = _wrapper_against_bare(DATA / f"models/{name}.onnx", image, size, rounds)
-        result.append(
-            _row(f"{name} {size[0]}x{size[1]}: detector / bare call ({bare_ms:.1f} ms)", ratio, BAR)
-        )
-    result.append(_row("motion detector on 1280x720, ms a call", _motion_ms(image), None))
-    result.append(_row("MobileNetV2 classifier, ms a crop in a batch of 8", _classifier_ms(image), None))
+        of = f"{name} {size[0]}x{size[1]}"
+        result.append(measured("bare call, ms", bare_ms, of=of))
+        result.append(measured("detector / bare call", ratio, of=of))
+    result.append(measured("motion detector on 1280x720, ms a call", _motion_ms(image)))
+    result.append(measured("MobileNetV2 classifier, ms a crop in a batch of 8", _classifier_ms(image)))
     return result
 
 
@@ -78,15 +77,6 @@ def _ms(call) -> float:
     start = time.perf_counter()
     call()
     return (time.perf_counter() - start) * 1e3
-
-
-def _row(measure: str, value: float, bar: float | None) -> dict:
-    return {
-        "measure": measure,
-        "value": round(value, 3),
-        "bar": bar,
-        "holds": None if bar is None else value <= bar,
-    }
 
 
 if __name__ == "__main__":

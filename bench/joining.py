@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import signal
-import socket
 import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
+from bench.bars import measured
 from bench.material import FPS, clip, nano
+from bench.processes import free_endpoint, running
 
 _GROUNDS = 5
 _PATIENCE_S = 60.0
@@ -21,33 +19,22 @@ _PATIENCE_S = 60.0
 
 def rows() -> list[dict[str, object]]:
     pictures_s, grounds_s, edge_s = _joined()
-    worst = FPS * max(pictures_s)
     return [
-        {
-            "measure": f"a late ground's first picture after the first message, in frames; worst of {_GROUNDS}",
-            "value": worst,
-            "bar": f"<= {FPS:.0f}",
-            "holds": worst <= FPS,
-        },
-        {
-            "measure": "a ground ends after Ctrl-C, worst, s",
-            "value": max(grounds_s),
-            "bar": None,
-            "holds": None,
-        },
-        {"measure": "the edge ends after Ctrl-C, s", "value": edge_s, "bar": None, "holds": None},
+        measured(
+            "a late ground's first picture, in frames", FPS * max(pictures_s), of=f"worst of {_GROUNDS}"
+        ),
+        measured("a ground ends after Ctrl-C, worst, s", max(grounds_s)),
+        measured("the edge ends after Ctrl-C, s", edge_s),
     ]
 
 
 def _joined() -> tuple[list[float], list[float], float]:
     """Seconds from first message to first picture and from Ctrl-C to the end of each ground, and of the edge."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     pictures_s, grounds_s = [], []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with _running(
+        with running(
             *(
                 "hvt_edge.cli",
                 "--source",
@@ -63,7 +50,7 @@ def _joined() -> tuple[list[float], list[float], float]:
         ) as edge:
             for number in range(_GROUNDS):
                 timing = folder / f"{number}.csv"
-                with _running(
+                with running(
                     *("hvt_ground.cli", "--connect", endpoint, "--quiet", "--detector", nano()),
                     *("--record", folder / f"{number}.rrd", "--timing", timing),
                 ) as ground:
@@ -78,18 +65,6 @@ def _long_clip(folder: Path) -> Path:
     long = folder / "long.ffconcat"
     long.write_text("ffconcat version 1.0\n" + "file once.mp4\n" * 40, encoding="ascii")
     return long
-
-
-@contextlib.contextmanager
-def _running(module: str, *arguments: object) -> Iterator[subprocess.Popen]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", module, *map(str, arguments)], stdout=subprocess.DEVNULL
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
 
 
 def _first_picture_s(timing: Path) -> float:

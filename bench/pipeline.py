@@ -14,6 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from bench.bars import measured
 from bench.material import FPS, SIZE, clip, frames, nano
 from hvt_common import __version__
 from hvt_common.inference.detect import open_detector
@@ -48,15 +49,11 @@ def rows() -> list[dict[str, object]]:
         edge.append(_edge())
         ground.append(_ground(units))
     return [
-        _row("edge, frames a second over its floor's", min(floor_edge) / min(edge)),
-        _row("ground, frames a second over its floor's", min(floor_ground) / min(ground)),
-        {"measure": "edge floor, ms a frame", "value": min(floor_edge) * 1e3, "bar": None, "holds": None},
-        {"measure": "ground floor, ms a frame", "value": min(floor_ground) * 1e3, "bar": None, "holds": None},
+        measured("edge, frames a second over its floor's", min(floor_edge) / min(edge)),
+        measured("ground, frames a second over its floor's", min(floor_ground) / min(ground)),
+        measured("edge floor, ms a frame", min(floor_edge) * 1e3),
+        measured("ground floor, ms a frame", min(floor_ground) * 1e3),
     ]
-
-
-def _row(measure: str, value: float) -> dict[str, object]:
-    return {"measure": measure, "value": value, "bar": ">= 0.90", "holds": value >= 0.90}
 
 
 def _bare_encode(taken) -> tuple[float, list[AccessUnit]]:

@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from bench.bars import measured
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
@@ -23,8 +24,6 @@ from hvt_common.inference.store import embedded_models
 from hvt_common.values import Detections, Image
 
 DATA = Path(os.environ.get("HVT_DATA", Path(__file__).resolve().parent.parent.parent / "shared" / "data"))
-LEAST_F1 = 0.99
-SHARE_BAR = 1.0
 MODELS = (
     ("yolox_nano", (1, 3, 384, 640), 25),
     ("yolov5su_visdrone_640", (1, 3, 640, 640), 9),
@@ -37,24 +36,23 @@ FRAMES = range(0, 351, 27)
 
 
 def rows() -> list[dict]:
-    """One row a measure: measure, value, bar, holds (bar and holds are None where there is none)."""
     providers = available()
     result = []
     for name, shape, rounds in (*MODELS, CLASSIFIER):
         times = _times(DATA / f"models/{name}.onnx", shape, rounds, providers)
         size = f"{shape[3]}x{shape[2]}"
-        result.append(_row(f"{name} {size}: cpu, ms", times["cpu"][0]))
+        result.append(measured("cpu, ms", times["cpu"][0], of=f"{name} {size}"))
         for provider in providers[1:]:
             ms, ratio = times[provider]
-            result.append(_row(f"{name} {size}: {provider}, ms", ms))
-            result.append(_row(f"{name} {size}: {provider} / cpu", ratio, SHARE_BAR, at_least=False))
+            result.append(measured(f"{provider}, ms", ms, of=f"{name} {size}"))
+            result.append(measured("provider / cpu, time", ratio, of=f"{name} {size}, {provider}"))
     images = _frames()
     models = {name: str(DATA / f"models/{name}.onnx") for name in COMPARED}
     models |= {name: name for name in embedded_models() if name == EMBEDDED}
     for name, spec in models.items():
         for provider in providers[1:]:
             f1 = _f1(spec, images, provider)
-            result.append(_row(f"{name}: F1 of {provider} against cpu on drone_carpark", f1, LEAST_F1))
+            result.append(measured("F1 of provider against cpu", f1, of=f"{name}, {provider}"))
     return result
 
 
@@ -138,15 +136,6 @@ def _iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return shared / (np.prod(box[2:] - box[:2]) + np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) - shared)
 
 
-def _row(measure: str, value: float, bar: float | None = None, *, at_least: bool = True) -> dict:
-    return {
-        "measure": measure,
-        "value": round(value, 3),
-        "bar": bar,
-        "holds": None if bar is None else (value >= bar if at_least else value <= bar),
-    }
-
-
 if __name__ == "__main__":
-    for row in rows():
-        print(row)
+    for one in rows():
+        print(one)

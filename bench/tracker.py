@@ -1,7 +1,7 @@
 """Milliseconds a frame of the tracker, and their ratio to roboflow's `trackers` where that is installed.
 
-Run ``python bench/tracker.py``. `trackers` is no dependency of the project: install it into an environment of its
-own and run this file with that Python and ``PYTHONPATH=common``.
+Run ``python -m bench.tracker``. `trackers` is no dependency of the project: install it into an environment of its
+own and run this module with that Python and ``PYTHONPATH=common:.``.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.bars import measured
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import Detections
 
@@ -20,7 +21,6 @@ COUNTS = (20, 50, 100, 500)
 FRAMES = {20: 150, 50: 150, 100: 100, 500: 30}
 ROUNDS = 5
 FPS = 30.0
-BAR_COUNT, BAR = 50, 0.35
 
 
 def scene(count: int, *, frames: int, seed: int = 7) -> list[Detections]:
@@ -102,21 +102,13 @@ def rows() -> list[dict[str, Any]]:
             own_ms.append(ours(detections) / len(detections) * 1e3)
             if theirs is not None:
                 their_ms.append(theirs(detections) / len(detections) * 1e3)
-        result.append(_row(f"tracker, {count} boxes, ms a frame", round(min(own_ms), 3)))
+        result.append(measured(f"{count} boxes, ms a frame", round(min(own_ms), 3)))
         if their_ms:
-            bar = BAR if count == BAR_COUNT else None
             ratio = round(min(own_ms) / min(their_ms), 3)
-            result.append(_row(f"tracker, {count} boxes, time / roboflow trackers", ratio, bar))
+            result.append(measured(f"{count} boxes, time / roboflow trackers", ratio))
     return result
 
 
-def _row(measure: str, value: float, bar: float | None = None) -> dict[str, Any]:
-    return {"measure": measure, "value": value, "bar": bar, "holds": None if bar is None else value <= bar}
-
-
 if __name__ == "__main__":
-    for row in rows():
-        judged = (
-            "" if row["bar"] is None else f"   at most {row['bar']}: {'holds' if row['holds'] else 'FAILS'}"
-        )
-        print(f"{row['measure']:48} {row['value']:8.3f}{judged}")
+    for one in rows():
+        print(one)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import zenoh
 
-from hvt_common.config import PATH, TEXT, load, option, switch, to_toml
+from hvt_common.config import PATH, TEXT, Group, load, to_toml
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
@@ -28,18 +28,21 @@ PROGRAM = "hvt-router"
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
+_ALL = Group()
+
+
 @dataclass(frozen=True, slots=True)
 class RouterConfig:
     """What the router runs with. See ``--help`` for each."""
 
-    zenoh_config: Path = option(
+    zenoh_config: Path = _ALL.option(
         PATH, Path(__file__).parent / "zenoh" / "router.json5", "Zenoh configuration, JSON5, with mode router"
     )
-    listen: tuple[str, ...] = option(
+    listen: tuple[str, ...] = _ALL.option(
         TEXT, (), "Zenoh endpoint to listen on, instead of those of the file", many=True
     )
-    connect: tuple[str, ...] = option(TEXT, (), "another router to connect to", many=True)
-    insecure: bool = switch("allow listening beyond this machine without keys")
+    connect: tuple[str, ...] = _ALL.option(TEXT, (), "another router to connect to", many=True)
+    insecure: bool = _ALL.switch("allow listening beyond this machine without keys")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,6 +1,6 @@
 """One frozen dataclass per process, filled from defaults, then a TOML file, then flags; validated once.
 
-A field is declared with `option` or a `Group` of them: its kind (how text becomes a value and back) and its help.
+A field is declared by its `Group`: its kind (how text becomes a value and back) and its help.
 Every value passes through its kind whether it comes from the file or from the command line, so both say the
 same sentence when it is wrong. ``--help`` leaves out what is ``rare``; ``--help-all`` lists everything. A class
 may name in ``GONE`` what it no longer takes: name → what to do in its place.
@@ -41,9 +41,7 @@ __all__ = [
     "integer",
     "load",
     "number",
-    "option",
     "or_auto",
-    "switch",
     "to_toml",
 ]
 
@@ -152,51 +150,36 @@ def or_auto(kind: SettingType) -> SettingType:
     return SettingType(f"{kind.metavar}|{AUTO}", parse, show)
 
 
-def option(
-    kind: SettingType,
-    default: Any,
-    help_line: str,
-    *,
-    many: bool = False,
-    shown_default: str = "",
-    group: str = "",
-    rare: bool = False,
-) -> Any:
-    """Declare a dataclass field that is also a flag ``--its-name`` and a TOML key ``its-name``.
-
-    With ``many`` the flag may be given several times and the value is a tuple. ``rare``: only in ``--help-all``.
-    """
-    metadata = {
-        "kind": kind,
-        "help": help_line,
-        "many": many,
-        "shown_default": shown_default,
-        "group": group,
-        "rare": rare,
-    }
-    return dataclasses.field(default=default, metadata=metadata)
-
-
-def switch(help_line: str, *, default: bool = False, group: str = "", rare: bool = False) -> Any:
-    """Declare a yes/no field: ``--name`` and ``--no-name``."""
-    metadata = {"help": help_line, "switch": True, "group": group, "rare": rare}
-    return dataclasses.field(default=default, metadata=metadata)
-
-
 @dataclass(frozen=True, slots=True)
 class Group:
     """Settings that ``--help`` lists under one title; those of a ``rare`` group only ``--help-all`` lists."""
 
-    title: str
+    title: str = ""
     rare: bool = False
 
-    def option(self, kind: SettingType, default: Any, help_line: str, **more: Any) -> Any:
-        """See `option`."""
-        return option(kind, default, help_line, group=self.title, rare=self.rare, **more)
+    def option(
+        self,
+        kind: SettingType,
+        default: Any,
+        help_line: str,
+        *,
+        many: bool = False,
+        shown_default: str = "",
+    ) -> Any:
+        """Declare a dataclass field that is also a flag ``--its-name`` and a TOML key ``its-name``.
 
-    def switch(self, help_line: str, **more: Any) -> Any:
-        """See `switch`."""
-        return switch(help_line, group=self.title, rare=self.rare, **more)
+        With ``many`` the flag may be given several times and the value is a tuple.
+        """
+        more = {"kind": kind, "many": many, "shown_default": shown_default}
+        return self._field(default, help_line, more)
+
+    def switch(self, help_line: str, *, default: bool = False) -> Any:
+        """Declare a yes/no field: ``--name`` and ``--no-name``."""
+        return self._field(default, help_line, {"switch": True})
+
+    def _field(self, default: Any, help_line: str, more: Mapping[str, Any]) -> Any:
+        metadata = {"help": help_line, "group": self.title, "rare": self.rare, **more}
+        return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True, slots=True)

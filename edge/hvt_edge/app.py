@@ -10,6 +10,7 @@ from typing import Any
 from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.runtime.process import with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
@@ -21,11 +22,11 @@ from hvt_edge.loop.realtime import RealtimePace
 from hvt_edge.operating.point import LoopClock
 from hvt_edge.perception.analyzer import FailingDetector
 from hvt_edge.perception.guarded_detector import GuardedDetector
-from hvt_edge.source.closing import closing_on
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
+from hvt_edge.source.live import closing_on
 from hvt_edge.status import StatusReporter
-from hvt_edge.summary import EdgeRun, summary
+from hvt_edge.summary import summary
 from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store
 from hvt_edge.world import World
 
@@ -57,6 +58,8 @@ class Edge:
         self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep)
         self._counts = FrameCounts()
         self._failures = self._world.failures
+        self._reached = False
+        """Whether anybody has subscribed to the video."""
         self.ledger = Ledger(window_ns=config.window_ns)
         """Every byte that left."""
 
@@ -68,18 +71,19 @@ class Edge:
         config, world = self._config, self._world
         check_files(config)
         check_codecs(config)
-        opened = world.open_detector(config)
         with ExitStack() as stack:
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
-            world.warm_up(config, opened, source)
+            background = (lambda call: call()) if self._lockstep else with_lower_priority
+            opened = background(lambda: world.open_detector(config))
+            background(lambda: world.warm_up(config, opened, source))
             detector: FailingDetector = opened
             if not self._lockstep:  # whose result would be of something else
                 detector = GuardedDetector(
                     opened,
-                    reopen=lambda: world.open_detector(config),
+                    open_again=lambda: world.open_detector(config),
                     failures=self._failures,
                     clock=world.clock,
                 )
@@ -124,7 +128,7 @@ class Edge:
             finally:
                 stages.stills.close()
                 self._say_goodbye(stages, link, status)
-        return summary(self._facts(stages, link), self.ledger)
+        return self._summary(stages, link)
 
     def _play(
         self, source: Source, stages: Stages, link: EdgeLink, status: StatusReporter, line: StatusLine
@@ -147,6 +151,7 @@ class Edge:
                 if now_ns >= next_status_ns:
                     next_status_ns = now_ns + SECOND_NS
                     status.send("running")
+                    self._reached |= link.has_subscriber(Channel.BASE)
                     line.show(status.line(self._link_text(stages, link)))
                     if stages.reconfiguration.wants_keyframe(now_ns):
                         stages.keyframes.require(now_ns)
@@ -216,6 +221,7 @@ class Edge:
         if stages.backlog is not None:
             stages.backlog.send_no_more()
         status.send("ended")
+        self._reached |= link.has_subscriber(Channel.BASE)
         if link.has_ground():  # what is still in a queue would be lost with the session
             self._world.inbox.wait_for_end(
                 base=self.ledger.messages(Account.BASE),
@@ -225,25 +231,31 @@ class Edge:
                 timeout_s=_GOODBYE_S,
             )
 
-    def _facts(self, stages: Stages, link: EdgeLink) -> EdgeRun:
+    def _summary(self, stages: Stages, link: EdgeLink) -> dict[str, Any]:
         counts, config, backlog, now = self._counts, self._config, stages.backlog, stages.operating.now
         stored = 0 if backlog is None else backlog.frames
-        return EdgeRun(
+        return summary(
+            self.ledger,
             edge=config.edge_id,
             session=f"{self._world.session_id:016x}",
             method=now.method,
             frames=counts.encoded - stored,
             frames_stored=stored,
+            frames_captured=counts.captured,
             frames_dropped=counts.dropped,
+            frames_dropped_cpu=counts.dropped_cpu,
+            frames_unanalyzed=counts.unanalyzed,
+            cores=counts.cpu.short,
             duration_s=counts.duration_s(config.nominal_fps),
             budget_bps=now.highest_budget_bps,
-            base_bps=now.base_bps,
+            budget_base_bps=now.base_bps,
             keyframes=stages.keyframes.sent,
             keyframe_requests=stages.keyframes.served,
             tracks=stages.stills.analyzer.tracks,
             encode_ms=counts.encode_ms,
             perception_ms=stages.stills.analyzer.mean_ms,
             unusable_messages=link.unusable,
+            unreached="" if self._reached else link.trouble or "nobody subscribed to its video",
             store=None if backlog is None else backlog.numbers,
             failed=self._failures.parts,
         )

@@ -11,7 +11,7 @@ from hvt_common.runtime.process import limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, start_log, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
-from hvt_edge.summary import table
+from hvt_edge.summary import table, title
 
 __all__ = ["main"]
 
@@ -37,9 +37,9 @@ def _run(argv: Sequence[str] | None) -> int:
     release_log = start_log("hvt-edge", quiet=config.quiet)
     stop = stop_on_signals()
     content = Edge(config, stop=stop, on_started=release_log).run()
+    print_table(title(content), table(content))
     if config.summary is not None:
         write_json(config.summary, content)
-    print_table(f"{config.edge_id}: sent", table(content))
     return 0
 
 

@@ -139,9 +139,7 @@ class EdgeConfig:
     min_budget: int | None = _LINK_RARE.option(
         BITRATE, None, "what --adapt never goes below", shown_default="100kbps, at most --budget"
     )
-    window: float = _LINK_RARE.option(
-        DURATION, 1.0, "the budget holds in every rolling window of this length"
-    )
+    window: float = _LINK_RARE.option(DURATION, 1.0, "the budget holds in every window of this length")
     connect: tuple[str, ...] = _LINK.option(
         TEXT,
         (),
@@ -157,9 +155,7 @@ class EdgeConfig:
         integer(1, 2), 1, "2: one Zenoh link for what is urgent and one for the rest (docs/adaptation.md)"
     )
     insecure: bool = _LINK_RARE.switch("allow listening beyond this machine without keys")
-    wait: float = _LINK.option(
-        DURATION, 15.0, "how long a file, a folder or the demo waits for the first ground before it plays"
-    )
+    wait: float = _LINK.option(DURATION, 15.0, "how long a clip waits for its first ground before it plays")
 
     method: str = _SENT.option(choice(*METHODS), "M5", "who gets a still, and when")
     profile: str | None = _SENT.option(
@@ -216,9 +212,7 @@ class EdgeConfig:
         TEXT, "off", "detect in tiles of the source too: CxR, auto, or off; needs --candidates source"
     )
     detect_every: int = _MODELS_RARE.option(integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame")
-    confidence: float = _MODELS.option(
-        number(0.01, 1), 0.25, "confidence from which a detection starts a track"
-    )
+    confidence: float = _MODELS.option(number(0.01, 1), 0.25, "confidence of a detection that starts a track")
     nms_iou: float = _MODELS_RARE.option(
         number(0.01, 1), 0.45, "overlap above which two boxes of a class are one"
     )
@@ -231,7 +225,7 @@ class EdgeConfig:
     )
 
     ring: int = _FILES_RARE.option(
-        BYTES, 256_000_000, "memory for source frames, from which stills are served on demand; 0 for none"
+        BYTES, 24_000_000, "memory for source frames, from which stills are served on demand; 0 for none"
     )
     ring_time: float = _FILES_RARE.option(
         DURATION, 5.0, "how far back those go; where memory is short, with frames left out"

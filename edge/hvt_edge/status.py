@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 
 from hvt_common import __version__
 from hvt_common.protocol.ledger import Ledger
@@ -12,7 +13,6 @@ from hvt_common.protocol.messages import (
     Health,
     Info,
     Status,
-    fitted_class_names,
     fitted_text,
 )
 from hvt_common.runtime.failures import Failures
@@ -32,32 +32,24 @@ _MILLION = 1_000_000
 _PART_BYTES, _REASON_BYTES = 24, 160
 
 
+@dataclass(eq=False)
 class InfoReporter:
     """Answers ``info``; from any thread."""
 
-    def __init__(
-        self,
-        config: EdgeConfig,
-        *,
-        session_id: int,
-        operating: Operating,
-        view: View,
-        class_names: tuple[str, ...],
-        clock: Callable[[], int],
-    ) -> None:
-        self._config = config
-        self._session_id = session_id
-        self._operating = operating
-        self._view = view
-        self._class_names = fitted_class_names(class_names)
-        self._clock = clock
+    config: EdgeConfig
+    _: KW_ONLY
+    session_id: int
+    operating: Operating
+    view: View
+    class_names: tuple[str, ...]
+    clock: Callable[[], int]
 
     def info(self, received_ns: int | None = None) -> bytes:
         """What a ground needs to know of the session; times are of the clock that the headers go by."""
-        config, view, now = self._config, self._view, self._operating.now
-        answered_ns = self._clock()
+        config, view, now = self.config, self.view, self.operating.now
+        answered_ns = self.clock()
         info = Info(
-            session_id=self._session_id,
+            session_id=self.session_id,
             edge=config.edge_id,
             software=__version__,
             started_ns=now.started_ns,
@@ -72,80 +64,74 @@ class InfoReporter:
             budget_bps=now.budget_bps,
             base_bps=now.base_bps,
             window_ns=config.window_ns,
-            class_names=self._class_names,
+            class_names=self.class_names,
             received_ns=answered_ns if received_ns is None else received_ns,
             answered_ns=answered_ns,
         )
         return info.pack()
 
 
+@dataclass(eq=False)
 class StatusReporter:
     """Sends ``status`` and makes the status line; in the frame loop."""
 
-    def __init__(
-        self,
-        config: EdgeConfig,
-        *,
-        session_id: int,
-        operating: Operating,
-        ledger: Ledger,
-        counts: FrameCounts,
-        keyframes: KeyframeRequests,
-        transmitter: Transmitter,
-        stills: StillStage,
-        inbox: FeedbackInbox,
-        failures: Failures,
-        clock: Callable[[], int],
-        loop_clock: LoopClock,
-    ) -> None:
-        self._config = config
-        self._session_id = session_id
-        self._operating = operating
-        self._failures = failures
-        self._ledger = ledger
-        self._counts = counts
-        self._keyframes = keyframes
-        self._transmitter = transmitter
-        self._stills = stills
-        self._inbox = inbox
-        self._clock = clock
-        self._loop_clock = loop_clock
+    config: EdgeConfig
+    _: KW_ONLY
+    session_id: int
+    operating: Operating
+    ledger: Ledger
+    counts: FrameCounts
+    keyframes: KeyframeRequests
+    transmitter: Transmitter
+    stills: StillStage
+    inbox: FeedbackInbox
+    failures: Failures
+    clock: Callable[[], int]
+    loop_clock: LoopClock
+
+    def __post_init__(self) -> None:
         self._sequence = 0
 
     def send(self, state: str) -> None:
         """Send the report, made for the moment at which it may go."""
-        self._counts.measure_cpu(perception_ns=self._stills.analyzer.spent_ns)
-        self._transmitter.status(lambda at_ns: self._status(state, at_ns), now_ns=self._loop_clock())
+        self.counts.measure_cpu(perception_ns=self.stills.analyzer.spent_ns)
+        self.transmitter.status(lambda at_ns: self._status(state, at_ns), now_ns=self.loop_clock())
         self._sequence += 1
 
     def line(self, link: str) -> str:
         """The status line."""
-        config, now, ledger = self._config, self._operating.now, self._ledger
-        rate_bps = ledger.window_bytes(None, self._loop_clock()) * 8 * SECOND_NS / ledger.window_ns
-        sent = sum(ledger.outcomes("sent").values())
-        return (
-            f"{config.edge_id} {self._counts.duration_s(config.nominal_fps):6.1f} s  {bitrate_text(rate_bps)} of "
-            f"{bitrate_text(now.total_bps)}  {now.method}  stills {sent}, {self._stills.pending} pending  "
-            f"tracks {self._stills.analyzer.tracks}  {link}"
-        )
+        config, now, ledger, counts = self.config, self.operating.now, self.ledger, self.counts
+        rate_bps = ledger.window_bytes(None, self.loop_clock()) * 8 * SECOND_NS / ledger.window_ns
+        parts = [
+            f"{config.edge_id} {counts.duration_s(config.nominal_fps):6.1f} s",
+            f"{bitrate_text(rate_bps)} of {bitrate_text(now.total_bps)}",
+            now.method,
+            f"stills {sum(ledger.outcomes('sent').values())}, {self.stills.pending} pending",
+            f"tracks {self.stills.analyzer.tracks}",
+            link,
+        ]
+        if counts.dropped_cpu:
+            parts.append(f"{counts.dropped_cpu} frames dropped: slow machine")
+        parts += [f"{one.part.upper()} FAILED" for one in self.failures.parts if not one.working]
+        return "  ".join(parts)
 
     def _status(self, state: str, at_ns: int) -> Status:
         """Totals, outcomes and health at ``at_ns``.
 
         In lockstep no field depends on this machine's speed: the same input gives the same bytes.
         """
-        counts, stills, transmitter = self._counts, self._stills, self._transmitter
-        account = self._ledger.summary(counts.duration_s(self._config.nominal_fps))
+        counts, stills, transmitter = self.counts, self.stills, self.transmitter
+        account = self.ledger.summary(counts.duration_s(self.config.nominal_fps))
         worst = account.worst_window_bps
-        measured = self._config.pace != "lockstep"
-        reported_ns = self._inbox.received_ns
-        age_ms = -1 if reported_ns is None else max(0, (self._clock() - reported_ns) // _MILLION)
+        measured = self.config.pace != "lockstep"
+        reported_ns = self.inbox.received_ns
+        age_ms = -1 if reported_ns is None else max(0, (self.clock() - reported_ns) // _MILLION)
         return Status(
-            session_id=self._session_id,
+            session_id=self.session_id,
             sequence=self._sequence,
             state=state,
             send_ns=at_ns,
-            media_ns=max(0, at_ns - self._operating.now.started_ns),
+            media_ns=max(0, at_ns - self.operating.now.started_ns),
             last_base_sequence=transmitter.base_sequence,
             last_still_sequence=transmitter.still_sequence,
             base_bytes=account.base_bytes,
@@ -165,7 +151,7 @@ class StatusReporter:
                 frames_captured=counts.captured,
                 frames_encoded=counts.encoded,
                 frames_dropped=counts.dropped,
-                keyframes=self._keyframes.sent,
+                keyframes=self.keyframes.sent,
                 tracks=stills.analyzer.tracks,
                 base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
                 still_queue=stills.pending,
@@ -185,6 +171,6 @@ class StatusReporter:
                     failed_ns=one.failed_ns,
                     working=one.working,
                 )
-                for one in self._failures.parts[:MOST_FAILED_PARTS]
+                for one in self.failures.parts[:MOST_FAILED_PARTS]
             ),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
@@ -10,84 +10,55 @@ from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.failures import Failure
 from hvt_common.units import bitrate_text
 from hvt_edge.backlog.worker import StoreNumbers
+from hvt_edge.loop.cpu import Cores
 
-__all__ = ["EdgeRun", "summary", "table"]
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeRun:
-    """The numbers of a run that the ledger does not hold."""
-
-    edge: str
-    session: str
-    method: str
-    frames: int
-    """Encoded and sent."""
-    frames_dropped: int
-    """Given up before encoding because the link or the machine was behind."""
-    duration_s: float
-    """From the first frame sent to the last; frames dropped between them count."""
-    budget_bps: int
-    base_bps: int
-    """The part of the budget for the base stream."""
-    keyframes: int
-    keyframe_requests: int
-    tracks: int
-    encode_ms: float
-    """Mean."""
-    perception_ms: float
-    """Mean of decoding, detection and tracking over all frames."""
-    unusable_messages: int
-    frames_stored: int = 0
-    """Encoded while the link was away, and not sent at once."""
-    store: StoreNumbers | None = None
-    """What was kept while the link was away; None where nothing ever is."""
-    failed: tuple[Failure, ...] = ()
+__all__ = ["summary", "table", "title"]
 
 
-def summary(run: EdgeRun, ledger: Ledger) -> dict[str, Any]:
-    """The JSON summary; rates count every byte on the line: payload, attachments, transport overhead."""
-    account = ledger.summary(run.duration_s)
-    stills: dict[str, Any] = {
-        outcome: sum(account.outcomes[outcome].values()) for outcome in ("sent", "deferred", "dropped")
-    }
-    stills["reasons"] = {outcome: account.outcomes[outcome] for outcome in ("sent", "deferred", "dropped")}
+_RATES = (
+    *("base_bytes", "roi_bytes", "backlog_bytes", "meta_bytes", "overhead_bytes"),
+    *("total_bps", "base_bps", "roi_bps"),
+)
+
+
+def summary(
+    ledger: Ledger,
+    *,
+    duration_s: float,
+    cores: Cores,
+    store: StoreNumbers | None,
+    failed: tuple[Failure, ...],
+    **facts: str | float,
+) -> dict[str, Any]:
+    """The JSON summary; rates count every byte on the line: payload, attachments, transport overhead.
+
+    ``duration_s`` is from the first frame sent to the last; ``cores`` of the times in which frames were left out for
+    want of time. ``facts`` are numbers that the ledger does not hold, as they are.
+    """
+    account = ledger.summary(duration_s)
+    reasons = {outcome: account.outcomes[outcome] for outcome in ("sent", "deferred", "dropped")}
+    stills: dict[str, Any] = {outcome: sum(counts.values()) for outcome, counts in reasons.items()}
     on_roi = stills["sent"] - account.outcomes["sent"].get("stored", 0)
+    stills["reasons"] = reasons
     stills["mean_bytes"] = round(account.roi_bytes / on_roi) if on_roi else 0
-    stills["per_minute"] = round(60 * stills["sent"] / run.duration_s, 2) if run.duration_s else 0.0
+    stills["per_minute"] = round(60 * stills["sent"] / duration_s, 2) if duration_s else 0.0
     return {
-        "edge": run.edge,
-        "session": run.session,
-        "method": run.method,
-        "frames": run.frames,
-        "frames_stored": run.frames_stored,
-        "frames_dropped": run.frames_dropped,
-        "duration_s": round(run.duration_s, 3),
-        "base_bytes": account.base_bytes,
-        "roi_bytes": account.roi_bytes,
-        "backlog_bytes": account.backlog_bytes,
-        "meta_bytes": account.meta_bytes,
-        "overhead_bytes": account.overhead_bytes,
-        "total_bps": account.total_bps,
-        "base_bps": account.base_bps,
-        "roi_bps": account.roi_bps,
-        "budget_bps": run.budget_bps,
-        "budget_base_bps": run.base_bps,
-        "worst_window_bps": {
-            "base": account.worst_window_bps.base,
-            "roi": account.worst_window_bps.roi,
-            "total": account.worst_window_bps.total,
-        },
+        **{name: round(fact, 2) if isinstance(fact, float) else fact for name, fact in facts.items()},
+        "duration_s": round(duration_s, 3),
+        **{name: getattr(account, name) for name in _RATES},
+        "worst_window_bps": asdict(account.worst_window_bps),
         "stills": stills,
-        "tracks": run.tracks,
-        "keyframes": run.keyframes,
-        "keyframe_requests": run.keyframe_requests,
-        "encode_ms": round(run.encode_ms, 2),
-        "perception_ms": round(run.perception_ms, 2),
-        "unusable_messages": run.unusable_messages,
-        "store": None if run.store is None else asdict(run.store),
-        "failed": [asdict(one) | {"failed_at": _clock_time(one.failed_ns)} for one in run.failed],
+        "cores_needed": round(cores.needed, 2),
+        "cores_free": round(cores.free, 2),
+        "store": None if store is None else asdict(store),
+        "failed": [asdict(one) | {"failed_at": _clock_time(one.failed_ns)} for one in failed],
     }
+
+
+def title(content: dict[str, Any]) -> str:
+    """Of the table: it counts what would have been sent where nobody took it."""
+    sent = f"NOT SENT ({content['unreached']})" if content["unreached"] else "sent"
+    return f"{content['edge']}: {sent}"
 
 
 def table(content: dict[str, Any]) -> list[tuple[str, str]]:
@@ -95,11 +66,11 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     stills, worst = content["stills"], content["worst_window_bps"]
     total = content["total_bps"]
     share = f"{total / content['budget_bps']:.0%} of {bitrate_text(content['budget_bps'])}"
-    dropped = f", {content['frames_dropped']} dropped before encoding" if content["frames_dropped"] else ""
     sent = f"{stills['sent']}, {stills['per_minute']:.0f} a minute, {stills['mean_bytes']} bytes in the mean"
     rows = [
         ("method", content["method"]),
-        ("frames", f"{content['frames']} in {content['duration_s']:.1f} s{dropped}"),
+        ("frames", f"{content['frames']} in {content['duration_s']:.1f} s"),
+        *_left_out(content),
         ("total", f"{bitrate_text(total)}, {share}; fullest window {bitrate_text(worst['total'])}"),
         ("base", f"{bitrate_text(content['base_bps'])}; fullest window {bitrate_text(worst['base'])}"),
         ("stills", f"{bitrate_text(content['roi_bps'])}; fullest window {bitrate_text(worst['roi'])}"),
@@ -120,6 +91,21 @@ def _failure(one: dict[str, Any]) -> str:
     times = "" if one["count"] == 1 else f", {one['count']} times"
     again = "; works again" if one["working"] else ""
     return f"{one['part']} at {one['failed_at']}{times}: {one['reason']}{again}"
+
+
+def _left_out(content: dict[str, Any]) -> list[tuple[str, str]]:
+    """Why frames were not coded or not analyzed."""
+    captured, cpu, skipped = (content[f"frames_{name}"] for name in ("captured", "dropped_cpu", "unanalyzed"))
+    needed, free = content["cores_needed"], content["cores_free"]
+    cores = f": encoder and detector need {needed:.1f} cores, {free:.1f} were free" if needed else ""
+    rows = []
+    if link := content["frames_dropped"] - cpu:
+        rows.append(("", f"{link} of {captured} frames dropped: the link had no room"))
+    if cpu:
+        rows.append(("", f"{cpu} of {captured} frames dropped{cores}"))
+    if skipped:
+        rows.append(("", f"{skipped} of {captured} frames not analyzed{'' if cpu else cores}"))
+    return rows
 
 
 def _store_rows(store: dict[str, Any] | None) -> list[tuple[str, str]]:

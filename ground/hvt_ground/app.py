@@ -10,10 +10,10 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
-from hvt_common.errors import UserError
+from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
-from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.runtime.reporting import StatusLine, check_writable
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
@@ -57,7 +57,8 @@ class Ground:
     def run(self) -> list[dict[str, Any]]:
         """Serve edges until ``stop`` is set, or with ``--once`` until they have ended; return a summary a session.
 
-        Raises `UserError` before anything is received, where a setting, a file or a port cannot be used.
+        Raises `UserError` before anything is received, where a setting, a file or a port cannot be used, and
+        `FlightError` after that.
         """
         config = self._config
         check_edge_pattern(config.edges)
@@ -91,8 +92,11 @@ class Ground:
             self._say_where(line, page="" if view is None else view.page)
             try:
                 self._serve(link, factory, line, watch, models.failures)
-            finally:
                 self._close_edges()
+            except Exception as error:
+                raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
+            finally:
+                self._stop_edges()
         return [
             completed(content, one.sessions, sinks=sinks, failures=models.failures)
             for edge, one in sorted(self._edges.items())
@@ -198,11 +202,14 @@ class Ground:
         return gone
 
     def _close_edges(self) -> None:
-        for one in self._edges.values():
-            one.stop()
+        self._stop_edges()
         for one in self._edges.values():
             one.close()
         self._raise_error()
+
+    def _stop_edges(self) -> None:
+        for one in self._edges.values():
+            one.stop()
 
     def _raise_error(self) -> None:
         for one in self._edges.values():

@@ -20,7 +20,7 @@ _DESCRIPTION = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the ground; return 0, or 2 after a sentence on what is wrong."""
+    """Run the ground; return 0, or after a sentence 2 (a setting is wrong) or 1 (it went wrong in flight)."""
     return exit_with_sentence(_run, program="hvt-ground", argv=argv)
 
 
@@ -47,13 +47,12 @@ def _run(argv: Sequence[str] | None) -> int:
     release_log = start_log("hvt-ground", quiet=config.quiet)
     stop = stop_on_signals()
     sessions = Ground(config, stop=stop, on_started=release_log).run()
-    if config.summary is not None:
-        edges = {content["edge"] for content in sessions}
-        write_json(config.summary, sessions[0] if len(sessions) == 1 and len(edges) == 1 else sessions)
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
     if not sessions:
         say("hvt-ground: no edge was heard")
+    if config.summary is not None:
+        write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
     return 0
 
 

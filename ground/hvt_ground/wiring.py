@@ -154,7 +154,7 @@ def make_pipeline(
     config: GroundConfig, models: Models, *, info: Info, emit: Callable[[Event], None]
 ) -> Pipeline:
     """The pipeline of one session."""
-    detector, classifier = models.take(info.edge)
+    detector, classifier = models.take()
     reader = _reader(config, detector, classifier, info=info)
     motion = cast('Literal["off", "flow", "ecc"]', config.camera_motion)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
@@ -172,7 +172,6 @@ def make_pipeline(
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
         path=path,
         camera=None if motion == "off" else CameraMotion(motion, scale=None),
-        release=lambda: models.give_back(detector, classifier),
     )
     return Pipeline(
         parts,
@@ -188,7 +187,7 @@ def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info)
     """What analyzes the stored video and stills of a session."""
     return BacklogPerception(
         info,
-        checkout=partial(models.checkout, info.edge),
+        take_models=models.take,
         tracker_of=lambda: _tracker(config, info),
         reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
         detect_every=config.detect_every,

@@ -18,33 +18,34 @@ from hvt_common.config import (
     SHARE,
     SIZE,
     TEXT,
+    Group,
     SettingType,
     choice,
     integer,
     load,
     number,
-    option,
-    switch,
     to_toml,
 )
 from hvt_common.errors import UserError
+
+_ALL = Group()
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
     """One field of each kind."""
 
-    source: str | None = option(TEXT, None, "where frames come from")
-    budget: int = option(BITRATE, 800_000, "all of it")
-    wait: float = option(DURATION, 1.5, "how long")
-    share: float = option(SHARE, 0.5, "100% of it")
-    size: tuple[int, int] = option(SIZE, (64, 48), "in pixels")
-    frames: int = option(integer(1, 9, unit=" frames"), 5, "how many")
-    gain: float = option(number(0, 2), 1.0, "factor")
-    fit_mode: str = option(choice("crop", "letterbox"), "crop", "how")
-    listen: tuple[str, ...] = option(TEXT, (), "endpoints", many=True)
-    file: Path | None = option(PATH, None, "to write")  # noqa: RUF009 - as in config.py
-    loud: bool = switch("say more")
+    source: str | None = _ALL.option(TEXT, None, "where frames come from")
+    budget: int = _ALL.option(BITRATE, 800_000, "all of it")
+    wait: float = _ALL.option(DURATION, 1.5, "how long")
+    share: float = _ALL.option(SHARE, 0.5, "100% of it")
+    size: tuple[int, int] = _ALL.option(SIZE, (64, 48), "in pixels")
+    frames: int = _ALL.option(integer(1, 9, unit=" frames"), 5, "how many")
+    gain: float = _ALL.option(number(0, 2), 1.0, "factor")
+    fit_mode: str = _ALL.option(choice("crop", "letterbox"), "crop", "how")
+    listen: tuple[str, ...] = _ALL.option(TEXT, (), "endpoints", many=True)
+    file: Path | None = _ALL.option(PATH, None, "to write")  # noqa: RUF009 - as in config.py
+    loud: bool = _ALL.switch("say more")
 
 
 def read(*argv: str) -> Camera:

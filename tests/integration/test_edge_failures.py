@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -105,6 +107,38 @@ def test_a_full_card_ends_the_local_copy_and_nothing_else(link, tmp_path):
     assert "Traceback" not in edge.said
 
 
+@pytest.mark.parametrize("how", ["full", "removed"])
+def test_a_store_that_fails_in_an_outage_costs_what_it_would_have_stored(link, tmp_path, how):
+    """A full card, or one that is pulled out while the link is down, would end the flight, or storing for good."""
+    scene = pictures(tmp_path / "clip", [int(90 + 80 * np.sin(index)) for index in range(1200)])
+    with small_disk(tmp_path / "card") as card:
+        (card / "old.bin").write_bytes(bytes(400_000))
+        store = ("--store", "10MB", "--store-folder", str(card / "store"))
+        settings = ("--wait", "0s", *SMALL, "--source", str(scene), "--detector", "motion", *store)
+        edge = link.edge(*settings, listens=True)
+        with joined(link.edge_endpoint) as session:
+            watcher = Watcher(session)
+            eventually(lambda: watcher.units or not edge.alive, within_s=SOON_S, what="video")
+        if how == "removed":
+            eventually((card / "store").exists, within_s=SOON_S, what="nobody watches: it is stored")
+            shutil.rmtree(card / "store")
+        edge.until("store: --store-folder")
+        with joined(link.edge_endpoint) as session:
+            watcher = Watcher(session)
+            eventually(lambda: watcher.failed("store"), within_s=SOON_S, what="status says so")
+            watcher.goes_on()
+            (card / "old.bin").unlink()
+            eventually(lambda: watcher.failed("store").working, within_s=SOON_S, what="it works again")
+            watcher.goes_on()
+        edge.stop()
+        (failed,) = edge.summary()["failed"]
+    assert failed["part"] == "store"
+    assert {"full": "no space is left", "removed": "removed, with all"}[how] in failed["reason"]
+    assert f"store at {failed['failed_at']}" in edge.told
+    assert edge.said.count("store: ") <= 3, edge.said
+    assert "Traceback" not in edge.said
+
+
 def test_a_model_that_fails_leaves_the_video(link, tmp_path):
     """The flight would end in the first bright minute of a model that cannot bear light."""
     model = failing_in_the_light(tmp_path / "model.onnx")
@@ -160,3 +194,23 @@ def test_who_reports_nothing_gets_all_frames_of_a_camera_and_no_backlog(link, fr
     assert len(indices) >= 0.95 * (indices[-1] - indices[0] + 1)
     assert stored <= indices[0] + 1, "nothing but what came before anybody watched"
     assert edge.summary()["total_bps"] <= 400_000
+
+
+@pytest.mark.realtime
+def test_on_a_slow_machine_perception_gives_way_to_video(link, tmp_path):
+    """The picture would stutter because a detector wants the processor."""
+    scene = pictures(tmp_path / "clip", [90] * 100)
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})  # the edge inherits it
+    try:
+        edge = link.edge(
+            *("--source", str(scene), "--wait", "0s", "--store", "0", "--preset", "ultrafast"),
+            *("--size", "1280x720", "--fps", "20", "--detect-every", "1"),
+        )
+    finally:
+        os.sched_setaffinity(0, cores)
+    summary = edge.finish()
+    assert summary["frames"] > 45, "with threads of equal rank it was 15 to 40"
+    assert summary["frames_unanalyzed"] > 5
+    assert summary["cores_needed"] > 0.5
+    assert "of 100 frames not analyzed" in edge.told

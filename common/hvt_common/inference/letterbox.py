@@ -91,8 +91,9 @@ class Letterboxer:
             np.copyto(place, image_bgr)
         else:
             cv2.resize(image_bgr, (width, height), dst=place, interpolation=cv2.INTER_LINEAR)
-        cv2.split(self._canvas, self._planes[::-1] if self._rgb else self._planes)
-        cv2.LUT(self._column, self._table, dst=self._target)
+        for channel, target in enumerate(self._targets[::-1] if self._rgb else self._targets):
+            cv2.extractChannel(self._canvas, channel, dst=self._plane)
+            cv2.LUT(self._plane, self._table, dst=target)
         return self._tensor, self._letterbox
 
     def _lay_out(self, image_size: tuple[int, int], input_size: tuple[int, int]) -> None:
@@ -100,11 +101,9 @@ class Letterboxer:
         self._letterbox = Letterbox.fitted(image_size, input_size, anchor=self._anchor)
         self._input_size = input_size
         self._canvas: Image = np.full((height, width, 3), _FILL, np.uint8)
-        # The three planes, one below the other, and the tensor seen the same way.
-        self._column = np.empty((3 * height, width), np.uint8)
-        self._planes = list(self._column.reshape(3, height, width))
+        self._plane = np.empty((height, width), np.uint8)
         self._tensor = np.empty((1, 3, height, width), self._dtype)
-        self._target = self._tensor.view(self._table.dtype).reshape(3 * height, width)
+        self._targets = list(self._tensor.view(self._table.dtype)[0])
 
 
 def as_bgr(image: npt.NDArray[np.uint8]) -> Image:

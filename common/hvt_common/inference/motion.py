@@ -26,12 +26,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse.csgraph import connected_components
 
 from hvt_common.camera_motion import Affine, CameraMotion
 from hvt_common.inference.class_names import MOVING
 from hvt_common.inference.letterbox import as_bgr
-from hvt_common.inference.nms import MAX_DETECTIONS
+from hvt_common.inference.nms import MAX_DETECTIONS, components
 from hvt_common.values import Detections, Image
 
 __all__ = ["MotionDetector", "MotionSettings"]
@@ -225,7 +224,8 @@ def _confidence(excess: npt.NDArray[np.float32]) -> float:
 def _merged(boxes: _Floats, confidences: _Floats, *, near_share: float) -> tuple[_Floats, _Floats]:
     """Join boxes that overlap by a third of the smaller one, both grown a little; repeated until none do."""
     while len(boxes) > 1:
-        count, groups = connected_components(_overlapping(boxes, near_share), directed=False)
+        firsts, groups = np.unique(components(_overlapping(boxes, near_share)), return_inverse=True)
+        count = len(firsts)
         if count == len(boxes):
             break
         joined = np.column_stack([np.full((count, 2), np.inf), np.full((count, 2), -np.inf)])

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from hvt_common.values import Boxes
 
-__all__ = ["MAX_CANDIDATES", "MAX_DETECTIONS", "suppress"]
+__all__ = ["MAX_CANDIDATES", "MAX_DETECTIONS", "components", "suppress"]
 
 MAX_CANDIDATES = 8192
 """At most so many of the most confident boxes are compared, so that no image costs more than a tenth of a second."""
@@ -54,3 +54,13 @@ def _greedy(rects: npt.NDArray[np.float64], iou: float) -> npt.NDArray[np.intp]:
     # Scores as ranks: OpenCV sorts again, and a strictly falling sequence leaves it no choice.
     ranks = np.arange(len(rects), 0, -1, dtype=np.float32)
     return np.asarray(cv2.dnn.NMSBoxes(rects, ranks, 0.0, iou), np.intp).reshape(-1)  # type: ignore[arg-type]
+
+
+def components(linked: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+    """(N,) the least index in the component of each node of a symmetric (N, N) graph."""
+    count = len(linked)
+    linked = linked | np.eye(count, dtype=bool)
+    least = np.arange(count)
+    while not np.array_equal(least, spread := np.where(linked, least, count).min(axis=1, initial=count)):
+        least = spread
+    return least

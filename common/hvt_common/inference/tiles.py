@@ -12,11 +12,10 @@ from typing import Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse.csgraph import connected_components
 
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import Detector
-from hvt_common.inference.nms import MAX_DETECTIONS, suppress
+from hvt_common.inference.nms import MAX_DETECTIONS, components, suppress
 from hvt_common.values import Boxes, Detections, Image
 
 __all__ = [
@@ -242,12 +241,12 @@ def _joined(partial: Boxes, class_ids: npt.NDArray[np.int32]) -> tuple[Boxes, np
     longer = np.maximum(a[..., 2:] - a[..., :2], b[..., 2:] - b[..., :2])
     one = (shared > 0).all(axis=-1) & (shared > _ACROSS * longer).any(axis=-1)
     one &= class_ids[:, None] == class_ids[None, :]
-    count, group = connected_components(one, directed=False)
-    low = np.full((count, 2), np.inf, np.float32)
-    high = np.full((count, 2), -np.inf, np.float32)
+    best, group = np.unique(components(one), return_inverse=True)
+    low = np.full((len(best), 2), np.inf, np.float32)
+    high = np.full((len(best), 2), -np.inf, np.float32)
     np.minimum.at(low, group, partial[:, :2])
     np.maximum.at(high, group, partial[:, 2:])
-    return np.concatenate((low, high), axis=1), np.unique(group, return_index=True)[1]
+    return np.concatenate((low, high), axis=1), best
 
 
 def _first_come(same: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:

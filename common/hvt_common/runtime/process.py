@@ -8,8 +8,13 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
-__all__ = ["STOP_SIGNALS", "limit_malloc_arenas", "lower_priority", "stop_on_signals"]
+__all__ = ["STOP_SIGNALS", "limit_malloc_arenas", "lower_priority", "stop_on_signals", "with_lower_priority"]
+
+T = TypeVar("T")
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _NICENESS = 10
@@ -20,9 +25,10 @@ _M_MMAP_THRESHOLD = -3
 _M_ARENA_MAX = -8
 
 _ARENAS = 2
-_MMAP_THRESHOLD_BYTES = 32 << 20
-"""Also the largest threshold that glibc takes on 64 bits."""
-_TRIM_THRESHOLD_BYTES = 64 << 20
+_MMAP_THRESHOLD_BYTES = 4 << 20
+"""A 1080p frame is mapped on its own and given back at once; a 720p frame is not, which would cost a tenth of the
+edge's time."""
+_TRIM_THRESHOLD_BYTES = 16 << 20
 
 
 def stop_on_signals() -> threading.Event:
@@ -47,13 +53,18 @@ def lower_priority() -> None:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
 
 
+def with_lower_priority(call: Callable[[], T]) -> T:
+    """Run it in a thread of lower priority; threads that it starts, such as a network's, have that too."""
+    with ThreadPoolExecutor(1, initializer=lower_priority) as pool:
+        return pool.submit(call).result()
+
+
 def limit_malloc_arenas() -> None:
     """Have all threads allocate from two arenas, which reuse what is freed for the next frame; only with glibc.
 
     By default glibc gives each thread an arena of its own (up to eight for each processor) and moves its mmap
     threshold with what is freed. A frame that one thread allocates and another frees then leaves a hole that is not
-    reused, and the process grows in steps for hours without holding more. To map each frame on its own cures that
-    too, and costs a sixth of the edge's time. Call it before threads are started.
+    reused, and the process grows in steps for hours without holding more. Call it before threads are started.
 
     Where the environment has any ``MALLOC_*``, nothing is changed.
     """

@@ -18,7 +18,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from hvt_common.errors import UserError
+from hvt_common.errors import FlightError, UserError
 
 __all__ = ["StatusLine", "check_writable", "print_table", "say", "start_log", "write_json"]
 
@@ -166,11 +166,14 @@ def check_writable(path: Path | None, *, name: str) -> None:
 
 
 def write_json(path: Path, content: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:
-    """Write the summary; into a file whole or not at all."""
+    """Write the summary; into a file whole or not at all. Raises `FlightError` where it cannot be written."""
     text = json.dumps(content, indent=2) + "\n"
-    if path.exists() and not path.is_file():  # /dev/stdout or a pipe: to be written to, not to be replaced
-        path.write_text(text, encoding="utf-8")
-        return
-    scratch = path.with_name(path.name + ".part")
-    scratch.write_text(text, encoding="utf-8")
-    scratch.replace(path)
+    # /dev/stdout or a pipe is to be written to, not to be replaced.
+    replaces = path.is_file() or not path.exists()
+    scratch = path.with_name(path.name + ".part") if replaces else path
+    try:
+        scratch.write_text(text, encoding="utf-8")
+        if replaces:
+            scratch.replace(path)
+    except OSError as error:
+        raise FlightError(f"{path} cannot be written ({error.strerror})") from error

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import lap
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 __all__ = ["assign", "grown", "overlaps", "pair"]
 
@@ -33,13 +33,9 @@ def overlaps(a_xyxy_px: _Floats, b_xyxy_px: _Floats) -> _Floats:
 def assign(cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
     """Rows and columns of the (N, M) costs that belong together at least total cost, none at ``limit`` or above.
 
-    The optimum is that of ``lap.lapjv(cost, extend_cost=True, cost_limit=limit)``, which ByteTrack uses. lap
-    extends the matrix so that every row and every column left alone costs ``limit / 2``; a pair saves two of
-    these, so lap minimises the sum of ``cost - limit`` over all sets of pairs, complete or not. Here costs are
-    clipped to the limit before a complete assignment. Any set of pairs can be filled up to a complete one, and
-    each pair added counts ``min(cost, limit) - limit <= 0``; dropping the pairs at the limit gives 0 back for
-    each. So the two minima are the same number, and what remains after dropping reaches it. (To assign first
-    and drop above the limit afterwards is something else: one hopeless row may push its neighbours aside.)
+    The optimum is ByteTrack's: `lap` extends the matrix so that every row and every column left alone costs
+    ``limit / 2``. (To assign first and drop above the limit afterwards is something else: one hopeless row may push
+    its neighbours aside.)
 
     A pair whose row and column have no other candidate under the limit is part of every optimum, and a row
     without candidates of none: both are resolved without the solver, which gets only the rest.
@@ -53,8 +49,8 @@ def assign(cost: _Floats, *, limit: float) -> tuple[_Indices, _Indices]:
     by_row[rows[alone]] = 0
     by_column[columns[alone]] = 0
     open_rows, open_columns = by_row.nonzero()[0], by_column.nonzero()[0]
-    contested = np.minimum(cost[open_rows[:, None], open_columns], limit)
-    picked_rows, picked_columns = linear_sum_assignment(contested)
+    contested = np.ascontiguousarray(cost[open_rows[:, None], open_columns])
+    picked_rows, picked_columns = lap.lapjvx(contested, extend_cost=True, cost_limit=limit, return_cost=False)
     under = contested[picked_rows, picked_columns] < limit
     return (
         np.concatenate((rows[alone], open_rows[picked_rows[under]])),

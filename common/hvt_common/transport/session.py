@@ -126,7 +126,7 @@ def query(
 
     Blocks for at most ``timeout_s``. Two edges of one id both answer.
     """
-    replies = session.get(keys.key(channel), payload=question, timeout=timeout_s, **_asking(channel))
+    replies = session.get(keys.key(channel), payload=question, timeout=timeout_s, **_query_options(channel))
     for reply in replies:
         if reply.ok is not None:
             data: bytes = reply.ok.payload.to_bytes()
@@ -155,10 +155,10 @@ def query_later(
             on_answer(reply.ok.payload.to_bytes())
 
     handler: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(reply, on_end)
-    session.get(keys.key(channel), handler, payload=question, timeout=timeout_s, **_asking(channel))
+    session.get(keys.key(channel), handler, payload=question, timeout=timeout_s, **_query_options(channel))
 
 
-def _asking(channel: Channel) -> dict[str, Any]:
+def _query_options(channel: Channel) -> dict[str, Any]:
     delivery = DELIVERIES[channel]
     return {
         "target": zenoh.QueryTarget.ALL,

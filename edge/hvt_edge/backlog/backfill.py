@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 
-from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind
+from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, ObjectKey
 from hvt_common.units import SECOND_NS
 from hvt_edge.backlog.disk import Store
-from hvt_edge.backlog.entry import Entry, Key
+from hvt_edge.backlog.entry import Entry
 
 __all__ = ["Backfill", "Chunk"]
 
@@ -40,9 +40,7 @@ _OTHER_RECEIVER_NS = 5 * SECOND_NS
 class Chunk:
     """Bytes of one object."""
 
-    session_id: int
-    kind: BacklogKind
-    number: int
+    key: ObjectKey
     offset: int
     total_bytes: int
     data: bytes
@@ -70,15 +68,15 @@ class Backfill:
         self._store = store
         self._session_id = session_id
         self._on_done = on_done
-        self._line: OrderedDict[Key, _Transfer] = OrderedDict()
-        self._data: tuple[Key, bytes] | None = None
+        self._line: OrderedDict[ObjectKey, _Transfer] = OrderedDict()
+        self._data: tuple[ObjectKey, bytes] | None = None
         self._informed: set[int] = set()
         """Sessions whose facts the ground has."""
         self._requested: set[int] = set()
         """Sessions whose facts it requested."""
-        self._refused: set[Key] = set()
+        self._refused: set[ObjectKey] = set()
         """What the present ground does not take; another is offered it again, and so is any after the next start."""
-        self._acknowledged: dict[Key, int] = {}
+        self._acknowledged: dict[ObjectKey, int] = {}
         """What the present ground has said it has of objects that are not done."""
         self._receiver_id: int | None = None
         self._reported_ns = 0
@@ -113,26 +111,17 @@ class Backfill:
             self._refused.clear()
             self._acknowledged.clear()
         self._reported_ns = now_ns
-        for acknowledged_range in acknowledged_ranges:
-            key = (
-                acknowledged_range.session_id,
-                BacklogKind(acknowledged_range.kind),
-                acknowledged_range.number,
-            )
-            transfer = self._line.get(key)
+        for one in acknowledged_ranges:
+            transfer = self._line.get(one.key)
             if transfer is not None:
-                self._advance(transfer, acknowledged_range.acknowledged_bytes, now_ns)
-            elif key in self._refused:
-                self._late(key, acknowledged_range.acknowledged_bytes)
-            elif (
-                key[1:] == (BacklogKind.INFO, 0)
-                and not acknowledged_range.acknowledged_bytes
-                and self._store.find(key) is not None
-            ):
-                self._informed.discard(acknowledged_range.session_id)
-                self._requested.add(acknowledged_range.session_id)
+                self._advance(transfer, one.acknowledged_bytes, now_ns)
+            elif one.key in self._refused:
+                self._late(one.key, one.acknowledged_bytes)
+            elif one.kind == BacklogKind.INFO and not one.acknowledged_bytes and self._store.find(one.key):
+                self._informed.discard(one.session_id)
+                self._requested.add(one.session_id)
 
-    def _late(self, key: Key, acknowledged_bytes: int) -> None:
+    def _late(self, key: ObjectKey, acknowledged_bytes: int) -> None:
         """The ground had it after all when it was put aside."""
         entry = self._store.find(key)
         data = None if entry is None else self._store.read(entry)
@@ -150,12 +139,9 @@ class Backfill:
     def _forget(self) -> None:
         """Forget objects that are not here any more."""
         self._refused = {key for key in self._refused if self._store.find(key) is not None}
-        here = {
-            key: acknowledged_range
-            for key, acknowledged_range in self._acknowledged.items()
-            if self._store.find(key) is not None
+        self._acknowledged = {
+            key: size for key, size in self._acknowledged.items() if self._store.find(key) is not None
         }
-        self._acknowledged = here
 
     def _advance(self, transfer: _Transfer, acknowledged_bytes: int, now_ns: int) -> None:
         if acknowledged_bytes > transfer.total_bytes:
@@ -186,7 +172,7 @@ class Backfill:
         self._store.remove(entry)
         self._on_done(entry)
 
-    def _leave(self, key: Key) -> None:
+    def _leave(self, key: ObjectKey) -> None:
         self._line.pop(key, None)
         if self._data is not None and self._data[0] == key:
             self._data = None
@@ -207,12 +193,12 @@ class Backfill:
             key, offset = transfer.entry.key, transfer.sent_bytes
             transfer.sent_bytes += len(chunk)
             transfer.since_ns = now_ns
-            return Chunk(*key, offset=offset, total_bytes=len(data), data=chunk)
+            return Chunk(key, offset, len(data), chunk)
         return None
 
     def take_back(self, chunk: Chunk) -> None:
         """This chunk has not been sent after all."""
-        transfer = self._line.get((chunk.session_id, chunk.kind, chunk.number))
+        transfer = self._line.get(chunk.key)
         if transfer is not None:
             transfer.sent_bytes = min(transfer.sent_bytes, chunk.offset)
 

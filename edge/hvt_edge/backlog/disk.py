@@ -25,9 +25,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind, BacklogUnit, pack_backlog_units
+from hvt_common.protocol.messages import (
+    MAX_BACKLOG_BYTES,
+    BacklogKind,
+    BacklogUnit,
+    ObjectKey,
+    pack_backlog_units,
+)
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.entry import Entry, Key, OpenSegment, worth
+from hvt_edge.backlog.entry import Entry, OpenSegment, worth
 
 __all__ = ["FILE_NAME", "Store"]
 
@@ -38,6 +44,7 @@ _STILLS_SHARE = 0.25
 _PAGE_BYTES = 4096
 _LOG_BYTES = 2 * 64 * _PAGE_BYTES
 """Of the write-ahead log: 64 pages are moved into the file, and the last write before that may be a large one."""
+_REMOVED = "removed, with all that was stored"
 _TRIAL_BYTES = 64 * 1024
 # One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
 _OPEN = """
@@ -76,6 +83,7 @@ _TIDY = """
 DELETE FROM object WHERE kind = 'info' AND session <> ?
 AND session NOT IN (SELECT session FROM object WHERE kind <> 'info')
 """
+_PARTS = "SELECT frame_index, capture_ns, keyframe, data, crc FROM part WHERE object = ? ORDER BY rowid"
 _ENTRY = "SELECT id, session, kind, number, rank, span_ns FROM here"
 
 
@@ -111,6 +119,10 @@ class Store:
     def open_segments(self) -> int:
         """1 while frames are being appended, else 0."""
         return int(self._open is not None)
+
+    @property
+    def _open_row(self) -> int:
+        return -1 if self._open is None else self._open.row
 
     @property
     def span_ns(self) -> int:
@@ -162,13 +174,14 @@ class Store:
 
     def end_segment(self) -> None:
         """What was appended is an object now."""
-        segment, self._open = self._open, None
-        if segment is not None and self._db is not None:
+        if self._open is None or self._db is None:
+            return
+        try:
             with self._disk():
-                try:
-                    self._db.executescript(_ADOPT)
-                finally:
-                    self._count()
+                self._db.executescript(_ADOPT)
+        finally:
+            self._count(open_row=-1)
+            self._open = None
 
     def _add(self, kind: BacklogKind, number: int, capture_ns: int, rank: float, data: bytes = b"") -> int:
         assert self._db is not None
@@ -197,7 +210,7 @@ class Store:
         """The facts of a session; None where they are not here."""
         return self.find((session_id, BacklogKind.INFO, 0))
 
-    def find(self, key: Key) -> Entry | None:
+    def find(self, key: ObjectKey) -> Entry | None:
         """The entry of this name, if it is still here."""
         session_id, kind, number = key
         where = f"{_ENTRY} WHERE session = ? AND kind = ? AND number = ?"
@@ -208,40 +221,29 @@ class Store:
 
         Of a segment: its frames up to the first damaged one.
         """
-        with self._disk():
-            parts = [] if self._db is None else self._parts(entry)
+        parts: list[tuple[Any, ...]] = []
+        for *facts, data, crc in self._rows(_PARTS, entry.row):
+            if type(data) is not bytes or zlib.crc32(data) != crc:
+                break
+            parts.append((*facts, data))
+        whole: bytes = parts[0][-1] if parts else b""
         if entry.kind is BacklogKind.BASE and parts:
-            data = pack_backlog_units(
-                [BacklogUnit(part[0], part[1], bool(part[2]), part[3]) for part in parts]
+            whole = pack_backlog_units(
+                [BacklogUnit(index, at, bool(key), unit) for index, at, key, unit in parts]
             )
-        else:
-            data = parts[0][3] if parts else b""
-        if 0 < len(data) <= MAX_BACKLOG_BYTES:
-            return data
+        if 0 < len(whole) <= MAX_BACKLOG_BYTES:
+            return whole
         self._note_damaged(f"{entry} cannot be read")
         self.remove(entry)
         return None
 
-    def _parts(self, entry: Entry) -> list[tuple[int, int, int, bytes]]:
-        assert self._db is not None
-        parts = []
-        columns = (
-            "SELECT frame_index, capture_ns, keyframe, data, crc FROM part WHERE object = ? ORDER BY rowid"
-        )
-        for *rest, data, crc in self._db.execute(columns, (entry.row,)):
-            if type(data) is not bytes or zlib.crc32(data) != crc:
-                break
-            parts.append((*rest, data))
-        return parts
-
     def remove(self, entry: Entry) -> None:
         """It has arrived, or has to make room; with the last of a former session its facts go too."""
-        if self._db is None:
-            return
-        with self._disk():
-            self._db.execute("INSERT OR IGNORE INTO gone VALUES (?)", (entry.row,))
-            self._delete_gone(self._db)
-            self._count()
+        if self._db is not None:
+            with self._disk():
+                self._db.execute("INSERT OR IGNORE INTO gone VALUES (?)", (entry.row,))
+                self._delete_gone(self._db)
+                self._count()
 
     def _delete_gone(self, db: sqlite3.Connection) -> None:
         with contextlib.suppress(sqlite3.OperationalError):
@@ -267,14 +269,18 @@ class Store:
         self.close()
 
     def _ranked(self, kind: BacklogKind, order: str = "DESC") -> Iterator[Entry]:
-        opened = -1 if self._open is None else self._open.row
-        return self._entries(f"{_ENTRY} WHERE kind = ? AND id <> ? ORDER BY rank {order}", kind, opened)
+        return self._entries(
+            f"{_ENTRY} WHERE kind = ? AND id <> ? ORDER BY rank {order}", kind, self._open_row
+        )
 
     def _entries(self, select: str, *values: Any) -> Iterator[Entry]:
+        for row, session, kind, *rest in self._rows(select, *values):
+            yield Entry(row, int(session, 16), BacklogKind(kind), *rest)
+
+    def _rows(self, select: str, *values: Any) -> Iterator[Any]:
         if self._db is not None:
             with self._disk():
-                for row, session, kind, *rest in self._db.execute(select, values):
-                    yield Entry(row, int(session, 16), BacklogKind(kind), *rest)
+                yield from self._db.execute(select, values)
 
     # Space
 
@@ -292,21 +298,16 @@ class Store:
             self.evicted_segments += kind is BacklogKind.BASE
             self.remove(least)
 
-    def _count(self) -> None:
-        assert self._db is not None
-        opened = -1 if self._open is None else self._open.row
-        counts = {BacklogKind.STILL: (0, 0, 0), BacklogKind.BASE: (0, 0, 0)}
+    def _count(self, *, open_row: int | None = None) -> None:
         sums = "SELECT kind, count(*), sum(bytes), sum(span_ns) FROM here WHERE id <> ? GROUP BY kind"
-        for kind, *row in self._db.execute(sums, (opened,)):
-            counts[BacklogKind(kind)] = (row[0], row[1], row[2])
-        self.stills, self._still_bytes, _ = counts[BacklogKind.STILL]
-        self.segments, _, self._span_ns = counts[BacklogKind.BASE]
+        open_row = self._open_row if open_row is None else open_row
+        counts = {kind: numbers for kind, *numbers in self._rows(sums, open_row)}
+        self.stills, self._still_bytes, _ = counts.get(BacklogKind.STILL, (0, 0, 0))
+        self.segments, _, self._span_ns = counts.get(BacklogKind.BASE, (0, 0, 0))
         self._measure()
 
     def _measure(self) -> None:
-        assert self._db is not None
-        pages: int = self._db.execute("PRAGMA page_count").fetchone()[0]
-        self.disk_bytes = pages * _PAGE_BYTES
+        self.disk_bytes = sum(pages for (pages,) in self._rows("PRAGMA page_count")) * _PAGE_BYTES
 
     # The file
 
@@ -321,7 +322,7 @@ class Store:
         """With this session's facts in it."""
         if self._db is not None and not self._file.exists():
             self._lose()
-            raise FileNotFoundError(errno.ENOENT, "removed, with all that was stored", str(self._file))
+            raise FileNotFoundError(errno.ENOENT, _REMOVED, str(self._file))
         db = self._ready()
         if self.info_of(self._session_id) is None:
             self._add(BacklogKind.INFO, 0, 0, 0.0, self._info())
@@ -329,6 +330,7 @@ class Store:
 
     def _opened(self) -> sqlite3.Connection:
         self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._file.touch(mode=0o600)  # SQLite's log gets the same
         db = sqlite3.connect(self._file, timeout=0, isolation_level=None)
         try:
             db.executescript(_OPEN)
@@ -363,7 +365,7 @@ class Store:
                 db.close()
 
     def _lose(self) -> None:
-        """What is stored counts no more; `enter` may find it again."""
+        """What is stored counts no more, until it is found again."""
         self._disconnect()
         self._still_bytes = self._span_ns = self.disk_bytes = self.stills = self.segments = 0
 
@@ -381,10 +383,11 @@ class Store:
                     str(self.path),
                 ) from None
             self._lose()
+            why = str(error) if self._file.exists() else _REMOVED
             if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
                 self._file.replace(self._file.with_suffix(".damaged"))
                 self._note_damaged(f"{self._file} is damaged and is put aside as .damaged")
-            raise OSError(errno.EIO, str(error), str(self.path)) from None
+            raise OSError(errno.EIO, why, str(self._file)) from None
 
     def _note_damaged(self, what: str) -> None:
         self.damaged += 1

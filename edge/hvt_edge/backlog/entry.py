@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind
+from hvt_common.protocol.messages import MAX_BACKLOG_BYTES, BacklogKind, ObjectKey
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 
-__all__ = ["FIRST_STORED", "SEGMENT_NS", "Entry", "Key", "OpenSegment", "worth"]
+__all__ = ["FIRST_STORED", "SEGMENT_NS", "Entry", "OpenSegment", "worth"]
 
 FIRST_STORED = 2**31
 """Stills that are stored for later have numbers of their own: those that are sent have no holes then."""
@@ -19,9 +19,6 @@ _HALF_LIFE_NS = 600 * SECOND_NS
 _LEAST_STRENGTH = -60.0
 _MOST_SEGMENT_BYTES = MAX_BACKLOG_BYTES - 512 * 1024
 _MOST_SEGMENT_UNITS = 2400
-
-Key = tuple[int, BacklogKind, int]
-"""Session, kind and number: what an object is called on the link."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +36,7 @@ class Entry:
     """Of video: from its first frame to its last."""
 
     @property
-    def key(self) -> Key:
+    def key(self) -> ObjectKey:
         """What it is called on the link."""
         return self.session_id, self.kind, self.number
 

@@ -11,9 +11,8 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, BacklogStill
+from hvt_common.protocol.messages import AcknowledgedRange, BacklogStill, ObjectKey
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.entry import Key
 
 __all__ = ["EndSegment", "Intake", "IntakeStill", "News"]
 
@@ -48,7 +47,7 @@ class News:
     """The link went: what was on its way is not."""
     video_first: bool = False
     """A ground requested the video."""
-    acknowledged: dict[tuple[int, Key], AcknowledgedRange] = field(default_factory=dict)
+    acknowledged: dict[tuple[int, ObjectKey], AcknowledgedRange] = field(default_factory=dict)
     """What grounds say they have, by receiver id and object."""
 
 
@@ -60,12 +59,19 @@ class Intake:
         self._changed = threading.Condition()
         self._items: deque[Item] = deque()
         self._queued = 0
+        self._in_hand = False
         self._news = News()
         self._closed = False
 
     def __len__(self) -> int:
         """Frames and stills that wait."""
         return self._queued
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits, and nothing is in hand since the last `take`."""
+        with self._changed:
+            return not (self._items or self._in_hand)
 
     @property
     def ended(self) -> bool:
@@ -105,7 +111,7 @@ class Intake:
         with self._changed:
             known = self._news.acknowledged
             for one in acknowledged_ranges:
-                key = (receiver_id, (one.session_id, BacklogKind(one.kind), one.number))
+                key = (receiver_id, one.key)
                 known.pop(key, None)
                 known[key] = one
             while len(known) > _MOST_ACKNOWLEDGED_RANGES:
@@ -124,5 +130,6 @@ class Intake:
             self._changed.wait_for(lambda: self._items or self._news.woken, timeout=timeout_s)
             news, self._news = self._news, News()
             item = self._items.popleft() if self._items else None
+            self._in_hand = item is not None
             self._queued -= item is not None and not isinstance(item, EndSegment)
             return news, item

@@ -161,12 +161,12 @@ class BacklogStage:
     def resume(self) -> None:
         """The keyframe to go on with has been made: it and what follows is sent."""
         self._lose_in_flight()  # stills that went out while the link was going, or coming
-        self._worker.end_segment()
+        self._worker.intake.end_segment()
         self.state = State.LIVE
 
     def _leave(self) -> None:
         """The link has gone: what was in flight is stored first."""
-        self._worker.interrupt()
+        self._worker.intake.signal(interrupted=True)
         self._lose_in_flight()
         self._segment_ns = None
         self.state = State.OFFLINE
@@ -213,7 +213,7 @@ class BacklogStage:
 
     def _unfinished(self) -> bool:
         """Whether anything was admitted that may not have arrived."""
-        stored = self._worker.queued or not self.numbers.empty
+        stored = not (self._worker.intake.idle and self.numbers.empty)
         return bool(stored or self.state is not State.LIVE or self._unnamed)
 
     @property
@@ -225,7 +225,7 @@ class BacklogStage:
         """The run ends: what no report has named by now is stored, and sent as what was stored."""
         if self._unnamed:
             self._lose_in_flight()
-            self._worker.end_segment()
+            self._worker.intake.end_segment()
 
     # The stills' thread
 
@@ -239,11 +239,11 @@ class BacklogStage:
         """A ground has reported on this session (any thread)."""
         self._outage.reported(now_ns)
         if feedback.backlog:
-            self._worker.on_acknowledged(feedback.backlog, receiver_id=feedback.receiver_id)
+            self._worker.intake.on_acknowledged(feedback.backlog, receiver_id=feedback.receiver_id)
 
     def send_video(self) -> bool:
         """Somebody wants the video before the stills; False where nothing is kept."""
-        self._worker.video_first()
+        self._worker.intake.signal(video_first=True)
         return not self.numbers.empty
 
     @property

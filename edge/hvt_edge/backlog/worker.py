@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from queue import SimpleQueue
 
-from hvt_common.protocol.messages import AcknowledgedRange, BacklogKind, pack_backlog_still
+from hvt_common.protocol.messages import BacklogKind, pack_backlog_still
 from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.runtime.process import lower_priority
 from hvt_common.units import SECOND_NS
@@ -101,8 +101,9 @@ class StoreWorker:
         self._on_sent = on_sent
         self._close_s = close_s
         self._backfill = Backfill(store, session_id=session_id, on_done=self._note_done)
-        self._intake = Intake(_QUEUE)
-        self._sending = ChunkThread(send, on_done=self._intake.signal)
+        self.intake = Intake(_QUEUE)
+        """For signals, see there; what is to be stored comes by `offer`."""
+        self._sending = ChunkThread(send, on_done=self.intake.signal)
         self._sent_stills = self._sent_ns = self._trickle_ns = 0
         self._slow = False
         self._retry = RetryPause()
@@ -125,7 +126,7 @@ class StoreWorker:
         self.check()
         if self.failed:
             return False
-        if not self._intake.offer(item):
+        if not self.intake.offer(item):
             if not self._slow:
                 self._slow = True
                 _log.warning(
@@ -133,27 +134,6 @@ class StoreWorker:
                 )
             return False
         return True
-
-    def on_acknowledged(self, acknowledged_ranges: Sequence[AcknowledgedRange], *, receiver_id: int) -> None:
-        """A ground acknowledges what it has. One that is lost comes again."""
-        self._intake.on_acknowledged(acknowledged_ranges, receiver_id=receiver_id)
-
-    def end_segment(self) -> None:
-        """The link is back: what was stored may be sent."""
-        self._intake.end_segment()
-
-    def interrupt(self) -> None:
-        """The link is away: what was on its way is not."""
-        self._intake.signal(interrupted=True)
-
-    def video_first(self) -> None:
-        """A ground requested the video."""
-        self._intake.signal(video_first=True)
-
-    @property
-    def queued(self) -> int:
-        """Frames and stills that are not on disk yet."""
-        return len(self._intake)
 
     @property
     def numbers(self) -> StoreNumbers:
@@ -179,14 +159,14 @@ class StoreWorker:
 
     def close(self) -> None:
         """Write what waits, end the file, join the thread. A disk that hangs costs what waits, and a warning."""
-        self._intake.signal(closed=True)
+        self.intake.signal(closed=True)
         self._thread.join(timeout=self._close_s)
         if self._thread.is_alive():
             _log.warning(
                 "the disk of --store-folder takes longer than %g s: %d frames and stills that wait for it are not "
                 "stored",
                 self._close_s,
-                self.queued,
+                len(self.intake),
             )
         self._sending.close(self._close_s)
         self.check()
@@ -197,7 +177,7 @@ class StoreWorker:
         lower_priority()
         try:
             self._attempt(self._store.enter)
-            while not self._intake.ended:
+            while not self.intake.ended:
                 self._turn()
             self._attempt(self._store.close)
         except BaseException as error:  # noqa: BLE001 - handed to the frame loop, which ends the process
@@ -205,7 +185,7 @@ class StoreWorker:
 
     def _turn(self) -> None:
         busy = self._store.stills or self._store.segments
-        news, item = self._intake.take(_BUSY_S if busy else _IDLE_S)
+        news, item = self.intake.take(_BUSY_S if busy else _IDLE_S)
         self._attempt(lambda: self._note(news))
         if self.failed and self._retry.due(self._clock()) and self._attempt(self._store.trial):
             self.failed = False

@@ -10,7 +10,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 from hvt_common.errors import UserError
@@ -52,6 +52,7 @@ class _Result:
     tracks: tuple[TrackNow, ...] = ()
 
 
+@dataclass(eq=False)
 class Commands:
     """Answers one session's requests; may be called from any thread.
 
@@ -59,30 +60,19 @@ class Commands:
     of planned keyframes.
     """
 
-    def __init__(
-        self,
-        config: EdgeConfig,
-        *,
-        operating: Operating,
-        session_id: int,
-        keyframes: KeyframeRequests,
-        on_demand: OnDemand,
-        chooser: Chooser,
-        backlog: BacklogStage | None,
-        base_size: tuple[int, int],
-        clock: Callable[[], int],
-        loop_clock: Callable[[], int],
-    ) -> None:
-        self._config = config
-        self._operating = operating
-        self._session_id = session_id
-        self._keyframes = keyframes
-        self._on_demand = on_demand
-        self._chooser = chooser
-        self._backlog = backlog
-        self._base_size = base_size
-        self._clock = clock
-        self._loop_clock = loop_clock
+    config: EdgeConfig
+    _: KW_ONLY
+    operating: Operating
+    session_id: int
+    keyframes: KeyframeRequests
+    on_demand: OnDemand
+    chooser: Chooser
+    backlog: BacklogStage | None
+    base_size: tuple[int, int]
+    clock: Callable[[], int]
+    loop_clock: Callable[[], int]
+
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
         self._request_times: deque[int] = deque(maxlen=_MOST_REQUESTS)
         self._changed_ns: int | None = None
@@ -107,7 +97,7 @@ class Commands:
 
     def _answer(self, result: _Result, *, reason: str = "") -> ControlAnswer:
         return ControlAnswer(
-            session_id=self._session_id,
+            session_id=self.session_id,
             accepted=not reason,
             reason=reason,
             still_request=result.still_request,
@@ -116,7 +106,7 @@ class Commands:
         )
 
     def _obey(self, request: ControlRequest) -> _Result:
-        if request.session_id not in (0, self._session_id):
+        if request.session_id not in (0, self.session_id):
             raise RefusedError("that session has ended")
         self._check_rate()
         command = self._commands.get(request.command)
@@ -125,7 +115,7 @@ class Commands:
         return command(request.arguments)
 
     def _check_rate(self) -> None:
-        now_ns, times = self._clock(), self._request_times
+        now_ns, times = self.clock(), self._request_times
         if len(times) == _MOST_REQUESTS and now_ns - times[0] < SECOND_NS:
             raise RefusedError(f"too many requests: at most {_MOST_REQUESTS} a second are served")
         times.append(now_ns)
@@ -134,32 +124,32 @@ class Commands:
 
     def _keyframe(self, arguments: Arguments) -> _Result:
         _Reader("keyframe", arguments).end()
-        refusal = self._keyframes.request(self._loop_clock())
+        refusal = self.keyframes.request(self.loop_clock())
         if refusal is not None:
             raise RefusedError(refusal)
         return _Result()
 
     def _still(self, arguments: Arguments) -> _Result:
-        number, frame_index = self._on_demand.request(_on_demand_request(arguments))
+        number, frame_index = self.on_demand.request(_on_demand_request(arguments))
         return _Result(still_request=number, frame_index=frame_index)
 
     def _still_outcome(self, arguments: Arguments) -> _Result:
         reader = _Reader("still-outcome", arguments)
         number = reader.needed("ask", 0, _U32)
         reader.end()
-        self._on_demand.outcome(number)
+        self.on_demand.outcome(number)
         return _Result()
 
     def _tracks(self, arguments: Arguments) -> _Result:
         _Reader("tracks", arguments).end()
-        frame_index, tracks = self._on_demand.tracks()
+        frame_index, tracks = self.on_demand.tracks()
         return _Result(frame_index=frame_index, tracks=tracks)
 
     def _set_budget(self, arguments: Arguments) -> _Result:
         reader = _Reader("set-budget", arguments)
         bps = reader.needed("bps", 1, _MOST_BPS)
         reader.end()
-        now = self._operating.now
+        now = self.operating.now
         self._change(bps, now.video_share, now.method)
         return _Result()
 
@@ -167,7 +157,7 @@ class Commands:
         reader = _Reader("set-method", arguments)
         name = reader.text("method")
         reader.end()
-        now = self._operating.now
+        now = self.operating.now
         before, policy = method(now.method), method(name)
         if policy.name == before.name:
             return _Result()
@@ -176,42 +166,42 @@ class Commands:
                 "R0 codes the video in another way from the first frame on: start the edge with it"
             )
         self._change(now.budget_bps, self._share_for(policy.video_only), policy.name)
-        self._chooser.set_method(policy)
+        self.chooser.set_method(policy)
         return _Result()
 
     def _send_backlog(self, arguments: Arguments) -> _Result:
         _Reader("send-backlog", arguments).end()
-        if self._backlog is None:
+        if self.backlog is None:
             raise RefusedError("this edge stores nothing while its link is away (--store 0)")
-        if not self._backlog.send_video():
+        if not self.backlog.send_video():
             raise RefusedError("nothing is stored that was not sent")
         return _Result()
 
     # Changes of the rates
 
     def _change(self, budget_bps: int, video_share: float | None, method_name: str) -> None:
-        now = self._operating.now
+        now = self.operating.now
         rates_change = (budget_bps, video_share) != (now.budget_bps, now.video_share)
         if rates_change:
-            now_ns = self._clock()
+            now_ns = self.clock()
             if self._changed_ns is not None and now_ns - self._changed_ns < _REST_NS:
                 raise RefusedError("the rates were changed a moment ago: wait two seconds")
             self._check_base(budget_bps, video_share)
             self._changed_ns = now_ns
-        self._operating.command(budget_bps=budget_bps, video_share=video_share, method=method_name)
+        self.operating.command(budget_bps=budget_bps, video_share=video_share, method=method_name)
         if rates_change:
-            self._keyframes.require(self._loop_clock())
+            self.keyframes.require(self.loop_clock())
 
     def _share_for(self, video_only: bool) -> float | None:  # noqa: FBT001 - one caller
         """The base's share for a method of that kind: with no stills it is all, else what the edge began with."""
         if video_only:
             return 1.0
-        began = self._config
+        began = self.config
         return REGIMES["low"].video_share if method(began.method).video_only else began.fixed_share
 
     def _check_base(self, budget_bps: int, video_share: float | None) -> None:
         """As `hvt_edge.config.check_rate`, in words for whoever commands from afar."""
-        config, size = self._config, self._base_size
+        config, size = self.config, self.base_size
         fps = LEAST_FPS if config.auto_fps else config.nominal_fps
         least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
         share = FIRST_SHARE if video_share is None else video_share

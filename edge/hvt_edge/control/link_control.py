@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.protocol.messages import Feedback
 from hvt_common.runtime.failures import Failures
@@ -26,6 +27,7 @@ _MOST_WAIT_NS = 100_000_000
 """A frame that would wait longer for the budget's window is dropped before it is encoded."""
 
 
+@dataclass(eq=False)
 class LinkControl:
     """Applies receiver reports: `on_feedback` in the link's thread, all else in the frame loop.
 
@@ -34,108 +36,93 @@ class LinkControl:
     that the budget allows, and is no link of which anything is known.
     """
 
-    def __init__(
-        self,
-        *,
-        has_ground: Callable[[], bool],
-        has_subscriber: Callable[[], bool],
-        session_id: int,
-        transmitter: Transmitter,
-        keyframes: KeyframeRequests,
-        inbox: FeedbackInbox,
-        reconfiguration: EncoderReconfiguration,
-        clock: Callable[[], int],
-        pacer: Pacer | None,
-        in_flight: BaseInFlight,
-        outbox: Outbox,
-        stills: StillSender,
-        backlog: BacklogStage | None,
-        failures: Failures,
-    ) -> None:
-        self._has_ground = has_ground
-        self._has_subscriber = has_subscriber
-        self._failures = failures
+    _: KW_ONLY
+    has_ground: Callable[[], bool]
+    has_subscriber: Callable[[], bool]
+    session_id: int
+    transmitter: Transmitter
+    keyframes: KeyframeRequests
+    inbox: FeedbackInbox
+    reconfiguration: EncoderReconfiguration
+    clock: Callable[[], int]
+    pacer: Pacer | None
+    in_flight: BaseInFlight
+    outbox: Outbox
+    stills: StillSender
+    backlog: BacklogStage | None
+    failures: Failures
+
+    def __post_init__(self) -> None:
         self._had_ground = False
-        self._session_id = session_id
-        self._transmitter = transmitter
-        self._keyframes = keyframes
-        self._inbox = inbox
-        self._reconfiguration = reconfiguration
-        self._clock = clock
-        self._pacer = pacer
-        self._in_flight = in_flight
-        self._outbox = outbox
-        self._stills = stills
-        self._backlog = backlog
         self._primary = PrimaryReceiver()
 
     def before_frame(self, now_ns: int) -> None:
         """What the link carries decides on budget, base rate, keyframe, and on whether anything is sent at all."""
-        ground = self._has_ground()
+        ground = self.has_ground()
         # A ground that has left, with somebody there still who reports nothing: what was known of the path is void.
-        linked = ground or (self._has_subscriber() and not self._had_ground)
+        linked = ground or (self.has_subscriber() and not self._had_ground)
         self._had_ground = ground
-        offline = self._backlog is not None and self._backlog.before_frame(now_ns, linked=linked)
+        offline = self.backlog is not None and self.backlog.before_frame(now_ns, linked=linked)
         if not linked:
             self._primary.forget()
-        if self._pacer is None:
+        if self.pacer is None:
             return
-        back = self._pacer.link(linked, reports=ground, now_ns=now_ns)
+        back = self.pacer.link(linked, reports=ground, now_ns=now_ns)
         if offline:  # what is stored has the quality that the link had
-            self._reconfiguration.hold(now_ns)
+            self.reconfiguration.hold(now_ns)
         if offline or not linked:  # nothing is carried anywhere
             return
-        if self._reconfiguration.track_link(now_ns) or back:
-            self._keyframes.require(now_ns)
+        if self.reconfiguration.track_link(now_ns) or back:
+            self.keyframes.require(now_ns)
 
     def admits(self, now_ns: int) -> bool:
         """Whether a frame may be coded now; what is held back would only wait and grow old."""
-        if self._pacer is None:
+        if self.pacer is None:
             return True
-        return self._pacer.admits_base(now_ns) and self._transmitter.base_wait_ns(now_ns) <= _MOST_WAIT_NS
+        return self.pacer.admits_base(now_ns) and self.transmitter.base_wait_ns(now_ns) <= _MOST_WAIT_NS
 
     def finish(self, *, stop: threading.Event, note: Callable[[str], None]) -> None:
         """After the last frame of a recorded source: send what was stored."""
-        if self._backlog is not None:
-            self._backlog.finish(before_frame=self._after_last, stop=stop, note=note)
+        if self.backlog is not None:
+            self.backlog.finish(before_frame=self._after_last, stop=stop, note=note)
 
     def _after_last(self, now_ns: int) -> None:
-        self._stills.store_lost(now_ns)
+        self.stills.store_lost(now_ns)
         self.before_frame(now_ns)
         self.admits(now_ns)  # which gives up what is lost: nothing else would, without frames
 
     def on_feedback(self, feedback: Feedback) -> None:
         """A ground reports (any thread). Where that fails the rate falls to its floor until a report counts again."""
-        if feedback.session_id != self._session_id:
+        if feedback.session_id != self.session_id:
             return
         try:
-            self._apply(feedback, now_ns=self._clock())
+            self._apply(feedback, now_ns=self.clock())
         except Exception as error:  # noqa: BLE001 - in a thread of the link, where nobody would hear of it
-            self._failures.failed(_PART, f"a report failed ({type(error).__name__}: {error})")
-            if self._pacer is not None:
-                self._pacer.on_fault(self._clock())
+            self.failures.failed(_PART, f"a report failed ({type(error).__name__}: {error})")
+            if self.pacer is not None:
+                self.pacer.on_fault(self.clock())
         else:
-            self._failures.works(_PART)
+            self.failures.works(_PART)
 
     def _apply(self, feedback: Feedback, *, now_ns: int) -> None:
         """Whether the report counts is decided here, once."""
-        sent = (self._transmitter.base_sequence, self._transmitter.still_sequence)
+        sent = (self.transmitter.base_sequence, self.transmitter.still_sequence)
         report = self._primary.judge(feedback, sent=sent, now_ns=now_ns)
-        self._keyframes.report_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)
-        if self._pacer is not None:
-            self._pacer.on_report(report)
+        self.keyframes.report_losses(feedback.receiver_id, feedback.lost + feedback.corrupt)
+        if self.pacer is not None:
+            self.pacer.on_report(report)
         if report.primary:
-            self._in_flight.on_report(feedback.base_sequence)
-            self._outbox.on_report(
+            self.in_flight.on_report(feedback.base_sequence)
+            self.outbox.on_report(
                 feedback.still_sequence,
                 feedback.missing_stills,
                 now_ns=now_ns,
-                round_trip_ns=0 if self._pacer is None else self._pacer.round_trip_ns,
+                round_trip_ns=0 if self.pacer is None else self.pacer.round_trip_ns,
             )
-        if self._backlog is not None:
-            self._backlog.on_feedback(feedback, now_ns=now_ns)
+        if self.backlog is not None:
+            self.backlog.on_feedback(feedback, now_ns=now_ns)
         # Last: who waits there for the end goes on to store what is not acknowledged.
-        self._inbox.on_report(report)
+        self.inbox.on_report(report)
 
 
 def wait_for_ground(

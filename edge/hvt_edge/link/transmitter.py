@@ -43,13 +43,7 @@ from hvt_edge.link.budget import RollingBudget
 from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
 from hvt_edge.link.pacer import Pacer
 
-__all__ = [
-    "PLAIN_ENCODING",
-    "STILL_ATTACHMENT_BYTES",
-    "Outlet",
-    "StillEnvelope",
-    "Transmitter",
-]
+__all__ = ["PLAIN_ENCODING", "STILL_ATTACHMENT_BYTES", "Outlet", "StillEnvelope", "Transmitter"]
 
 STILL_ATTACHMENT_BYTES = 100
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
@@ -262,10 +256,11 @@ class Transmitter:
 
         0: another thread has taken the allowance since, and it was not sent.
         """
+        session_id, kind, number = chunk.key
         header = BacklogHeader(
-            session_id=chunk.session_id,
-            kind=chunk.kind,
-            number=chunk.number,
+            session_id=session_id,
+            kind=kind,
+            number=number,
             offset=chunk.offset,
             total_bytes=chunk.total_bytes,
             send_ns=now_ns,

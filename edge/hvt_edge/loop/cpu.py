@@ -75,11 +75,11 @@ def _sample() -> _Sample | None:
     names = {f"cpu{core}" for core in _cores()}
     try:
         rows = [line.split() for line in _STAT.read_text(encoding="ascii").splitlines()]
-        ticks = sum(
+        busy = sum(
             sum(int(value) for place, value in enumerate(row[1:9]) if place not in _IDLE)
             for row in rows
             if row[0] in names
         )
     except (OSError, ValueError, IndexError):
         return None
-    return _Sample(time.monotonic(), time.process_time(), ticks / os.sysconf("SC_CLK_TCK"))
+    return _Sample(time.monotonic(), time.process_time(), busy / os.sysconf("SC_CLK_TCK"))

@@ -13,7 +13,6 @@ from hvt_common.units import SECOND_NS
 from hvt_common.values import Frame
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.source.pacing import realtime_admits
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.frame_decision import Action
@@ -21,6 +20,9 @@ from hvt_edge.video.stage import BaseStage
 
 __all__ = ["RealtimePace"]
 
+_MOST_GAP_NS = SECOND_NS // 4
+"""Of a clip that cannot be read in time so much is left out in a row, and no more: else nothing would be shown."""
+_LINK_BOUND_NS = SECOND_NS // 100
 _BEHIND_SHARE = 0.5
 """Of the time between two frames: later than that the loop is late."""
 
@@ -55,6 +57,7 @@ class RealtimePace:
         self._stop = stop
         self._before_frame = before_frame
         self._missed: int | None = None
+        self._must_code_ns = 0
         self._link_bound = False
         """Sending the last frame took longer than coding it."""
         self._worker = StillWorker(stills, results=inbox.take, failures=failures, clock=clock)
@@ -74,9 +77,10 @@ class RealtimePace:
         self._drop(newly_missed)
         behind = newly_missed > 0
         if not self._live:
-            if not realtime_admits(frame, clock=self._clock, fps=self._fps, stop=self._stop):
+            if not self._in_time(frame) and frame.capture_ns < self._must_code_ns:
                 self._drop(1)
                 return
+            self._must_code_ns = frame.capture_ns + _MOST_GAP_NS
             behind = self._clock() - frame.capture_ns > _BEHIND_SHARE * SECOND_NS / self._fps
         now_ns = self._clock()
         self._before_frame(now_ns)
@@ -89,9 +93,10 @@ class RealtimePace:
             self._base.send(unit, decision, now_ns=self._clock())
         elif decision.action is Action.HOLD:
             self._counts.dropped_link += 1
-        self._link_bound = time.perf_counter_ns() - encoded_ns > encoded_ns - began_ns
+        sending_ns = time.perf_counter_ns() - encoded_ns
+        self._link_bound = sending_ns > max(encoded_ns - began_ns, _LINK_BOUND_NS)
         # Video goes first: perception gets no frame while the loop is late.
-        self._counts.unanalyzed += not self._worker.take(frame, unit, room=not behind)
+        self._counts.unanalyzed += not self._worker.take(frame, unit, late=behind)
 
     def __enter__(self) -> Self:
         return self
@@ -107,3 +112,10 @@ class RealtimePace:
             self._counts.dropped_link += count
         else:
             self._counts.dropped_cpu += count
+
+    def _in_time(self, frame: Frame) -> bool:
+        """Wait until the frame of a clip is due; False where it is so late that the next is due already."""
+        early_ns = frame.capture_ns - self._clock()
+        if early_ns > 0:
+            self._stop.wait(early_ns / SECOND_NS)
+        return -early_ns < SECOND_NS / self._fps

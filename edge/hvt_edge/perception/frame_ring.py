@@ -1,16 +1,19 @@
 """The last seconds of untouched source frames, each with its tracks, for stills on demand.
 
-Frames are kept raw: a still has to be cut from what the camera gave, and another loss before the still codec would be
-paid in its bits. The bound is in bytes and in seconds. Where the bytes do not hold every frame of those
-seconds, frames are kept further apart, evenly, so that the ring reaches as far back as asked for: 256 MB hold
-every frame of 5 s at 1280x720 and 15 fps, every second one at 1920x1080, and one each 0.7 s at 3840x2160. The
-newest frame is always there.
+The newest is there as the source gave it; those before it as 4:2:0, half the memory, which is what still codecs and
+cameras have anyway. Their bound is in bytes and in seconds. Where the bytes do not hold every frame of those seconds,
+frames are kept further apart, evenly, so that the ring reaches as far back as asked for: 24 MB hold one each 0.3 s at
+1280x720, one each 0.8 s at 1920x1080 and one of 5 s ago at 3840x2160.
 """
 
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
 
 from hvt_common.values import Frame, Image, Tracks
 
@@ -19,9 +22,9 @@ __all__ = ["FrameRing", "RingFrame", "RingSettings"]
 
 @dataclass(frozen=True, slots=True)
 class RingSettings:
-    """The bounds; with fewer bytes than a frame takes, nothing is kept."""
+    """The bounds of all but the newest; with no bytes, nothing is kept."""
 
-    max_bytes: int = 256_000_000
+    max_bytes: int = 24_000_000
     max_age_ns: int = 5_000_000_000
 
 
@@ -31,10 +34,34 @@ class RingFrame:
 
     frame_index: int
     capture_ns: int
-    source_bgr: Image
-    """As the source gave it, not copied: nobody may write into it."""
+    size: tuple[int, int]
+    """(width, height) of the source in pixels."""
+    pixels: npt.NDArray[np.uint8]
+    """The source's own, not copied: nobody may write into it. Or, where it has two dimensions, I420."""
     tracks: Tracks
     """At this very frame, base pixels."""
+
+    @property
+    def source_bgr(self) -> Image:
+        """The whole source frame."""
+        if self.pixels.ndim == 3:
+            return self.pixels
+        return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_YUV2BGR_I420), np.uint8)
+
+    @property
+    def packed_bytes(self) -> int:
+        """Memory of the pixels once `packed`."""
+        return self.pixels.nbytes // 2 if self._packs else self.pixels.nbytes
+
+    def packed(self) -> RingFrame:
+        """The same in half the memory, where the sides are even."""
+        if not self._packs:
+            return self
+        return replace(self, pixels=np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_BGR2YUV_I420), np.uint8))
+
+    @property
+    def _packs(self) -> bool:
+        return self.pixels.ndim == 3 and not any(side % 2 for side in self.size)
 
 
 class FrameRing:
@@ -43,8 +70,7 @@ class FrameRing:
     def __init__(self, settings: RingSettings = RingSettings()) -> None:
         self._settings = settings
         self._frames: list[RingFrame] = []
-        """Oldest first; all but the newest lie on the grid that `_spacing_ns` makes."""
-        self._size_bytes = 0
+        """Oldest first; all but the newest are packed and lie on the grid that `_spacing_ns` makes."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -52,8 +78,8 @@ class FrameRing:
 
     @property
     def size_bytes(self) -> int:
-        """Memory of the pixels."""
-        return self._size_bytes
+        """Memory of the pixels, without the newest's."""
+        return sum(one.pixels.nbytes for one in self._frames[:-1])
 
     @property
     def newest(self) -> RingFrame | None:
@@ -63,17 +89,16 @@ class FrameRing:
 
     def add(self, frame: Frame, tracks: Tracks) -> None:
         """Keep a frame, newer than all before; let go of what there is no more room or time for."""
-        size_bytes = frame.source_bgr.nbytes
+        height, width = frame.source_bgr.shape[:2]
+        newest = RingFrame(frame.index, frame.capture_ns, (width, height), frame.source_bgr, tracks)
         with self._lock:
-            if size_bytes > self._settings.max_bytes:
-                self._drop_from(0)
+            if not self._settings.max_bytes:
                 return
-            spacing_ns = self._spacing_ns(size_bytes)
             # The newest was kept for being the newest; unless it lies on the grid, it makes way for this one.
-            if len(self._frames) > 1 and self._gap_ns(-1) < spacing_ns:
-                self._size_bytes -= self._frames.pop().source_bgr.nbytes
-            self._frames.append(RingFrame(frame.index, frame.capture_ns, frame.source_bgr, tracks))
-            self._size_bytes += size_bytes
+            last = self._frames.pop() if self._frames else None
+            if last is not None and (not self._frames or self._gap_ns(last) >= self._spacing_ns(last)):
+                self._frames.append(last.packed())
+            self._frames.append(newest)
             self._let_go(frame.capture_ns - self._settings.max_age_ns)
 
     def near_time(self, capture_ns: int) -> RingFrame | None:
@@ -98,26 +123,22 @@ class FrameRing:
                 return 0.0
             return (self._frames[-1].capture_ns - self._frames[0].capture_ns) / 1e9
 
-    def _spacing_ns(self, size_bytes: int) -> int:
+    def _spacing_ns(self, frame: RingFrame) -> int:
         """The least time between two frames on the grid, for them to reach back all the seconds."""
-        count = self._settings.max_bytes // size_bytes
-        # The newest is one more, and so is the one that is about to grow too old.
-        return self._settings.max_age_ns // max(1, count - 2)
+        count = self._settings.max_bytes // frame.packed_bytes
+        return self._settings.max_age_ns // max(1, count - 1)  # one more is about to grow too old
 
-    def _gap_ns(self, place: int) -> int:
-        return self._frames[place].capture_ns - self._frames[place - 1].capture_ns
+    def _gap_ns(self, newer: RingFrame) -> int:
+        return newer.capture_ns - self._frames[-1].capture_ns
 
     def _reach_ns(self) -> int:
         """Half a gap before the oldest: what was asked for lies nearer to it than to one that is gone."""
-        gap_ns = self._gap_ns(1) if len(self._frames) > 1 else 0
-        return self._frames[0].capture_ns - gap_ns // 2
+        first = self._frames[0].capture_ns
+        gap_ns = self._frames[1].capture_ns - first if len(self._frames) > 1 else 0
+        return first - gap_ns // 2
 
     def _let_go(self, oldest_ns: int) -> None:
         while len(self._frames) > 1 and (
-            self._size_bytes > self._settings.max_bytes or self._frames[0].capture_ns < oldest_ns
+            self.size_bytes > self._settings.max_bytes or self._frames[0].capture_ns < oldest_ns
         ):
-            self._size_bytes -= self._frames.pop(0).source_bgr.nbytes
-
-    def _drop_from(self, place: int) -> None:
-        del self._frames[place:]
-        self._size_bytes = sum(one.source_bgr.nbytes for one in self._frames)
+            self._frames.pop(0)

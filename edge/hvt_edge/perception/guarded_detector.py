@@ -14,20 +14,20 @@ _PART = "detector"
 
 
 class GuardedDetector:
-    """Used from one thread; ``reopen`` opens the model anew and may raise whatever it likes."""
+    """Used from one thread; ``open_again`` opens the model anew and may raise whatever it likes."""
 
     def __init__(
         self,
         detector: Detector,
         *,
-        reopen: Callable[[], Detector],
+        open_again: Callable[[], Detector],
         failures: Failures,
         clock: Callable[[], int],
         pause: RetryPause | None = None,
     ) -> None:
         self._detector: Detector | None = detector
         self.class_names = detector.class_names
-        self._reopen = reopen
+        self._open_again = open_again
         self._failures = failures
         self._clock = clock
         self._pause = pause or RetryPause()
@@ -38,7 +38,7 @@ class GuardedDetector:
             if self._detector is None:
                 if not self._pause.due(self._clock()):
                     return None
-                self._detector = self._reopen()
+                self._detector = self._open_again()
             found = self._detector.detect(image_bgr)
         except Exception as error:  # noqa: BLE001 - a runtime raises what it likes
             self._detector = None

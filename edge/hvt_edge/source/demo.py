@@ -1,12 +1,21 @@
-"""The drawn demo scene as a source. Who draws it says so by the entry point ``demo`` in the group ``hvt.scenes``."""
+"""The drawn demo scene as a source. Who draws it says so by the entry point ``demo`` in the group ``hvt.scenes``.
+
+It is drawn in a process of its own, as a camera is a device of its own: its ground takes 130 MB, and a picture 30 ms,
+beside the coding of the one before.
+"""
 
 from __future__ import annotations
 
 import math
+import pickle
+import subprocess
+import sys
 from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+
+import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
@@ -15,6 +24,9 @@ from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.resample import Resizer, capture_time_ns
 
 __all__ = ["DemoSource", "DrawnScene", "check_truth", "write_truth_of"]
+
+_ENTRY = {"group": "hvt.scenes", "name": "demo"}
+_END_S = 5.0
 
 
 class DrawnScene(Protocol):
@@ -37,36 +49,84 @@ class DrawnScene(Protocol):
 class DemoSource(Source):
     """The demo scene from its beginning to its end, at the base rate.
 
-    The frame at ``index`` shows ``scene`` at the moment ``index / fps``. Raises `UserError` where no scene is
+    The frame at ``index`` shows the scene at the moment ``index / fps``. Raises `UserError` where no scene is
     installed.
     """
 
     live = False
 
     def __init__(self, *, size: BaseSize, fps: float, fit: Fit, seed: int, max_frames: int | None) -> None:
-        self.scene = _open_scene(seed)
-        self.class_names = self.scene.class_names
+        if not entry_points(**_ENTRY):
+            raise UserError("--source demo: no package installed here draws a scene; install hvt whole")
+        self._drawing = subprocess.Popen(
+            [sys.executable, "-m", __name__, str(seed)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for this process, which then ends that one
+        )
+        self._size: tuple[int, int]
+        self._size, self.class_names, duration_s = self._answer()
         self.fps = fps
-        self._resizer = Resizer(self.scene.size, size, fit=fit)
+        self._resizer = Resizer(self._size, size, fit=fit)
         self.view = self._resizer.view
-        whole = math.ceil(self.scene.duration_s * exact_rate(fps))
-        self._count = whole if max_frames is None else min(whole, max_frames)
-        self.frame_count = self._count
+        whole = math.ceil(duration_s * exact_rate(fps))
+        self.frame_count = self._count = whole if max_frames is None else min(whole, max_frames)
 
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """The scene from its beginning."""
         rate = exact_rate(self.fps)
+        self._request("image", 0.0)
         for index in range(self._count):
+            self._request("image", float((index + 1) / rate))  # drawn while this one is coded
             capture_ns = capture_time_ns(index, fps=rate, start_ns=start_ns)
-            image = self.scene.image(float(index / rate))
-            yield self._resizer.frame(image, index=index, capture_ns=capture_ns)
+            yield self._resizer.frame(self._picture(), index=index, capture_ns=capture_ns)
+        self._picture()
+
+    def write_truth(self, path: Path, *, fps: float) -> None:
+        """Write the ground truth of a flight at that rate; before the first frame."""
+        self._request("truth", path, fps, self.view)
+        self._answer()
+
+    def close(self) -> None:
+        """End the drawing."""
+        self._drawing.kill()
+        self._drawing.communicate(timeout=_END_S)
+
+    def _request(self, *request: Any) -> None:
+        assert self._drawing.stdin is not None, "it was opened with a pipe"
+        pickle.dump(request, self._drawing.stdin)
+        self._drawing.stdin.flush()
+
+    def _answer(self) -> Any:
+        assert self._drawing.stdout is not None, "it was opened with a pipe"
+        return pickle.load(self._drawing.stdout)  # noqa: S301 - our own process
+
+    def _picture(self) -> Image:
+        assert self._drawing.stdout is not None, "it was opened with a pipe"
+        picture = np.empty((self._size[1], self._size[0], 3), np.uint8)
+        if self._drawing.stdout.readinto(picture.data) != picture.nbytes:  # type: ignore[attr-defined]
+            raise UserError("--source demo: the process that draws the scene has ended")
+        return picture
 
 
-def _open_scene(seed: int) -> DrawnScene:
-    for entry in entry_points(group="hvt.scenes", name="demo"):
-        scene: DrawnScene = entry.load()(seed)
-        return scene
-    raise UserError("--source demo: no package installed here draws a scene; install hvt whole")
+def _draw(seed: int) -> None:
+    """What the other process does, until nobody asks any more."""
+    (entry,) = entry_points(**_ENTRY)
+    scene: DrawnScene = entry.load()(seed)
+    requests, answers = sys.stdin.buffer, sys.stdout.buffer
+    pickle.dump((scene.size, scene.class_names, scene.duration_s), answers)
+    answers.flush()
+    while True:
+        try:
+            kind, *rest = pickle.load(requests)  # noqa: S301 - from the process that started this one
+        except EOFError:
+            return
+        if kind == "image":
+            answers.write(scene.image(min(rest[0], scene.duration_s)).data)
+        else:
+            path, fps, view = rest
+            pickle.dump(scene.write_truth(path, fps=fps, view=view), answers)
+        answers.flush()
 
 
 def check_truth(path: Path | None, source: Source) -> None:
@@ -78,4 +138,8 @@ def check_truth(path: Path | None, source: Source) -> None:
 def write_truth_of(source: Source, path: Path | None, *, fps: float) -> None:
     """Write the demo's ground truth, where it is asked for."""
     if path is not None and isinstance(source, DemoSource):
-        source.scene.write_truth(path, fps=fps, view=source.view)
+        source.write_truth(path, fps=fps)
+
+
+if __name__ == "__main__":
+    _draw(int(sys.argv[1]))

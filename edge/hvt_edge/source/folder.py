@@ -96,7 +96,10 @@ class FolderSource(Source):
 
 
 def _read(file: Path) -> Image | None:
-    """The image as BGR, 8 bits; None if it cannot be decoded."""
-    data = np.fromfile(file, np.uint8)
+    """The image as BGR, 8 bits; None if it cannot be read or decoded."""
+    try:
+        data = np.fromfile(file, np.uint8)
+    except OSError:  # it was there a moment ago
+        return None
     image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     return None if image is None else np.asarray(image, np.uint8)

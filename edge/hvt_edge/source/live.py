@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,7 +18,7 @@ from hvt_edge.source.camera_clock import CameraClock
 from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.resample import Gate, Resizer
 
-__all__ = ["Grabber", "LiveSource", "Shot", "SignalLost"]
+__all__ = ["Grabber", "LiveSource", "Shot", "SignalLost", "closing_on"]
 
 _log = logging.getLogger(__name__)
 
@@ -173,3 +174,18 @@ class LiveSource(Source):
             else:
                 self.restarts += 1
                 return
+
+
+@contextmanager
+def closing_on(stop: threading.Event, source: Source) -> Iterator[None]:
+    """Close a live source as soon as ``stop`` is set: one whose signal is lost would keep its reader waiting."""
+
+    def wait() -> None:
+        stop.wait()
+        source.close()
+
+    threading.Thread(target=wait, name="hvt-stop", daemon=True).start()
+    try:
+        yield
+    finally:
+        stop.set()

@@ -66,7 +66,7 @@ def crop_job_for(
     request: OnDemandRequest, frame: RingFrame, *, maker: StillMaker, view: View, class_names: tuple[str, ...]
 ) -> CropJob:
     """Crop what is requested out of that frame; raises `RefusedError` where it is not in it."""
-    height, width = frame.source_bgr.shape[:2]
+    width, height = frame.size
     box: Box
     if request.track_id is not None:
         row = _row(frame, request.track_id)

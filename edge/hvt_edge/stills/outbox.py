@@ -44,11 +44,8 @@ class OutboxSettings:
     max_on_demand_ns: int = 10 * SECOND_NS
     max_sent: int = 64
     max_sent_bytes: int = 2 * _MIB
-    """Of coded stills that are not acknowledged."""
     max_crop_bytes: int = 8 * _MIB
-    """Of the pixels of sent stills that can be coded again."""
     max_sent_ns: int = 4 * SECOND_NS
-    """What was sent longer ago is not sent again."""
     least_wait_ns: int = SECOND_NS
     wait_round_trips: int = 3
     """A still is overdue after so many round trips, and after ``least_wait_ns`` at the earliest."""
@@ -70,7 +67,6 @@ class OutboxStill:
     """The ground could not decode the first still of this crop."""
     state: StillState = StillState.PENDING
     coded: Still | None = None
-    """None while it is pending."""
     envelope: StillEnvelope | None = None
     """With its header, packed once: by the first that sends or stores it."""
     sent_ns: int = 0
@@ -126,7 +122,7 @@ class Outbox:
     """
 
     def __init__(self, settings: OutboxSettings = OutboxSettings(), *, reports: bool = True) -> None:
-        self._settings = settings
+        self.settings = settings
         self._reports = reports
         self._lock = threading.RLock()
         self._pending: dict[int, OutboxStill] = {}
@@ -152,7 +148,7 @@ class Outbox:
 
     @property
     def pending(self) -> tuple[OutboxStill, ...]:
-        """Of the method, in no order."""
+        """Of the method."""
         with self._lock:
             return tuple(self._pending.values())
 
@@ -175,7 +171,7 @@ class Outbox:
     def admits(self, request: Request, *, now_ns: int) -> bool:
         """Whether a still of this request would stay if it were offered now."""
         with self._lock:
-            if len(self._pending) < self._settings.max_pending or request.candidate.track_id in self._pending:
+            if len(self._pending) < self.settings.max_pending or request.candidate.track_id in self._pending:
                 return True
             least = min(map(_order, self._pending.values()))
         return (request.score, -now_ns, -request.candidate.track_id) > least
@@ -194,7 +190,7 @@ class Outbox:
                 elif older.track_ids & new.track_ids:
                     _take_off(older, new.track_ids)
             self._pending[new.track_id] = new
-            if len(self._pending) > self._settings.max_pending:
+            if len(self._pending) > self.settings.max_pending:
                 left.append(self._expire(min(self._pending.values(), key=_order), "queue_full"))
         return left
 
@@ -210,7 +206,7 @@ class Outbox:
 
     def expire(self, now_ns: int) -> list[tuple[OutboxStill, str]]:
         """Give up what has been pending for too long."""
-        settings = self._settings
+        settings = self.settings
         with self._lock:
             for one in self._on_demand:
                 one.since_ns = now_ns if one.since_ns is None else one.since_ns
@@ -228,11 +224,6 @@ class Outbox:
         with self._lock:
             return [self._expire(one, "ended") for one in (*self._on_demand, *self.pending)]
 
-    @property
-    def max_pending_ns(self) -> int:
-        """How long a still of the method may be pending."""
-        return self._settings.max_pending_ns
-
     # Coded
 
     def sequence(self, *, store: bool) -> int:
@@ -241,7 +232,7 @@ class Outbox:
 
     def sent(self, pending: OutboxStill, still: Still, *, now_ns: int, resend: CropJob | None = None) -> None:
         """It goes out. ``resend`` is its crop as it would be coded for a ground that cannot decode the still."""
-        settings = self._settings
+        settings = self.settings
         with self._lock:
             self._leave_pending(pending)
             self._next_sequences[False] += 1
@@ -256,10 +247,6 @@ class Outbox:
             while len(self._sent) > settings.max_sent or self.sent_bytes > settings.max_sent_bytes:
                 self._forget(next(iter(self._sent.values())))
 
-    def sent_again(self, sent: OutboxStill) -> None:
-        """A second copy of it goes out."""
-        sent.copies += 1
-
     def stored(self, one: OutboxStill, still: Still) -> None:
         """It goes to the backlog: a pending still while the link is away, or a lost one."""
         with self._lock:
@@ -268,19 +255,20 @@ class Outbox:
                 self._next_sequences[True] += 1
             one.state, one.coded, one.job = StillState.STORED, still, None
 
-    # Sent
+    def sent_again(self, sent: OutboxStill) -> None:
+        """A second copy of it goes out."""
+        sent.copies += 1
 
     @property
     def unacknowledged(self) -> int:
         """How many were sent that no report has named."""
         with self._lock:
-            return sum(one.state is StillState.SENT for one in self._sent.values()) if self._reports else 0
+            return len(self._unnamed())
 
     @property
     def sent_bytes(self) -> int:
         """Of coded stills that are not acknowledged."""
-        sent = [one for one in self._sent.values() if one.state is StillState.SENT]
-        return sum(len(one.still.data) for one in sent) if self._reports else 0
+        return sum(len(one.still.data) for one in self._unnamed())
 
     @property
     def crop_bytes(self) -> int:
@@ -295,11 +283,10 @@ class Outbox:
             return False
         with self._lock:
             self._reported_ns, self._round_trip_ns = now_ns, round_trip_ns
-            lost = set(missing)
             named = [
                 one
                 for sequence, one in self._sent.items()
-                if one.state is StillState.SENT and sequence <= still_sequence and sequence not in lost
+                if one.state is StillState.SENT and sequence <= still_sequence and sequence not in missing
             ]
             for one in named:
                 one.state = StillState.ACKNOWLEDGED
@@ -321,7 +308,7 @@ class Outbox:
         left: list[tuple[OutboxStill, str]] = []
         with self._lock:
             for one in tuple(self._sent.values()):
-                if now_ns - one.sent_ns > self._settings.max_sent_ns:
+                if now_ns - one.sent_ns > self.settings.max_sent_ns:
                     self._drop_crop(one)
             for sequence in sorted(self._undecodable):
                 sent = self._sent[sequence]
@@ -342,14 +329,13 @@ class Outbox:
 
         Only what a report could have named counts: where none comes, nothing is known of what has arrived.
         """
-        settings = self._settings
+        settings = self.settings
         wait_ns = max(settings.least_wait_ns, settings.wait_round_trips * self._round_trip_ns)
         with self._lock:
             overdue = [
                 one
-                for one in self._sent.values()
-                if one.state is StillState.SENT
-                and one.copies == 1
+                for one in self._unnamed()
+                if one.copies == 1
                 and self._reported_ns - one.sent_ns >= wait_ns
                 and now_ns - one.sent_ns <= settings.max_sent_ns
             ]
@@ -357,17 +343,17 @@ class Outbox:
 
     def lose(self) -> list[OutboxStill]:
         """The link is away: take what no report has named for lost; most useful first."""
-        if not self._reports:
-            return []
         with self._lock:
-            lost = [one for one in self._sent.values() if one.state is StillState.SENT]
+            lost = self._unnamed()
             for one in lost:
                 one.state = StillState.LOST
                 del self._sent[one.still.sequence]
                 self._undecodable.discard(one.still.sequence)
         return sorted(lost, key=lambda one: -one.utility)
 
-    # Leaving
+    def _unnamed(self) -> list[OutboxStill]:
+        """Sent, and not acknowledged; none where reports do not count."""
+        return [one for one in self._sent.values() if one.state is StillState.SENT] if self._reports else []
 
     def _expire(self, pending: OutboxStill, reason: str) -> tuple[OutboxStill, str]:
         self._leave_pending(pending)

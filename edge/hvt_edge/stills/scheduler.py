@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 from hvt_common.values import Still, View
 from hvt_edge.perception.analyzer import AnalyzedFrame
@@ -46,6 +46,7 @@ class ChooserSettings:
     """Whether candidates were found on the source, and may be unknown to the ground."""
 
 
+@dataclass(eq=False)
 class Chooser:
     """Decides at each step which candidates get a still, and codes pending stills as the budget allows.
 
@@ -57,33 +58,21 @@ class Chooser:
     allowed: it holds up nobody, because what it shows grows old.
     """
 
-    def __init__(
-        self,
-        method: Method,
-        *,
-        outbox: Outbox,
-        suppression: Suppression,
-        maker: StillMaker,
-        memory: TrackMemory,
-        view: View,
-        class_names: tuple[str, ...],
-        settings: ChooserSettings,
-        on_outcome: Callable[[str, str], None],
-        observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None,
-        on_demand: OnDemand | None = None,
-    ) -> None:
-        self._method = method
-        self._outbox = outbox
-        self._on_demand = on_demand
-        self._suppression = suppression
-        self._maker = maker
-        self._memory = memory
-        self._view = view
-        self._class_names = class_names
-        self._settings = settings
-        self._on_outcome = on_outcome
-        self._observe = observe
-        self._most_bytes = settings.most_bytes
+    method: Method
+    _: KW_ONLY
+    outbox: Outbox
+    suppression: Suppression
+    maker: StillMaker
+    memory: TrackMemory
+    view: View
+    class_names: tuple[str, ...]
+    settings: ChooserSettings
+    on_outcome: Callable[[str, str], None]
+    observe: Callable[[Sequence[Candidate], Step], None] = lambda _candidates, _step: None
+    on_demand: OnDemand | None = None
+
+    def __post_init__(self) -> None:
+        self._most_bytes = self.settings.most_bytes
         self._costs: dict[str, CostModel] = {}
         self._put_off = False
         self._held_up: dict[int, int] = {}
@@ -96,80 +85,80 @@ class Chooser:
 
         Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
         """
-        if self._on_demand is not None:
-            self._on_demand.add(analyzed)
-        if self._method.video_only:
+        if self.on_demand is not None:
+            self.on_demand.add(analyzed)
+        if self.method.video_only:
             return
         due = analyzed.detected or self._put_off
-        able = analyzed.base_bgr is not None or not self._maker.codec.needs_base
+        able = analyzed.base_bgr is not None or not self.maker.codec.needs_base
         self._put_off = due and not able
         if not (due and able):
-            self._memory.observe(analyzed.tracks, now_ns=now_ns)
+            self.memory.observe(analyzed.tracks, now_ns=now_ns)
             return
         step = Step(
             frame_index=analyzed.frame.index,
             now_ns=now_ns,
-            fps=self._settings.fps,
-            base_size=self._view.base_size,
-            cost=self._cost_of(self._maker.codec.name).estimate(),
+            fps=self.settings.fps,
+            base_size=self.view.base_size,
+            cost=self._cost_of(self.maker.codec.name).estimate(),
             allowance_bytes=allowance_bytes,
-            still_overhead_bytes=self._settings.overhead_bytes,
-            from_source=self._settings.from_source,
+            still_overhead_bytes=self.settings.overhead_bytes,
+            from_source=self.settings.from_source,
         )
-        candidates = self._memory.candidates(
+        candidates = self.memory.candidates(
             analyzed.tracks,
-            view=self._view,
-            class_names=self._class_names,
+            view=self.view,
+            class_names=self.class_names,
             now_ns=now_ns,
             source_bgr=analyzed.frame.source_bgr,
             base_bgr=analyzed.base_bgr,
         )
-        self._observe(candidates, step)
+        self.observe(candidates, step)
         for request in self._requests(self._unheld(candidates, now_ns=now_ns), step):
             self._crop(request, analyzed, now_ns=now_ns)
 
     def _unheld(self, candidates: Sequence[Candidate], *, now_ns: int) -> list[Candidate]:
         """Those that neither suppression nor gate holds back."""
-        allowed, held = self._suppression.apply(candidates, now_ns=now_ns)
+        allowed, held = self.suppression.apply(candidates, now_ns=now_ns)
         for _, reason in held:
-            self._on_outcome("deferred", reason)
+            self.on_outcome("deferred", reason)
         # The gate comes last because it reads pixels, and before the method, so that the places in the outbox go to
         # those that gain from a still.
         return [one for one in allowed if not self._gated(one, now_ns=now_ns)]
 
     def _gated(self, candidate: Candidate, *, now_ns: int) -> bool:
-        gate = self._settings.gate
+        gate = self.settings.gate
         if not gate.on or candidate.loss is None or not gate.good_enough(candidate.loss()):
             return False
         self._refuse(candidate, "base_good", now_ns=now_ns)
         return True
 
     def _requests(self, candidates: list[Candidate], step: Step) -> list[Request]:
-        requests = self._method.requests(candidates, step)
-        if not self._settings.share:
+        requests = self.method.requests(candidates, step)
+        if not self.settings.share:
             return requests
         joined = group(
             requests,
             cost=step.cost,
             overhead_bytes=step.still_overhead_bytes,
-            padding=self._maker.padding,
-            source_size=self._view.source_size,
+            padding=self.maker.padding,
+            source_size=self.view.source_size,
         )
         return [request for request, _ in joined]
 
     def _crop(self, request: Request, analyzed: AnalyzedFrame, *, now_ns: int) -> None:
-        if not self._outbox.admits(request, now_ns=now_ns):
-            self._on_outcome("dropped", "queue_full")
+        if not self.outbox.admits(request, now_ns=now_ns):
+            self.on_outcome("dropped", "queue_full")
             return
-        job = self._maker.crop(analyzed.frame, request, view=self._view, base_bgr=analyzed.base_bgr)
+        job = self.maker.crop(analyzed.frame, request, view=self.view, base_bgr=analyzed.base_bgr)
         if isinstance(job, NoStill):
             for one in (request.candidate, *request.also):
-                self._memory.record_refused(one.track_id, now_ns=now_ns)
-            self._on_outcome("dropped", job.reason)
+                self.memory.record_refused(one.track_id, now_ns=now_ns)
+            self.on_outcome("dropped", job.reason)
             return
         # A pending still must not hold frames: what is measured on them is measured now.
         pending = OutboxStill(job, request.without_frame(), request.score, now_ns)
-        self._count_left(self._outbox.offer(pending))
+        self._count_left(self.outbox.offer(pending))
 
     # Which stills go now
 
@@ -178,31 +167,31 @@ class Chooser:
 
         ``store``: they go to the backlog. Then none builds on the base, which may come later still, or never.
         """
-        self._count_left(self._outbox.offer_undecodable(now_ns))
-        self._count_left(self._outbox.expire(now_ns))
+        self._count_left(self.outbox.offer_undecodable(now_ns))
+        self._count_left(self.outbox.expire(now_ns))
         yield from self._requested(now_ns=now_ns, allowance=allowance, store=store)
-        if self._outbox.on_demand is not None:
+        if self.outbox.on_demand is not None:
             return  # it waits for its allowance; none of the others takes that away
-        while (pending := self._outbox.best()) is not None:
+        while (pending := self.outbox.best()) is not None:
             yield from self._overdue(over=pending.utility, now_ns=now_ns, allowance=allowance)
             job = pending.crop
             if store:
-                job = job.recoded(self._maker.without_base, reason=job.header.reason)
-            limit_bytes = allowance(replace(job.header, sequence=self._outbox.sequence(store=store)))
+                job = job.recoded(self.maker.without_base, reason=job.header.reason)
+            limit_bytes = allowance(replace(job.header, sequence=self.outbox.sequence(store=store)))
             if not self._may_go(pending, job, limit_bytes, now_ns=now_ns):
                 break  # the most useful waits for its allowance; a lesser one does not slip in before it
             if self._code(pending, job, now_ns=now_ns, allowance=allowance, store=store):
                 yield pending
         else:
             yield from self._overdue(over=-math.inf, now_ns=now_ns, allowance=allowance)
-        held = {pending.track_id for pending in self._outbox.pending}
+        held = {pending.track_id for pending in self.outbox.pending}
         self._held_up = {track_id: ns for track_id, ns in self._held_up.items() if track_id in held}
 
     def _requested(self, *, now_ns: int, allowance: Allowance, store: bool) -> Iterator[OutboxStill]:
         """Those that grounds requested."""
-        while isinstance(pending := self._outbox.on_demand, OnDemandStill) and self._on_demand is not None:
-            sequence = self._outbox.sequence(store=store)
-            still = self._on_demand.code(pending, now_ns=now_ns, allowance=allowance, sequence=sequence)
+        while isinstance(pending := self.outbox.on_demand, OnDemandStill) and self.on_demand is not None:
+            sequence = self.outbox.sequence(store=store)
+            still = self.on_demand.code(pending, now_ns=now_ns, allowance=allowance, sequence=sequence)
             if still is None:
                 return
             self._coded(pending, still, now_ns=now_ns, store=store)
@@ -210,13 +199,13 @@ class Chooser:
 
     def _overdue(self, *, over: float, now_ns: int, allowance: Allowance) -> Iterator[OutboxStill]:
         """Those to be sent again that are more useful than ``over``, and fit."""
-        for sent in self._outbox.overdue(now_ns):
+        for sent in self.outbox.overdue(now_ns):
             if sent.utility <= over:
                 return
             # Something newer of its track says more.
-            if sent.track_id not in self._outbox and len(sent.still.data) <= allowance(sent.still):
-                self._on_outcome("sent", AGAIN)
-                self._outbox.sent_again(sent)
+            if sent.track_id not in self.outbox and len(sent.still.data) <= allowance(sent.still):
+                self.on_outcome("sent", AGAIN)
+                self.outbox.sent_again(sent)
                 yield sent
 
     def _may_go(self, pending: OutboxStill, job: CropJob, limit_bytes: int, *, now_ns: int) -> bool:
@@ -225,14 +214,14 @@ class Chooser:
         expected = expected_bytes(
             pending.request,
             cost=self._cost_of(job.header.codec).estimate(),
-            padding=self._maker.padding,
-            source_size=self._view.source_size,
+            padding=self.maker.padding,
+            source_size=self.view.source_size,
         )
         if limit_bytes >= min(expected, self._most_bytes * _FULL_SHARE):
             return True
         # By track: methods request again at each step, and every new still takes the place of the last.
         since_ns = self._held_up.setdefault(pending.track_id, now_ns)
-        return now_ns - since_ns >= _PATIENCE_SHARE * self._outbox.max_pending_ns
+        return now_ns - since_ns >= _PATIENCE_SHARE * self.outbox.settings.max_pending_ns
 
     def _code(
         self, pending: OutboxStill, job: CropJob, *, now_ns: int, allowance: Allowance, store: bool
@@ -240,9 +229,9 @@ class Chooser:
         """Code it to its allowance; False where no still comes of it."""
         assert pending.request is not None, "it is of the method"
         self._held_up.pop(pending.track_id, None)
-        made = self._maker.code(job, sequence=self._outbox.sequence(store=store), allowance=allowance)
+        made = self.maker.code(job, sequence=self.outbox.sequence(store=store), allowance=allowance)
         if isinstance(made, NoStill):
-            self._outbox.give_up(pending)
+            self.outbox.give_up(pending)
             self._refuse(pending.request.candidate, made.reason, now_ns=now_ns)
             return False
         height, width = job.crop_bgr.shape[:2]
@@ -253,9 +242,9 @@ class Chooser:
         ):  # else its tracks have rested since it was sent first, and it is not sent a third time
             self._record_sent(pending.request, made, now_ns=now_ns)
             if (
-                made.codec != self._maker.without_base.name
+                made.codec != self.maker.without_base.name
             ):  # it builds on the base, and a ground may lack that
-                resend = job.recoded(self._maker.without_base, reason=made.reason)
+                resend = job.recoded(self.maker.without_base, reason=made.reason)
         self._coded(pending, made, now_ns=now_ns, store=store, resend=resend)
         return True
 
@@ -269,15 +258,15 @@ class Chooser:
         resend: CropJob | None = None,
     ) -> None:
         if store:
-            self._outbox.stored(pending, still)
-            self._on_outcome("deferred", "stored")
+            self.outbox.stored(pending, still)
+            self.on_outcome("deferred", "stored")
         else:
-            self._outbox.sent(pending, still, now_ns=now_ns, resend=resend)
-            self._on_outcome("sent", still.reason)
+            self.outbox.sent(pending, still, now_ns=now_ns, resend=resend)
+            self.on_outcome("sent", still.reason)
 
     def _record_sent(self, request: Request, still: Still, *, now_ns: int) -> None:
         for one in (request.candidate, *request.also):
-            self._memory.record_sent(
+            self.memory.record_sent(
                 one.track_id,
                 frame_index=still.frame_index,
                 now_ns=now_ns,
@@ -292,13 +281,13 @@ class Chooser:
         self, track_id: int, *, class_name: str, confidence: float, entropy_nats: float
     ) -> None:
         """The ground has classified a still of this track."""
-        self._memory.record_feedback(
+        self.memory.record_feedback(
             track_id, class_name=class_name, confidence=confidence, entropy_nats=entropy_nats
         )
 
     def set_method(self, method: Method) -> None:
         """From the next decision step on; what is pending already stays."""
-        self._method = method
+        self.method = method
 
     def set_most_bytes(self, most_bytes: int) -> None:
         """The largest admission that the budget can give from now on, payload."""
@@ -306,21 +295,21 @@ class Chooser:
 
     def close(self) -> None:
         """What is pending will not be sent any more."""
-        if self._on_demand is not None:
-            self._on_demand.close()
-        self._count_left(self._outbox.clear())
+        if self.on_demand is not None:
+            self.on_demand.close()
+        self._count_left(self.outbox.clear())
 
     def _count_left(self, left: Iterable[tuple[OutboxStill, str]]) -> None:
         for one, reason in left:
             if isinstance(one, OnDemandStill):
-                if self._on_demand is not None:
-                    self._on_demand.expired(one, reason)
+                if self.on_demand is not None:
+                    self.on_demand.expired(one, reason)
             else:
-                self._on_outcome("deferred" if reason == "replaced" else "dropped", reason)
+                self.on_outcome("deferred" if reason == "replaced" else "dropped", reason)
 
     def _refuse(self, candidate: Candidate, reason: str, *, now_ns: int) -> None:
-        self._memory.record_refused(candidate.track_id, now_ns=now_ns)
-        self._on_outcome("dropped", reason)
+        self.memory.record_refused(candidate.track_id, now_ns=now_ns)
+        self.on_outcome("dropped", reason)
 
     def _cost_of(self, codec: str) -> CostModel:
         """Learnt for each codec apart: a residual takes a fraction of what an intra still takes."""

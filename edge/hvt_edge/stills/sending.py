@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY, dataclass
+
 from hvt_common.values import Still
 from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.link.transmitter import Transmitter
@@ -12,62 +14,58 @@ from hvt_edge.stills.outbox import Outbox, OutboxStill
 __all__ = ["StillSender"]
 
 
+@dataclass(eq=False)
 class StillSender:
     """For the stills' thread, and after its end for the one that ends the run; ``backlog`` may be None."""
 
-    def __init__(
-        self,
-        outbox: Outbox,
-        *,
-        maker: StillMaker,
-        transmitter: Transmitter,
-        backlog: BacklogStage | None = None,
-    ) -> None:
-        self._outbox = outbox
-        self._maker = maker
-        self._transmitter = transmitter
-        self._backlog = backlog
+    outbox: Outbox
+    _: KW_ONLY
+    maker: StillMaker
+    transmitter: Transmitter
+    backlog: BacklogStage | None = None
+
+    def __post_init__(self) -> None:
         self._breaks = 0
         """Of the link, as far as this has noticed them."""
 
     @property
     def offline(self) -> bool:
         """Whether the link is away, and stills are stored."""
-        return self._backlog is not None and self._backlog.offline
+        return self.backlog is not None and self.backlog.offline
 
     def allowance(self, now_ns: int, *, paced: bool) -> Allowance:
         """How many payload bytes a still may take now."""
-        return lambda still: self._transmitter.still_allowance_bytes(now_ns, still=still, paced=paced)
+        return lambda still: self.transmitter.still_allowance_bytes(now_ns, still=still, paced=paced)
 
     def put(self, coded: OutboxStill, *, now_ns: int, store: bool) -> None:
         """Send a coded still, or a second copy of it, or store it."""
         if store:
             self._store(coded, now_ns=now_ns, counted=True)
             return
-        coded.envelope = coded.envelope or self._transmitter.envelope(coded.still)
-        self._transmitter.still(coded.envelope, now_ns=now_ns, copy=coded.copies > 1)
+        coded.envelope = coded.envelope or self.transmitter.envelope(coded.still)
+        self.transmitter.still(coded.envelope, now_ns=now_ns, copy=coded.copies > 1)
 
     def store_lost(self, now_ns: int) -> None:
         """Store what was sent before the link went away, or came back, and no report has named."""
-        if self._backlog is None or self._backlog.breaks == self._breaks:
+        if self.backlog is None or self.backlog.breaks == self._breaks:
             return
-        self._breaks = self._backlog.breaks
-        for lost in self._outbox.lose():
-            self._outbox.stored(lost, self._without_base(lost.still, lost.job))
+        self._breaks = self.backlog.breaks
+        for lost in self.outbox.lose():
+            self.outbox.stored(lost, self._without_base(lost.still, lost.job))
             self._store(lost, now_ns=now_ns, counted=False)
 
     def close(self, now_ns: int) -> None:
         """The run ends: what no report has named by now is stored."""
-        if self._backlog is not None:
-            self._backlog.end_in_flight()
+        if self.backlog is not None:
+            self.backlog.end_in_flight()
         self.store_lost(now_ns)
 
     def _store(self, one: OutboxStill, *, now_ns: int, counted: bool) -> None:
-        assert self._backlog is not None, "nothing is stored without one"
+        assert self.backlog is not None, "nothing is stored without one"
         if one.envelope is None or one.envelope.still is not one.still:
-            one.envelope = self._transmitter.envelope(one.still)
-        packed = self._transmitter.store_still(one.envelope, now_ns=now_ns, counted=counted)
-        self._backlog.store_still(
+            one.envelope = self.transmitter.envelope(one.still)
+        packed = self.transmitter.store_still(one.envelope, now_ns=now_ns, counted=counted)
+        self.backlog.store_still(
             packed, number=one.still.sequence, capture_ns=one.still.capture_ns, utility=one.utility
         )
 
@@ -75,6 +73,6 @@ class StillSender:
         """A sent still, coded anew without the base; itself where it is so, or its crop is gone."""
         if job is None:
             return still
-        most_bytes = self._transmitter.most_still_bytes()
-        made = self._maker.code(job, sequence=still.sequence, allowance=lambda _: most_bytes)
+        most_bytes = self.transmitter.most_still_bytes()
+        made = self.maker.code(job, sequence=still.sequence, allowance=lambda _: most_bytes)
         return still if isinstance(made, NoStill) else made

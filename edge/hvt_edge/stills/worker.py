@@ -25,8 +25,8 @@ _PART = "stills"
 _BEHIND_FRAMES = 3
 """With more frames queued than this, detection is put off; decoding never is."""
 _LEAST_FRAMES = 2
-MAX_QUEUE_BYTES = 160 * 2**20
-"""Of frames that are queued: 16 of 1280x720 and 1920x1080, 5 of 3840x2160."""
+MAX_QUEUE_BYTES = 32 * 2**20
+"""Of frames that are queued: 6 of 1280x720, 3 of 1920x1080, 2 of 3840x2160."""
 _RETRY_S = 0.025
 _MOST_SKIPPED_BYTES = 2 * 2**20
 
@@ -78,13 +78,13 @@ class StillWorker:
         """Whether the next frame finds no room, or the stage has failed a moment ago."""
         return self._frames.qsize() >= self._most_frames or not self._pause.due(self._clock())
 
-    def take(self, frame: Frame, unit: AccessUnit | None, *, room: bool = True) -> bool:
-        """Queue one frame, in order, with its access unit if it has one; False where there is no room for it."""
+    def take(self, frame: Frame, unit: AccessUnit | None, *, late: bool = False) -> bool:
+        """Queue one frame, in order, with its access unit if it has one; False where it is skipped."""
         # All frames of a source have one size, so a bound in bytes is a bound in frames.
         fitting = self._max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
         self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
         with self._lock:
-            if self.full or not room:
+            if self.full or late:
                 self._skipped.add(unit)
                 return False
             self._frames.put((frame, *self._skipped.take(unit)))

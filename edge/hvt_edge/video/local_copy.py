@@ -84,7 +84,7 @@ class LocalCopy:
     def _run(self) -> None:
         while (unit := self._queue.get()) is not None:
             try:
-                self._keep(unit)
+                self._append(unit)
             except Exception as error:  # noqa: BLE001 - it ends the copy, never the flight
                 self._fail(error)
         try:
@@ -93,7 +93,7 @@ class LocalCopy:
         except (av.error.FFmpegError, OSError) as error:
             self._fail(error)
 
-    def _keep(self, unit: AccessUnit) -> None:
+    def _append(self, unit: AccessUnit) -> None:
         if self._file is None:
             if not unit.keyframe or not self._pause.due(time.monotonic_ns()):
                 return

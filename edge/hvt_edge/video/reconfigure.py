@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Protocol
 
 from hvt_edge.link.pacer import Pacer
@@ -47,6 +47,7 @@ class OpenEncoder(Protocol):
         ...
 
 
+@dataclass(eq=False)
 class EncoderReconfiguration:
     """Called before each keyframe for the link; observes decision steps, which may come from another thread.
 
@@ -55,25 +56,18 @@ class EncoderReconfiguration:
     first, then frames.
     """
 
-    def __init__(
-        self,
-        operating: Operating,
-        settings: ReconfigurationSettings,
-        *,
-        open_encoder: OpenEncoder,
-        transmitter: Transmitter,
-        split: Split | None,
-        pacer: Pacer | None = None,
-    ) -> None:
-        self._operating = operating
-        self._settings = settings
-        self._open_encoder = open_encoder
-        self._transmitter = transmitter
-        self._split = split
-        self._pacer = pacer
+    operating: Operating
+    settings: ReconfigurationSettings
+    _: KW_ONLY
+    open_encoder: OpenEncoder
+    transmitter: Transmitter
+    split: Split | None
+    pacer: Pacer | None = None
+
+    def __post_init__(self) -> None:
         self._trigger = ReconfigurationTrigger()
         self._lock = threading.Lock()
-        now = operating.now
+        now = self.operating.now
         self._opened = {"total_bps": now.budget_bps, "base_bps": now.base_bps, "decimation": now.decimation}
         """What x265 was last opened for."""
         self._commanded = (now.budget_bps, now.video_share)
@@ -83,12 +77,12 @@ class EncoderReconfiguration:
 
     def track_link(self, now_ns: int) -> bool:
         """Hold the budget to the link's rate; True where the base should be opened anew: a keyframe is wanted."""
-        if self._pacer is None:
+        if self.pacer is None:
             return False
-        self._allow(self._pacer.rate_bps, now_ns)
-        wanted_bps = self._base_of(self._pacer.steady_bps)
+        self._allow(self.pacer.rate_bps, now_ns)
+        wanted_bps = self._base_of(self.pacer.steady_bps)
         return self._trigger.wants(
-            wanted_bps, self._operating.now.base_bps, at_ceiling=self._pacer.at_ceiling, now_ns=now_ns
+            wanted_bps, self.operating.now.base_bps, at_ceiling=self.pacer.at_ceiling, now_ns=now_ns
         )
 
     def hold(self, now_ns: int) -> None:
@@ -96,17 +90,17 @@ class EncoderReconfiguration:
 
         The pacer takes the silence for a link that carries next to nothing; stills would find no room in the store.
         """
-        if self._pacer is None:
+        if self.pacer is None:
             return
-        now = self._operating.now
+        now = self.operating.now
         self._allow(min(self._commanded[0], round(now.base_bps / self._share)), now_ns)
 
     def least_decimation(self) -> int:
         """At the link's rate, each n-th source frame at the most can be coded: x265 has a least for each frame."""
-        if self._pacer is None:
+        if self.pacer is None:
             return 1
-        settings = self._settings
-        base_bps, nominal_fps = self._base_of(self._pacer.steady_bps), settings.nominal_fps
+        settings = self.settings
+        base_bps, nominal_fps = self._base_of(self.pacer.steady_bps), settings.nominal_fps
         most = max(1, int(nominal_fps / settings.least_fps))
         for decimation in range(1, most):
             if base_bps >= least_base_bps(settings.size, nominal_fps / decimation, edge_id=settings.edge_id):
@@ -115,28 +109,28 @@ class EncoderReconfiguration:
 
     def observe(self, candidates: Sequence[Candidate], step: Step) -> None:
         """Take in all tracks of a decision step."""
-        if self._split is not None:
+        if self.split is not None:
             with self._lock:
-                self._split.observe(candidates, step)
+                self.split.observe(candidates, step)
 
     def wants_keyframe(self, now_ns: int) -> bool:
         """Whether rates are so far off that it is worth a keyframe of its own; once a second."""
-        now = self._operating.now
+        now = self.operating.now
         if self._commanded != (now.budget_bps, now.video_share):  # it came while a keyframe was being made
             return True
         with self._lock:
-            return self._moving and self._split is not None and self._split.wants_keyframe(now_ns)
+            return self._moving and self.split is not None and self.split.wants_keyframe(now_ns)
 
-    def reopen(self) -> BaseEncoder:
+    def open_again(self) -> BaseEncoder:
         """Return another encoder for what the last was opened for."""
-        return self._open_encoder(**self._opened)
+        return self.open_encoder(**self._opened)
 
     def __call__(self, decimation: int, now_ns: int) -> BaseEncoder | None:
         """Return the encoder to go on with from this keyframe, or None for the one there is."""
         changed = self._take_command()
-        if self._pacer is not None:
-            return self._at_links_rate(self._pacer, decimation, now_ns, changed=changed)
-        now = self._operating.now
+        if self.pacer is not None:
+            return self._at_links_rate(self.pacer, decimation, now_ns, changed=changed)
+        now = self.operating.now
         base_bps, total_bps = self._proposed_bps(changed=changed), now.budget_bps
         if not changed and (decimation, base_bps) == (now.decimation, now.base_bps):
             return None
@@ -145,9 +139,9 @@ class EncoderReconfiguration:
     def _at_links_rate(
         self, pacer: Pacer, decimation: int, now_ns: int, *, changed: bool
     ) -> BaseEncoder | None:
-        now = self._operating.now
+        now = self.operating.now
         if changed:
-            floor_bps = min(now.budget_bps, self._settings.min_budget_bps)
+            floor_bps = min(now.budget_bps, self.settings.min_budget_bps)
             pacer.set_ceiling(now.budget_bps, floor_bps=floor_bps)
         self._proposed_bps(changed=changed)  # which moves the share
         base_bps = self._base_of(pacer.steady_bps)
@@ -163,23 +157,23 @@ class EncoderReconfiguration:
     ) -> BaseEncoder:
         self.count += 1
         self._opened = {"total_bps": encoder_total_bps, "base_bps": base_bps, "decimation": decimation}
-        self._operating.open(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
+        self.operating.open(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
         self._set_budget(now_ns)
-        return self.reopen()
+        return self.open_again()
 
     def _allow(self, total_bps: int, now_ns: int) -> None:
-        if total_bps != self._operating.now.total_bps:
-            self._operating.allow(total_bps)
+        if total_bps != self.operating.now.total_bps:
+            self.operating.allow(total_bps)
             self._set_budget(now_ns)
 
     def _set_budget(self, now_ns: int) -> None:
-        now = self._operating.now
-        fps = self._settings.nominal_fps / now.decimation
-        self._transmitter.set_rates(now.total_bps, now.base_bps, fps, now_ns=now_ns)
+        now = self.operating.now
+        fps = self.settings.nominal_fps / now.decimation
+        self.transmitter.set_rates(now.total_bps, now.base_bps, fps, now_ns=now_ns)
 
     def _base_of(self, total_bps: int) -> int:
         """The base's part of so much in all; never less than x265 can follow at its lowest frame rate."""
-        settings = self._settings
+        settings = self.settings
         least_bps = least_base_bps(settings.size, settings.least_fps, edge_id=settings.edge_id)
         return max(least_bps, base_rate_bps(total_bps, self._share, metadata_bps=settings.metadata_bps))
 
@@ -189,7 +183,7 @@ class EncoderReconfiguration:
         commanded = self._commanded[1]
         if commanded is not None:
             return commanded
-        return FIRST_SHARE if self._split is None else self._split.share
+        return FIRST_SHARE if self.split is None else self.split.share
 
     @property
     def _moving(self) -> bool:
@@ -198,23 +192,23 @@ class EncoderReconfiguration:
 
     def _take_command(self) -> bool:
         """Whether another total or share was commanded since the last keyframe; it holds from now on."""
-        now = self._operating.now
+        now = self.operating.now
         before, self._commanded = self._commanded, (now.budget_bps, now.video_share)
         return before != self._commanded
 
     def _proposed_bps(self, *, changed: bool) -> int:
-        now = self._operating.now
-        if not self._moving or self._split is None:
+        now = self.operating.now
+        if not self._moving or self.split is None:
             return self._base_of_budget() if changed else now.base_bps
-        total_bps = now.budget_bps if self._pacer is None else self._pacer.steady_bps
+        total_bps = now.budget_bps if self.pacer is None else self.pacer.steady_bps
         with self._lock:
-            if changed or self._pacer is not None:
-                self._split.set_total(total_bps)
-            share = self._split.propose()
-            share = self._split.share if share is None and changed else share
+            if changed or self.pacer is not None:
+                self.split.set_total(total_bps)
+            share = self.split.propose()
+            share = self.split.share if share is None and changed else share
         return now.base_bps if share is None else round(now.budget_bps * share)
 
     def _base_of_budget(self) -> int:
         return base_rate_bps(
-            self._operating.now.budget_bps, self._share, metadata_bps=self._settings.metadata_bps
+            self.operating.now.budget_bps, self._share, metadata_bps=self.settings.metadata_bps
         )

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from fractions import Fraction
 
 import av
@@ -90,6 +90,7 @@ def usable(regions: Iterable[Region], *, size: tuple[int, int]) -> Sequence[Regi
     return inside[:MOST_REGIONS] or [Region((0, 0, min(BLOCK_PX, width), min(BLOCK_PX, height)), 0.0)]
 
 
+@dataclass(eq=False)
 class TrackRegions:
     """R0: the boxes of the tracks at ``-depth``, less where they cover much of the picture.
 
@@ -97,18 +98,11 @@ class TrackRegions:
     from the rest of the picture stay about the same.
     """
 
-    def __init__(
-        self,
-        size: tuple[int, int],
-        *,
-        depth: float,
-        padding: float = 0.1,
-        free_share: float = 0.25,
-    ) -> None:
-        self._size = size
-        self._depth = depth
-        self._padding = padding
-        self._free_share = free_share
+    size: tuple[int, int]
+    _: KW_ONLY
+    depth: float
+    padding: float = 0.1
+    free_share: float = 0.25
 
     def regions(self, tracks: Tracks | None) -> list[Region]:
         """Return what the next frame gets, keyframe or not; ``tracks`` (base pixels) may be some frames old."""
@@ -119,14 +113,14 @@ class TrackRegions:
         share = self._covered(blocks)
         if share <= 0:
             return []
-        offset = -self._depth * min(1.0, self._free_share / share)
+        offset = -self.depth * min(1.0, self.free_share / share)
         return [Region((x1, y1, x2, y2), offset) for x1, y1, x2, y2 in blocks]
 
     def _blocks(self, boxes: Boxes) -> list[tuple[int, int, int, int]]:
         """The padded boxes on the grid of blocks, inside the picture; those outside it are left out."""
-        pad = (boxes[:, 2:] - boxes[:, :2]) * self._padding
+        pad = (boxes[:, 2:] - boxes[:, :2]) * self.padding
         grown = np.concatenate([boxes[:, :2] - pad, boxes[:, 2:] + pad], axis=1)
-        limits = np.array([*self._size, *self._size], np.float64)
+        limits = np.array([*self.size, *self.size], np.float64)
         grown = np.clip(np.nan_to_num(grown.astype(np.float64)), 0, limits)
         low = np.floor(grown[:, :2] / BLOCK_PX) * BLOCK_PX
         high = np.minimum(np.ceil(grown[:, 2:] / BLOCK_PX) * BLOCK_PX, limits[:2])
@@ -135,7 +129,7 @@ class TrackRegions:
 
     def _covered(self, blocks: Sequence[tuple[int, int, int, int]]) -> float:
         """Share of the picture's blocks that at least one box touches."""
-        width, height = self._size
+        width, height = self.size
         mask = np.zeros((math.ceil(height / BLOCK_PX), math.ceil(width / BLOCK_PX)), np.bool_)
         for x1, y1, x2, y2 in blocks:
             mask[y1 // BLOCK_PX : -(-y2 // BLOCK_PX), x1 // BLOCK_PX : -(-x2 // BLOCK_PX)] = True

@@ -31,8 +31,8 @@ class BaseStage:
     ``first_keyframe_bytes`` is the guess until a keyframe has been coded. ``reconfigure(decimation, now_ns)`` runs
     before each keyframe for the link and returns a newly opened encoder, or None where nothing has changed: x265
     takes neither another frame rate nor another bit rate once it is open. ``admits(now_ns)`` says whether pacer and
-    budget have room for a frame. ``reopen()`` gives another encoder where the one there is has failed; without it, as
-    in lockstep, the failure is raised.
+    budget have room for a frame. ``open_again()`` gives another encoder for one that has failed; without it,
+    as in lockstep, the failure is raised.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class BaseStage:
         reconfigure: Callable[[int, int], BaseEncoder | None] | None = None,
         admits: Callable[[int], bool] = lambda _now_ns: True,
         backlog: BacklogStage | None = None,
-        reopen: Callable[[], BaseEncoder] | None = None,
+        open_again: Callable[[], BaseEncoder] | None = None,
         failures: Failures | None = None,
     ) -> None:
         self._encoder = encoder
@@ -62,7 +62,7 @@ class BaseStage:
         self._reconfigure = reconfigure
         self._admits = admits
         self._backlog = backlog
-        self._reopen = reopen
+        self._open_again = open_again
         self._failures = failures
         self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
         self._begins_anew = False
@@ -98,9 +98,9 @@ class BaseStage:
             regions = [] if self._regions is None else self._regions.regions(tracks)
             unit = self._encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
         except Exception as error:
-            if self._reopen is None:
+            if self._open_again is None:
                 raise
-            self._open_again(error, now_ns=now_ns)
+            self._recover(error, now_ns=now_ns)
             return None
         assert unit.keyframe or not decision.keyframe, "x265 makes a keyframe of each frame that is to be one"
         if self._begins_anew and self._failures is not None:
@@ -129,8 +129,8 @@ class BaseStage:
             self._keyframe_bytes = line_bytes
             self._requests.note_cost(self._transmitter.takes_ns(line_bytes))
 
-    def _open_again(self, error: Exception, *, now_ns: int) -> None:
-        assert self._reopen is not None, "checked"
+    def _recover(self, error: Exception, *, now_ns: int) -> None:
+        assert self._open_again is not None, "checked"
         assert self._failures is not None, "goes with it"
         while True:
             self._failures.failed(_PART, f"x265 failed ({error})")
@@ -141,7 +141,7 @@ class BaseStage:
                     "video without it, and another start may help"
                 ) from error
             try:
-                self._encoder = self._reopen()
+                self._encoder = self._open_again()
             except Exception as again:  # noqa: BLE001 - another failure of the same kind
                 error = again
                 continue

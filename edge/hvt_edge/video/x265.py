@@ -62,12 +62,13 @@ class BaseEncoder:
         """
         assert self._tagger is not None or not regions, "regions need EncoderSettings.side_data"
         picture = self._to_yuv.reformat(
-            av.VideoFrame.from_ndarray(frame.base_bgr, format="bgr24"),
+            av.VideoFrame.from_numpy_buffer(frame.base_bgr, format="bgr24"),
             format="yuv420p",
             dst_colorspace=Colorspace.ITU709,
             src_color_range=ColorRange.JPEG,
             dst_color_range=ColorRange.MPEG,
             interpolation=UNBIASED,
+            threads=1,
         )
         if self._tagger is not None:
             picture = self._tagger.tag(picture, regions)

@@ -9,6 +9,7 @@ from functools import partial
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import fitted_class_names
 from hvt_common.runtime.failures import Failures
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.backlog.stage import BacklogStage
@@ -125,7 +126,7 @@ def build_stages(
         session_id=session_id,
         operating=operating,
         view=view,
-        class_names=class_names,
+        class_names=fitted_class_names(class_names),
         clock=clock,
     )
     backlog = make_backlog(
@@ -174,7 +175,7 @@ def build_stages(
         reconfigure=reconfiguration,
         admits=link_control.admits,
         backlog=backlog,
-        reopen=None if lockstep else reconfiguration.reopen,
+        open_again=None if lockstep else reconfiguration.open_again,
         failures=failures,
     )
     on_demand = make_on_demand(

@@ -5,9 +5,8 @@ from __future__ import annotations
 from hvt_ground.backlog.assembly import (
     BacklogAssembly,
     BacklogContent,
-    BacklogKey,
     StoredStill,
     backlog_content,
 )
 
-__all__ = ["BacklogAssembly", "BacklogContent", "BacklogKey", "StoredStill", "backlog_content"]
+__all__ = ["BacklogAssembly", "BacklogContent", "StoredStill", "backlog_content"]

@@ -23,16 +23,14 @@ from hvt_common.protocol.messages import (
     BacklogUnit,
     Flags,
     Info,
+    ObjectKey,
     RoiHeader,
     WireError,
     parse_backlog_still,
     parse_backlog_units,
 )
 
-__all__ = ["BacklogAssembly", "BacklogContent", "BacklogKey", "StoredStill", "backlog_content"]
-
-BacklogKey = tuple[int, str, int]
-"""Session id, kind, number."""
+__all__ = ["BacklogAssembly", "BacklogContent", "StoredStill", "backlog_content"]
 
 _MAX_UNREPORTED = 512
 _MAX_REFUSALS = 256
@@ -82,10 +80,10 @@ class BacklogAssembly:
         self._max_objects = max_objects
         self._max_bytes = max_bytes
         self._remember = remember
-        self._open: OrderedDict[BacklogKey, _Open] = OrderedDict()
-        self._done: OrderedDict[BacklogKey, int] = OrderedDict()
-        self._refusals: OrderedDict[BacklogKey, int] = OrderedDict()
-        self._unreported: OrderedDict[BacklogKey, int] = OrderedDict()
+        self._open: OrderedDict[ObjectKey, _Open] = OrderedDict()
+        self._done: OrderedDict[ObjectKey, int] = OrderedDict()
+        self._refusals: OrderedDict[ObjectKey, int] = OrderedDict()
+        self._unreported: OrderedDict[ObjectKey, int] = OrderedDict()
         self.refused = 0
         """Objects that were complete and unusable."""
 
@@ -106,7 +104,7 @@ class BacklogAssembly:
         Raises `WireError` where the chunk cannot be one.
         """
         _check(header, payload)
-        key = _key(header)
+        key = header.key
         if self._done.get(key) == header.total_bytes:
             self._done.move_to_end(key)
             self._report(key, header.total_bytes)
@@ -129,7 +127,7 @@ class BacklogAssembly:
             del self._open[key]
         return None
 
-    def settle(self, key: BacklogKey, *, usable: bool) -> None:
+    def settle(self, key: ObjectKey, *, usable: bool) -> None:
         """Say what came of an object that was handed out: it is where it belongs, or nothing could be made of it."""
         entry = self._open.get(key)
         if entry is None or not entry.handed:
@@ -147,7 +145,7 @@ class BacklogAssembly:
         _trim(self._refusals, _MAX_REFUSALS)
         self._report(key, 0)
 
-    def drop(self, key: BacklogKey) -> None:
+    def drop(self, key: ObjectKey) -> None:
         """Forget an object that was handed out and cannot be taken: another ground may, or this one later."""
         entry = self._open.get(key)
         if entry is not None and entry.handed:
@@ -181,7 +179,7 @@ class BacklogAssembly:
             for (session_id, kind, number), acknowledged_range in taken
         )
 
-    def _entry(self, key: BacklogKey, total_bytes: int) -> _Open:
+    def _entry(self, key: ObjectKey, total_bytes: int) -> _Open:
         """The object's entry, now the newest; a new one where there is none or it was of another size."""
         entry = self._open.get(key)
         if entry is None or (entry.total_bytes != total_bytes and not entry.handed):
@@ -189,7 +187,7 @@ class BacklogAssembly:
         self._open.move_to_end(key)
         return entry
 
-    def _make_space(self, key: BacklogKey, more_bytes: int) -> bool:
+    def _make_space(self, key: ObjectKey, more_bytes: int) -> bool:
         """Whether there is room for so much more of this object, which may cost others theirs."""
         while len(self._open) > self._max_objects or self.size_bytes + more_bytes > self._max_bytes:
             victim = next((one for one, entry in self._open.items() if one != key and not entry.handed), None)
@@ -198,7 +196,7 @@ class BacklogAssembly:
             del self._open[victim]
         return True
 
-    def _finish(self, key: BacklogKey, total_bytes: int) -> None:
+    def _finish(self, key: ObjectKey, total_bytes: int) -> None:
         self._refusals.pop(key, None)
         if key[1] != BacklogKind.INFO:  # one that was forgotten here has to come through again
             self._done[key] = total_bytes
@@ -206,16 +204,16 @@ class BacklogAssembly:
             _trim(self._done, self._remember)
         self._report(key, total_bytes)
 
-    def _report_busy(self, key: BacklogKey, entry: _Open, total_bytes: int) -> None:
+    def _report_busy(self, key: ObjectKey, entry: _Open, total_bytes: int) -> None:
         """Of another object of the same name nothing is here."""
         self._report(key, entry.total_bytes - 1 if entry.total_bytes == total_bytes else 0)
 
-    def _report(self, key: BacklogKey, acknowledged_bytes: int) -> None:
+    def _report(self, key: ObjectKey, acknowledged_bytes: int) -> None:
         self._unreported[key] = acknowledged_bytes
         _trim(self._unreported, _MAX_UNREPORTED)
 
 
-def backlog_content(key: BacklogKey, data: bytes, *, edge: str) -> BacklogContent:
+def backlog_content(key: ObjectKey, data: bytes, *, edge: str) -> BacklogContent:
     """What the bytes of a whole object hold; raises `WireError` and nothing else, for any bytes whatever."""
     session_id, kind, number = key
     if kind == BacklogKind.INFO:
@@ -252,10 +250,6 @@ def _check(header: BacklogHeader, payload: bytes) -> None:
         raise WireError("a piece of a session's facts has a number, or is of too many")
 
 
-def _key(header: BacklogHeader) -> BacklogKey:
-    return header.session_id, header.kind, header.number
-
-
-def _trim(ring: OrderedDict[BacklogKey, int], most: int) -> None:
+def _trim(ring: OrderedDict[ObjectKey, int], most: int) -> None:
     while len(ring) > most:
         ring.popitem(last=False)

@@ -14,8 +14,15 @@ from functools import partial
 from pathlib import Path
 
 from hvt_common.protocol.channels import DELIVERIES, Channel
-from hvt_common.protocol.messages import AcknowledgedRange, BacklogHeader, BacklogKind, Info, WireError
-from hvt_ground.backlog.assembly import BacklogAssembly, BacklogKey, StoredStill, backlog_content
+from hvt_common.protocol.messages import (
+    AcknowledgedRange,
+    BacklogHeader,
+    BacklogKind,
+    Info,
+    ObjectKey,
+    WireError,
+)
+from hvt_ground.backlog.assembly import BacklogAssembly, StoredStill, backlog_content
 from hvt_ground.backlog.jobs import Destination, StillJob, VideoJob
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.backlog.session_backlog import SessionBacklog
@@ -92,7 +99,7 @@ class EdgeBacklog:
             whole = self._assembly.chunk(header, payload, may_finish=may_finish)
         if whole is None:
             return False
-        self._deliver((header.session_id, header.kind, header.number), whole, own, worker)
+        self._deliver(header.key, whole, own, worker)
         return True
 
     def session_ended(self, info: Info) -> None:
@@ -110,7 +117,7 @@ class EdgeBacklog:
         if self._recordings is not None:
             self._recordings.close()
 
-    def _deliver(self, key: BacklogKey, whole: bytes, own: SessionBacklog, worker: PerceptionWorker) -> None:
+    def _deliver(self, key: ObjectKey, whole: bytes, own: SessionBacklog, worker: PerceptionWorker) -> None:
         try:
             content = backlog_content(key, whole, edge=self._edge)
         except WireError:
@@ -142,7 +149,7 @@ class EdgeBacklog:
         assert recordings is not None, "without, no chunk of another session is taken"
         return Destination(partial(recordings.acquire, info), recordings.release)
 
-    def _done(self, key: BacklogKey, session: int, usable: bool | None) -> None:  # noqa: FBT001 - partial
+    def _done(self, key: ObjectKey, session: int, usable: bool | None) -> None:  # noqa: FBT001 - partial
         """A job has ended; None: its object was not taken."""
         with self._lock:
             if session != self._sessions:
@@ -153,7 +160,7 @@ class EdgeBacklog:
             else:
                 self._assembly.settle(key, usable=usable)
 
-    def _settle(self, key: BacklogKey, *, usable: bool) -> None:
+    def _settle(self, key: ObjectKey, *, usable: bool) -> None:
         with self._lock:
             self._assembly.settle(key, usable=usable)
 

@@ -6,7 +6,7 @@ Neither the tracks of the open session nor a detector's memory are touched.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -76,7 +76,7 @@ class StretchTracker:
 class BacklogPerception:
     """Of one session. For one thread at a time.
 
-    ``checkout`` gives the models for the time of a job, ``tracker_of`` makes a tracker for one stretch,
+    ``take_models`` gives detector and classifier, ``tracker_of`` makes a tracker for one stretch,
     ``reader_of`` makes what names stills of detector and classifier.
     """
 
@@ -84,13 +84,13 @@ class BacklogPerception:
         self,
         info: Info,
         *,
-        checkout: Callable[[], AbstractContextManager[ModelSet]],
+        take_models: Callable[[], ModelSet],
         tracker_of: Callable[[], ByteTracker],
         reader_of: Callable[[Detector, Classifier | None], StillReader],
         detect_every: int,
     ) -> None:
         self._info = info
-        self._checkout = checkout
+        self._take_models = take_models
         self._tracker_of = tracker_of
         self._reader_of = reader_of
         self._detect_every = detect_every
@@ -98,39 +98,36 @@ class BacklogPerception:
 
     @contextmanager
     def track(self, emit: Emit) -> Iterator[StretchTracker]:
-        """Give a tracker for one stretch of video, with the models meanwhile."""
-        with self._checkout() as (detector, _):
-            tracker = StretchTracker(
-                detector,
-                self._tracker_of(),
-                first_id=self._next_id,
-                detect_every=self._detect_every,
-                emit=emit,
-            )
-            try:
-                yield tracker
-            finally:
-                self._next_id = tracker.next_id
+        """Give a tracker for one stretch of video."""
+        tracker = StretchTracker(
+            self._take_models()[0],
+            self._tracker_of(),
+            first_id=self._next_id,
+            detect_every=self._detect_every,
+            emit=emit,
+        )
+        try:
+            yield tracker
+        finally:
+            self._next_id = tracker.next_id
 
     def read(self, still: ReceivedStill, *, emit: Emit) -> None:
         """Decode, name and give out a still of a session that is over: no track of it is here to be matched."""
         info = self._info
-        with self._checkout() as (detector, classifier):
-            reader = self._reader_of(detector, classifier)
-            names, edge_classes = unified_names(detector.class_names, info.class_names)
-            stage = StillStage(
-                reader,
-                Refiner(
-                    "replace", fps=info.fps, detector_classes=names, classifier_classes=reader.class_names
-                ),
-                history=History(),
-                fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_frames=1)),
-                view=info.view,
-                wants_base=False,
-                gap_frames=1,
-                emit=emit,
-            )
-            header = still.header
-            moment = Progress(header.frame_index, header.capture_ns, picture_index=header.frame_index)
-            stage.take([still], moment)
-            stage.end(moment)
+        detector, classifier = self._take_models()
+        reader = self._reader_of(detector, classifier)
+        names, edge_classes = unified_names(detector.class_names, info.class_names)
+        stage = StillStage(
+            reader,
+            Refiner("replace", fps=info.fps, detector_classes=names, classifier_classes=reader.class_names),
+            history=History(),
+            fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_frames=1)),
+            view=info.view,
+            wants_base=False,
+            gap_frames=1,
+            emit=emit,
+        )
+        header = still.header
+        moment = Progress(header.frame_index, header.capture_ns, picture_index=header.frame_index)
+        stage.take([still], moment)
+        stage.end(moment)

@@ -9,12 +9,27 @@ from __future__ import annotations
 import statistics
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from hvt_common.protocol.messages import MAX_MISSING_STILLS, BaseHeader
+from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
+from hvt_common.protocol.messages import (
+    MAX_MISSING_STILLS,
+    BacklogHeader,
+    BaseHeader,
+    Info,
+    RoiHeader,
+    Status,
+    TrackStep,
+)
+from hvt_common.runtime.statistics import LatencyStats
+from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS
+from hvt_ground.events import Event, MessageTiming, Traffic
 
-__all__ = ["REPORT_LINE_BYTES", "LinkMeasurement", "ReceptionStatistics", "Uptime"]
+__all__ = ["REPORT_LINE_BYTES", "LinkMeasurement", "ReceptionStatistics", "SessionAccount", "Uptime"]
 
 _MS = 1_000_000
 REPORT_LINE_BYTES = 180
@@ -184,3 +199,88 @@ class Uptime:
         if self._arrived_ns is None:
             return now_ns
         return self._lived_ns + (0 if pending else max(0, now_ns - self._handled_ns))
+
+
+class SessionAccount:
+    """What crossed the line in one session, and when. For the receiving thread; ``emit`` takes the events."""
+
+    def __init__(
+        self,
+        info: Info,
+        *,
+        clock: Callable[[], int],
+        clock_offset: ClockOffset,
+        emit: Callable[[Event], None],
+    ) -> None:
+        self.ledger = Ledger(window_ns=info.window_ns)
+        self.receive_latency = LatencyStats()
+        self.overlay_latency = LatencyStats()
+        self._info = info
+        self._keys = EdgeKeys(info.edge)
+        self._clock = clock
+        self._clock_offset = clock_offset
+        self._emit = emit
+        self._next_traffic_ns = 0
+
+    def count(self, row: Channel, account: Account, item: Received, *, at_ns: int) -> None:
+        """Take the bytes of a message on the line."""
+        size, extra = len(item.payload), len(item.attachment)
+        self.ledger.count(
+            account,
+            payload_bytes=size,
+            attachment_bytes=extra,
+            overhead_bytes=overhead_bytes(size, extra, key=self._keys.key(row), encoding=item.encoding),
+            at_ns=at_ns,
+        )
+
+    def time(
+        self,
+        kind: str,
+        item: Received,
+        header: BaseHeader | RoiHeader | TrackStep | Status | BacklogHeader,
+        *,
+        handled: bool | None,
+    ) -> None:
+        """Give out when a message came; ``handled``: something was made of it, None is said later."""
+        size, extra = len(item.payload), len(item.attachment)
+        frame_index, capture_ns = -1, 0
+        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
+            frame_index, capture_ns = header.frame_index, header.capture_ns
+        self._emit(
+            MessageTiming(
+                kind=kind,
+                sequence=header.number if isinstance(header, BacklogHeader) else header.sequence,
+                frame_index=frame_index,
+                capture_ns=capture_ns,
+                send_ns=header.send_ns,
+                received_ns=item.received_ns,
+                handled_ns=None if handled is None else self._clock() if handled else 0,
+                line_bytes=size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding),
+                clock_offset_ns=self._clock_offset.offset_ns,
+            )
+        )
+
+    def traffic_due(self, header: BaseHeader) -> bool:
+        """Whether to call `traffic`: twice a second of the stream."""
+        return header.send_ns >= self._next_traffic_ns
+
+    def traffic(self, header: BaseHeader, *, tracks: int, tracks_refined: int) -> None:
+        """Give out how full the link was and how old the picture is."""
+        at_ns, ledger = header.send_ns, self.ledger
+        self._next_traffic_ns = at_ns + SECOND_NS // 2
+        to_bps = 8 * SECOND_NS / self._info.window_ns
+        lockstep = self._info.pace == "lockstep"
+        self._emit(
+            Traffic(
+                frame_index=header.frame_index,
+                capture_ns=header.capture_ns,
+                base_bps=ledger.window_bytes(Account.BASE, at_ns) * to_bps,
+                roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
+                total_bps=ledger.window_bytes(None, at_ns) * to_bps,
+                budget_bps=self._info.budget_bps,
+                receive_latency_ms=None if lockstep else self.receive_latency.percentile(50),
+                overlay_latency_ms=None if lockstep else self.overlay_latency.percentile(50),
+                tracks=tracks,
+                tracks_refined=tracks_refined,
+            )
+        )

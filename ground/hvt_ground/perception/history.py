@@ -2,9 +2,8 @@
 
 A still arrives after its frame: it is matched to the tracks of that very frame and shown beside (or pasted
 into) the decoded picture of it. Tracks are small and kept for `track_frames`. Pictures are large: 1280x720 BGR
-is 2.7 MB, so the default bound of 96 MiB is 36 frames, 2.4 s at 15 fps. Where the edge codes fewer frames than there
-are frames, the same 36 reach back further. They are kept just as given, without a lossy detour, because a residual
-still must be applied to exactly the pixels that the edge had.
+is 2.7 MB. Where the edge codes fewer frames than there are frames, as many reach back further. They are kept just as
+given, without a lossy detour, because a residual still must be applied to exactly the pixels that the edge had.
 """
 
 from __future__ import annotations

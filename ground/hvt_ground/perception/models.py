@@ -1,9 +1,7 @@
-"""The detectors and classifiers of a ground: opened once, checked out by one session at a time."""
+"""The detector and the classifier of a ground: opened once, for all its sessions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 
 from hvt_common.inference.classify import Classifier, open_classifier
@@ -23,51 +21,20 @@ ModelSet = tuple[Detector, Classifier | None]
 
 
 class Models:
-    """Opens detector and classifier once to check them; one set serves one session at a time, for its buffers."""
+    """Opens detector and classifier once; all sessions take turns with them.
+
+    Two pictures at once would each have half the cores, and take twice the memory and threads.
+    """
 
     def __init__(self, config: GroundConfig) -> None:
         self._config = config
         self.failures = Failures(SteadyClock())
         """Models whose run raised."""
-        self._ready: list[ModelSet] = [self._open()]
-        self._serving: dict[str, ModelSet] = {}
-        """By edge, what the session that is open has."""
+        self._set = self._open()
 
-    def take(self, edge: str | None = None) -> ModelSet:
-        """A detector, and a classifier where one is wanted, that no other session uses."""
-        try:
-            taken = self._ready.pop()
-        except IndexError:
-            taken = self._open()
-        if edge is not None:
-            self._serving[edge] = taken
-        return taken
-
-    def give_back(self, detector: Detector, classifier: Classifier | None) -> None:
-        """Take them back from a session that has ended; a network keeps nothing of it, the motion detector does."""
-        for edge, serving in list(self._serving.items()):
-            if serving[0] is detector:
-                del self._serving[edge]
-        if self._config.detector != MOTION:
-            self._ready.append((detector, classifier))
-
-    @contextmanager
-    def checkout(self, edge: str) -> Iterator[ModelSet]:
-        """The set of an edge's open session, for another job of its worker; of an edge without one a set of its own.
-
-        A motion detector is a new one: it remembers pictures, and opening it costs nothing.
-        """
-        serving = self._serving.get(edge)
-        if serving is None:
-            taken = self.take()
-            try:
-                yield taken
-            finally:
-                self.give_back(*taken)
-        elif self._config.detector == MOTION:
-            yield self._open_detector(), serving[1]
-        else:
-            yield serving
+    def take(self) -> ModelSet:
+        """A detector, and a classifier where one is wanted; a motion detector is a new one: it remembers pictures."""
+        return (self._open_detector(), self._set[1]) if self._config.detector == MOTION else self._set
 
     def _open_detector(self) -> Detector:
         config = self._config

@@ -32,17 +32,10 @@ _GAP_S = 1.0
 """For how long the base stream may leave out frames and still tell where tracks were between."""
 
 
-_HISTORY_FRAMES = 45
-_MOST_HISTORY_BYTES = 256 * 2**20
-
-
-def _history_bytes(base_size: tuple[int, int]) -> int:
-    """For pictures that residual stills may build on: three seconds at 15 fps, as far as memory allows."""
-    return min(_MOST_HISTORY_BYTES, _HISTORY_FRAMES * 3 * base_size[0] * base_size[1])
-
-
-def _release_nothing() -> None:
-    """Models that nobody else takes need no release."""
+_HISTORY_S = 3.0
+"""Of pictures that residual stills may build on."""
+_MOST_HISTORY_FRAMES = 45
+_MOST_HISTORY_BYTES = 128 * 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +51,7 @@ class DecodedFrame:
 
 @dataclass(frozen=True, slots=True)
 class PipelineParts:
-    """What perception of one session are made of; none of it may be shared with another session."""
+    """What perception of one session is made of; but for the detector none of it may be shared with another."""
 
     detector: Detector
     tracker: ByteTracker
@@ -70,8 +63,6 @@ class PipelineParts:
     """The one that ``fusion`` moves boxes by."""
     camera: CameraMotion | None
     """None where the camera's motion is not followed."""
-    release: Callable[[], None] = _release_nothing
-    """Called when the session has ended: its models may serve another."""
 
 
 class Pipeline:
@@ -97,7 +88,11 @@ class Pipeline:
         self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
         gap_frames = max(1, round(_GAP_S * fps))
-        self._history = History(max_bytes=_history_bytes(view.base_size), gap_frames=gap_frames)
+        self._history = History(
+            max_frames=min(_MOST_HISTORY_FRAMES, max(1, round(_HISTORY_S * fps))),
+            max_bytes=_MOST_HISTORY_BYTES,
+            gap_frames=gap_frames,
+        )
         self._stills = StillStage(
             parts.reader,
             parts.refiner,
@@ -216,7 +211,6 @@ class Pipeline:
         """
         self._stills.end(self._now)
         self._history.clear()
-        self._parts.release()
 
     # The base stream
 

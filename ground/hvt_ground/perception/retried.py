@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
@@ -18,7 +19,7 @@ _Answer = TypeVar("_Answer")
 
 
 class _Retried(Generic[_Model]):
-    """A model and how to open another, for one thread at a time; ``failures`` has it under ``part``."""
+    """A model and how to open another; threads take turns. ``failures`` has it under ``part``."""
 
     def __init__(
         self,
@@ -35,6 +36,7 @@ class _Retried(Generic[_Model]):
         self._failures = failures
         self._pause = pause or RetryPause()
         self._failed = False
+        self._lock = threading.Lock()
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -43,6 +45,10 @@ class _Retried(Generic[_Model]):
 
     def _run(self, use: Callable[[_Model], _Answer]) -> _Answer | None:
         """None where it fails, or has failed and is left alone for a while."""
+        with self._lock:
+            return self._try(use)
+
+    def _try(self, use: Callable[[_Model], _Answer]) -> _Answer | None:
         now_ns = time.monotonic_ns()
         if self._failed and not self._pause.due(now_ns):
             return None

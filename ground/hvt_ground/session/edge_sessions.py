@@ -137,7 +137,10 @@ class EdgeSessions:
     def close(self) -> None:
         """End the session that is open, and close the recordings of former ones."""
         self._end_session()
-        self.backlog.close()
+        try:
+            self.backlog.close()
+        except Exception as error:  # noqa: BLE001 - the summaries are there all the same
+            self.failures.failed(f"recordings of former sessions of {self.port.edge}", reason_of(error))
 
     # What is due
 
@@ -159,14 +162,14 @@ class EdgeSessions:
             self._backlog_ns = None
             session.report_backlog()
         session.report_if_due()
-        self._follow_clock(session, now_ns)
+        self._refresh_clock(session, now_ns)
         if self._is_over(session, now_ns):
             gone = self._ended_ns is None
             self._end_session()
             if gone:
                 self._receiver.wait_for_keyframe()  # should it come back, it starts with a keyframe
 
-    def _follow_clock(self, session: GroundSession, now_ns: int) -> None:
+    def _refresh_clock(self, session: GroundSession, now_ns: int) -> None:
         """Ask the edge for its time now and then; nothing waits for the answer."""
         while (answer := self.port.take_info()) is not None:
             self._learn(answer)
@@ -175,7 +178,6 @@ class EdgeSessions:
             self.port.request_info(session.info.session_id)
 
     def _query_info(self, session_id: int) -> Info | None:
-        """The facts of that session, and the edge's time: another edge of the same id may have another clock."""
         answer = self.port.query_info(session_id)
         return None if answer is None else self._learn(answer)
 

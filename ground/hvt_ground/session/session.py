@@ -9,8 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 
-from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.clock_offset import ClockOffset
+from hvt_common.protocol.ledger import Account
 from hvt_common.protocol.messages import (
     MAX_STILL_RESULTS,
     BacklogHeader,
@@ -23,18 +24,17 @@ from hvt_common.protocol.messages import (
     TrackStep,
     TrackStepDecoder,
 )
-from hvt_common.runtime.statistics import LatencyStats
 from hvt_common.transport.inbox import Received
 from hvt_common.units import SECOND_NS, counts_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, MessageTiming, Notice, StillsRead, Traffic, VideoSample
+from hvt_ground.events import Event, Notice, StillsRead, VideoSample
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
-from hvt_ground.link.statistics import ReceptionStatistics
+from hvt_ground.link.statistics import ReceptionStatistics, SessionAccount
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
 from hvt_ground.perception.worker import Analyze, LockstepWorker, PerceptionWorker, Read, RealtimeWorker, Step
 from hvt_ground.session.receiver_report import ReceiverReports
@@ -74,10 +74,12 @@ class GroundSession:
         self._queued = [one for one in sinks if isinstance(one, QueuedSink)]
         self.info = info
         self.lockstep = info.pace == "lockstep"
-        self.ledger = Ledger(window_ns=info.window_ns)
+        self._clock_offset = ClockOffset() if reports is None else reports.clock_offset
+        self._account = SessionAccount(info, clock=clock, clock_offset=self._clock_offset, emit=self._emit)
+        self.ledger = self._account.ledger
+        self.receive_latency = self._account.receive_latency
+        self.overlay_latency = self._account.overlay_latency
         self.pipeline = pipeline_of(self._emit)
-        self.receive_latency = LatencyStats()
-        self.overlay_latency = LatencyStats()
         self.frames_decoded = 0
         self.frames_received = 0
         self.stills_received = 0
@@ -93,7 +95,6 @@ class GroundSession:
         self._reports = reports
         self._report_lock = threading.Lock()
         self._statistics = ReceptionStatistics(lockstep=self.lockstep)
-        self._keys = EdgeKeys(info.edge)
         self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
         self.last_status: Status | None = None
@@ -103,7 +104,6 @@ class GroundSession:
         self._first_index: int | None = None
         self._last_index = -1
         self._last_capture_ns = 0
-        self._next_traffic_ns = 0
         self._results: list[StillResult] = []
         self._results_lock = threading.Lock()
         self._still_window = StillSequenceWindow()
@@ -129,17 +129,19 @@ class GroundSession:
         if packet.on_time:  # of one that waited behind a hole the time says nothing
             delay_ms = None
             if not self.lockstep:
-                delay_ms = max(0.0, (item.received_ns - self._to_local_ns(header.capture_ns)) / _MILLION)
+                delay_ms = max(
+                    0.0, (item.received_ns - self._clock_offset.to_local_ns(header.capture_ns)) / _MILLION
+                )
             self._statistics.base(
                 header, size_bytes=item.size_bytes, arrived_ns=item.received_ns, delay_ms=delay_ms
             )
         good = self._access_unit(header, item, decode=decode, starts_run=packet.arrival.starts_run)
-        self._time(Channel.BASE, item, header, handled=good and decode)
+        self._account.time(Channel.BASE, item, header, handled=good and decode)
         return good
 
     def _access_unit(self, header: BaseHeader, item: Received, *, decode: bool, starts_run: bool) -> bool:
         at_ns = header.send_ns
-        self._account(Channel.BASE, Account.BASE, item, at_ns=at_ns)
+        self._account.count(Channel.BASE, Account.BASE, item, at_ns=at_ns)
         self.frames_received += 1
         if self._first_index is None:
             self._first_index = header.frame_index
@@ -155,10 +157,13 @@ class GroundSession:
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
         self.backlog.live(header.frame_index, item.payload, keyframe=header.keyframe, after_gap=starts_run)
         # In lockstep capture and sending are media time and say nothing of delay: count from here.
-        reference_ns = item.received_ns if self.lockstep else self._to_local_ns(header.capture_ns)
+        reference_ns = (
+            item.received_ns if self.lockstep else self._clock_offset.to_local_ns(header.capture_ns)
+        )
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
         self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, image))
-        self._traffic(at_ns)
+        if self._account.traffic_due(header):
+            self._account.traffic(header, tracks=self.pipeline.tracks, tracks_refined=self.pipeline.refined)
         return True
 
     def still(self, header: RoiHeader, item: Received, *, media_type: str) -> None:
@@ -166,10 +171,10 @@ class GroundSession:
         self._statistics.still(header.sequence, size_bytes=item.size_bytes, arrived_ns=item.received_ns)
         if not self._still_window.is_new(header.sequence, send_ns=header.send_ns):
             if self._still_window.is_copy(header.sequence, send_ns=header.send_ns):
-                self._account(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
+                self._account.count(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
             return
-        self._account(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
-        self._time(Channel.ROI, item, header, handled=None)
+        self._account.count(Channel.ROI, Account.ROI, item, at_ns=header.send_ns)
+        self._account.time(Channel.ROI, item, header, handled=None)
         self.stills_received += 1
         self.ledger.record_outcome("received", header.reason)
         self.worker.still(ReceivedStill(header, item.payload, media_type))
@@ -182,10 +187,10 @@ class GroundSession:
                 return
             self._step_decoder = TrackStepDecoder()
         self._last_step, self._stepped_ns = step.sequence, now_ns
-        self._account(Channel.TRACKS, Account.META, item, at_ns=step.send_ns)
+        self._account.count(Channel.TRACKS, Account.META, item, at_ns=step.send_ns)
         self.steps_received += 1
         tracks = self._step_decoder.decode(step)
-        self._time(Channel.TRACKS, item, step, handled=tracks is not None)
+        self._account.time(Channel.TRACKS, item, step, handled=tracks is not None)
         if tracks is not None:
             self.worker.step(tracks, step.capture_ns)
 
@@ -196,16 +201,16 @@ class GroundSession:
         if old and now_ns - self._status_ns < _ANEW_NS:
             return
         self._status_ns = now_ns
-        self._account(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
-        self._time(Channel.STATUS, item, status, handled=True)
+        self._account.count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
+        self._account.time(Channel.STATUS, item, status, handled=True)
         self.last_status = status
 
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
         """Count a chunk, of whichever session; ``delivered``: with it an object was whole, and is of use."""
         self._statistics.backlog(size_bytes=item.size_bytes, arrived_ns=item.received_ns)
-        self._account(Channel.BACKLOG, Account.BACKLOG, item, at_ns=header.send_ns)
+        self._account.count(Channel.BACKLOG, Account.BACKLOG, item, at_ns=header.send_ns)
         kind = f"{Channel.BACKLOG}-{header.kind}"
-        self._time(kind, item, header, handled=delivered)
+        self._account.time(kind, item, header, handled=delivered)
         if delivered and header.kind == BacklogKind.STILL and header.session_id == self.info.session_id:
             self._statistics.stored_still(header.number)
 
@@ -362,70 +367,7 @@ class GroundSession:
         self._collect_results()
         self.report()
 
-    # Account and events
-
-    def _to_local_ns(self, edge_ns: int) -> int:
-        return edge_ns if self._reports is None else self._reports.clock_offset.to_local_ns(edge_ns)
-
-    def _account(self, row: Channel, account: Account, item: Received, *, at_ns: int) -> None:
-        size, extra = len(item.payload), len(item.attachment)
-        self.ledger.count(
-            account,
-            payload_bytes=size,
-            attachment_bytes=extra,
-            overhead_bytes=overhead_bytes(size, extra, key=self._keys.key(row), encoding=item.encoding),
-            at_ns=at_ns,
-        )
-
-    def _time(
-        self,
-        kind: str,
-        item: Received,
-        header: BaseHeader | RoiHeader | TrackStep | Status | BacklogHeader,
-        *,
-        handled: bool | None,
-    ) -> None:
-        """Give out when a message came; ``handled``: something was made of it, None is said later."""
-        size, extra = len(item.payload), len(item.attachment)
-        line = size + extra + overhead_bytes(size, extra, key=item.key, encoding=item.encoding)
-        offset_ns = 0 if self._reports is None else self._reports.clock_offset.offset_ns
-        frame_index, capture_ns = -1, 0
-        if isinstance(header, BaseHeader | RoiHeader | TrackStep):
-            frame_index, capture_ns = header.frame_index, header.capture_ns
-        self._emit(
-            MessageTiming(
-                kind=kind,
-                sequence=header.number if isinstance(header, BacklogHeader) else header.sequence,
-                frame_index=frame_index,
-                capture_ns=capture_ns,
-                send_ns=header.send_ns,
-                received_ns=item.received_ns,
-                handled_ns=None if handled is None else self._clock() if handled else 0,
-                line_bytes=line,
-                clock_offset_ns=offset_ns,
-            )
-        )
-
-    def _traffic(self, at_ns: int) -> None:
-        """Twice a second of the stream, how full the link was and how old the picture is."""
-        if at_ns < self._next_traffic_ns:
-            return
-        self._next_traffic_ns = at_ns + SECOND_NS // 2
-        to_bps = 8 * SECOND_NS / self.info.window_ns
-        self._emit(
-            Traffic(
-                frame_index=self._last_index,
-                capture_ns=self._last_capture_ns,
-                base_bps=self.ledger.window_bytes(Account.BASE, at_ns) * to_bps,
-                roi_bps=self.ledger.window_bytes(Account.ROI, at_ns) * to_bps,
-                total_bps=self.ledger.window_bytes(None, at_ns) * to_bps,
-                budget_bps=self.info.budget_bps,
-                receive_latency_ms=None if self.lockstep else self.receive_latency.percentile(50),
-                overlay_latency_ms=None if self.lockstep else self.overlay_latency.percentile(50),
-                tracks=self.pipeline.tracks,
-                tracks_refined=self.pipeline.refined,
-            )
-        )
+    # Events
 
     def _emit(self, event: Event) -> None:
         self.backlog.note(event)

@@ -19,7 +19,7 @@ from hvt_common.runtime.failures import reason_of
 from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_common.transport.session import declare_publisher, query, query_later, subscribe
+from hvt_common.transport.session import declare_publisher, query_later, subscribe
 
 __all__ = ["MAX_EDGES", "EdgePort", "GroundLink"]
 
@@ -66,50 +66,37 @@ class EdgePort:
         self._errors: deque[Exception] = deque(maxlen=_MOST_ERRORS)
         self._answers: deque[InfoAnswer] = deque(maxlen=_MOST_ANSWERS)
 
-    def query_info(self, session_id: int | None = None) -> InfoAnswer | None:
-        """Return the session's facts; None without an answer in time.
-
-        With ``session_id`` only that one's answer counts: two edges may bear the same id.
-        """
-        requested_ns = self._clock()
-        found: list[InfoAnswer] = []
-
-        def wanted(data: bytes) -> bool:
-            answer = self._info_answer(data, session_id, requested_ns)
-            found.extend([] if answer is None else [answer])
-            return answer is not None
-
-        try:
-            query(
-                self._session, Channel.INFO, keys=self._keys, question=b"", timeout_s=_ANSWER_S, wanted=wanted
-            )
-        except zenoh.ZError as error:
-            _log.warning("%s: it could not be asked for info: %s", self.edge, error)
+    def query_info(self, session_id: int) -> InfoAnswer | None:
+        """Wait for the facts of that session, of another edge of this id none; None without an answer in time."""
+        found: deque[InfoAnswer] = deque()
+        over = threading.Event()
+        self._query_info(session_id, found, on_end=over.set)
+        over.wait(2 * _ANSWER_S)
         return found[0] if found else None
 
     def request_info(self, session_id: int) -> None:
         """As `query_info`, without waiting: `take_info` has the answer, if one comes."""
-        requested_ns = self._clock()
-
-        def note(data: bytes) -> None:
-            answer = self._info_answer(data, session_id, requested_ns)
-            if answer is not None:
-                self._answers.append(answer)
-
-        self._ask(Channel.INFO, b"", on_answer=note, on_end=lambda: None)
+        self._query_info(session_id, self._answers, on_end=lambda: None)
 
     def take_info(self) -> InfoAnswer | None:
         """An answer to `request_info`, once."""
         return self._answers.popleft() if self._answers else None
 
-    def _info_answer(self, data: bytes, session_id: int | None, requested_ns: int) -> InfoAnswer | None:
-        answered_ns = self._clock()
-        try:
-            info = Info.parse(data)
-        except WireError as error:
-            _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
-            return None
-        return (info, requested_ns, answered_ns) if session_id in (None, info.session_id) else None
+    def _query_info(self, session_id: int, found: deque[InfoAnswer], *, on_end: Callable[[], None]) -> None:
+        requested_ns = self._clock()
+
+        def note(data: bytes) -> None:
+            answered_ns = self._clock()
+            try:
+                info = Info.parse(data)
+            except WireError as error:
+                _log.warning("%s: its answer to info cannot be used: %s", self.edge, error)
+                return
+            if info.session_id == session_id:
+                found.append((info, requested_ns, answered_ns))
+                on_end()
+
+        self._query(Channel.INFO, b"", on_answer=note, on_end=on_end)
 
     def fail(self, error: Exception) -> None:
         """Hand over what went wrong in a callback."""
@@ -136,17 +123,17 @@ class EdgePort:
         """Ask for a keyframe; does not wait for the answer, which is the keyframe."""
         request = ControlRequest(session_id=0, command=Command.KEYFRAME, arguments={})
         answered = threading.Event()
-        self._ask(
+        self._query(
             Channel.CONTROL,
             request.pack(),
             on_answer=lambda _answer: answered.set(),
             on_end=lambda: self._note_control(answered=answered.is_set()),
         )
 
-    def _ask(
+    def _query(
         self, row: Channel, question: bytes, *, on_answer: Callable[[bytes], None], on_end: Callable[[], None]
     ) -> None:
-        def hear(data: bytes) -> None:
+        def take(data: bytes) -> None:
             try:
                 on_answer(data)
             except Exception as error:  # noqa: BLE001 - for the edge's thread
@@ -159,11 +146,12 @@ class EdgePort:
                 keys=self._keys,
                 question=question,
                 timeout_s=_ANSWER_S,
-                on_answer=hear,
+                on_answer=take,
                 on_end=on_end,
             )
         except zenoh.ZError as error:
-            _log.debug("%s: %s was not asked: %s", self.edge, row, error)
+            _log.debug("%s: nothing was asked on %s: %s", self.edge, row, error)
+            on_end()
 
     def _note_control(self, *, answered: bool) -> None:
         """Say once that nothing is answered: a question without the right to ask is dropped in silence."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -26,13 +26,13 @@ class Ground:
     """The painted ground.
 
     Attributes:
-        bgra: (H, W, 4) uint8, the world from its north-west corner; the fourth channel means nothing.
+        bgr: (H, W, 3) uint8, the world from its north-west corner.
         m_per_px: its resolution.
         light: (h, w) float32 at ``light_m_per_px``: 1 in the sun, lower in the shade of roofs and trees.
         light_m_per_px: resolution of ``light``.
     """
 
-    bgra: npt.NDArray[np.uint8]
+    bgr: npt.NDArray[np.uint8]
     m_per_px: float
     light: npt.NDArray[np.float32]
     light_m_per_px: float
@@ -76,12 +76,16 @@ class _Painter:
         high, wide = (round(metres / m_per_px) for metres in (WORLD_M[1], WORLD_M[0]))
         self.bgr = np.zeros((high, wide, 3), np.uint8)
         self._shade = np.zeros((high, wide), np.uint8)
-        fine = rng.standard_normal((high, wide), np.float32)
-        self._fine = 0.6 * fine + 0.8 * _noise(rng, (high, wide), cell_px=0.16 / m_per_px)
-        self._middle = _noise(rng, (high, wide), cell_px=0.9 / m_per_px)
-        self._coarse = 0.7 * _noise(rng, (high, wide), cell_px=5 / m_per_px) + 0.7 * _noise(
-            rng, (high, wide), cell_px=19 / m_per_px
+        # Each of these pictures of the world takes 43 MB: never more than three at once.
+        self._fine = rng.standard_normal((high, wide), np.float32)
+        fine, middle, coarse, broad = (
+            _noise(rng, (high, wide), cell_px=cell_m / m_per_px) for cell_m in (0.16, 0.9, 5, 19)
         )
+        self._fine *= np.float32(0.6)
+        self._fine += _enlarged(fine, (high, wide), gain=0.8)
+        self._coarse = _enlarged(coarse, (high, wide), gain=0.7)
+        self._coarse += _enlarged(broad, (high, wide), gain=0.7)
+        self._middle = _enlarged(middle, (high, wide), gain=1.0)
 
     def surface(self, kind: str, rect: Rect) -> None:
         """Cover a rectangle with a material."""
@@ -104,20 +108,17 @@ class _Painter:
             "tiles": ((70.0, 86.0, 150.0), 0.07, 0.05, 0.04),
         }
         colour, fine, middle, coarse = materials[kind]
-        region = self._slice(rect)
         gain = self._appearance.texture_gain
-        noise = (
-            fine * self._fine[region] + middle * self._middle[region] + coarse * self._coarse[region]
-        ) * gain + 1
-        tint = np.array(colour, np.float32)
-        if kind in {"grass", "island"}:  # dry patches lean towards the soil
-            dry = np.clip(0.20 + 0.22 * self._coarse[region] + 0.1 * self._middle[region], 0, 0.75)[..., None]
-            picture = (tint * (1 - dry) + np.array(self._appearance.soil_bgr, np.float32) * dry) * noise[
-                ..., None
-            ]
-        else:
-            picture = tint * noise[..., None]
-        self.bgr[region] = np.clip(picture, 0, 255)
+        tint, soil = (np.array(one, np.float32) for one in (colour, appearance.soil_bgr))
+        for region in _strips(*self._slice(rect)):
+            noise = (
+                fine * self._fine[region] + middle * self._middle[region] + coarse * self._coarse[region]
+            ) * gain + 1
+            picture = tint
+            if kind in {"grass", "island"}:  # dry patches lean towards the soil
+                dry = np.clip(0.20 + 0.22 * self._coarse[region] + 0.1 * self._middle[region], 0, 0.75)
+                picture = tint * (1 - dry[..., None]) + soil * dry[..., None]
+            self.bgr[region] = np.clip(picture * noise[..., None], 0, 255)
         if kind in {"lot", "court"}:
             self.frame(rect, wide_m=0.25, colour=_gain(appearance.paving_bgr, 0.98))
         if kind == "court":
@@ -179,11 +180,12 @@ class _Painter:
             radius = round(0.92 * tree.r / self._m_per_px * 16)
             cv2.circle(self._shade, centre.tolist(), radius, 225, -1, cv2.LINE_AA, _SHIFT)
         self._shade = np.asarray(cv2.blur(self._shade, (5, 5)), np.uint8)
-        dark = 1 - self._appearance.shadow_strength * (self._shade.astype(np.float32) / 255)
-        # Skylight is blue, so a shadow keeps a little more of it.
-        for channel, share in enumerate((1.10, 1.03, 1.0)):
-            plane = self.bgr[..., channel] * np.minimum(dark * np.where(dark < 1, share, 1), 1)
-            self.bgr[..., channel] = plane
+        for region in _strips(*(slice(0, length) for length in self._shade.shape)):
+            dark = 1 - self._appearance.shadow_strength * (self._shade[region].astype(np.float32) / 255)
+            # Skylight is blue, so a shadow keeps a little more of it.
+            for channel, share in enumerate((1.10, 1.03, 1.0)):
+                plane = self.bgr[region][..., channel]
+                plane[:] = plane * np.minimum(dark * np.where(dark < 1, share, 1), 1)
 
     def canopy(self, tree: Tree, picture: npt.NDArray[np.uint8]) -> None:
         """Lay a tree's crown over the ground."""
@@ -203,8 +205,7 @@ class _Painter:
         size = (round(WORLD_M[0] / step), round(WORLD_M[1] / step))
         shade = cv2.resize(self._shade, size, interpolation=cv2.INTER_AREA)
         light = (1 - self._appearance.shadow_strength * shade / 255.0).astype(np.float32)
-        bgra = np.asarray(cv2.cvtColor(self.bgr, cv2.COLOR_BGR2BGRA), np.uint8)
-        return Ground(bgra, self._m_per_px, light, step)
+        return Ground(self.bgr, self._m_per_px, light, step)
 
     def _slice(self, rect: Rect) -> tuple[slice, slice]:
         x0, y0, x1, y1 = (max(0, round(v / self._m_per_px)) for v in (rect.x0, rect.y0, rect.x1, rect.y1))
@@ -342,7 +343,21 @@ def _mix(first: Bgr, second: Bgr) -> Bgr:
     return ((first[0] + second[0]) / 2, (first[1] + second[1]) / 2, (first[2] + second[2]) / 2)
 
 
+def _strips(rows: slice, columns: slice, *, height: int = 32) -> Iterator[tuple[slice, slice]]:
+    """The region in strips, for what needs many numbers a pixel."""
+    for top in range(rows.start, rows.stop, height):
+        yield slice(top, min(top + height, rows.stop)), columns
+
+
 def _noise(rng: _Rng, shape: tuple[int, int], *, cell_px: float) -> npt.NDArray[np.float32]:
-    """Smooth noise of unit strength with features about ``cell_px`` wide."""
-    small = rng.standard_normal((int(shape[0] / cell_px) + 3, int(shape[1] / cell_px) + 3), np.float32)
-    return np.asarray(cv2.resize(small, shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+    """Noise of unit strength, one number for each ``cell_px``."""
+    return rng.standard_normal((int(shape[0] / cell_px) + 3, int(shape[1] / cell_px) + 3), np.float32)
+
+
+def _enlarged(
+    noise: npt.NDArray[np.float32], shape: tuple[int, int], *, gain: float
+) -> npt.NDArray[np.float32]:
+    """The noise, smooth, over the whole world."""
+    large = np.asarray(cv2.resize(noise, shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
+    large *= np.float32(gain)
+    return large

@@ -62,12 +62,9 @@ class SharedModels(Models):
     def __init__(self, detector: Detector, classifier: Classifier | None = None) -> None:
         self._shared = detector, classifier
 
-    def take(self, edge: str | None = None) -> tuple[Detector, Classifier | None]:  # noqa: ARG002
+    def take(self) -> tuple[Detector, Classifier | None]:
         """The same for every session."""
         return self._shared
-
-    def give_back(self, detector: Detector, classifier: Classifier | None) -> None:
-        """They were never away."""
 
 
 class _Worker(LockstepWorker):
@@ -110,8 +107,7 @@ class GroundSide:
         self._link = link
         self._info = info
         self._now_ns = info.started_ns
-        self._models = models
-        detector, classifier = self._borrowed = models.take()
+        detector, classifier = models.take()
         shared = SharedModels(detector, classifier)
         self._session = GroundSession(
             info,
@@ -168,7 +164,6 @@ class GroundSide:
         if self.lists:
             last = max(self.lists)
             self.lists[last] = self._record.complete(self.lists[last], lists=self.lists)
-        self._models.give_back(*self._borrowed)
 
     def _make_worker(self, analyze: Analyze, step: Step, read: Read) -> _Worker:
         self._worker = _Worker(analyze, step, read, name=self._info.edge)

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from hvt_common.errors import UserError
+from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.runtime.reporting import StatusLine, check_writable, print_table, write_json
 
 
@@ -80,3 +80,15 @@ def test_quiet_is_quiet(capsys):
         line.show("status")
         line.note("note")
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_result_that_cannot_be_written_is_a_sentence_and_code_1(tmp_path, capsys):
+    """After an hour's flight a traceback would be all that is left; or a supervisor never start it again."""
+
+    def flight(_argv):
+        write_json(tmp_path / "gone" / "summary.json", {})
+        return 0
+
+    assert exit_with_sentence(flight, program="hvt-edge", argv=[]) == 1
+    said = capsys.readouterr().err
+    assert said == f"hvt-edge: {tmp_path}/gone/summary.json cannot be written (No such file or directory)\n"

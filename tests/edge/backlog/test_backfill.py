@@ -35,10 +35,11 @@ class Ground:
 
     def take(self, chunk: Chunk) -> None:
         """A piece arrives."""
+        key = session_id, kind, number = chunk.key
         header = BacklogHeader(
-            session_id=chunk.session_id,
-            kind=chunk.kind,
-            number=chunk.number,
+            session_id=session_id,
+            kind=kind,
+            number=number,
             offset=chunk.offset,
             total_bytes=chunk.total_bytes,
             send_ns=1,
@@ -46,14 +47,13 @@ class Ground:
         whole = self.assembly.chunk(BacklogHeader.parse(header.pack(chunk.data), chunk.data), chunk.data)
         if whole is None:
             return
-        key = (chunk.session_id, chunk.kind, chunk.number)
-        if chunk.kind == BacklogKind.INFO:
-            self.knows.add(chunk.session_id)
-        elif chunk.session_id not in self.knows:
-            self.assembly.want_info(chunk.session_id)
+        if kind == BacklogKind.INFO:
+            self.knows.add(session_id)
+        elif session_id not in self.knows:
+            self.assembly.want_info(session_id)
             self.assembly.settle(key, usable=False)
             return
-        backlog_content(key, whole, edge="uav-1") if chunk.kind != BacklogKind.INFO else None
+        backlog_content(key, whole, edge="uav-1") if kind != BacklogKind.INFO else None
         self.twice[key] += 1
         self.objects[key] = whole
         self.order.append(key)
@@ -207,7 +207,7 @@ def test_what_a_ground_does_not_take_is_put_aside_and_never_deleted(tmp_path, ca
             assert rig.backfill.given_up == 0
             rig.run(60)
         assert rig.backfill.given_up == 3
-        assert Counter(chunk.number for chunk in rig.sent if chunk.offset == 0) == {1: 3, 2: 3, 0: 3}
+        assert Counter(chunk.key[2] for chunk in rig.sent if chunk.offset == 0) == {1: 3, 2: 3, 0: 3}
         assert (folder.stills, folder.segments) == (2, 1)
         assert (folder.stills, folder.segments) == (2, 1)
         assert "3 tries" in caplog.text
@@ -313,7 +313,7 @@ def test_only_facts_that_are_here_can_be_asked_for(tmp_path):
         ]
         backfill.on_acknowledged(strangers, receiver_id=1, now_ns=1)
         sent = [backfill.next_chunk(10_000, now_ns=2, round_trip_ns=RTT) for _ in range(3)]
-        assert [(one.session_id, one.kind) for one in sent if one] == [(7, "info"), (7, "still")]
+        assert [one.key[:2] for one in sent if one] == [(7, "info"), (7, "still")]
 
 
 def test_bytes_count_as_arrived_once_whatever_the_link_does(tmp_path):

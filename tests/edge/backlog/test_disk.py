@@ -153,6 +153,15 @@ def test_what_was_kept_is_there_after_a_restart(tmp_path):
     assert (tmp_path / FILE_NAME).stat().st_size < 50_000
 
 
+def test_nobody_else_may_read_what_is_stored(tmp_path):
+    """Every user of the drone's computer could look at what its camera saw."""
+    tmp_path.chmod(0o755)
+    with opened(tmp_path) as folder:
+        add_stills(folder, {1: 1.0})
+        modes = {one.name: one.stat().st_mode & 0o777 for one in tmp_path.iterdir()}
+    assert modes == {FILE_NAME: 0o600, f"{FILE_NAME}-wal": 0o600}
+
+
 def test_what_is_too_old_is_dropped_at_the_start(tmp_path, caplog):
     """Last week's flight would fill the link of today's."""
     with opened(tmp_path) as folder:

@@ -91,7 +91,7 @@ def test_a_disk_that_hangs_costs_what_waits_and_says_so(tmp_path, caplog):
         worker.close()
     assert f"{taken - 1} frames and stills" in caplog.text, "one is being written"
     disk.set()
-    eventually(lambda: not worker.queued, within_s=10, what="the thread has gone on")
+    eventually(lambda: not len(worker.intake), within_s=10, what="the thread has gone on")
 
 
 def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
@@ -108,13 +108,13 @@ def test_no_word_is_lost_while_the_disk_is_slow(tmp_path):
     worker = worker_of(tmp_path / "store", link, info=slow)
     units = [shifted(unit, 4 * part) for part in range(10) for unit in UNITS]
     taken = [unit.frame_index for unit in units if worker.offer(unit)]
-    worker.end_segment()
-    worker.video_first()
+    worker.intake.end_segment()
+    worker.intake.signal(video_first=True)
     disk.set()
-    eventually(lambda: not worker.queued, within_s=20, what="all is stored")
+    eventually(lambda: worker.intake.idle, within_s=20, what="all is stored")
     link.open = True
     eventually(lambda: link.sent, within_s=20, what="an ended segment is sent")
-    assert link.sent[0][1].kind == "base", "before the still"
+    assert link.sent[0][1].key[1] == "base", "before the still"
     assert not worker.offer(UNITS[0]) or worker.numbers.segments > 1
     worker.close()
     assert len(taken) < len(units)
@@ -131,7 +131,7 @@ def test_one_frame_is_not_nothing(tmp_path):
     worker.offer(UNIT)
     eventually(lambda: not worker.numbers.empty, within_s=10, what="it is there")
     assert (worker.numbers.segments, worker.numbers.video_s) == (1, 0.0)
-    worker.end_segment()
+    worker.intake.end_segment()
     worker.close()
     assert (worker.numbers.segments, worker.numbers.empty) == (1, False)
 
@@ -168,7 +168,7 @@ def test_a_link_that_is_full_does_not_hold_up_the_disk(tmp_path):
     assert link.entered.wait(timeout=10), "a chunk is being sent"
     for unit in UNITS[:10]:
         worker.offer(shifted(unit, 50))
-    eventually(lambda: worker.numbers.segments == 2 and not worker.queued, within_s=10, what="it is kept")
+    eventually(lambda: worker.numbers.segments == 2 and worker.intake.idle, within_s=10, what="it is kept")
     assert link.sent == []
     link.full.set()
     eventually(lambda: len(link.sent) > 3, within_s=10, what="it goes on")
@@ -187,7 +187,7 @@ def test_after_the_last_word_nothing_goes_out(tmp_path):
     link.full.set()
     for unit in UNITS[:10]:
         worker.offer(shifted(unit, 50))
-    eventually(lambda: worker.numbers.segments == 2 and not worker.queued, within_s=10, what="it is kept")
+    eventually(lambda: worker.numbers.segments == 2 and worker.intake.idle, within_s=10, what="it is kept")
     worker.close()
     assert len(link.sent) == 1, "the one that was under way"
 
@@ -235,7 +235,9 @@ def test_a_folder_that_vanishes_in_mid_flight_is_made_again(tmp_path, caplog):
     worker = worker_of(store, link)
     for unit in UNITS[:10]:
         worker.offer(unit)
-    eventually(lambda: worker.numbers.video_s > 0.5, within_s=10, what="they are written")
+    eventually(
+        lambda: worker.intake.idle and worker.numbers.video_s > 0.5, within_s=10, what="they are written"
+    )
     shutil.rmtree(store)
     with caplog.at_level(logging.WARNING):
         worker.offer(shifted(UNITS[0], 60))
@@ -263,7 +265,7 @@ def test_a_full_disk_stops_storing_alone_until_there_is_space(small_disk, caplog
         for unit in units:
             if not worker.offer(unit):
                 break
-            eventually(lambda: not worker.queued, within_s=10, what="it is taken")
+            eventually(lambda: worker.intake.idle, within_s=10, what="it is taken")
         eventually(lambda: worker.failed, within_s=10, what="the disk is full")
         stored = worker.numbers
         assert stored.segments >= 2
@@ -271,13 +273,13 @@ def test_a_full_disk_stops_storing_alone_until_there_is_space(small_disk, caplog
             link.now_ns += 100 * S
             time.sleep(0.3)
         link.open = True
-        eventually(lambda: len({chunk.number for _, chunk in link.sent}) >= 2, within_s=10, what="it is sent")
+        eventually(lambda: len({chunk.key for _, chunk in link.sent}) >= 2, within_s=10, what="it is sent")
         link.open = False
         ranges = [
             AcknowledgedRange(session_id=7, kind="base", number=number, acknowledged_bytes=total)
-            for number, total in {(chunk.number, chunk.total_bytes) for _, chunk in link.sent}
+            for number, total in {(chunk.key[2], chunk.total_bytes) for _, chunk in link.sent}
         ]
-        worker.on_acknowledged(ranges, receiver_id=1)
+        worker.intake.on_acknowledged(ranges, receiver_id=1)
         eventually(
             lambda: worker.numbers.segments == stored.segments - len(ranges),
             within_s=10,
@@ -322,7 +324,7 @@ def test_an_error_in_sending_ends_the_process_too():
 
     woken = threading.Event()
     sending = ChunkThread(broken, on_done=woken.set)
-    sending.put(Chunk(7, BacklogKind.STILL, 1, 0, 3, b"abc"))
+    sending.put(Chunk((7, BacklogKind.STILL, 1), 0, 3, b"abc"))
     assert woken.wait(timeout=10)
     with pytest.raises(ZeroDivisionError):
         sending.take()

@@ -47,7 +47,7 @@ class Rig:
 
     def backlog(self, size: int, *, now_ns: int = NOW_NS, offset: int = 0) -> int:
         """A chunk of so many bytes."""
-        return self.sender.backlog(Chunk(7, BacklogKind.BASE, 0, offset, 10**6, bytes(size)), now_ns=now_ns)
+        return self.sender.backlog(Chunk((7, BacklogKind.BASE, 0), offset, 10**6, bytes(size)), now_ns=now_ns)
 
 
 def test_a_chunk_that_lost_its_room_to_a_still_is_not_sent():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -11,6 +12,7 @@ from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
@@ -33,10 +35,12 @@ class Out:
 
     def __init__(self) -> None:
         self.units = 0
+        self.takes_s = 0.0
 
     def put(self, channel, payload, *, attachment=None, encoding="") -> None:
         """One message."""
         self.units += channel is Channel.BASE
+        time.sleep(self.takes_s)
 
 
 class BlockedStills:
@@ -62,11 +66,9 @@ class BlockedStills:
         """Nothing."""
 
 
-@pytest.mark.timeout(120)
-def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
-    """The picture would freeze a second after a still met a full link, and thaw when the link does."""
-    out, stills, counts = Out(), BlockedStills(), FrameCounts()
-    base = BaseStage(
+def base_stage(out: Out) -> BaseStage:
+    """That sends there."""
+    return BaseStage(
         BaseEncoder(EncoderSettings(size=SIZE, fps=15, bitrate_bps=100_000, preset="ultrafast")),
         keyframes=KeyframeRequests(),
         transmitter=Transmitter(
@@ -81,6 +83,13 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
         local_copy=None,
         first_keyframe_bytes=5000,
     )
+
+
+@pytest.mark.timeout(120)
+def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
+    """The picture would freeze a second after a still met a full link, and thaw when the link does."""
+    out, stills, counts = Out(), BlockedStills(), FrameCounts()
+    base = base_stage(out)
     frames = list(framed(smooth_pictures(60, size=SIZE)))
     with RealtimePace(
         base, stills, inbox=FeedbackInbox(), clock=SteadyClock(), fps=15, live=True, counts=counts,
@@ -95,6 +104,45 @@ def test_a_still_that_blocks_for_seconds_costs_no_frame_of_video():
             pace.step(frame)
     assert out.units == 60
     assert stills.decoded == max(stills.frames) + 1, "no unit is missing before any frame that was analyzed"
+
+
+@pytest.mark.timeout(60)
+def test_frames_missed_count_for_the_link_or_for_the_machine():
+    """Who flies would buy a faster computer for a thin link."""
+    out, stills, counts = Out(), BlockedStills(), FrameCounts()
+    stills.released.set()
+    frames = list(framed(smooth_pictures(6, size=SIZE)))
+    with RealtimePace(
+        base_stage(out), stills, inbox=FeedbackInbox(), clock=SteadyClock(), fps=15, live=True, counts=counts,
+        stop=threading.Event(), failures=Failures(time.time_ns),
+    ) as pace:  # fmt: skip
+        pace.step(frames[0], missed=4)
+        assert (counts.captured, counts.dropped) == (1, 0), "what came before the first is nobody's fault"
+        out.takes_s = 0.5
+        pace.step(frames[1], missed=4)
+        out.takes_s = 0.0
+        pace.step(frames[2], missed=9)
+        assert (counts.dropped_link, counts.dropped_cpu) == (5, 0)
+        pace.step(frames[3], missed=12)
+        assert (counts.dropped_link, counts.dropped_cpu) == (5, 3)
+        assert counts.captured == 4 + 8
+        assert counts.unanalyzed == 2, "perception gave way where video was late"
+
+
+@pytest.mark.timeout(60)
+def test_a_clip_that_cannot_be_read_in_time_is_shown_all_the_same():
+    """A slow disk, or a scene that is slow to draw, would give a flight without a picture."""
+    out, stills, counts, clock = Out(), BlockedStills(), FrameCounts(), SteadyClock()
+    stills.released.set()
+    late_ns = clock() - 60 * SECOND_NS
+    with RealtimePace(
+        base_stage(out), stills, inbox=FeedbackInbox(), clock=clock, fps=15, live=False, counts=counts,
+        stop=threading.Event(), failures=Failures(time.time_ns),
+    ) as pace:  # fmt: skip
+        for frame in framed(smooth_pictures(30, size=SIZE)):
+            pace.step(replace(frame, capture_ns=late_ns + frame.index * SECOND_NS // 15))
+    assert 6 <= out.units <= 10, "about four a second"
+    assert counts.dropped == 30 - out.units
 
 
 def unit(index: int, *, keyframe: bool = False, size: int = 1_000) -> AccessUnit:

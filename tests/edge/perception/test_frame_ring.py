@@ -13,7 +13,7 @@ from media.clips import START_NS
 from rigs.flight import tracks_at
 
 SECOND_NS = 1_000_000_000
-PICTURE = np.zeros((10, 20, 3), np.uint8)  # 600 bytes
+PICTURE = np.zeros((10, 20, 3), np.uint8)  # 600 bytes, 300 packed
 
 
 def frame(index: int, *, fps: float = 15.0, picture: np.ndarray = PICTURE) -> Frame:
@@ -30,7 +30,7 @@ def filled(ring: FrameRing, count: int, *, fps: float = 15.0) -> FrameRing:
 
 def test_with_room_every_frame_of_the_last_seconds_is_there():
     """An operator who saw something a moment ago would get the frame beside it."""
-    ring = filled(FrameRing(RingSettings(max_bytes=600 * 200, max_age_ns=2 * SECOND_NS)), 100)
+    ring = filled(FrameRing(RingSettings(max_bytes=300 * 200, max_age_ns=2 * SECOND_NS)), 100)
     assert len(ring) == 31
     assert [ring.near_index(index).frame_index for index in (69, 80, 99)] == [69, 80, 99]
     assert ring.near_index(68) is None
@@ -39,8 +39,8 @@ def test_with_room_every_frame_of_the_last_seconds_is_there():
 
 def test_with_little_memory_it_goes_back_as_far_with_frames_left_out():
     """On a 4K camera "three seconds ago" would be refused, because 250 MB are gone after 0.7 s."""
-    ring = filled(FrameRing(RingSettings(max_bytes=600 * 10, max_age_ns=5 * SECOND_NS)), 400)
-    assert ring.size_bytes <= 6000
+    ring = filled(FrameRing(RingSettings(max_bytes=300 * 10, max_age_ns=5 * SECOND_NS)), 400)
+    assert ring.size_bytes <= 3000
     assert ring.reach_s() == pytest.approx(5.0, abs=0.7)
     kept = [
         ring.near_time(START_NS + round(399 / 15 * SECOND_NS) - ago * SECOND_NS) for ago in (0, 1, 2, 3, 4)
@@ -62,23 +62,35 @@ def test_its_bounds_hold_and_the_newest_is_always_there(count, max_bytes, age_s,
     ring = FrameRing(RingSettings(max_bytes=max_bytes, max_age_ns=round(age_s * SECOND_NS)))
     for index in range(count):
         ring.add(frame(index, fps=fps), tracks_at(index, {}))
-        assert ring.size_bytes == 600 * len(ring) <= max_bytes
+        assert ring.size_bytes == 300 * max(0, len(ring) - 1) <= max_bytes
         assert ring.reach_s() <= age_s + 1e-9
-        if max_bytes >= 600:
+        if max_bytes:
             assert ring.newest.frame_index == index
         else:
             assert ring.newest is None
 
 
-def test_the_pixels_are_the_sources_own_and_the_tracks_those_of_the_frame():
+def test_the_newest_is_the_sources_own_and_the_tracks_are_those_of_the_frame():
     """A still would show what another loss left of it, or the place where the object was later."""
-    picture = np.random.default_rng(0).integers(0, 255, (10, 20, 3), np.uint8)
     ring = FrameRing()
-    ring.add(frame(0, picture=picture), tracks_at(0, {7: (1.0, 1.0, 5.0, 5.0)}))
-    ring.add(frame(1), tracks_at(1, {7: (2.0, 1.0, 6.0, 5.0)}))
+    ring.add(frame(0), tracks_at(0, {7: (1.0, 1.0, 5.0, 5.0)}))
+    ring.add(frame(1, picture=PICTURE), tracks_at(1, {7: (2.0, 1.0, 6.0, 5.0)}))
+    assert ring.newest.source_bgr is PICTURE
+    assert ring.near_index(0).tracks.boxes_xyxy_px.tolist() == [[1, 1, 5, 5]]
+
+
+@pytest.mark.parametrize(("size", "error"), [((64, 48), 10), ((65, 48), 0)])
+def test_a_frame_of_before_is_what_the_camera_saw(size, error):
+    """A still of three seconds ago would show other colours, or half the picture."""
+    x, y = np.meshgrid(np.linspace(0, 1, size[0]), np.linspace(0, 1, size[1]))
+    picture = np.stack([255 * x, 255 * y, 255 * (1 - x)], axis=2).astype(np.uint8)
+    ring = FrameRing()
+    for index in range(3):
+        ring.add(frame(index, picture=picture), tracks_at(index, {}))
     kept = ring.near_index(0)
-    assert kept.source_bgr is picture
-    assert kept.tracks.boxes_xyxy_px.tolist() == [[1, 1, 5, 5]]
+    assert kept.source_bgr.shape == picture.shape
+    assert np.abs(kept.source_bgr.astype(int) - picture).max() <= error
+    assert (ring.size_bytes < picture.nbytes * 2) == (error > 0)
 
 
 def test_a_frame_that_is_gone_or_to_come_is_not_replaced_by_another():

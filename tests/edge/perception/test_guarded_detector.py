@@ -19,12 +19,12 @@ def test_a_model_whose_run_raises_is_opened_again_with_growing_pauses(tmp_path, 
     opened, now_ns = [], [0]
     failures = Failures(lambda: now_ns[0])
 
-    def reopen():
+    def open_again():
         opened.append(now_ns[0] // SECOND_NS)
         return open_detector(str(path))
 
     detector = GuardedDetector(
-        open_detector(str(path)), reopen=reopen, failures=failures, clock=lambda: now_ns[0],
+        open_detector(str(path)), open_again=open_again, failures=failures, clock=lambda: now_ns[0],
         pause=RetryPause(),
     )  # fmt: skip
     assert detector.detect(DARK) is not None

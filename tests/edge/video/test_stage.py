@@ -79,11 +79,11 @@ class Rig:
             regions=regions,
             frame_skip=self.frame_skip,
             reconfigure=self._reconfigure if reconfigures else None,
-            reopen=self._reopen if reopens else None,
+            open_again=self._open_again if reopens else None,
             failures=self.failures,
         )
 
-    def _reopen(self) -> BaseEncoder:
+    def _open_again(self) -> BaseEncoder:
         self.reopened += 1
         return BaseEncoder(SETTINGS)
 

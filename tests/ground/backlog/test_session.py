@@ -6,7 +6,6 @@ import csv
 import itertools
 import threading
 import time
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -56,10 +55,9 @@ def wait_for(condition, *, timeout_s: float = 30) -> None:
 class Models:
     """Gives red-square detectors."""
 
-    @contextmanager
-    def checkout(self):
+    def take(self):
         """One for each."""
-        yield RedSquares(), None
+        return RedSquares(), None
 
 
 def settings(info: Info, path: Path, **changes) -> RecorderSettings:
@@ -79,7 +77,7 @@ def look_of(info: Info, models=None) -> BacklogPerception:
     """What looks at kept things."""
     return BacklogPerception(
         info,
-        checkout=(models or Models()).checkout,
+        take_models=(models or Models()).take,
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,
@@ -693,9 +691,8 @@ def test_a_still_is_read_in_the_middle_of_a_stretch(flight, tmp_path):
             return super().read(stills, base_bgr)
 
     class Stepped:
-        @contextmanager
-        def checkout(self):
-            yield Stepwise(), None
+        def take(self):
+            return Stepwise(), None
 
     with Rig(
         tmp_path, flight, pipeline=lambda emit: pipeline_of(emit, reader=Reader()), models=Stepped()

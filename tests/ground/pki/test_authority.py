@@ -132,7 +132,7 @@ def test_a_new_machine_names_the_files_that_change(fleet: Fleet, capsys: pytest.
 def test_each_machine_has_its_keys_where_its_own_file_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A drone with its keys elsewhere would send the ground to look for its own there: it would not start any more."""
+    """A drone with its keys elsewhere would send the ground to look for its own there: it would not start."""
     folder = tmp_path / "keys"
 
     def keys(command: str, name: str, *words: str) -> None:

@@ -284,6 +284,9 @@ def test_who_may_not_is_told_by_its_own_program_and_goes_on(told: dict[str, Runn
     process.until(after)
     assert process.alive
     process.stop()
+    if who == "uav-1":
+        assert "uav-1: NOT SENT (" in process.told, "its end says it as well"
+        assert "the other side wants a certificate" in process.summary()["unreached"]
 
 
 @pytest.fixture

@@ -212,7 +212,6 @@ class Rig:
             method=config.method,
             decimation=1,
         )
-        self.failures = Failures(lambda: self.now_ns)
         self.watched = False
         """Somebody subscribes to the video who is no ground."""
         self.link_control = LinkControl(

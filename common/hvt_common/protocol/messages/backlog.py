@@ -26,6 +26,7 @@ __all__ = [
     "BacklogKind",
     "BacklogStill",
     "BacklogUnit",
+    "ObjectKey",
     "pack_backlog_still",
     "pack_backlog_units",
     "parse_backlog_still",
@@ -39,6 +40,10 @@ _MAX_UNITS = 2400
 _MAX_HEADER_BYTES = 1024
 _MAX_ENCODING_BYTES = 64
 _SIZE = Int(1, MAX_BACKLOG_BYTES)
+
+
+ObjectKey = tuple[int, str, int]
+"""Session, kind and number: what an object is called on the link."""
 
 
 class BacklogKind(StrEnum):
@@ -73,6 +78,11 @@ class BacklogHeader(Message):
     send_ns: int = wire_field(Int(0, I63))
     """When the chunk was handed to Zenoh, the edge's clock."""
 
+    @property
+    def key(self) -> ObjectKey:
+        """Of the object."""
+        return self.session_id, self.kind, self.number
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcknowledgedRange:
@@ -83,6 +93,11 @@ class AcknowledgedRange:
     number: int = wire_field(Int(0, U32))
     acknowledged_bytes: int = wire_field(Int(0, MAX_BACKLOG_BYTES))
     """The whole object: the edge may delete it. Less than before: send again from there."""
+
+    @property
+    def key(self) -> ObjectKey:
+        """Of the object."""
+        return self.session_id, self.kind, self.number
 
 
 @dataclass(frozen=True, slots=True)

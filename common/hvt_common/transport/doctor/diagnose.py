@@ -21,6 +21,7 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.transport.doctor.certificate import TlsFiles
 from hvt_common.transport.doctor.probe import why_no_link
+from hvt_common.transport.doctor.strangers import Strangers, listening_ports
 from hvt_common.transport.rights import Rights
 from hvt_common.transport.zenoh_config import LinkSettings, configure, connect_endpoints
 
@@ -28,7 +29,7 @@ __all__ = ["PATIENCE_S", "LinkWatch", "control_unanswered", "visit"]
 
 _log = logging.getLogger(__name__)
 
-_CHECK_S = 1.0
+_CHECK_S, _STRANGERS_S = 1.0, 0.1
 PATIENCE_S = 4.0
 _FIRST_PAUSE_S, _LAST_PAUSE_S = 10.0, 120.0
 """From one visit to the next: doubled each time, for a visit costs some kilobytes of a link that may be thin."""
@@ -69,7 +70,8 @@ class LinkWatch:
         self._session = session
         self._patience_s = patience_s
         self._examine = examine or visit
-        self._config = configure(settings)[0]
+        self._config, listen = configure(settings)
+        self._strangers = Strangers(listening_ports(listen))
         self._file = settings.zenoh_config
         self._edge = settings.name
         self._served = served
@@ -115,10 +117,14 @@ class LinkWatch:
     # The thread
 
     def _run(self) -> None:
-        linked_s = time.monotonic()
-        next_visit_s, pause_s = linked_s + self._patience_s, _FIRST_PAUSE_S
-        while not self._stop.wait(min(_CHECK_S, self._patience_s)):
+        next_visit_s, pause_s = time.monotonic() + self._patience_s, _FIRST_PAUSE_S
+        next_check_s = 0.0
+        while not self._stop.wait(min(_STRANGERS_S, self._patience_s)):
             now_s = time.monotonic()
+            self._check_strangers(now_s)
+            if now_s < next_check_s:
+                continue
+            next_check_s = now_s + min(_CHECK_S, self._patience_s)
             if self._check(now_s):
                 self._trouble = ""
                 next_visit_s, pause_s = now_s + self._patience_s, _FIRST_PAUSE_S
@@ -139,6 +145,25 @@ class LinkWatch:
             except zenoh.ZError:  # closed elsewhere
                 return True
             return bool(links)
+
+    def _check_strangers(self, now_s: float) -> None:
+        with self._using:
+            if self._stop.is_set():
+                return
+            try:
+                hosts = self._strangers.check(self._far_ends, now_s)
+            except (OSError, zenoh.ZError):  # the session is closed elsewhere
+                return
+        for host in hosts:
+            _log.warning(
+                "somebody at %s connects again and again and is refused: it has no certificate of this CA, or speaks "
+                "no Zenoh; if it is one of yours, its own log says why (docs/security.md)",
+                host,
+            )
+
+    def _far_ends(self) -> list[str]:
+        ends = (str(end) for link in self._session.info.links() for end in (link.src, link.dst))
+        return [_bare(end).partition("/")[2] for end in ends]
 
     def _names(self, links: list[zenoh.Link]) -> dict[str, bool]:
         """Who is at the other end of the links, each with whether it is a router."""

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
+from hvt_common.tracking.association import assign
 from hvt_common.values import Boxes, Tracks, iou
 
 __all__ = ["Matcher", "StillToMatch", "TrackMatch"]
@@ -132,8 +132,8 @@ class Matcher:
             return found
         boxes = tracks.boxes_xyxy_px[rows]
         preference = self._preference(heads, tracks, rows, frame_index, class_names)
-        pairs = linear_sum_assignment(preference, maximize=True)
-        chosen = {int(r): int(c) for r, c in zip(*pairs, strict=True) if preference[r, c] > 0}
+        pairs = assign(-preference, limit=0.0)
+        chosen = {int(r): int(c) for r, c in zip(*pairs, strict=True)}
         for r, c in chosen.items():
             taken = [column for row, column in chosen.items() if row != r]
             if _ambiguous(preference[r], c, taken, boxes):

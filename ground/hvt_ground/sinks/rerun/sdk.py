@@ -62,6 +62,7 @@ def send_blueprint(recording: rr.RecordingStream, one: RecordingId, blueprint: r
     """Send the blueprint and make it active: the SDK's own function never frees the stream that it writes it to."""
     try:
         _send_and_let_go(recording, one.application, blueprint)
+        release_recordings()
     except (AttributeError, TypeError) as error:
         _log.debug("this Rerun SDK has other names inside (%s): a recording leaves its threads behind", error)
         rr.send_blueprint(blueprint, recording=recording)

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hvt_common.errors import UserError
+from hvt_common.errors import FlightError, UserError
 from hvt_common.runtime.reporting import write_json
 from hvt_common.values import Image
 from hvt_study.report.example.choice import CropExample, Example, Lane, Timeline, Word
@@ -37,8 +37,9 @@ def save_example(folder: Path, example: Example) -> None:
             for name in _PICTURES:
                 (place / f"{crop['percentile']}-{name}.png").write_bytes(crop.pop(f"{name}_png"))
         write_json(place / _FILE, content)
-    except OSError as error:
-        raise UserError(f"{place} cannot be written ({error.strerror}): name a folder that can") from None
+    except (OSError, FlightError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"{place} cannot be written ({why}): name a folder that can") from None
 
 
 def load_example(folder: Path) -> Example | None:

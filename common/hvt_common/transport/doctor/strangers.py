@@ -1,0 +1,84 @@
+"""Who connects to our listening ports and is refused: Zenoh closes such a connection and says nothing of it.
+
+The kernel's table of TCP connections (/proc/net/tcp, Linux only) has who connects now. A connection that ends and
+never was one of the session's links was refused: no certificate, one of another CA, or no Zenoh at all.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import struct
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+__all__ = ["Strangers", "listening_ports"]
+
+_TABLES = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
+_LISTEN = "0A"
+_TIMES, _WITHIN_S = 3, 600.0
+"""Who is refused tries again each second, and on a quick link is seen now and then only; an own client that comes and
+goes between two looks is not so frequent."""
+_AGAIN_S = 60.0
+_MOST_HOSTS = 256
+
+
+class Strangers:
+    """``ports`` are those that we listen on. For one thread; check several times a second."""
+
+    def __init__(self, ports: Iterable[int], *, tables: Iterable[Path] = _TABLES) -> None:
+        self._ports = frozenset(ports)
+        self._tables = [one for one in tables if one.exists()] if self._ports else []
+        self._pending: set[str] = set()
+        """Connections that are no links, or not yet."""
+        self._refused: OrderedDict[str, list[float]] = OrderedDict()
+        """Host → when its connections ended, the last ones."""
+        self._said_s: dict[str, float] = {}
+
+    def check(self, links: Callable[[], Iterable[str]], now_s: float) -> list[str]:
+        """Return the hosts to be named now; ``links`` gives the far ends of the links that stand."""
+        connected = {one for table in self._tables for one in self._connected(table)}
+        if not connected and not self._pending:
+            return []
+        linked = set(links())
+        ended = self._pending - connected - linked
+        self._pending = connected - linked
+        return [host for host in map(_host, sorted(ended)) if self._note(host, now_s)]
+
+    def _note(self, host: str, now_s: float) -> bool:
+        times = self._refused.setdefault(host, [])
+        self._refused.move_to_end(host)
+        if len(self._refused) > _MOST_HOSTS:
+            self._said_s.pop(self._refused.popitem(last=False)[0], None)
+        times[:] = [*(one for one in times if now_s - one < _WITHIN_S), now_s][-_TIMES:]
+        if len(times) < _TIMES or now_s - self._said_s.get(host, -_AGAIN_S) < _AGAIN_S:
+            return False
+        self._said_s[host] = now_s
+        return True
+
+    def _connected(self, table: Path) -> Iterable[str]:
+        for line in table.read_text(encoding="ascii").splitlines()[1:]:
+            _, ours, theirs, state = line.split(maxsplit=4)[:4]
+            if state != _LISTEN and int(ours.rpartition(":")[2], 16) in self._ports:
+                address, _, port = theirs.rpartition(":")
+                yield f"{_address(address)}:{int(port, 16)}"
+
+
+def listening_ports(endpoints: Iterable[str]) -> set[int]:
+    """Of the TCP and TLS endpoints, such as ``tls/0.0.0.0:7447``."""
+    found = (re.match(r"(?:tcp|tls)/.*:(\d+)(?:[?#]|$)", one) for one in endpoints)
+    return {int(one[1]) for one in found if one is not None}
+
+
+def _address(text: str) -> str:
+    """The kernel writes words of four bytes in the machine's own order."""
+    words = [int(text[at : at + 8], 16) for at in range(0, len(text), 8)]
+    address = ipaddress.ip_address(struct.pack(f"={len(words)}I", *words))
+    if isinstance(address, ipaddress.IPv6Address):
+        return str(address.ipv4_mapped or f"[{address}]")
+    return str(address)
+
+
+def _host(far_end: str) -> str:
+    return far_end.rpartition(":")[0]

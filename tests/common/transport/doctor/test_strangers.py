@@ -1,0 +1,81 @@
+"""Who knocks and is refused is named, once a minute; who has a link is not."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import time
+from pathlib import Path
+
+import pytest
+
+from hvt_common.transport.doctor.diagnose import LinkWatch
+from hvt_common.transport.doctor.strangers import Strangers, listening_ports
+from hvt_common.transport.session import open_session
+from programs.fleet_keys import Fleet
+from programs.processes import eventually
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs the kernel's table")
+
+
+def knock(port: int) -> None:
+    """A program that speaks neither TLS nor Zenoh, such as a scanner of ports."""
+    with socket.create_connection(("127.0.0.1", port)):
+        time.sleep(0.3)
+
+
+def test_a_stranger_is_named_and_an_edge_is_not(tmp_path: Path, free_port: int, caplog) -> None:
+    """Somebody would try the door of a ground all day, and its log says nothing; or each edge would look like it."""
+    fleet = Fleet(tmp_path / "keys")
+    fleet.keys("add-edge", "uav-1")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    ground = fleet.settings("base", "ground", listen=(endpoint,))
+    edge = fleet.settings("uav-1", "edge", connect=(endpoint,))
+
+    def said() -> list[str]:
+        return [one.getMessage() for one in caplog.records if "refused" in one.getMessage()]
+
+    with (
+        caplog.at_level(logging.WARNING),
+        open_session(ground) as session,
+        LinkWatch(session, ground, served=lambda _name: True),
+    ):
+        for _ in range(4):
+            with open_session(edge) as own:
+                eventually(lambda own=own: own.info.links(), within_s=20, what="the edge has a link")
+                time.sleep(0.3)
+        assert said() == []
+        for _ in range(6):
+            knock(free_port)
+        eventually(said, within_s=20, what="the stranger is named")
+        time.sleep(0.5)
+    assert len(said()) == 1
+    assert said()[0].startswith("somebody at 127.0.0.1 connects again and again and is refused")
+
+
+def test_each_stranger_once_a_minute(tmp_path: Path) -> None:
+    """A scanner would fill the log."""
+    header = (
+        "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode\n"
+    )
+    table = tmp_path / "tcp"
+    table.write_text(header)
+
+    def shown(now_s: float, *far_ends: str, links: tuple[str, ...] = ()) -> list[str]:
+        lines = [f"   0: 00000000:1D17 {one} 01 0 0 0 0 0 0 0\n" for one in far_ends]
+        lines.append(
+            "   1: 00000000:1D17 00000000:0000 0A 0 0 0 0 0 0 0\n   2: 0100007F:0016 0200000A:9999 01 0 0\n"
+        )
+        table.write_text(header + "".join(lines))
+        return strangers.check(lambda: links, now_s)
+
+    strangers = Strangers(listening_ports(["tls/0.0.0.0:7447", "udp/0.0.0.0:22"]), tables=[table])
+    told = [(at_s, host) for at_s in range(100) for host in shown(at_s, *(["0700000A:A000"] * (at_s % 2)))]
+    assert told == [(6, "10.0.0.7"), (66, "10.0.0.7")]
+    for at_s in range(100, 120, 2):
+        assert shown(at_s, "0800000A:A001") == []
+        assert shown(at_s + 1, "0800000A:A001", links=("10.0.0.8:40961",)) == [], (
+            "it takes its time, and is in"
+        )
+        assert shown(at_s + 1.5) == []

@@ -1,0 +1,107 @@
+"""One run of a ground: when it ends by itself, and what it says where it cannot go on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hvt_common.errors import FlightError
+from hvt_ground.app import Ground
+from hvt_ground.config import GroundConfig, check
+from programs.outsider import joined
+from programs.processes import eventually
+
+
+def config(port: int, folder: Path, **changes: Any) -> GroundConfig:
+    """A light ground."""
+    listen = (f"tcp/127.0.0.1:{port}",)
+    return check(
+        GroundConfig(
+            listen=listen, record=folder, detector="motion", classifier="none", quiet=True, **changes
+        )
+    )
+
+
+class Run:
+    """A ground in a thread of its own."""
+
+    def __init__(self, settings: GroundConfig) -> None:
+        self.started, self.stop = threading.Event(), threading.Event()
+        self.sessions: list[dict[str, Any]] | None = None
+        self._ground = Ground(settings, stop=self.stop, on_started=self.started.set)
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        assert self.started.wait(60)
+
+    def _run(self) -> None:
+        self.sessions = self._ground.run()
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return not self._thread.is_alive()
+
+
+def test_once_it_ends_when_who_came_left_without_a_picture(free_port: int, tmp_path: Path) -> None:
+    """A script would wait for ever for an edge whose camera failed."""
+    run = Run(config(free_port, tmp_path, once=True, wait=1.0))
+    try:
+        with joined(f"tcp/127.0.0.1:{free_port}") as outsider:
+            with outsider.liveliness().declare_token("hvt/uav-1/alive"):
+                time.sleep(2.0)
+                assert not run.over, "it is there, and may yet send a picture"
+            eventually(lambda: run.over, within_s=20, what="the ground has ended")
+        assert run.sessions == []
+    finally:
+        run.stop.set()
+
+
+def test_once_it_ends_when_nobody_comes_in_time(free_port: int, tmp_path: Path) -> None:
+    """A script would wait for ever for an edge that does not start."""
+    began_s = time.monotonic()
+    run = Run(config(free_port, tmp_path, once=True, wait=1.0))
+    eventually(lambda: run.over, within_s=20, what="the ground has ended")
+    assert time.monotonic() - began_s >= 1.0
+    assert run.sessions == []
+
+
+def test_once_without_a_time_to_wait_it_waits(free_port: int, tmp_path: Path) -> None:
+    """A ground that is started before its edge would be gone when that comes."""
+    run = Run(config(free_port, tmp_path, once=True))
+    time.sleep(1.5)
+    assert not run.over
+    run.stop.set()
+    eventually(lambda: run.over, within_s=20, what="the ground has ended")
+
+
+class Failing(threading.Event):
+    """What a run is stopped by, where even that goes wrong."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Not this time."""
+        raise RuntimeError("can't start new thread")
+
+
+def test_what_cannot_be_put_right_in_flight_is_one_sentence(free_port: int, tmp_path: Path) -> None:
+    """A supervisor would read a traceback, and not know whether to start it again."""
+    ground = Ground(config(free_port, tmp_path), stop=Failing())
+    with pytest.raises(FlightError, match=r"^the ground cannot go on: RuntimeError: can't start new thread$"):
+        ground.run()
+
+
+@pytest.mark.integration
+def test_a_summary_that_cannot_be_written_any_more_is_code_1(free_port: int, tmp_path: Path) -> None:
+    """A disk that filled in flight would look like a wrong setting, so that the ground is not started again."""
+    words = ["--listen", f"tcp/127.0.0.1:{free_port}", "--detector", "motion", "--classifier", "none"]
+    words += ["--once", "--wait", "1s", "--summary", "/dev/full", "--quiet"]
+    command = [sys.executable, "-m", "hvt_ground.cli", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "hvt-ground: /dev/full cannot be written (No space left on device)\n"
+    assert done.stdout == "hvt-ground: no edge was heard\n", "what is known is told first"
