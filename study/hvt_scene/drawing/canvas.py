@@ -44,7 +44,9 @@ class Sprite:
         self.height_m = height_m
         self._levels: dict[int, tuple[npt.NDArray[np.uint8], float, float]] = {}
         self._shape = bgra.shape
-        self._packed = zlib.compress(bgra.tobytes(), 1)  # hundreds of them: 30 MB, of which one level is drawn
+        self._packed = zlib.compress(
+            bgra.tobytes(), 1
+        )  # hundreds of them: 30 MB, of which one level is drawn
         self.outline_m = _outline(bgra)
 
     def level(self, m_per_px: float) -> tuple[npt.NDArray[np.uint8], float, float]:

@@ -330,7 +330,6 @@ def _output(settings: RecorderSettings) -> RrdFile | LiveRecording:
 def _facts(settings: RecorderSettings, frames: str) -> dict[str, str]:
     width, height = settings.base_size
     return {
-        "edge": settings.edge_id,
         "session": settings.session,
         "base": f"{width}x{height} HEVC, {frames}",
         "budget": bitrate_text(settings.budget_bps),
