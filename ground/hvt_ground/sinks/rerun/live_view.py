@@ -145,7 +145,7 @@ class LiveRecording:
 def started_viewer(
     options: Sequence[str], *, port: int, needs: str, environment: Mapping[str, str] | None = None
 ) -> subprocess.Popen[bytes]:
-    """The viewer's process, once it listens at ``port``; `UserError` with what it ``needs`` where it does not start."""
+    """The viewer's process, once it listens at ``port``; `UserError` with what it ``needs`` where it never does."""
     process = subprocess.Popen(  # noqa: S603  # the SDK's own program, no shell
         [str(viewer_program()), "--bind", _HOST, "--port", str(port), *options],
         env={**(environment or {}), **viewer_environment()},

@@ -272,6 +272,7 @@ def test_a_full_disk_is_one_sentence(events: list[Event]) -> None:
         pytest.skip("no /dev/full on this system")
     with pytest.raises(UserError, match="No space left"):
         Recorder(settings(Path("/dev/full")))
+    assert Path("/dev/full").is_char_device(), "what was there before is not removed"
 
 
 KILLED = """
