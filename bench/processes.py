@@ -41,7 +41,7 @@ class Peaks:
         self.mb = [0.0] * len(processes)
         self.threads = [0] * len(processes)
 
-    def look(self) -> None:
+    def measure(self) -> None:
         # Not ru_maxrss of a child, which begins with this process's own.
         for index, process in enumerate(self._processes):
             with contextlib.suppress(OSError, TypeError):  # it has ended
@@ -54,7 +54,7 @@ class Peaks:
         while process.poll() is None:
             if time.monotonic() > until_s:
                 raise RuntimeError(f"{process.args!r} has not ended within {patience_s:.0f} s")
-            self.look()
+            self.measure()
             time.sleep(0.1)
 
 

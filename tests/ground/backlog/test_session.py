@@ -33,6 +33,7 @@ from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
+from hvt_ground.sinks.rerun.gallery import SLOTS
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.status import completed, summary, table
@@ -322,7 +323,7 @@ def test_stills_of_an_outage_are_shown_at_their_own_time(flight, tmp_path):
     recording = Recording(tmp_path / "0.rrd")
     shown = [frame for frame, _ in recording.stills()]
     assert [frame for frame in shown if 25 < frame < 65] == list(range(27, 39))
-    captions = recording.latest("/stills/captions", "Boxes2D:labels", 33)
+    captions = [recording.latest(f"/stills/{slot}", "Boxes2D:labels", 33) for slot in range(SLOTS)]
     assert sum(bool(text) for text in captions) >= 5
     assert any("12 stills from the outage at " in text for _, _, text in recording.events())
 
