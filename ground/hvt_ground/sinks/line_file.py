@@ -37,11 +37,7 @@ class LineFile:
             self.log(",".join(columns) + "\n")
         except UserError:
             self.close()
-<<<<<<< HEAD
-            if path.is_file():  # a device stays
-=======
             if fresh:
->>>>>>> h-sinks
                 path.unlink(missing_ok=True)
             raise
 

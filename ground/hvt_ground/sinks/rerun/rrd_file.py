@@ -68,11 +68,7 @@ class RrdFile:
             self._write(stream[:_STREAM_HEADER_BYTES] + _messages(stream), at=0)
         except UserError:
             self._release()
-<<<<<<< HEAD
-            if path.is_file():  # a device stays
-=======
             if fresh:
->>>>>>> h-sinks
                 path.unlink(missing_ok=True)
             raise
         self._compacted_bytes = self.size_bytes
