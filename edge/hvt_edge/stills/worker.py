@@ -25,8 +25,8 @@ _PART = "stills"
 _BEHIND_FRAMES = 3
 """With more frames queued than this, detection is put off; decoding never is."""
 _LEAST_FRAMES = 2
-MAX_QUEUE_BYTES = 32 * 2**20
-"""Of frames that are queued: 6 of 1280x720, 3 of 1920x1080, 2 of 3840x2160."""
+MAX_QUEUE_BYTES = 24 * 2**20
+"""Of frames that are queued: 4 of 1280x720, 2 of 1920x1080 and more."""
 _RETRY_S = 0.025
 _MOST_SKIPPED_BYTES = 2 * 2**20
 

@@ -56,6 +56,7 @@ class RrdFile:
         self._id = recording_id
         self._screen = screen
         self._compacted_bytes = self.size_bytes = 0
+        fresh = not path.exists()
         self._file = _created(path)
         self._recording = new_recording(recording_id)
         self._stream = rr.binary_stream(self._recording)
@@ -67,7 +68,8 @@ class RrdFile:
             self._write(stream[:_STREAM_HEADER_BYTES] + _messages(stream), at=0)
         except UserError:
             self._release()
-            path.unlink(missing_ok=True)
+            if fresh:
+                path.unlink(missing_ok=True)
             raise
         self._compacted_bytes = self.size_bytes
 
