@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from contextlib import contextmanager
 
 from hvt_common.protocol.messages import parse_backlog_units
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -16,10 +15,9 @@ from rigs.backlog_chunks import video_object
 from rigs.flight import Flight, RedSquares, SameAnswer
 
 
-@contextmanager
 def models():
     """A real detector of red squares."""
-    yield RedSquares(), None
+    return RedSquares(), None
 
 
 def test_work_that_was_never_begun_lets_its_recording_go():
