@@ -191,9 +191,6 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         )
     if content["failure"]:
         rows.append(("session failed", content["failure"]))
-    for one in content.get("failed", ()):
-        times = "" if one["count"] == 1 else f"{one['count']} times, last "
-        rows.append(("failed", f"{one['part']}, {times}at {one['last']}: {one['reason']}"))
     rows += [("former session", path) for path in backlog.get("recordings", ())]
     if latency["p50"] is not None:
         since = "receiving" if content["pace"] == "lockstep" else "capture"
