@@ -41,10 +41,10 @@ class Peaks:
         self.mb = [0.0] * len(processes)
         self.threads = [0] * len(processes)
 
-    def look(self) -> None:
+    def measure(self) -> None:
         # Not ru_maxrss of a child, which begins with this process's own.
         for index, process in enumerate(self._processes):
-            with contextlib.suppress(OSError, AttributeError):  # it has ended
+            with contextlib.suppress(OSError, TypeError):  # it has ended
                 text = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii")
                 self.mb[index] = int(re.search(r"VmHWM:\s+(\d+)", text)[1]) / 1024
                 self.threads[index] = max(self.threads[index], int(re.search(r"Threads:\s+(\d+)", text)[1]))
@@ -53,8 +53,8 @@ class Peaks:
         until_s = time.monotonic() + patience_s
         while process.poll() is None:
             if time.monotonic() > until_s:
-                raise RuntimeError(f"{process.args} has not ended within {patience_s:.0f} s")
-            self.look()
+                raise RuntimeError(f"{process.args!r} has not ended within {patience_s:.0f} s")
+            self.measure()
             time.sleep(0.1)
 
 

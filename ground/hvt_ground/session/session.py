@@ -150,8 +150,8 @@ class GroundSession:
             return True
         if starts_run:
             self._decoder.reset()
-        image = self._decoder.decode(item.payload)
-        if image is None or image.shape[1::-1] != self.info.base_size:
+        picture = self._decoder.decode_yuv(item.payload)
+        if picture is None or picture.size != self.info.base_size:
             return False
         self.frames_decoded += 1
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
@@ -161,7 +161,7 @@ class GroundSession:
             item.received_ns if self.lockstep else self._clock_offset.to_local_ns(header.capture_ns)
         )
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
-        self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, image))
+        self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, picture))
         if self._account.traffic_due(header):
             self._account.traffic(header, tracks=self.pipeline.tracks, tracks_refined=self.pipeline.refined)
         return True

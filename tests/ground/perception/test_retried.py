@@ -132,10 +132,10 @@ def test_a_model_that_never_works_is_opened_ever_more_seldom(tmp_path: Path) -> 
     detector = RetriedDetector(open_one, "detector", failures, pause=pause)
     until = time.monotonic() + 0.7
     while time.monotonic() < until:
-        assert len(detector.detect(picture(0, value=255).image_bgr)) == 0
+        assert len(detector.detect(picture(0, value=255).picture)) == 0
         time.sleep(0.002)
     assert 3 <= len(opened) <= 6, "after 0, 0.05, 0.15, 0.35 s"
     path.unlink()
     time.sleep(pause.pause_ns / SECOND_NS)
-    assert len(detector.detect(picture(0, value=100).image_bgr)) == 0
+    assert len(detector.detect(picture(0, value=100).picture)) == 0
     assert "d.onnx" in failures.parts[0].reason, "it cannot be opened either"

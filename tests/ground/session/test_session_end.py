@@ -31,7 +31,7 @@ def test_all_sessions_take_turns_with_the_same_models():
     (detector, classifier), other = models.take(), models.take()
     assert (detector, classifier) == other
     inside, most = [], []
-    model, found = detector.model, detector.model.detect
+    model, found = detector.part, detector.part.detect
 
     def watched(image):
         inside.append(1)
