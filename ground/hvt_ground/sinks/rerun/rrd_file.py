@@ -38,6 +38,7 @@ _STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
 _END = 0
 _SPARE_BYTES = 2 * 2**20
+_FLUSH_S = 10.0
 _filters = threading.Lock()
 """Warning filters are the process's."""
 
@@ -110,6 +111,7 @@ class RrdFile:
                 if hurry and hurry.is_set():
                     return
                 recording.send_chunks([chunk])
+                recording.flush(timeout_sec=_FLUSH_S)  # or all would be in memory
             recording.disconnect()
             scratch.replace(self.path)
             self.size_bytes = self.path.stat().st_size
