@@ -30,7 +30,7 @@ from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, StillsRead, VideoSample
+from hvt_ground.events import Event, Notice, Refinement, StillsRead, VideoSample
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
@@ -370,6 +370,7 @@ class GroundSession:
     # Events
 
     def _emit(self, event: Event) -> None:
-        self.backlog.note(event)
+        if isinstance(event, Refinement):
+            self.backlog.note(event)
         for sink in self.sinks:
             sink.log(event)
