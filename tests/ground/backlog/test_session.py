@@ -521,7 +521,7 @@ def test_no_more_files_are_made_than_the_bound(flight, tmp_path):
 
 def received(item: Received) -> ReceivedStill:
     """A still as it is handed on."""
-    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload, item.encoding)
+    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
 
 def test_a_recording_in_use_stays_open(flight, tmp_path):
