@@ -857,6 +857,7 @@ def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path):
         rig.inbox.put(item)
     assert rig.thread.close(timeout_s=60)
     assert rig.thread.error is None
+    rig.outputs.close(within_s=60)
     assert len(Recording(tmp_path / "0.rrd").video()) == 30 + 25
     (last,) = [one for report in rig.port.reports for one in report.backlog if one.acknowledged_bytes][-1:]
     assert last.kind == "base"
