@@ -34,7 +34,7 @@ def running(module: str, *arguments: object, core: int | None = None) -> Iterato
 
 
 class Peaks:
-    """Most resident memory and most threads of each process so far."""
+    """Most resident memory of each process so far, and its threads when it was last looked at."""
 
     def __init__(self, processes: Sequence[subprocess.Popen]) -> None:
         self._processes = processes
@@ -47,7 +47,7 @@ class Peaks:
             with contextlib.suppress(OSError, TypeError):  # it has ended
                 text = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii")
                 self.mb[index] = int(re.search(r"VmHWM:\s+(\d+)", text)[1]) / 1024
-                self.threads[index] = max(self.threads[index], int(re.search(r"Threads:\s+(\d+)", text)[1]))
+                self.threads[index] = int(re.search(r"Threads:\s+(\d+)", text)[1])
 
     def until_ended(self, process: subprocess.Popen, *, patience_s: float) -> None:
         until_s = time.monotonic() + patience_s
