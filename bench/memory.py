@@ -81,7 +81,7 @@ def _played(count: int) -> tuple[float, int]:
             began_s = time.monotonic()
             for edge in edges:
                 edge.send(units[index % len(units)], index)
-            peaks.look()
+            peaks.sample()
             time.sleep(max(0.0, 1 / _FPS - (time.monotonic() - began_s)))
     return peaks.mb[0], peaks.threads[0]
 

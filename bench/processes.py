@@ -34,14 +34,14 @@ def running(module: str, *arguments: object, core: int | None = None) -> Iterato
 
 
 class Peaks:
-    """Most resident memory of each process so far, and its threads when it was last looked at."""
+    """Most resident memory of each process so far, and its threads at the last sample."""
 
     def __init__(self, processes: Sequence[subprocess.Popen]) -> None:
         self._processes = processes
         self.mb = [0.0] * len(processes)
         self.threads = [0] * len(processes)
 
-    def look(self) -> None:
+    def sample(self) -> None:
         # Not ru_maxrss of a child, which begins with this process's own.
         for index, process in enumerate(self._processes):
             with contextlib.suppress(OSError, TypeError):  # it has ended
@@ -54,7 +54,7 @@ class Peaks:
         while process.poll() is None:
             if time.monotonic() > until_s:
                 raise RuntimeError(f"{process.args!r} has not ended within {patience_s:.0f} s")
-            self.look()
+            self.sample()
             time.sleep(0.1)
 
 
