@@ -216,7 +216,7 @@ class RemoteEdge:
             header, item = self._wait(inbox, answer, until_s=until_s, timeout_s=timeout_s)
         finally:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
-        received = ReceivedStill(header, item.payload, item.encoding)
+        received = ReceivedStill(header, item.payload)
         try:
             image = decode_still(received, base_bgr=None, view=info.view)
         except StillError as error:

@@ -15,11 +15,6 @@ from rigs.backlog_chunks import video_object
 from rigs.flight import Flight, RedSquares, SameAnswer
 
 
-def models():
-    """A real detector of red squares."""
-    return RedSquares(), None
-
-
 def test_work_that_was_never_begun_lets_its_recording_go():
     """The recording of a former session would stay open for ever, and with each such session one more."""
     flight = Flight(30, keyframes=(10,))
@@ -34,7 +29,7 @@ def test_work_that_was_never_begun_lets_its_recording_go():
 
     perception = BacklogPerception(
         info,
-        take_models=models,
+        take_models=lambda: (RedSquares(), None),
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,

@@ -51,7 +51,7 @@ class Rig:
 def received(flight: Flight, index: int, sequence: int, **changes) -> ReceivedStill:
     """A still with its header parsed."""
     item = flight.still(index, sequence, **changes)
-    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload, item.encoding)
+    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
 
 def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures):
@@ -268,7 +268,7 @@ def test_stills_that_wait_are_bounded(flight, pictures):
     rig = Rig()
     rig.pipeline.analyze(pictures[0], hurry=False)
     one = residual(flight, pictures, 5, 0)
-    rig.pipeline.read([ReceivedStill(replace(one.header, sequence=i), one.data, "") for i in range(70)])
+    rig.pipeline.read([ReceivedStill(replace(one.header, sequence=i), one.data) for i in range(70)])
     assert [result.still_sequence for result in rig.pipeline.take_results()] == list(range(6))
 
 

@@ -108,7 +108,7 @@ def test_a_still_is_shown_though_nobody_can_name_it(tmp_path: Path, classifier: 
     pipeline.analyze(picture(0, value=200), hurry=False)
     item = flight.still(0, 0)
     header = replace(RoiHeader.parse(item.attachment, item.payload), frame_index=0)
-    pipeline.read([ReceivedStill(header, item.payload, "image/jpeg")])
+    pipeline.read([ReceivedStill(header, item.payload)])
     (shown,) = [one for one in events if isinstance(one, Refinement)]
     assert shown.still == item.payload
     assert pipeline.outcomes == {"unread": 1}

@@ -107,7 +107,7 @@ def test_edge_and_ground_hand_their_provider_on(tmp_path: Path) -> None:
     for word in ("cpu", "openvino") if find_openvino() else ("cpu",):
         at_edge = make_detector(EdgeConfig(source="demo", detector=detector, provider=word))
         ground = Models(GroundConfig(detector=detector, classifier=classifier, provider=word)).take()
-        models = [at_edge.model, *(one.model.model for one in ground)]
+        models = [at_edge.model, *(one.part.model for one in ground)]
         assert [one.provider.provider for one in models] == [word] * 3
     assert EdgeConfig().provider == GroundConfig().provider == "auto"
     with pytest.raises(UserError, match="is not known"):
