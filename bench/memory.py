@@ -56,7 +56,7 @@ def _demo() -> tuple[float, float]:
             running("hvt_edge.cli", *_PROVIDER, "--source", "demo", "--connect", endpoint, "--quiet") as edge,
         ):
             peaks = Peaks([edge, ground])
-            peaks.until_ended(edge, patience_s=120)
+            peaks.until_ended(edge, patience_s=180)
             peaks.until_ended(ground, patience_s=60)
     return peaks.mb[0], peaks.mb[1]
 
@@ -81,7 +81,7 @@ def _played(count: int) -> tuple[float, int]:
             began_s = time.monotonic()
             for edge in edges:
                 edge.send(units[index % len(units)], index)
-            peaks.look()
+            peaks.sample()
             time.sleep(max(0.0, 1 / _FPS - (time.monotonic() - began_s)))
     return peaks.mb[0], peaks.threads[0]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal, cast
+from typing import Final, cast
 
 import cv2
 import numpy as np
@@ -10,13 +10,10 @@ import numpy.typing as npt
 
 from hvt_common.values import Image
 
-__all__ = ["Affine", "CameraMotion", "Method"]
+__all__ = ["Affine", "CameraMotion"]
 
 Affine = npt.NDArray[np.float64]
 """(2, 3) float64: ``current = affine[:, :2] @ previous + affine[:, 2]``, both in pixels of the full image."""
-
-Method = Literal["flow", "ecc"]
-"""``flow`` follows corners (fast, large motion, similarity); ``ecc`` aligns all pixels (slower, general affine)."""
 
 _Gray = npt.NDArray[np.uint8]
 _Points = npt.NDArray[np.float32]
@@ -31,9 +28,6 @@ _RANSAC_PX: Final = 1.0
 # Fewer corners that agree than this, or a smaller share of them, is chance: objects, noise, an empty sky.
 _LEAST_INLIERS: Final = 12
 _LEAST_INLIER_SHARE: Final = 0.3
-_ECC_STEPS: Final = 50
-_ECC_PRECISION: Final = 1e-4
-_ECC_BLUR_PX: Final = 5
 # No camera zooms or rolls this far between two frames: such an estimate is wrong.
 _SCALE_RANGE: Final = (0.5, 2.0)
 
@@ -45,12 +39,9 @@ class CameraMotion:
     the longer side to 320 pixels, which a tracker needs no more than: 0.1 of them is the median error.
     """
 
-    def __init__(self, method: Method = "flow", *, scale: float | None = 0.5) -> None:
-        if method not in ("flow", "ecc"):
-            raise ValueError(f"camera motion method is {method!r}, must be 'flow' or 'ecc'")
+    def __init__(self, *, scale: float | None = 0.5) -> None:
         if scale is not None and not 0 < scale <= 1:
             raise ValueError(f"camera motion scale is {scale}, must be above 0 and at most 1")
-        self._estimate = _by_flow if method == "flow" else _by_ecc
         self._scale = scale
         self._previous: _Gray | None = None
 
@@ -67,7 +58,7 @@ class CameraMotion:
         previous, self._previous = self._previous, current
         if previous is None or previous.shape != current.shape:
             return _identity()
-        estimate = self._estimate(previous, current)
+        estimate = _by_flow(previous, current)
         if estimate is None or not _plausible(estimate):
             return _identity()
         return _at_full_size(estimate, full_size=full_size, small_size=small_size)
@@ -103,25 +94,6 @@ def _by_flow(previous: _Gray, current: _Gray) -> Affine | None:
         return None
     agreeing = np.count_nonzero(inliers)
     if agreeing < max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * np.count_nonzero(tracked)):
-        return None
-    return np.asarray(affine, np.float64)
-
-
-def _by_ecc(previous: _Gray, current: _Gray) -> Affine | None:
-    """The affine map that maximises the enhanced correlation coefficient (Evangelidis and Psarakis, 2008).
-
-    ECC only finds optima nearby, so it starts from the translation found by phase correlation.
-    """
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ECC_STEPS, _ECC_PRECISION)
-    everywhere = np.full_like(previous, 255)
-    try:
-        window = cv2.createHanningWindow((previous.shape[1], previous.shape[0]), cv2.CV_32F)
-        shift, _ = cv2.phaseCorrelate(previous.astype(np.float32), current.astype(np.float32), window)
-        start = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
-        _, affine = cv2.findTransformECC(
-            previous, current, start, cv2.MOTION_AFFINE, stop, everywhere, _ECC_BLUR_PX
-        )
-    except cv2.error:  # did not converge: no texture, no overlap left, or hardly any pixels
         return None
     return np.asarray(affine, np.float64)
 

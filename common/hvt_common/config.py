@@ -203,7 +203,7 @@ def load(
 
     Raises `UserError` for an unknown flag or key, a value that its kind does not take, or an unreadable file.
     """
-    words = _with_joined_values(sys.argv[1:] if argv is None else argv)
+    words = with_joined_values(sys.argv[1:] if argv is None else argv)
     _refuse_gone(config_class, words)
     parser = _flags(config_class, program=program, description=description, rare="--help-all" in words)
     given = vars(parser.parse_args(words))
@@ -218,7 +218,7 @@ def load(
     return config_class(**values), Loaded(values=values, print_config=print_config)
 
 
-def _with_joined_values(argv: Sequence[str]) -> list[str]:
+def with_joined_values(argv: Sequence[str]) -> list[str]:
     """``--budget -5kbps`` as ``--budget=-5kbps``: argparse would take the value for a flag, and not name it."""
     joined: list[str] = []
     for word in argv:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NoReturn
 
-__all__ = ["FlightError", "UserError", "exit_with_sentence", "needs_extra"]
+__all__ = ["FlightError", "Parser", "UserError", "exit_with_sentence", "needs_extra"]
 
 
 class UserError(Exception):
@@ -23,6 +25,14 @@ class FlightError(Exception):
 
     A supervisor starts the program again, which may help.
     """
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong with the arguments in one sentence, without the usage above it."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise `UserError`."""
+        raise UserError(f"{message}; see {self.prog} --help")
 
 
 def exit_with_sentence(

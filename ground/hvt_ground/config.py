@@ -65,7 +65,7 @@ class GroundConfig:
         number(0.01, 1), 0.45, "overlap above which two boxes of a class are one"
     )
     camera_motion: str = _MODELS_RARE.option(
-        choice("off", "flow", "ecc"), "flow", "how the tracker follows the camera's own motion"
+        choice("off", "flow"), "flow", "how the tracker follows the camera's own motion"
     )
     classifier: str | None = _MODELS.option(
         TEXT,

@@ -29,7 +29,8 @@ def status_text(edges: Iterable[tuple[str, EdgeSessions]], *, failures: Failures
             parts.append("  ".join([f"{edge}: {state}", *failed_texts(sessions.failures)]))
             continue
         if sessions.silent_s > _LOST_S and not session.lockstep:
-            parts.append(f"{edge}: {session.duration_s:.1f} s  LINK LOST for {sessions.silent_s:.0f} s")
+            lost = f"{edge}: {session.duration_s:.1f} s  LINK LOST for {sessions.silent_s:.0f} s"
+            parts.append("  ".join([lost, *failed_texts(sessions.failures)]))
             continue
         latency_ms = session.overlay_latency.percentile(50)
         age = "" if latency_ms is None or session.lockstep else f"  {latency_ms:.0f} ms"
@@ -190,9 +191,6 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
         )
     if content["failure"]:
         rows.append(("session failed", content["failure"]))
-    for one in content.get("failed", ()):
-        times = "" if one["count"] == 1 else f"{one['count']} times, last "
-        rows.append(("failed", f"{one['part']}, {times}at {one['last']}: {one['reason']}"))
     rows += [("former session", path) for path in backlog.get("recordings", ())]
     if latency["p50"] is not None:
         since = "receiving" if content["pace"] == "lockstep" else "capture"

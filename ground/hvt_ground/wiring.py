@@ -156,7 +156,7 @@ def make_pipeline(
     """The pipeline of one session."""
     detector, classifier = models.take()
     reader = _reader(config, detector, classifier, info=info)
-    motion = cast('Literal["off", "flow", "ecc"]', config.camera_motion)
+    motion = cast('Literal["off", "flow"]', config.camera_motion)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
     path = CameraPath(ahead_frames=max(1, round(info.fps)))
     parts = PipelineParts(
@@ -171,7 +171,7 @@ def make_pipeline(
         ),
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
         path=path,
-        camera=None if motion == "off" else CameraMotion(motion, scale=None),
+        camera=None if motion == "off" else CameraMotion(scale=None),
     )
     return Pipeline(
         parts,
@@ -195,7 +195,7 @@ def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info)
 
 
 def _tracker(config: GroundConfig, info: Info) -> ByteTracker:
-    motion = cast('Literal["off", "flow", "ecc"]', config.camera_motion)
+    motion = cast('Literal["off", "flow"]', config.camera_motion)
     return ByteTracker(TrackerSettings.starting_at(config.confidence, camera_motion=motion), fps=info.fps)
 
 

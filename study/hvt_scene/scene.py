@@ -116,10 +116,10 @@ class Scene:
     def _warp_ground(self, pose: Matrix) -> Bgra:
         matrix = to_centres(pose, m_per_px=self._ground.m_per_px)
         if self._appearance.tilt_deg:
-            warped = cv2.warpPerspective(self._ground.bgr, matrix, self.size, borderMode=cv2.BORDER_REFLECT)
+            warped = cv2.warpPerspective(self._ground.bgra, matrix, self.size, borderMode=cv2.BORDER_REFLECT)
         else:
-            warped = cv2.warpAffine(self._ground.bgr, matrix[:2], self.size, borderMode=cv2.BORDER_REFLECT)
-        return np.asarray(cv2.cvtColor(warped, cv2.COLOR_BGR2BGRA), np.uint8)
+            warped = cv2.warpAffine(self._ground.bgra, matrix[:2], self.size, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(warped, np.uint8)
 
     def _cast_shadows(
         self, frame: Bgra, chosen: npt.NDArray[np.int64], places: Floats, local: Floats

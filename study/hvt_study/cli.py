@@ -6,22 +6,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import NoReturn
 
-from hvt_common.errors import UserError, exit_with_sentence, needs_extra
+from hvt_common.errors import Parser, exit_with_sentence, needs_extra
 from hvt_study.commands import COMMANDS, RENAMED
 
 __all__ = ["main"]
 
 _PROGRAM = "hvt-study"
 _INTERRUPTED = 130
-
-
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one sentence, without the usage above it."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see {self.prog} --help")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,7 +34,7 @@ def _run(argv: Sequence[str] | None) -> int:
         now = RENAMED[words[0]]
         print(f"{_PROGRAM}: {words[0]} is called {now} from this release on", file=sys.stderr)
         words[0] = now
-    parser = _Parser(prog=_PROGRAM, description="Experiments with the stages of HVT, without a network.")
+    parser = Parser(prog=_PROGRAM, description="Experiments with the stages of HVT, without a network.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     with needs_extra("'hvt[study]'"):
         for name, summary in COMMANDS.items():

@@ -10,7 +10,9 @@ from hvt_edge.summary import summary, table
 
 def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
     """Who flies would not know whether to buy a processor, a modem or a card."""
-    failure = Failure("local copy", "card.mkv is full", 3, 1_790_000_000 * 10**9, working=True)
+    failure = Failure(
+        "local copy", "card.mkv is full", 3, 1_790_000_000 * 10**9, 1_790_000_000 * 10**9, working=True
+    )
     content = summary(
         Ledger(),
         edge="uav-1",

@@ -86,7 +86,7 @@ def test_two_viewers(ground):
         ("refine", "guess", "replace, fuse"),
         ("detect-every", "0", "1 to 1000"),
         ("confidence", "2", "0.01 to 1"),
-        ("camera-motion", "yes", "off, flow, ecc"),
+        ("camera-motion", "yes", "off, flow"),
         ("wait", "-1s", "2s"),
     ],
 )

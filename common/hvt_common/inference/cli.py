@@ -6,13 +6,12 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.errors import Parser, UserError, exit_with_sentence
 from hvt_common.inference.store import embedded_models, resolve_model
 from hvt_common.inference.store.manifest import ModelEntry
 from hvt_common.inference.store.store import Store, file_digest
@@ -22,13 +21,6 @@ __all__ = ["main"]
 _PROGRAM = "hvt-models"
 _INTERRUPTED = 130
 _SHOWN_CLASSES = 12
-
-
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with the arguments in one sentence, without the usage above it."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see {self.prog} --help")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,7 +39,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog=_PROGRAM,
         description="Models for --detector and --classifier: fetched once, checked at each use. "
         "They lie in the folder that HVT_MODELS names, else in the platform's cache folder.",

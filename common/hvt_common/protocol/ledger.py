@@ -1,7 +1,7 @@
 """The ledger of the link: bytes by channel, rolling windows, and the outcome of every still.
 
 Pure: the time of each message is an argument. Both sides count the same sizes and the times of the headers, and get
-    the same totals and windows.
+the same totals and windows.
 """
 
 from __future__ import annotations
@@ -146,32 +146,17 @@ class Ledger:
         self._outcomes: dict[StillOutcome, Counter[str]] = {
             outcome: Counter() for outcome in ("sent", "deferred", "dropped", "received")
         }
-        self.base_bytes = 0
-        """Payload of ``base``."""
-        self.roi_bytes = 0
-        """Payload of ``roi``."""
-        self.backlog_bytes = 0
-        """Payload of ``backlog``."""
-        self.meta_bytes = 0
-        """Attachments of all three, and payload and attachments of everything else."""
-        self.overhead_bytes = 0
-        self.first_ns: int | None = None
-        self.last_ns: int | None = None
+        self._bytes = dict.fromkeys(Account, 0)
+        """Payload by account; of `Account.META` also all attachments."""
+        self._overhead_bytes = 0
 
     def count(
         self, channel: Account, *, payload_bytes: int, attachment_bytes: int, overhead_bytes: int, at_ns: int
     ) -> None:
         """Add one message; ``at_ns`` is the time that its windows go by."""
-        self.overhead_bytes += overhead_bytes
-        self.meta_bytes += attachment_bytes
-        if channel is Account.BASE:
-            self.base_bytes += payload_bytes
-        elif channel is Account.ROI:
-            self.roi_bytes += payload_bytes
-        elif channel is Account.BACKLOG:
-            self.backlog_bytes += payload_bytes
-        else:
-            self.meta_bytes += payload_bytes
+        self._overhead_bytes += overhead_bytes
+        self._bytes[Account.META] += attachment_bytes
+        self._bytes[channel] += payload_bytes
         line = payload_bytes + attachment_bytes + overhead_bytes
         self._line[channel] += line
         self._messages[channel] += 1
@@ -191,9 +176,19 @@ class Ledger:
         return self._messages[channel]
 
     @property
+    def base_bytes(self) -> int:
+        """Payload of ``base``."""
+        return self._bytes[Account.BASE]
+
+    @property
+    def roi_bytes(self) -> int:
+        """Payload of ``roi``."""
+        return self._bytes[Account.ROI]
+
+    @property
     def line_bytes(self) -> int:
         """Everything counted so far."""
-        return self.base_bytes + self.roi_bytes + self.backlog_bytes + self.meta_bytes + self.overhead_bytes
+        return sum(self._bytes.values()) + self._overhead_bytes
 
     def window_bytes(self, channel: Account | None, now_ns: int) -> int:
         """Line bytes of the messages in the window that ends at ``now_ns``; of all channels for None.
@@ -225,11 +220,8 @@ class Ledger:
 
         return LedgerSummary(
             duration_s=duration_s,
-            base_bytes=self.base_bytes,
-            roi_bytes=self.roi_bytes,
-            backlog_bytes=self.backlog_bytes,
-            meta_bytes=self.meta_bytes,
-            overhead_bytes=self.overhead_bytes,
+            **{f"{account.value}_bytes": size for account, size in self._bytes.items()},
+            overhead_bytes=self._overhead_bytes,
             messages={channel.value: number for channel, number in self._messages.items()},
             base_bps=rate(self._line[Account.BASE]),
             roi_bps=rate(self._line[Account.ROI]),
@@ -239,8 +231,6 @@ class Ledger:
         )
 
     def _enter(self, at_ns: int, channel: Account, line: int) -> None:
-        self.first_ns = at_ns if self.first_ns is None else min(self.first_ns, at_ns)
-        self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
         if self._pending and at_ns < self._pending[-1][0] - self._slack_ns:
             self._release(before_ns=self._pending[-1][0] + 1)
             self._windows.restart()

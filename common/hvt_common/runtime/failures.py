@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 
-__all__ = ["Failure", "Failures", "RetryPause", "reason_of"]
+__all__ = ["Failure", "Failures", "Retried", "RetryPause", "reason_of"]
 
 _log = logging.getLogger(__name__)
 
+_Part = TypeVar("_Part")
+_Answer = TypeVar("_Answer")
 _STEADY_NS = 60 * SECOND_NS
 """What fails again after it worked for so long is news, and begins with a short pause."""
 
@@ -104,3 +108,48 @@ class RetryPause:
     def due(self, now_ns: int) -> bool:
         """Whether it may be tried."""
         return now_ns - self._failed_ns >= self._pause_ns
+
+
+class Retried(Generic[_Part]):
+    """A part that may raise whatever it likes: it is opened again after a pause. Threads take turns.
+
+    ``failures`` has it under ``name``; ``clock`` is nanoseconds without steps. Raises what ``open_part`` does.
+    """
+
+    def __init__(
+        self,
+        open_part: Callable[[], _Part],
+        name: str,
+        failures: Failures,
+        *,
+        clock: Callable[[], int] = time.monotonic_ns,
+        pause: RetryPause | None = None,
+    ) -> None:
+        self.part = open_part()
+        """The one that is open, or that failed last."""
+        self._open_part = open_part
+        self._name = name
+        self._failures = failures
+        self._clock = clock
+        self._pause = pause or RetryPause()
+        self._failed = False
+        self._lock = threading.Lock()
+
+    def run(self, use: Callable[[_Part], _Answer]) -> _Answer | None:
+        """None where it fails, or has failed and is left alone for a while."""
+        with self._lock:
+            if self._failed and not self._pause.due(self._clock()):
+                return None
+            try:
+                if self._failed:
+                    self.part = self._open_part()
+                answer = use(self.part)
+            except Exception as error:  # noqa: BLE001 - a runtime raises what it likes
+                self._failed = True
+                self._pause.failed(self._clock())
+                self._failures.failed(self._name, reason_of(error))
+                return None
+            if self._failed:
+                self._failed = False
+                self._failures.works(self._name)
+            return answer

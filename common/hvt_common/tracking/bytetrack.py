@@ -63,13 +63,11 @@ class TrackerSettings:
     changes; 0 is off."""
     class_decay: float = 0.9
     """What a class vote is still worth one matched detection later: 1 never forgets."""
-    camera_motion: Literal["off", "flow", "ecc"] = "off"
+    camera_motion: Literal["off", "flow"] = "off"
     """How to estimate the camera's motion, which then moves all tracks before they are matched."""
 
     @classmethod
-    def starting_at(
-        cls, confidence: float, *, camera_motion: Literal["off", "flow", "ecc"]
-    ) -> TrackerSettings:
+    def starting_at(cls, confidence: float, *, camera_motion: Literal["off", "flow"]) -> TrackerSettings:
         """What both sides run with: detections from ``confidence`` start tracks, weaker ones carry them on."""
         return cls(
             track_confidence=confidence,
@@ -91,8 +89,8 @@ class TrackerSettings:
             raise ValueError(
                 f"low_confidence is {self.low_confidence}, must not exceed track_confidence {self.track_confidence}"
             )
-        if self.camera_motion not in ("off", "flow", "ecc"):
-            raise ValueError(f"camera_motion is {self.camera_motion!r}, must be 'off', 'flow' or 'ecc'")
+        if self.camera_motion not in ("off", "flow"):
+            raise ValueError(f"camera_motion is {self.camera_motion!r}, must be 'off' or 'flow'")
 
     @property
     def birth_confidence(self) -> float:
@@ -130,7 +128,7 @@ class ByteTracker:
         self._fps = fps
         self._buffer_frames = int(fps / 30.0 * self._settings.track_buffer)
         method = self._settings.camera_motion
-        self._camera = None if method == "off" else CameraMotion(method, scale=None)
+        self._camera = None if method == "off" else CameraMotion(scale=None)
         self.reset()
 
     def reset(self) -> None:

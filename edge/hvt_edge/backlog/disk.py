@@ -5,12 +5,10 @@ costs what the system had still in memory. The file shrinks with what is in it.
 
 What has to go where the store is full, least useful first:
 
-* **Video, oldest first**, as long as stills take less than a quarter of the space. Whoever comes back to the link
-  wants to know what happened, and the way to now is closer from a short while ago than from an hour ago.
+* **Video, oldest first**, as long as stills take less than a quarter of the space: the way to now is closer from a
+  short while ago than from an hour ago.
 * **Stills by their worth**: the utility that their method gave, halved with each ten minutes. They are a hundredth
-  of the video's bytes and most of what it shows of an object, so a quarter of the space holds those of a long time.
-
-So video takes all of the space while there are few stills, and the best stills outlive the video around them.
+  of the video's bytes and most of what it shows of an object, so the best outlive the video around them.
 """
 
 from __future__ import annotations
@@ -47,15 +45,16 @@ _LOG_BYTES = 2 * 64 * _PAGE_BYTES
 _REMOVED = "removed, with all that was stored"
 _TRIAL_BYTES = 64 * 1024
 # One process at a time: exclusive locking also keeps the log's index in memory, so no disk needs shared mappings.
-_OPEN = """
-PRAGMA locking_mode = EXCLUSIVE;
+_NEW = """
 PRAGMA page_size = 4096;
 PRAGMA auto_vacuum = FULL;
 PRAGMA journal_mode = WAL;
-PRAGMA wal_autocheckpoint = 64;
+"""
+_OPEN = """
 PRAGMA synchronous = NORMAL;
 PRAGMA foreign_keys = ON;
 PRAGMA temp_store = MEMORY;
+PRAGMA wal_autocheckpoint = 64;
 BEGIN IMMEDIATE;
 CREATE TABLE IF NOT EXISTS object (
     id INTEGER PRIMARY KEY, session TEXT NOT NULL, kind TEXT NOT NULL, number INTEGER NOT NULL,
@@ -138,7 +137,7 @@ class Store:
             self._ready()
 
     def trial(self) -> None:
-        """Write and delete something: whether the disk takes anything again."""
+        """Write and delete something; raises where the disk still refuses."""
         with self._disk():
             db = self._writable()
             row = db.execute("INSERT INTO part (data) VALUES (zeroblob(?))", (_TRIAL_BYTES,)).lastrowid
@@ -150,10 +149,10 @@ class Store:
     def add_still(self, number: int, data: bytes, *, utility: float, capture_ns: int) -> None:
         """Store a still; ``data`` is `pack_backlog_still`'s."""
         with self._disk():
-            self._writable()
+            db = self._writable()
             if self.find((self._session_id, BacklogKind.STILL, number)) is not None:
                 return
-            self._evict_for(len(data))
+            self._evict_for(len(data), db)
             self._add(BacklogKind.STILL, number, capture_ns, worth(utility, capture_ns), data)
             self._count()
 
@@ -163,7 +162,7 @@ class Store:
             self.end_segment()
         with self._disk():
             db = self._writable()
-            self._evict_for(len(unit.data))
+            self._evict_for(len(unit.data), db)
             if self._open is None:
                 row = self._add(BacklogKind.BASE, unit.frame_index, unit.capture_ns, float(unit.capture_ns))
                 self._open = OpenSegment(row, unit, unit)
@@ -284,19 +283,21 @@ class Store:
 
     # Space
 
-    def _evict_for(self, needed_bytes: int) -> None:
+    def _evict_for(self, needed_bytes: int, db: sqlite3.Connection) -> None:
         while self.disk_bytes + needed_bytes > self._file_bytes:
             video_first = self._still_bytes < _STILLS_SHARE * self._file_bytes
             kind = BacklogKind.BASE if self.segments and video_first else BacklogKind.STILL
             if (least := next(self._ranked(kind, "ASC"), None)) is None:
                 return
             if not self.evicted_stills + self.evicted_segments:
-                _log.warning(
-                    "the store is full (--store %d MB): the least useful goes", self._max_bytes // 10**6
-                )
+                megabytes = self._max_bytes // 10**6
+                _log.warning("the store is full (--store %d MB): the least useful goes", megabytes)
+            # Not `remove`: where even this takes space that is not there, all would go in vain.
+            with self._disk():
+                db.execute("DELETE FROM object WHERE id = ?", (least.row,))
             self.evicted_stills += kind is BacklogKind.STILL
             self.evicted_segments += kind is BacklogKind.BASE
-            self.remove(least)
+            self._count()
 
     def _count(self, *, open_row: int | None = None) -> None:
         sums = "SELECT kind, count(*), sum(bytes), sum(span_ns) FROM here WHERE id <> ? GROUP BY kind"
@@ -333,7 +334,8 @@ class Store:
         self._file.touch(mode=0o600)  # SQLite's log gets the same
         db = sqlite3.connect(self._file, timeout=0, isolation_level=None)
         try:
-            db.executescript(_OPEN)
+            db.execute("PRAGMA locking_mode = EXCLUSIVE")
+            db.executescript((_NEW if not self._file.stat().st_size else "") + _OPEN)
         except sqlite3.Error as error:
             db.close()
             if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
@@ -356,7 +358,7 @@ class Store:
                 )
             db.execute(_TIDY, (self._session,))
         self._count()
-        self._evict_for(0)
+        self._evict_for(0, db)
 
     def _disconnect(self) -> None:
         db, self._db, self._open = self._db, None, None

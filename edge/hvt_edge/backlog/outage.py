@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
 
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit
 
-__all__ = ["SILENCE_NS", "BaseInFlight", "InFlightSettings", "Outage"]
+__all__ = ["SILENCE_NS", "BaseInFlight", "Outage"]
 
 _MS = 1_000_000
 SILENCE_NS = 1_500 * _MS
@@ -61,19 +60,12 @@ class Outage:
         return reported_ns is not None and now_ns - reported_ns > SILENCE_NS
 
 
-@dataclass(frozen=True, slots=True)
-class InFlightSettings:
-    """Bounds of what is held for an outage that may come."""
-
-    max_age_ns: int = 4 * SECOND_NS
-    max_bytes: int = 2 * 2**20
-
-
 class BaseInFlight:
     """Access units that were sent and that no report has named; the oldest leaves first. Thread-safe."""
 
-    def __init__(self, settings: InFlightSettings = InFlightSettings()) -> None:
-        self._settings = settings
+    def __init__(self, *, max_age_ns: int = 4 * SECOND_NS, max_bytes: int = 2 * 2**20) -> None:
+        self._max_age_ns = max_age_ns
+        self._max_bytes = max_bytes
         self._lock = threading.Lock()
         self._units: deque[tuple[int, int, AccessUnit]] = deque()
         """(sequence, time of sending, unit)."""
@@ -89,12 +81,11 @@ class BaseInFlight:
 
     def sent(self, sequence: int, unit: AccessUnit, *, now_ns: int) -> None:
         """An access unit goes out."""
-        settings = self._settings
         with self._lock:
             self._units.append((sequence, now_ns, unit))
             self._size_bytes += len(unit.data)
             while self._units and (
-                self._size_bytes > settings.max_bytes or now_ns - self._units[0][1] > settings.max_age_ns
+                self._size_bytes > self._max_bytes or now_ns - self._units[0][1] > self._max_age_ns
             ):
                 self._forget()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import ExitStack
-from types import TracebackType
+from dataclasses import KW_ONLY, dataclass
 from typing import Protocol, Self
 
 import zenoh
@@ -135,12 +135,11 @@ class ZenohLink:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._stack.close()
 
 
+@dataclass(eq=False)
 class EdgeListener:
     """Queryables info and control; a subscriber of feedback; last the alive token, by which grounds find the edge.
 
@@ -148,29 +147,23 @@ class EdgeListener:
     quick; ``clock`` is that of the headers.
     """
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        keys: EdgeKeys,
-        *,
-        info: Callable[[int], bytes],
-        control: Callable[[ControlRequest], ControlAnswer],
-        on_feedback: Callable[[Feedback], None],
-        failures: Failures,
-        clock: Callable[[], int],
-    ) -> None:
-        self._failures = failures
-        self._info = info
-        self._control = control
-        self._handle_feedback = on_feedback
-        self._clock = clock
+    session: zenoh.Session
+    keys: EdgeKeys
+    _: KW_ONLY
+    info: Callable[[int], bytes]
+    control: Callable[[ControlRequest], ControlAnswer]
+    on_feedback: Callable[[Feedback], None]
+    failures: Failures
+    clock: Callable[[], int]
+
+    def __post_init__(self) -> None:
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
-        serve(session, Channel.INFO, keys=keys, answer=self._on_info)
-        serve(session, Channel.CONTROL, keys=keys, answer=self._on_control)
-        self._feedback = session.declare_subscriber(keys.key(Channel.FEEDBACK), self._on_feedback)
-        self._token = session.liveliness().declare_token(keys.key(Channel.ALIVE))
+        serve(self.session, Channel.INFO, keys=self.keys, answer=self._on_info)
+        serve(self.session, Channel.CONTROL, keys=self.keys, answer=self._on_control)
+        self._feedback = self.session.declare_subscriber(self.keys.key(Channel.FEEDBACK), self._on_feedback)
+        self._token = self.session.liveliness().declare_token(self.keys.key(Channel.ALIVE))
 
     def close(self) -> None:
         """Withdraw the token, so that grounds see the end."""
@@ -179,13 +172,11 @@ class EdgeListener:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     def _on_info(self, _query: bytes) -> bytes | None:
-        return self._answered(Channel.INFO, lambda: self._info(self._clock()))
+        return self._answered(Channel.INFO, lambda: self.info(self.clock()))
 
     def _on_control(self, query: bytes) -> bytes | None:
         self._watch(Channel.CONTROL)
@@ -194,16 +185,16 @@ class EdgeListener:
         except WireError as error:
             self._skip("control", error)
             return None
-        return self._answered(Channel.CONTROL, lambda: self._control(request).pack())
+        return self._answered(Channel.CONTROL, lambda: self.control(request).pack())
 
     def _answered(self, channel: Channel, answer: Callable[[], bytes]) -> bytes | None:
         """None where that fails: an error in Zenoh's thread would be nobody's."""
         try:
             data = answer()
         except Exception as error:  # noqa: BLE001 - see above
-            self._failures.failed(channel, f"a ground got no answer ({type(error).__name__}: {error})")
+            self.failures.failed(channel, f"a ground got no answer ({type(error).__name__}: {error})")
             return None
-        self._failures.works(channel)
+        self.failures.works(channel)
         return data
 
     def _on_feedback(self, sample: zenoh.Sample) -> None:
@@ -213,10 +204,10 @@ class EdgeListener:
         except WireError as error:
             self._skip("feedback", error)
             return
-        self._handle_feedback(feedback)
+        self.on_feedback(feedback)
 
     def _watch(self, channel: Channel) -> None:
-        if self._flood.note(channel, now_ns=self._clock()) is not None:
+        if self._flood.note(channel, now_ns=self.clock()) is not None:
             _log.warning(
                 "more than %d messages a second on %s, far more than any ground sends: somebody floods this edge "
                 "(docs/security.md has keys against that)",

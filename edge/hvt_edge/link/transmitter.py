@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Protocol
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
@@ -93,6 +93,7 @@ class StillEnvelope:
         return self.header.with_fields(send_delay_ns=send_ns - self.still.capture_ns, flags=int(flags))
 
 
+@dataclass(eq=False)
 class Transmitter:
     """Sends access units, stills, tracks and status, and accounts for each.
 
@@ -100,28 +101,20 @@ class Transmitter:
     goes out, and holds stills while the link is busy. ``in_flight`` holds access units until they are reported.
     """
 
-    def __init__(
-        self,
-        outlet: Outlet,
-        *,
-        ledger: Ledger,
-        budget: RollingBudget,
-        edge_id: str,
-        session_id: int,
-        lockstep: bool,
-        wait_until: Callable[[int], None],
-        pacer: Pacer | None = None,
-        in_flight: BaseInFlight | None = None,
-    ) -> None:
-        self._outlet = outlet
-        self._pacer = pacer
-        self._in_flight = in_flight
-        self._ledger = ledger
-        self._budget = budget
-        self._keys = EdgeKeys(edge_id)
-        self._session_id = session_id
-        self._flags = Flags.LOCKSTEP if lockstep else Flags(0)
-        self._wait_until = wait_until
+    outlet: Outlet
+    _: KW_ONLY
+    ledger: Ledger
+    budget: RollingBudget
+    edge_id: str
+    session_id: int
+    lockstep: bool
+    wait_until: Callable[[int], None]
+    pacer: Pacer | None = None
+    in_flight: BaseInFlight | None = None
+
+    def __post_init__(self) -> None:
+        self._keys = EdgeKeys(self.edge_id)
+        self._flags = Flags.LOCKSTEP if self.lockstep else Flags(0)
         self._lock = threading.Lock()
         self.base_sequence = -1
         """Of the last access unit sent; -1 before the first."""
@@ -135,10 +128,10 @@ class Transmitter:
         """
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
-            at_ns = self._budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
+            at_ns = self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
             self.base_sequence += 2 if after_hole else 1
             header = BaseHeader(
-                session_id=self._session_id,
+                session_id=self.session_id,
                 sequence=self.base_sequence,
                 frame_index=unit.frame_index,
                 capture_ns=unit.capture_ns,
@@ -147,13 +140,13 @@ class Transmitter:
             )
             attachment = header.pack(unit.data)
             line_bytes = self._count(Channel.BASE, Account.BASE, unit.data, attachment, at_ns=at_ns)
-            self._budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
-            if self._pacer is not None:
-                self._pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
-            if self._in_flight is not None:
-                self._in_flight.sent(self.base_sequence, unit, now_ns=at_ns)
-        self._wait_until(at_ns)
-        self._outlet.put(
+            self.budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
+            if self.pacer is not None:
+                self.pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
+            if self.in_flight is not None:
+                self.in_flight.sent(self.base_sequence, unit, now_ns=at_ns)
+        self.wait_until(at_ns)
+        self.outlet.put(
             Channel.BASE, unit.data, attachment=attachment, encoding=DELIVERIES[Channel.BASE].encoding
         )
         return line_bytes
@@ -174,8 +167,8 @@ class Transmitter:
         budget allows, whether or not the link is free at this moment.
         """
         with self._lock:
-            line_bytes = self._budget.still_allowance(now_ns)
-        if paced and self._pacer is not None and not self._pacer.admits_still(now_ns):
+            line_bytes = self.budget.still_allowance(now_ns)
+        if paced and self.pacer is not None and not self.pacer.admits_still(now_ns):
             return 0
         if still is None:
             return self._payload_bytes(line_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding)
@@ -186,7 +179,7 @@ class Transmitter:
     def most_still_bytes(self) -> int:
         """About the payload of the largest still that the budget ever admits."""
         return self._payload_bytes(
-            self._budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding
+            self.budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding
         )
 
     def still(self, envelope: StillEnvelope, *, now_ns: int, copy: bool = False) -> None:
@@ -202,19 +195,19 @@ class Transmitter:
             line_bytes = self._count(
                 Channel.ROI, Account.ROI, still.data, attachment, at_ns=at_ns, encoding=encoding
             )
-            self._budget.record_still(line_bytes, now_ns=at_ns)
-            if self._pacer is not None and copy:  # its number stands for the first copy, or for later stills
-                self._pacer.sent_other(line_bytes, now_ns=at_ns)
-            elif self._pacer is not None:
-                self._pacer.sent_still(still.sequence, line_bytes, now_ns=at_ns)
-        self._wait_until(at_ns)
-        self._outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=encoding)
+            self.budget.record_still(line_bytes, now_ns=at_ns)
+            if self.pacer is not None and copy:  # its number stands for the first copy, or for later stills
+                self.pacer.sent_other(line_bytes, now_ns=at_ns)
+            elif self.pacer is not None:
+                self.pacer.sent_still(still.sequence, line_bytes, now_ns=at_ns)
+        self.wait_until(at_ns)
+        self.outlet.put(Channel.ROI, still.data, attachment=attachment, encoding=encoding)
 
     def store_base(self, unit: AccessUnit, *, now_ns: int) -> None:
         """An access unit is stored: it has used up its share, and left nothing of it to a still."""
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
-            self._budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, stored=True)
+            self.budget.record_base(line_bytes, now_ns=now_ns, keyframe=unit.keyframe, stored=True)
 
     def store_still(self, envelope: StillEnvelope, *, now_ns: int, counted: bool = True) -> BacklogStill:
         """The still as it would have gone out, for the backlog; ``counted``: its share of the budget is taken."""
@@ -223,24 +216,24 @@ class Transmitter:
         if counted:
             line_bytes = self._line_bytes(Channel.ROI, still.data, len(attachment), encoding=encoding)
             with self._lock:
-                self._budget.record_still(line_bytes, now_ns=now_ns)
+                self.budget.record_still(line_bytes, now_ns=now_ns)
         return BacklogStill(attachment, encoding, still.data)
 
     @property
     def round_trip_ns(self) -> int:
         """Of the link; half a second where it is not measured."""
-        return SECOND_NS // 2 if self._pacer is None else self._pacer.round_trip_ns
+        return SECOND_NS // 2 if self.pacer is None else self.pacer.round_trip_ns
 
     @property
     def total_bps(self) -> int:
         """The budget as it is now."""
-        return self._budget.total_bps
+        return self.budget.total_bps
 
     def backlog_allowance_bytes(self, now_ns: int, *, reserve: float) -> int:
         """Payload that a chunk of the backlog may have now; ``reserve``: see `RollingBudget.backlog_allowance`."""
         with self._lock:
-            line_bytes = self._budget.backlog_allowance(now_ns, reserve=reserve)
-        if self._pacer is not None and not self._pacer.admits_still(now_ns):
+            line_bytes = self.budget.backlog_allowance(now_ns, reserve=reserve)
+        if self.pacer is not None and not self.pacer.admits_still(now_ns):
             return 0
         around = BACKLOG_ATTACHMENT_BYTES + overhead_bytes(
             line_bytes,
@@ -268,13 +261,13 @@ class Transmitter:
         attachment = header.pack(chunk.data)
         with self._lock:
             needed_bytes = self._line_bytes(Channel.BACKLOG, chunk.data, len(attachment))
-            if needed_bytes > self._budget.backlog_allowance(now_ns, reserve=0.0):
+            if needed_bytes > self.budget.backlog_allowance(now_ns, reserve=0.0):
                 return 0
             line_bytes = self._count(Channel.BACKLOG, Account.BACKLOG, chunk.data, attachment, at_ns=now_ns)
-            self._budget.record_backlog(line_bytes, now_ns=now_ns)
-            if self._pacer is not None:
-                self._pacer.sent_other(line_bytes, now_ns=now_ns)
-        self._outlet.put(
+            self.budget.record_backlog(line_bytes, now_ns=now_ns)
+            if self.pacer is not None:
+                self.pacer.sent_other(line_bytes, now_ns=now_ns)
+        self.outlet.put(
             Channel.BACKLOG, chunk.data, attachment=attachment, encoding=DELIVERIES[Channel.BACKLOG].encoding
         )
         return line_bytes
@@ -293,47 +286,47 @@ class Transmitter:
     def set_rates(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
         """Total, base stream's share and coded frames a second from now on; see `RollingBudget.set_total`."""
         with self._lock:
-            self._budget.set_total(total_bps, base_bps, fps, now_ns=now_ns)
+            self.budget.set_total(total_bps, base_bps, fps, now_ns=now_ns)
 
     def base_wait_ns(self, now_ns: int) -> int:
         """How long an average base frame would wait for the budget's window, were it sent now."""
         with self._lock:
-            line_bytes = round(self._budget.base_step_bytes)
-            return max(0, self._budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
+            line_bytes = round(self.budget.base_step_bytes)
+            return max(0, self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
 
     def takes_ns(self, line_bytes: int) -> int:
         """How long so many line bytes take the whole budget."""
         with self._lock:
-            return 8 * SECOND_NS * line_bytes // self._budget.total_bps
+            return 8 * SECOND_NS * line_bytes // self.budget.total_bps
 
     def keyframe_fits(self, line_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a keyframe of so many line bytes leaves the budget whole."""
         with self._lock:
-            return self._budget.keyframe_fits(line_bytes, now_ns=now_ns)
+            return self.budget.keyframe_fits(line_bytes, now_ns=now_ns)
 
     def outcome(self, outcome: str, reason: str) -> None:
         """Note what became of a candidate: ``sent``, ``deferred`` or ``dropped``, and why."""
         assert outcome in ("sent", "deferred", "dropped")
         with self._lock:
-            self._ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
+            self.ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
 
     def _metadata(self, channel: Channel, make: Callable[[int], bytes], *, now_ns: int) -> None:
         """Send what belongs to neither stream as soon as the budget's window has room for it."""
         with self._lock:
             size_bytes = _GROWTH_BYTES + self._line_bytes(channel, make(now_ns), 0)
-            at_ns = self._budget.earliest_ns(size_bytes, now_ns=now_ns)
+            at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
             payload = make(at_ns)
             line_bytes = self._count(channel, Account.META, payload, b"", at_ns=at_ns)
-            self._budget.record_metadata(line_bytes, now_ns=at_ns)
-            if self._pacer is not None:
-                self._pacer.sent_other(line_bytes, now_ns=at_ns)
-        self._wait_until(at_ns)
-        self._outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
+            self.budget.record_metadata(line_bytes, now_ns=at_ns)
+            if self.pacer is not None:
+                self.pacer.sent_other(line_bytes, now_ns=at_ns)
+        self.wait_until(at_ns)
+        self.outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
 
     def _still_header(self, still: Still) -> RoiHeader:
         """All of it but send delay and flags."""
         return RoiHeader(
-            session_id=self._session_id,
+            session_id=self.session_id,
             sequence=still.sequence,
             frame_index=still.frame_index,
             capture_ns=still.capture_ns,
@@ -357,9 +350,9 @@ class Transmitter:
         line_bytes = self._line_bytes(
             Channel.ROI, envelope.still.data, header_bytes, encoding=envelope.encoding
         )
-        if self._budget.fits(line_bytes, now_ns=now_ns):
+        if self.budget.fits(line_bytes, now_ns=now_ns):
             return now_ns
-        return self._budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
+        return self.budget.earliest_ns(line_bytes + _GROWTH_BYTES, now_ns=now_ns)
 
     def _payload_bytes(self, line_bytes: int, attachment_bytes: int, media_type: str) -> int:
         """What of so many line bytes is left for a still's payload."""
@@ -379,7 +372,7 @@ class Transmitter:
         encoding: str = "",
     ) -> int:
         line_bytes = self._line_bytes(channel, payload, len(attachment), encoding=encoding)
-        self._ledger.count(
+        self.ledger.count(
             account,
             payload_bytes=len(payload),
             attachment_bytes=len(attachment),

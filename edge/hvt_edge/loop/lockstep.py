@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import KW_ONLY, dataclass
 from types import TracebackType
 from typing import Self
 
@@ -37,6 +38,7 @@ _STOP_S = 0.3
 _POLL_S = 0.1
 
 
+@dataclass(eq=False)
 class LockstepPace:
     """Runs frames in media time; where a ground is there at the start, the loop waits for its answers.
 
@@ -44,31 +46,22 @@ class LockstepPace:
     perception beside the next frame's encoding; it is closed with the pace.
     """
 
-    def __init__(
-        self,
-        base: BaseStage,
-        stills: StillStage,
-        *,
-        inbox: FeedbackInbox,
-        keyframes: KeyframeRequests,
-        clock: LoopClock,
-        fps: float,
-        counts: FrameCounts,
-        has_ground: Callable[[], bool],
-        stop: threading.Event,
-        executor: Executor | None = None,
-    ) -> None:
-        self._base = base
-        self._stills = stills
-        self._inbox = inbox
-        self._keyframes = keyframes
-        self._clock = clock
-        self._ahead_frames = max(1, round(_AHEAD_S * fps))
-        self._counts = counts
-        self._has_ground = has_ground
-        self._stop = stop
-        self._waits = has_ground()
-        self._executor = executor or ThreadPoolExecutor(1, thread_name_prefix="hvt-perception")
+    base: BaseStage
+    stills: StillStage
+    _: KW_ONLY
+    inbox: FeedbackInbox
+    keyframes: KeyframeRequests
+    clock: LoopClock
+    fps: float
+    counts: FrameCounts
+    has_ground: Callable[[], bool]
+    stop: threading.Event
+    executor: Executor | None = None
+
+    def __post_init__(self) -> None:
+        self._ahead_frames = max(1, round(_AHEAD_S * self.fps))
+        self._waits = self.has_ground()
+        self._executor = self.executor or ThreadPoolExecutor(1, thread_name_prefix="hvt-perception")
         self._analysis: tuple[Frame, int, bool, Future[AnalyzedFrame]] | None = None
         self._in_flight: deque[tuple[int, int, set[int]]] = deque()
         """(frame index, newest coded index by then, stills sent with it): what the ground is to answer."""
@@ -83,20 +76,20 @@ class LockstepPace:
         del missed  # of a camera, whose frames wait for nobody
         if frame is None:
             return
-        self._counts.captured += 1
+        self.counts.captured += 1
         now_ns = frame.capture_ns
         began_ns = time.perf_counter_ns()
-        decision = self._base.decide(frame.index, now_ns=now_ns)
-        unit = self._base.encode(frame, decision, now_ns=now_ns, tracks=self._stills.latest_tracks)
+        decision = self.base.decide(frame.index, now_ns=now_ns)
+        unit = self.base.encode(frame, decision, now_ns=now_ns, tracks=self.stills.latest_tracks)
         if unit is not None:
-            self._counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
+            self.counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
         self._finish_analysis()
-        self._clock.advance(now_ns)
+        self.clock.advance(now_ns)
         if unit is not None:
             self._coded_index = frame.index
-            self._base.send(unit, decision, now_ns=now_ns)
-        held = self._keyframes.due(now_ns)
-        analysis = self._executor.submit(self._stills.analyze, frame, unit)
+            self.base.send(unit, decision, now_ns=now_ns)
+        held = self.keyframes.due(now_ns)
+        analysis = self._executor.submit(self.stills.analyze, frame, unit)
         self._analysis = (frame, self._coded_index, held, analysis)
 
     def __enter__(self) -> Self:
@@ -108,7 +101,7 @@ class LockstepPace:
         try:
             if error is None:
                 self._finish_analysis()
-                self._wait_for_answers(before=self._counts.last_index + 1)
+                self._wait_for_answers(before=self.counts.last_index + 1)
         finally:
             self._executor.shutdown()
 
@@ -118,7 +111,7 @@ class LockstepPace:
         frame, coded_index, held, analysis = self._analysis
         self._analysis = None
         self._wait_for_answers(before=frame.index - self._ahead_frames + 1)
-        sent = self._stills.send(analysis.result(), now_ns=frame.capture_ns, held=held)
+        sent = self.stills.send(analysis.result(), now_ns=frame.capture_ns, held=held)
         # Of other frames the ground learns nothing, and answers nothing.
         if sent or coded_index == frame.index:
             self._in_flight.append((frame.index, coded_index, sent))
@@ -130,15 +123,15 @@ class LockstepPace:
             if self._waits:
                 self._waits = self._answered(coded_index, sent)
             self._newest_answered = max([self._newest_answered, *sent])
-        self._stills.on_results(self._inbox.take_up_to(self._newest_answered))
+        self.stills.on_results(self.inbox.take_up_to(self._newest_answered))
 
     def _answered(self, index: int, sent: set[int]) -> bool:
         """Wait for the ground's answer to a frame and its stills; False where it is gone or never answers."""
         waited_s = unsubscribed_s = 0.0
-        while not self._inbox.wait_for(frame_index=index, stills=sent, timeout_s=_POLL_S):
+        while not self.inbox.wait_for(frame_index=index, stills=sent, timeout_s=_POLL_S):
             waited_s += _POLL_S
-            unsubscribed_s = 0.0 if self._has_ground() else unsubscribed_s + _POLL_S
-            patience_s = _STOP_S if self._stop.is_set() else _GROUND_GONE_S
+            unsubscribed_s = 0.0 if self.has_ground() else unsubscribed_s + _POLL_S
+            patience_s = _STOP_S if self.stop.is_set() else _GROUND_GONE_S
             if waited_s >= patience_s or unsubscribed_s >= _UNSUBSCRIBED_S:
                 return False
         return True

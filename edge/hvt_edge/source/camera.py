@@ -28,6 +28,8 @@ class CameraGrabber:
         self.name = path
         self._fps = fps
         self._capture: cv2.VideoCapture | None = None
+        self._ahead_ns = 0
+        """Of Unix time before the monotonic clock, when the device was opened."""
 
     def open(self) -> None:
         """Open the device. Raises `UserError` if it is missing, no camera, busy or not permitted."""
@@ -51,6 +53,7 @@ class CameraGrabber:
         capture.set(cv2.CAP_PROP_FPS, self._fps)
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._capture = capture
+        self._ahead_ns = time.time_ns() - time.monotonic_ns()
 
     def restart(self) -> None:
         """Open again after `SignalLost`."""
@@ -72,18 +75,15 @@ class CameraGrabber:
                 raise SignalLost("the camera's frame cannot be decoded")
             return np.asarray(image, np.uint8)
 
-        return Shot(image, _taken_ns(capture.get(cv2.CAP_PROP_POS_MSEC)))
+        # The driver stamps its buffers by the monotonic clock; where it does not, this is 0.
+        buffer_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+        return Shot(image, self._ahead_ns + round(buffer_ms * 1e6) if buffer_ms > 0 else None)
 
     def close(self) -> None:
         """Let go of the device."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None
-
-
-def _taken_ns(buffer_ms: float) -> int | None:
-    """Unix time of a V4L2 buffer, which is stamped by the monotonic clock; None where the driver does not say."""
-    return round(buffer_ms * 1e6) + time.time_ns() - time.monotonic_ns() if buffer_ms > 0 else None
 
 
 def _quietly_opened(number: int) -> cv2.VideoCapture:

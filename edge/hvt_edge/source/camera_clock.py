@@ -11,6 +11,9 @@ _MOST_DELAY_NS = 5 * SECOND_NS
 _MEMORY_NS = 60 * SECOND_NS
 """The least delay of the last one to two of these counts: two clocks drift apart."""
 
+_STEP_NS = SECOND_NS
+"""From one frame to the next no delay changes by so much."""
+
 
 class CameraClock:
     """Turns a camera's time stamps into this process's time; one for each time that the camera was opened.
@@ -22,6 +25,7 @@ class CameraClock:
     def __init__(self) -> None:
         self._least_ns: int | None = None
         self._former_ns: int | None = None
+        self._delay_ns: int | None = None
         self._since_ns = 0
         self._last_ns = 0
 
@@ -33,6 +37,9 @@ class CameraClock:
 
     def _ahead_ns(self, delay_ns: int, now_ns: int) -> int:
         """What to add to the camera's time."""
+        if self._delay_ns is not None and abs(delay_ns - self._delay_ns) > _STEP_NS:
+            self._least_ns = self._former_ns = None  # one of the two clocks was set
+        self._delay_ns = delay_ns
         if self._least_ns is None or now_ns - self._since_ns > _MEMORY_NS:
             self._former_ns, self._least_ns, self._since_ns = self._least_ns, delay_ns, now_ns
         self._least_ns = min(self._least_ns, delay_ns)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -74,30 +74,24 @@ class OnDemandStill(OutboxStill):
     tried_ns: int | None = None
 
 
+@dataclass(eq=False)
 class OnDemand:
     """The edge's end of ``control: still``. `request`, `outcome` and `tracks` may be called from any thread.
 
     ``most_bytes()`` is the largest payload that the budget admits now. These stills never build on the base.
     """
 
-    def __init__(
-        self,
-        ring: FrameRing,
-        *,
-        outbox: Outbox,
-        maker: StillMaker,
-        view: View,
-        class_names: tuple[str, ...],
-        most_bytes: Callable[[], int],
-        settings: OnDemandSettings = OnDemandSettings(),
-    ) -> None:
-        self._ring = ring
-        self._outbox = outbox
-        self._maker = replace(maker, codec=maker.without_base, fallback=None, fidelity_db=0.0)
-        self._view = view
-        self._class_names = class_names
-        self._most_bytes = most_bytes
-        self._settings = settings
+    ring: FrameRing
+    _: KW_ONLY
+    outbox: Outbox
+    maker: StillMaker
+    view: View
+    class_names: tuple[str, ...]
+    most_bytes: Callable[[], int]
+    settings: OnDemandSettings = OnDemandSettings()
+
+    def __post_init__(self) -> None:
+        self._maker = replace(self.maker, codec=self.maker.without_base, fallback=None, fidelity_db=0.0)
         self._lock = threading.Lock()
         self._refusals: OrderedDict[int, str] = OrderedDict()
         """Number → why it was given up, or nothing where it is pending or was sent; of the last ones."""
@@ -106,7 +100,7 @@ class OnDemand:
 
     def add(self, analyzed: AnalyzedFrame) -> None:
         """Hold a frame with its tracks."""
-        self._ring.add(analyzed.frame, analyzed.tracks)
+        self.ring.add(analyzed.frame, analyzed.tracks)
 
     # From any thread
 
@@ -115,10 +109,10 @@ class OnDemand:
         if self._ended:
             raise RefusedError("the session is ending")
         self._check_queue()
-        if self._most_bytes() < _LEAST_BYTES:
+        if self.most_bytes() < _LEAST_BYTES:
             raise RefusedError("the budget leaves nothing for stills: raise it, or lower --video-share")
-        frame = frame_for(request, self._ring)
-        job = crop_job_for(request, frame, maker=self._maker, view=self._view, class_names=self._class_names)
+        frame = frame_for(request, self.ring)
+        job = crop_job_for(request, frame, maker=self._maker, view=self.view, class_names=self.class_names)
         quality_pct = self._maker.quality_pct if request.quality_pct is None else request.quality_pct
         maker = replace(self._maker, quality_pct=quality_pct, floor_pct=min(_FLOOR_PCT, quality_pct))
         with self._lock:
@@ -129,7 +123,7 @@ class OnDemand:
             pending = OnDemandStill(
                 replace(job, header=header), None, float("inf"), None, number=number, maker=maker
             )
-            self._outbox.offer_on_demand(pending)
+            self.outbox.offer_on_demand(pending)
             self._next_number += 1
             self._note(number, "")
         return number, frame.frame_index
@@ -147,12 +141,12 @@ class OnDemand:
 
     def tracks(self) -> tuple[int, tuple[TrackNow, ...]]:
         """The newest frame's index, and its tracks by id; of too many, those of most confidence."""
-        newest = self._ring.newest
+        newest = self.ring.newest
         if newest is None:
             raise RefusedError("there is no frame yet, or none is kept (--ring)")
         tracks = newest.tracks
-        width, height = self._view.source_size  # a box that is only predicted may be far outside
-        boxes = np.clip(self._view.to_source(tracks.boxes_xyxy_px), 0, (width, height, width, height))
+        width, height = self.view.source_size  # a box that is only predicted may be far outside
+        boxes = np.clip(self.view.to_source(tracks.boxes_xyxy_px), 0, (width, height, width, height))
         rows = sorted(np.argsort(-tracks.confidences, kind="stable")[:MAX_TRACKS_NOW].tolist())
         listed = [
             TrackNow(
@@ -181,10 +175,10 @@ class OnDemand:
         limit_bytes = allowance(full)
         if len(full.data) <= limit_bytes:
             return full
-        patient = now_ns - pending.first_ns < self._settings.patience_ns
-        if patient and limit_bytes < _FULL_SHARE * self._most_bytes():
+        patient = now_ns - pending.first_ns < self.settings.patience_ns
+        if patient and limit_bytes < _FULL_SHARE * self.most_bytes():
             return None
-        if pending.tried_ns is not None and now_ns - pending.tried_ns < self._settings.retry_ns:
+        if pending.tried_ns is not None and now_ns - pending.tried_ns < self.settings.retry_ns:
             return None
         pending.tried_ns = now_ns
         for shrink in _SHRINKS:  # the largest picture of which some quality fits
@@ -203,8 +197,8 @@ class OnDemand:
         self._ended = True
 
     def _check_queue(self) -> None:
-        pending = self._outbox.on_demand_pending
-        if pending >= self._settings.max_pending:
+        pending = self.outbox.on_demand_pending
+        if pending >= self.settings.max_pending:
             raise RefusedError(f"{pending} stills that were asked for wait already: ask again later")
 
     def _note(self, number: int, refusal: str) -> None:

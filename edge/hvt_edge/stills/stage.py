@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.protocol.messages import StillResult
 from hvt_common.values import AccessUnit, Frame, Tracks
@@ -17,30 +18,23 @@ from hvt_edge.stills.sending import StillSender
 __all__ = ["StillStage"]
 
 
+@dataclass(eq=False)
 class StillStage:
     """Takes each frame with its access unit, if it has one, after the unit was sent.
 
     With a ``reporter`` the edge's own tracks go out at each decision step, before the stills of it.
     """
 
-    def __init__(
-        self,
-        analyzer: Analyzer,
-        chooser: Chooser,
-        *,
-        outbox: Outbox,
-        sender: StillSender,
-        transmitter: Transmitter,
-        keyframes: KeyframeRequests,
-        reporter: TrackReporter | None = None,
-    ) -> None:
-        self.analyzer = analyzer
-        self._chooser = chooser
-        self._outbox = outbox
-        self._sender = sender
-        self._transmitter = transmitter
-        self._keyframes = keyframes
-        self._reporter = reporter
+    analyzer: Analyzer
+    chooser: Chooser
+    _: KW_ONLY
+    outbox: Outbox
+    sender: StillSender
+    transmitter: Transmitter
+    keyframes: KeyframeRequests
+    reporter: TrackReporter | None = None
+
+    def __post_init__(self) -> None:
         self._latest_tracks: Tracks | None = None
 
     @property
@@ -54,12 +48,12 @@ class StillStage:
     @property
     def pending(self) -> int:
         """How many stills of the method are pending."""
-        return len(self._outbox)
+        return len(self.outbox)
 
     @property
     def any_pending(self) -> bool:
         """Whether a still is pending, one that a ground requested included."""
-        return self._outbox.any_pending
+        return self.outbox.any_pending
 
     def analyze(
         self,
@@ -82,25 +76,25 @@ class StillStage:
         asks the plan.
         """
         self._latest_tracks = analyzed.tracks
-        if self._reporter is not None and analyzed.detected:
-            self._reporter.report(analyzed, now_ns=now_ns)
-        if most_bytes := self._transmitter.most_still_bytes():
-            self._chooser.set_most_bytes(most_bytes)
+        if self.reporter is not None and analyzed.detected:
+            self.reporter.report(analyzed, now_ns=now_ns)
+        if most_bytes := self.transmitter.most_still_bytes():
+            self.chooser.set_most_bytes(most_bytes)
         # What is requested waits until the link is free, which right behind a base frame it never is.
-        allowance_bytes = self._transmitter.still_allowance_bytes(now_ns, paced=False)
-        self._chooser.consider(analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes)
+        allowance_bytes = self.transmitter.still_allowance_bytes(now_ns, paced=False)
+        self.chooser.consider(analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes)
         return self.send_pending(now_ns=now_ns, held=held)
 
     def send_pending(self, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Send those that are pending and may go now, without another frame; the rest as of `send`."""
-        self._sender.store_lost(now_ns)
-        store = self._sender.offline
-        if not store and (self._keyframes.due(now_ns) if held is None else held):
+        self.sender.store_lost(now_ns)
+        store = self.sender.offline
+        if not store and (self.keyframes.due(now_ns) if held is None else held):
             return set()
         sent: set[int] = set()
-        allowance = self._sender.allowance(now_ns, paced=not store)
-        for coded in self._chooser.stills(now_ns=now_ns, allowance=allowance, store=store):
-            self._sender.put(coded, now_ns=now_ns, store=store)
+        allowance = self.sender.allowance(now_ns, paced=not store)
+        for coded in self.chooser.stills(now_ns=now_ns, allowance=allowance, store=store):
+            self.sender.put(coded, now_ns=now_ns, store=store)
             if not store:
                 sent.add(coded.still.sequence)
         return sent
@@ -112,9 +106,9 @@ class StillStage:
         """
         for result in results:
             if result.again:
-                self._outbox.on_undecodable(result.still_sequence)
+                self.outbox.on_undecodable(result.still_sequence)
             if result.class_name:
-                self._chooser.record_feedback(
+                self.chooser.record_feedback(
                     result.track_id,
                     class_name=result.class_name,
                     confidence=result.confidence,
@@ -123,4 +117,4 @@ class StillStage:
 
     def close(self) -> None:
         """Give up what is pending."""
-        self._chooser.close()
+        self.chooser.close()

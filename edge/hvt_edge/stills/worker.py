@@ -8,7 +8,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
+from dataclasses import KW_ONLY, dataclass
 from typing import Self
 
 from hvt_common.protocol.messages import StillResult
@@ -25,12 +25,13 @@ _PART = "stills"
 _BEHIND_FRAMES = 3
 """With more frames queued than this, detection is put off; decoding never is."""
 _LEAST_FRAMES = 2
-MAX_QUEUE_BYTES = 32 * 2**20
-"""Of frames that are queued: 6 of 1280x720, 3 of 1920x1080, 2 of 3840x2160."""
+MAX_QUEUE_BYTES = 24 * 2**20
+"""Of frames that are queued: 4 of 1280x720, 2 of 1920x1080 and more."""
 _RETRY_S = 0.025
 _MOST_SKIPPED_BYTES = 2 * 2**20
 
 
+@dataclass(eq=False)
 class StillWorker:
     """Runs a `StillStage` in a thread of its own.
 
@@ -39,29 +40,22 @@ class StillWorker:
     given up, and the stage goes on from a keyframe.
     """
 
-    def __init__(
-        self,
-        stage: StillStage,
-        *,
-        results: Callable[[], Sequence[StillResult]],
-        failures: Failures,
-        clock: Callable[[], int],
-        length: int = 16,
-        max_bytes: int = MAX_QUEUE_BYTES,
-        finish_s: float = 1.0,
-        pause: RetryPause | None = None,
-    ) -> None:
-        self._stage = stage
-        self._results = results
-        self._failures = failures
-        self._clock = clock
-        self._pause = pause or RetryPause()
+    stage: StillStage
+    _: KW_ONLY
+    results: Callable[[], Sequence[StillResult]]
+    failures: Failures
+    clock: Callable[[], int]
+    length: int = 16
+    max_bytes: int = MAX_QUEUE_BYTES
+    finish_s: float = 1.0
+    pause: RetryPause | None = None
+
+    def __post_init__(self) -> None:
+        self._pause = self.pause or RetryPause()
         self._frames: queue.Queue[tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None] = queue.Queue(
-            length
+            self.length
         )
-        self._most_frames = length
-        self._max_bytes = max_bytes
-        self._finish_s = finish_s
+        self._most_frames = self.length
         self._lock = threading.Lock()
         self._skipped = SkippedUnits()
         self._given_up = threading.Event()
@@ -76,12 +70,12 @@ class StillWorker:
     @property
     def full(self) -> bool:
         """Whether the next frame finds no room, or the stage has failed a moment ago."""
-        return self._frames.qsize() >= self._most_frames or not self._pause.due(self._clock())
+        return self._frames.qsize() >= self._most_frames or not self._pause.due(self.clock())
 
     def take(self, frame: Frame, unit: AccessUnit | None, *, late: bool = False) -> bool:
         """Queue one frame, in order, with its access unit if it has one; False where it is skipped."""
         # All frames of a source have one size, so a bound in bytes is a bound in frames.
-        fitting = self._max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
+        fitting = self.max_bytes // (frame.source_bgr.nbytes + frame.base_bgr.nbytes)
         self._most_frames = min(self._frames.maxsize, max(_LEAST_FRAMES, fitting))
         with self._lock:
             if self.full or late:
@@ -92,19 +86,17 @@ class StillWorker:
 
     def close(self) -> None:
         """Let the thread finish what it has, at most for ``finish_s``, then leave the rest; join it."""
-        until_s = time.monotonic() + self._finish_s
+        until_s = time.monotonic() + self.finish_s
         with contextlib.suppress(queue.Full):
-            self._frames.put(None, timeout=self._finish_s)
+            self._frames.put(None, timeout=self.finish_s)
         self._thread.join(timeout=max(0.0, until_s - time.monotonic()))
         self._given_up.set()
-        self._thread.join(timeout=self._finish_s)
+        self._thread.join(timeout=self.finish_s)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     def _run(self) -> None:
@@ -114,23 +106,23 @@ class StillWorker:
                 if (item := self._next()) is None:
                     return
                 behind = self._frames.qsize() >= _BEHIND_FRAMES
-                self._stage.on_results(self._results())
-                analyzed = self._stage.analyze(*item, hurry=behind)
-                self._stage.send(analyzed, now_ns=self._clock())
-                self._failures.works(_PART)
+                self.stage.on_results(self.results())
+                analyzed = self.stage.analyze(*item, hurry=behind)
+                self.stage.send(analyzed, now_ns=self.clock())
+                self.failures.works(_PART)
             except Exception as error:  # noqa: BLE001 - it ends stills for a while, never the flight
                 self._fail(error)
 
     def _fail(self, error: Exception) -> None:
         _log.debug("stills failed", exc_info=error)
         with self._lock:
-            self._pause.failed(self._clock())
+            self._pause.failed(self.clock())
             self._skipped.lose()
             with contextlib.suppress(queue.Empty):
                 while self._frames.get_nowait() is not None:
                     pass
                 self._given_up.set()  # what was taken away is the sign to end
-        self._failures.failed(_PART, f"perception and stills stopped ({type(error).__name__}: {error})")
+        self.failures.failed(_PART, f"perception and stills stopped ({type(error).__name__}: {error})")
 
     def _next(self) -> tuple[Frame, AccessUnit | None, Sequence[AccessUnit]] | None:
         """Return the next frame; until it comes what is pending is tried again.
@@ -141,8 +133,8 @@ class StillWorker:
             try:
                 return self._frames.get(timeout=_RETRY_S)
             except queue.Empty:
-                if self._stage.any_pending and self._pause.due(self._clock()):
-                    self._stage.send_pending(now_ns=self._clock())
+                if self.stage.any_pending and self._pause.due(self.clock()):
+                    self.stage.send_pending(now_ns=self.clock())
 
 
 class SkippedUnits:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 
 from hvt_common.errors import FlightError
 from hvt_common.runtime.failures import Failures
@@ -25,6 +26,7 @@ _PART = "encoder"
 _MOST_FAILURES, _FAILURES_NS = 3, 10 * SECOND_NS
 
 
+@dataclass(eq=False)
 class BaseStage:
     """Runs in the frame loop: `decide` for each source frame; `encode` and `send` for each that is coded.
 
@@ -35,48 +37,37 @@ class BaseStage:
     as in lockstep, the failure is raised.
     """
 
-    def __init__(
-        self,
-        encoder: BaseEncoder,
-        *,
-        keyframes: KeyframeRequests,
-        transmitter: Transmitter,
-        local_copy: LocalCopy | None,
-        first_keyframe_bytes: int,
-        regions: TrackRegions | None = None,
-        frame_skip: FrameSkip | None = None,
-        reconfigure: Callable[[int, int], BaseEncoder | None] | None = None,
-        admits: Callable[[int], bool] = lambda _now_ns: True,
-        backlog: BacklogStage | None = None,
-        open_again: Callable[[], BaseEncoder] | None = None,
-        failures: Failures | None = None,
-    ) -> None:
-        self._encoder = encoder
-        self._requests = keyframes
-        self._plan = KeyframePlan(keyframes)
-        self._transmitter = transmitter
-        self._local_copy = local_copy
-        self._keyframe_bytes = first_keyframe_bytes
-        self._regions = regions
-        self._frame_skip = frame_skip or FrameSkip()
-        self._reconfigure = reconfigure
-        self._admits = admits
-        self._backlog = backlog
-        self._open_again = open_again
-        self._failures = failures
+    encoder: BaseEncoder
+    _: KW_ONLY
+    keyframes: KeyframeRequests
+    transmitter: Transmitter
+    local_copy: LocalCopy | None
+    first_keyframe_bytes: int
+    regions: TrackRegions | None = None
+    frame_skip: FrameSkip | None = None
+    reconfigure: Callable[[int, int], BaseEncoder | None] | None = None
+    admits: Callable[[int], bool] = lambda _now_ns: True
+    backlog: BacklogStage | None = None
+    open_again: Callable[[], BaseEncoder] | None = None
+    failures: Failures | None = None
+
+    def __post_init__(self) -> None:
+        self._plan = KeyframePlan(self.keyframes)
+        self._keyframe_bytes = self.first_keyframe_bytes
+        self._frame_skip = self.frame_skip or FrameSkip()
         self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
         self._begins_anew = False
         """x265 was opened again: its next frame is a keyframe."""
 
     def decide(self, index: int, *, now_ns: int) -> FrameDecision:
         """Decide on the source frame of this index; once for each, in order."""
-        fits = self._transmitter.keyframe_fits(self._keyframe_bytes, now_ns=now_ns)
-        backlog = self._backlog
+        fits = self.transmitter.keyframe_fits(self._keyframe_bytes, now_ns=now_ns)
+        backlog = self.backlog
         return decide(
             FrameInputs(
                 due=self._frame_skip.codes(index),
                 keyframe_due=self._plan.now(now_ns, fits=fits) or self._begins_anew,
-                admitted=self._admits(now_ns),
+                admitted=self.admits(now_ns),
                 link=State.LIVE if backlog is None else backlog.state,
                 segment_due=backlog is not None and backlog.segment_due(now_ns),
                 probe_due=backlog is not None and backlog.probe_due(now_ns),
@@ -95,45 +86,45 @@ class BaseStage:
         try:
             if decision.reconfigures:
                 self._at_keyframe(frame.index, now_ns=now_ns)
-            regions = [] if self._regions is None else self._regions.regions(tracks)
-            unit = self._encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
+            regions = [] if self.regions is None else self.regions.regions(tracks)
+            unit = self.encoder.encode(frame, keyframe=decision.keyframe, regions=regions)
         except Exception as error:
-            if self._open_again is None:
+            if self.open_again is None:
                 raise
             self._recover(error, now_ns=now_ns)
             return None
         assert unit.keyframe or not decision.keyframe, "x265 makes a keyframe of each frame that is to be one"
-        if self._begins_anew and self._failures is not None:
-            self._failures.works(_PART)
+        if self._begins_anew and self.failures is not None:
+            self.failures.works(_PART)
         self._begins_anew = False
-        self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self._encoder.mean_qp)
+        self._frame_skip.coded(frame.index, keyframe=unit.keyframe, mean_qp=self.encoder.mean_qp)
         if decision.meets_plan:
             self._plan.done(now_ns)
-        if decision.resumes and self._backlog is not None:
-            self._backlog.resume()
-        if self._local_copy is not None:
-            self._local_copy.write(unit)
+        if decision.resumes and self.backlog is not None:
+            self.backlog.resume()
+        if self.local_copy is not None:
+            self.local_copy.write(unit)
         return unit
 
     def send(self, unit: AccessUnit, decision: FrameDecision, *, now_ns: int) -> None:
         """Store the unit, or send it, or both; blocks while the link is full: frames are dropped before encoding."""
-        if self._backlog is not None and decision.to_store:
-            self._backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
+        if self.backlog is not None and decision.to_store:
+            self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
             if decision.to_link:  # a probe; what it builds on was not sent
-                self._transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe)
+                self.transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe)
             else:
-                self._transmitter.store_base(unit, now_ns=now_ns)
+                self.transmitter.store_base(unit, now_ns=now_ns)
             return
-        line_bytes = self._transmitter.base(unit, now_ns=now_ns)
+        line_bytes = self.transmitter.base(unit, now_ns=now_ns)
         if unit.keyframe:
             self._keyframe_bytes = line_bytes
-            self._requests.note_cost(self._transmitter.takes_ns(line_bytes))
+            self.keyframes.note_cost(self.transmitter.takes_ns(line_bytes))
 
     def _recover(self, error: Exception, *, now_ns: int) -> None:
-        assert self._open_again is not None, "checked"
-        assert self._failures is not None, "goes with it"
+        assert self.open_again is not None, "checked"
+        assert self.failures is not None, "goes with it"
         while True:
-            self._failures.failed(_PART, f"x265 failed ({error})")
+            self.failures.failed(_PART, f"x265 failed ({error})")
             self._failed_ns.append(now_ns)
             if len(self._failed_ns) == _MOST_FAILURES and now_ns - self._failed_ns[0] <= _FAILURES_NS:
                 raise FlightError(
@@ -141,7 +132,7 @@ class BaseStage:
                     "video without it, and another start may help"
                 ) from error
             try:
-                self._encoder = self._open_again()
+                self.encoder = self.open_again()
             except Exception as again:  # noqa: BLE001 - another failure of the same kind
                 error = again
                 continue
@@ -152,6 +143,6 @@ class BaseStage:
         """What may change with a keyframe only."""
         before = self._frame_skip.decimation
         decimation = self._frame_skip.at_keyframe(index)
-        encoder = None if self._reconfigure is None else self._reconfigure(decimation, now_ns)
+        encoder = None if self.reconfigure is None else self.reconfigure(decimation, now_ns)
         assert encoder is not None or decimation == before, "another decimation needs another encoder"
-        self._encoder = encoder or self._encoder
+        self.encoder = encoder or self.encoder

@@ -36,7 +36,7 @@ def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
 def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) -> Analyzer:
     """Decoder, detector and tracker of the edge's own stream."""
     settings = TrackerSettings.starting_at(
-        config.confidence, camera_motion=cast('Literal["off", "flow", "ecc"]', config.camera_motion)
+        config.confidence, camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
     )
     return Analyzer(
         detector,

@@ -5,8 +5,7 @@ from __future__ import annotations
 from hvt_ground.backlog.assembly import (
     BacklogAssembly,
     BacklogContent,
-    StoredStill,
     backlog_content,
 )
 
-__all__ = ["BacklogAssembly", "BacklogContent", "StoredStill", "backlog_content"]
+__all__ = ["BacklogAssembly", "BacklogContent", "backlog_content"]

@@ -29,8 +29,9 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
+from hvt_ground.perception.stills.decode import ReceivedStill
 
-__all__ = ["BacklogAssembly", "BacklogContent", "StoredStill", "backlog_content"]
+__all__ = ["BacklogAssembly", "BacklogContent", "backlog_content"]
 
 _MAX_UNREPORTED = 512
 _MAX_REFUSALS = 256
@@ -38,17 +39,7 @@ _PATIENCE = 3
 """An object that is unusable so often is unusable for good: it is acknowledged, so that it does not take the link."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoredStill:
-    """A still that was stored, as it would have come on ``roi``."""
-
-    header: RoiHeader
-    """Carries the flag `STORED`."""
-    data: bytes
-    encoding: str
-
-
-BacklogContent = Info | StoredStill | tuple[BacklogUnit, ...]
+BacklogContent = Info | ReceivedStill | tuple[BacklogUnit, ...]
 """What an object holds: the facts of its session, a still, or a stretch of the base stream."""
 
 
@@ -233,12 +224,12 @@ def _info(session_id: int, data: bytes, *, edge: str) -> Info:
     return info
 
 
-def _still(session_id: int, number: int, data: bytes) -> StoredStill:
+def _still(session_id: int, number: int, data: bytes) -> ReceivedStill:
     stored = parse_backlog_still(data)
     header = RoiHeader.parse(stored.attachment, stored.payload)
     if header.session_id != session_id or header.sequence != number:
         raise WireError(f"past still {number} is another one inside")
-    return StoredStill(replace(header, flags=header.flags | Flags.STORED), stored.payload, stored.encoding)
+    return ReceivedStill(replace(header, flags=header.flags | Flags.STORED), stored.payload)
 
 
 def _check(header: BacklogHeader, payload: bytes) -> None:

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from hvt_common.protocol.channels import DELIVERIES, Channel
 from hvt_common.protocol.messages import (
     AcknowledgedRange,
     BacklogHeader,
@@ -22,7 +21,7 @@ from hvt_common.protocol.messages import (
     ObjectKey,
     WireError,
 )
-from hvt_ground.backlog.assembly import BacklogAssembly, StoredStill, backlog_content
+from hvt_ground.backlog.assembly import BacklogAssembly, backlog_content
 from hvt_ground.backlog.jobs import Destination, StillJob, VideoJob
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.backlog.session_backlog import SessionBacklog
@@ -138,8 +137,8 @@ class EdgeBacklog:
             self._working += 1
             done = partial(self._done, key, self._sessions)
         job: Job
-        if isinstance(content, StoredStill):
-            job = StillJob(_received(content), destination, done=done)
+        if isinstance(content, ReceivedStill):
+            job = StillJob(content, destination, done=done)
         else:
             job = VideoJob(content, destination, worker=worker, done=done)
         worker.submit(job)
@@ -173,8 +172,3 @@ class EdgeBacklog:
 
 def _release_nothing(_backlog: SessionBacklog) -> None:
     """The open session stays open as long as its worker."""
-
-
-def _received(still: StoredStill) -> ReceivedStill:
-    media_type = still.encoding.partition(";")[0] or DELIVERIES[Channel.ROI].encoding
-    return ReceivedStill(still.header, still.data, media_type)

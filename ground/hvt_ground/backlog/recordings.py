@@ -14,7 +14,7 @@ from pathlib import Path
 from hvt_common.protocol.messages import Info
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice
+from hvt_ground.events import Event, Notice, Refinement
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.sinks import QueuedSink
 
@@ -47,7 +47,8 @@ class BacklogRecording:
         self._perception.read(still, emit=self._emit)
 
     def _emit(self, event: Event) -> None:
-        self.backlog.note(event)
+        if isinstance(event, Refinement):
+            self.backlog.note(event)
         self.sink.log(event)
 
 

@@ -110,10 +110,9 @@ class SessionBacklog:
             for totals in (self.totals, self._news):
                 totals.add_still(header.frame_index, header.capture_ns)
 
-    def note(self, event: Event) -> None:
-        """Note what became of a stored still; other events pass by."""
-        if isinstance(event, Refinement):
-            self._late.take(event)
+    def note(self, still: Refinement) -> None:
+        """Note what became of a still, for the boxes of its frame should it be a stored one."""
+        self._late.take(still)
 
     def log_boxes(self, event: Event) -> None:
         """Log boxes of stored video, named by the stills."""

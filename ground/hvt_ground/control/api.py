@@ -205,7 +205,10 @@ class RemoteEdge:
         room. Raises `RefusedError` where the edge refused it or gave it up, `UserError` where it did not come in
         time.
         """
-        arguments = _still_arguments(track=track, box=box, at_s=at_s, frame=frame, quality_pct=quality_pct)
+        given = {"track": track, "frame": frame, "quality": quality_pct}
+        given["at_ms"] = None if at_s is None else round(at_s * 1000)
+        given |= zip(("x", "y", "w", "h"), box or (), strict=False)
+        arguments = {name: value for name, value in given.items() if value is not None}
         until_s = time.monotonic() + timeout_s
         self._check_may_command()
         info = self.info()
@@ -216,7 +219,7 @@ class RemoteEdge:
             header, item = self._wait(inbox, answer, until_s=until_s, timeout_s=timeout_s)
         finally:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
-        received = ReceivedStill(header, item.payload, item.encoding)
+        received = ReceivedStill(header, item.payload)
         try:
             image = decode_still(received, base_bgr=None, view=info.view)
         except StillError as error:
@@ -338,22 +341,6 @@ class EdgeClient:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _still_arguments(
-    *,
-    track: int | None,
-    box: tuple[int, int, int, int] | None,
-    at_s: float | None,
-    frame: int | None,
-    quality_pct: int | None,
-) -> dict[str, int]:
-    arguments: dict[str, int | None] = {"track": track, "frame": frame, "quality": quality_pct}
-    if box is not None:
-        arguments |= dict(zip(("x", "y", "w", "h"), box, strict=True))
-    if at_s is not None:
-        arguments["at_ms"] = round(at_s * 1000)
-    return {name: value for name, value in arguments.items() if value is not None}
 
 
 def _header(item: Received) -> RoiHeader | None:

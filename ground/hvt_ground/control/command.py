@@ -6,9 +6,9 @@ import argparse
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
 
-from hvt_common.errors import UserError
+from hvt_common.config import with_joined_values
+from hvt_common.errors import Parser, UserError
 from hvt_common.runtime.reporting import say
 from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s
 from hvt_ground.control.api import EdgeClient, RemoteEdge, RequestedStill, check_suffix
@@ -18,14 +18,9 @@ __all__ = ["COMMANDS", "run"]
 _TIMEOUT_S = 15.0
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see {self.prog} --help")
-
-
 def run(argv: Sequence[str]) -> int:
     """Run one command; `UserError` where an edge refuses it or the user can mend something."""
-    arguments = _parser().parse_args(_with_joined_values(argv))
+    arguments = _parser().parse_args(with_joined_values(argv))
     do = _prepare(arguments)
     with EdgeClient.connect(*arguments.connect, zenoh_config=arguments.zenoh_config) as edges:
         if arguments.command == "edges":
@@ -129,17 +124,6 @@ def _parse_box(text: str) -> tuple[int, int, int, int]:
     return x, y, w, h
 
 
-def _with_joined_values(argv: Sequence[str]) -> list[str]:
-    """``--at -3s`` as ``--at=-3s``: argparse would take the value for a flag."""
-    joined: list[str] = []
-    for word in argv:
-        if re.match(r"-[\d.]", word) and joined and re.fullmatch(r"--[a-z-]+", joined[-1]):
-            joined[-1] += f"={word}"
-        else:
-            joined.append(word)
-    return joined
-
-
 COMMANDS = {
     "still": "a still of the untouched source frame, now or of some seconds ago",
     "tracks": "what an edge tracks now, by its own ids",
@@ -151,7 +135,7 @@ COMMANDS = {
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="hvt-ground", description=__doc__)
+    parser = Parser(prog="hvt-ground", description=__doc__)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     made = {name: commands.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
     for name, one in made.items():

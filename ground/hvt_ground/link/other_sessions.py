@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 
+from hvt_common.protocol.messages import RoiHeader, Status
 from hvt_common.units import SECOND_NS
-from hvt_ground.link.packets import StatusPacket, StillPacket
+from hvt_ground.link.packets import Packet
 
 __all__ = ["DuplicatePublishers", "PreSessionBuffer"]
 
@@ -18,23 +19,20 @@ class PreSessionBuffer:
     """Holds the first report and the newest stills that came while no session was open."""
 
     def __init__(self) -> None:
-        self._status: StatusPacket | None = None
-        self._stills: deque[StillPacket] = deque(maxlen=_MOST_STILLS)
+        self._status: list[Packet] = []
+        self._stills: deque[Packet] = deque(maxlen=_MOST_STILLS)
 
-    def status(self, packet: StatusPacket) -> None:
-        """Note a report, if it is the first of its session: it may overtake the keyframe that begins it."""
-        if packet.status.sequence == 0:
-            self._status = packet
+    def hold(self, packet: Packet) -> None:
+        """Note a still, or the first report of a session: it may overtake the keyframe that begins it."""
+        if isinstance(packet.header, RoiHeader):
+            self._stills.append(packet)
+        elif isinstance(packet.header, Status) and packet.header.sequence == 0:
+            self._status = [packet]
 
-    def still(self, packet: StillPacket) -> None:
-        """Note a still; of many the oldest goes."""
-        self._stills.append(packet)
-
-    def take(self) -> list[StatusPacket | StillPacket]:
+    def take(self) -> list[Packet]:
         """Hand them out, once: the report, then the stills in the order in which they came."""
-        packets: list[StatusPacket | StillPacket] = [] if self._status is None else [self._status]
-        packets += self._stills
-        self._status = None
+        packets = [*self._status, *self._stills]
+        self._status = []
         self._stills.clear()
         return packets
 

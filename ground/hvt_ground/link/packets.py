@@ -8,7 +8,7 @@ from hvt_common.protocol.messages import BacklogHeader, RoiHeader, Status, Track
 from hvt_common.transport.inbox import Received
 from hvt_ground.link.reassemble import Arrival
 
-__all__ = ["BacklogPacket", "BasePacket", "Packet", "StatusPacket", "StillPacket", "TracksPacket"]
+__all__ = ["BasePacket", "Packet"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,36 +22,8 @@ class BasePacket:
 
 
 @dataclass(frozen=True, slots=True)
-class StillPacket:
-    """A still."""
+class Packet:
+    """Any other message."""
 
-    header: RoiHeader
+    header: RoiHeader | TrackStep | BacklogHeader | Status
     item: Received
-    media_type: str
-
-
-@dataclass(frozen=True, slots=True)
-class TracksPacket:
-    """The edge's tracks at one frame."""
-
-    step: TrackStep
-    item: Received
-
-
-@dataclass(frozen=True, slots=True)
-class BacklogPacket:
-    """A chunk of what was stored while the link was down."""
-
-    header: BacklogHeader
-    item: Received
-
-
-@dataclass(frozen=True, slots=True)
-class StatusPacket:
-    """The edge's report."""
-
-    status: Status
-    item: Received
-
-
-Packet = BasePacket | StillPacket | TracksPacket | BacklogPacket | StatusPacket

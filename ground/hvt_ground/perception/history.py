@@ -2,8 +2,9 @@
 
 A still arrives after its frame: it is matched to the tracks of that very frame and shown beside (or pasted
 into) the decoded picture of it. Tracks are small and kept for `track_frames`. Pictures are large: 1280x720 BGR
-is 2.7 MB. Where the edge codes fewer frames than there are frames, as many reach back further. They are kept just as
-given, without a lossy detour, because a residual still must be applied to exactly the pixels that the edge had.
+is 2.7 MB, so they are kept as they were decoded, in half of it. Where the edge codes fewer frames than there are
+frames, as many reach back further. There is no lossy detour, because a residual still must be applied to exactly the
+pixels that the edge had.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from dataclasses import replace
 import numpy as np
 
 from hvt_common.values import Image, Tracks
+from hvt_common.video.hevc import YuvPicture
 
-__all__ = ["History"]
+__all__ = ["History", "as_bgr"]
 
 DEFAULT_MAX_BYTES = 96 * 1024 * 1024
 
@@ -41,7 +43,7 @@ class History:
         self._max_bytes = max_bytes
         self._track_frames = track_frames
         self._gap_frames = gap_frames
-        self._frames: OrderedDict[int, Image] = OrderedDict()
+        self._frames: OrderedDict[int, Image | YuvPicture] = OrderedDict()
         self._frame_bytes = 0
         self._tracks: OrderedDict[int, Tracks] = OrderedDict()
 
@@ -60,11 +62,11 @@ class History:
         """Frame index of the newest tracks held; None before the first."""
         return next(reversed(self._tracks), None)
 
-    def add_frame(self, frame_index: int, image: Image) -> None:
-        """Keep a decoded picture (uint8; not copied, so hand over what nobody writes to again)."""
+    def add_frame(self, frame_index: int, picture: Image | YuvPicture) -> None:
+        """Keep a decoded picture (not copied, so hand over what nobody writes to again)."""
         _require_rising(next(reversed(self._frames), None), frame_index)
-        self._frames[frame_index] = image
-        self._frame_bytes += image.nbytes
+        self._frames[frame_index] = picture
+        self._frame_bytes += picture.nbytes
         while len(self._frames) > 1 and self._frames_too_large():
             _, dropped = self._frames.popitem(last=False)
             self._frame_bytes -= dropped.nbytes
@@ -90,15 +92,13 @@ class History:
 
     def frame(self, frame_index: int) -> Image | None:
         """The picture of that frame as it was given; None if it was never decoded or is gone."""
-        return self._frames.get(frame_index)
+        picture = self._frames.get(frame_index)
+        return None if picture is None else as_bgr(picture)
 
     def frame_before(self, frame_index: int, *, within: int) -> Image | None:
         """The picture of that frame or, where it was left out, of the newest one up to ``within`` frames before."""
-        exact = self._frames.get(frame_index)
-        if exact is not None:
-            return exact
-        before = [index for index in self._frames if frame_index - within <= index < frame_index]
-        return self._frames[before[-1]] if before else None
+        before = [index for index in self._frames if frame_index - within <= index <= frame_index]
+        return self.frame(max(before)) if before else None
 
     def tracks(self, frame_index: int) -> Tracks | None:
         """The tracks at that frame; None if it was lost, is not tracked yet, or is gone.
@@ -130,6 +130,11 @@ class History:
 
     def _frames_too_large(self) -> bool:
         return len(self._frames) > self._max_frames or self._frame_bytes > self._max_bytes
+
+
+def as_bgr(picture: Image | YuvPicture) -> Image:
+    """Its pixels."""
+    return picture.bgr() if isinstance(picture, YuvPicture) else picture
 
 
 def _require_rising(newest: int | None, frame_index: int) -> None:

@@ -15,10 +15,11 @@ from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Image, Tracks, View
+from hvt_common.video.hevc import YuvPicture
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import FusedTracks, Fusion
-from hvt_ground.perception.history import History
+from hvt_ground.perception.history import History, as_bgr
 from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
@@ -46,7 +47,8 @@ class DecodedFrame:
     capture_ns: int
     reference_ns: int
     """The moment on our clock that latency counts from: capture, or in lockstep the receiving."""
-    image_bgr: Image
+    picture: Image | YuvPicture
+    """Converted to BGR by whom it is analyzed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +151,10 @@ class Pipeline:
     def analyze(self, picture: DecodedFrame, *, hurry: bool) -> None:
         """Take the next frame; with ``hurry`` detection waits for a later one."""
         index = picture.frame_index
-        self._history.add_frame(index, picture.image_bgr)
-        self._estimate_camera(picture)
-        own = self._own = self._track(picture, hurry=hurry)
+        self._history.add_frame(index, picture.picture)
+        image = as_bgr(picture.picture)
+        self._estimate_camera(index, image)
+        own = self._own = self._track(index, image, hurry=hurry)
         self._picture_ns = picture.capture_ns
         ahead = self._now.frame_index > index
         shown_at = (self._now.frame_index, self._now.capture_ns) if ahead else (index, picture.capture_ns)
@@ -214,8 +217,7 @@ class Pipeline:
 
     # The base stream
 
-    def _track(self, picture: DecodedFrame, *, hurry: bool) -> Tracks:
-        index, image = picture.frame_index, picture.image_bgr
+    def _track(self, index: int, image: Image, *, hurry: bool) -> Tracks:
         due = self._detected_frame is None or index - self._detected_frame >= self._detect_every
         if hurry or not due:
             return self._parts.tracker.predict(frame_index=index, image_bgr=image)
@@ -224,20 +226,20 @@ class Pipeline:
         found = self._parts.detector.detect(image)
         return self._parts.tracker.update(found, frame_index=index, image_bgr=image)
 
-    def _estimate_camera(self, picture: DecodedFrame) -> None:
+    def _estimate_camera(self, index: int, image: Image) -> None:
         """Estimate the camera's motion, but only where boxes have to be moved along between pictures."""
         camera, parts = self._parts.camera, self._parts
         last = self._now.picture_index
-        self._leaves_out = self._leaves_out or (last >= 0 and picture.frame_index > last + 1)
+        self._leaves_out = self._leaves_out or (last >= 0 and index > last + 1)
         if camera is None or not (self._leaves_out or parts.fusion.knows_from_afar):
             self._camera_frame = None
             return
         if self._camera_frame is None:
             camera.reset()
-        affine = camera.step(picture.image_bgr)
+        affine = camera.step(image)
         if self._camera_frame is not None:
-            parts.path.add(affine, start=self._camera_frame, end=picture.frame_index)
-        self._camera_frame = picture.frame_index
+            parts.path.add(affine, start=self._camera_frame, end=index)
+        self._camera_frame = index
 
     def _own_at(self, frame_index: int) -> Tracks:
         """Our tracker's list at a frame: as it was, or moved on from the newest frame."""

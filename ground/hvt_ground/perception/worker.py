@@ -23,7 +23,7 @@ __all__ = ["Analyze", "Job", "LockstepWorker", "PerceptionWorker", "Read", "Real
 
 _log = logging.getLogger(__name__)
 
-_MOST_PICTURES = 24
+_MOST_PICTURES = 12
 """How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
 _BEHIND_PICTURES = 1
 _STILLS_AT_ONCE = 16

@@ -7,9 +7,9 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
-from hvt_common.errors import UserError, needs_extra
+from hvt_common.errors import Parser, UserError, needs_extra
 from hvt_common.runtime.reporting import say
 from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
 from hvt_ground.pki.zenoh_files import KEYS_FOLDER, edge_file, ground_file, router_file
@@ -20,11 +20,6 @@ if TYPE_CHECKING:
 __all__ = ["run"]
 
 _DIR = Path("hvt-keys")
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see {self.prog} --help")
 
 
 def run(argv: Sequence[str]) -> int:
@@ -146,7 +141,7 @@ def _list(roster: Roster, authority: Authority) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="hvt-ground keys", description=__doc__)
+    parser = Parser(prog="hvt-ground keys", description=__doc__)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     new_ca = commands.add_parser("new-ca", help="make the CA of a fleet, once")
     add_edge = commands.add_parser("add-edge", help="a key for an edge; NAME is its --edge-id")

@@ -10,21 +10,14 @@ from functools import partial
 
 from hvt_common import __version__
 from hvt_common.protocol.clock_offset import ClockOffset
-from hvt_common.protocol.messages import Info, WireError
+from hvt_common.protocol.messages import BacklogHeader, Info, RoiHeader, Status, TrackStep, WireError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
 from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.link.other_sessions import PreSessionBuffer
-from hvt_ground.link.packets import (
-    BacklogPacket,
-    BasePacket,
-    Packet,
-    StatusPacket,
-    StillPacket,
-    TracksPacket,
-)
+from hvt_ground.link.packets import BasePacket, Packet
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.session.receiver import Receiver
 from hvt_ground.session.receiver_report import ReceiverReports
@@ -195,30 +188,35 @@ class EdgeSessions:
 
     # Routing
 
-    def _route(self, packet: Packet) -> None:
-        session = self.session
+    def _route(self, packet: BasePacket | Packet) -> None:
+        if isinstance(packet, BasePacket):
+            self._base(packet)
+            return
+        session, header, item = self.session, packet.header, packet.item
+        shown = session is not None and header.session_id == session.info.session_id
+        row = item.key.rpartition("/")[2]
         try:
-            match packet:
-                case BasePacket():
-                    self._base(packet)
-                case StillPacket(header, item, media_type):
-                    if session is None:
-                        self._pre_session.still(packet)
-                    elif header.session_id != session.info.session_id:
-                        self._receiver.skip_stranger("roi", header.session_id)
-                    else:
-                        session.still(header, item, media_type=media_type)
-                case TracksPacket(step, item):
-                    if session is None or step.session_id != session.info.session_id:
-                        self._receiver.skip_stranger("tracks", step.session_id)
-                    else:
-                        session.tracks(step, item)
-                case BacklogPacket():
-                    self._backlog(packet)
-                case StatusPacket():
-                    self._status(packet)
+            if isinstance(header, BacklogHeader):
+                self._backlog(header, item)
+            elif session is not None and shown:
+                self._take(session, header, item)
+            elif isinstance(header, Status) or (isinstance(header, RoiHeader) and session is None):
+                self._pre_session.hold(packet)
+            else:
+                self._receiver.skip_stranger(row, header.session_id)
         except WireError as error:
-            self._receiver.skip(packet.item.key.rpartition("/")[2], error)
+            self._receiver.skip(row, error)
+
+    def _take(self, session: GroundSession, header: RoiHeader | TrackStep | Status, item: Received) -> None:
+        match header:
+            case RoiHeader():
+                session.still(header, item)
+            case TrackStep():
+                session.tracks(header, item)
+            case Status():
+                session.status(header, item)
+                if header.state == "ended":
+                    self._ended_ns = time.monotonic_ns()
 
     def _base(self, packet: BasePacket) -> None:
         arrival = packet.arrival
@@ -250,8 +248,8 @@ class EdgeSessions:
             return False
         return header.frame_index > session.newest_index
 
-    def _backlog(self, packet: BacklogPacket) -> None:
-        session, header, item = self.session, packet.header, packet.item
+    def _backlog(self, header: BacklogHeader, item: Received) -> None:
+        session = self.session
         if session is None:
             raise WireError("it was stored, and no session is open to take it")
         self._backlog_ns = time.monotonic_ns()
@@ -260,15 +258,6 @@ class EdgeSessions:
             delivered = self.backlog.chunk(header, item.payload, own=session.backlog, worker=session.worker)
         finally:
             session.backlog_chunk(header, item, delivered=delivered)
-
-    def _status(self, packet: StatusPacket) -> None:
-        session, status = self.session, packet.status
-        if session is None or status.session_id != session.info.session_id:
-            self._pre_session.status(packet)
-            return
-        session.status(status, packet.item)
-        if status.state == "ended":
-            self._ended_ns = time.monotonic_ns()
 
     # Sessions
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from hvt_common.protocol.channels import DELIVERIES, Channel, parse_key
+from hvt_common.protocol.channels import Channel, parse_key
 from hvt_common.protocol.messages import (
     BacklogHeader,
     BaseHeader,
@@ -19,14 +19,7 @@ from hvt_common.protocol.messages import (
 )
 from hvt_common.transport.inbox import Received
 from hvt_ground.link.other_sessions import DuplicatePublishers
-from hvt_ground.link.packets import (
-    BacklogPacket,
-    BasePacket,
-    Packet,
-    StatusPacket,
-    StillPacket,
-    TracksPacket,
-)
+from hvt_ground.link.packets import BasePacket, Packet
 from hvt_ground.link.reassemble import Arrival, Reassembler, StreamCounters
 from hvt_ground.link.statistics import Uptime
 
@@ -61,7 +54,7 @@ class Receiver:
         """For how long nothing has come."""
         return time.monotonic_ns() - self._last_message_ns
 
-    def receive(self, item: Received) -> Sequence[Packet]:
+    def receive(self, item: Received) -> Sequence[BasePacket | Packet]:
         """What one message brings: no packet where it is unusable or waits, several where it fills a hole."""
         self._last_message_ns = time.monotonic_ns()
         at_ns = self._uptime.handle(arrived_ns=item.received_ns, now_ns=self._clock())
@@ -74,14 +67,13 @@ class Receiver:
                     arrivals = self._reassembler.accept(header, item.payload, now_ns=at_ns)
                     return [_base_packet(arrival, item) for arrival in arrivals]
                 case Channel.ROI:
-                    media_type = item.encoding.partition(";")[0] or DELIVERIES[Channel.ROI].encoding
-                    return [StillPacket(RoiHeader.parse(item.attachment, item.payload), item, media_type)]
+                    return [Packet(RoiHeader.parse(item.attachment, item.payload), item)]
                 case Channel.TRACKS:
-                    return [TracksPacket(TrackStep.parse(item.payload), item)]
+                    return [Packet(TrackStep.parse(item.payload), item)]
                 case Channel.BACKLOG:
-                    return [BacklogPacket(BacklogHeader.parse(item.attachment, item.payload), item)]
+                    return [Packet(BacklogHeader.parse(item.attachment, item.payload), item)]
                 case Channel.STATUS:
-                    return [StatusPacket(Status.parse(item.payload), item)]
+                    return [Packet(Status.parse(item.payload), item)]
         except WireError as error:
             if row is Channel.BASE:
                 self._reassembler.corrupt()

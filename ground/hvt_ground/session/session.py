@@ -30,7 +30,7 @@ from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, StillsRead, VideoSample
+from hvt_ground.events import Event, Notice, Refinement, StillsRead, VideoSample
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
@@ -150,8 +150,8 @@ class GroundSession:
             return True
         if starts_run:
             self._decoder.reset()
-        image = self._decoder.decode(item.payload)
-        if image is None or image.shape[1::-1] != self.info.base_size:
+        picture = self._decoder.decode_yuv(item.payload)
+        if picture is None or picture.size != self.info.base_size:
             return False
         self.frames_decoded += 1
         self._emit(VideoSample(header.frame_index, header.capture_ns, item.payload, header.keyframe))
@@ -161,12 +161,12 @@ class GroundSession:
             item.received_ns if self.lockstep else self._clock_offset.to_local_ns(header.capture_ns)
         )
         self.receive_latency.add(max(0.0, (item.received_ns - reference_ns) / _MILLION))
-        self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, image))
+        self.worker.picture(DecodedFrame(header.frame_index, header.capture_ns, reference_ns, picture))
         if self._account.traffic_due(header):
             self._account.traffic(header, tracks=self.pipeline.tracks, tracks_refined=self.pipeline.refined)
         return True
 
-    def still(self, header: RoiHeader, item: Received, *, media_type: str) -> None:
+    def still(self, header: RoiHeader, item: Received) -> None:
         """Take one still; a second one of the same number is counted and not shown, a third ignored."""
         self._statistics.still(header.sequence, size_bytes=item.size_bytes, arrived_ns=item.received_ns)
         if not self._still_window.is_new(header.sequence, send_ns=header.send_ns):
@@ -177,7 +177,7 @@ class GroundSession:
         self._account.time(Channel.ROI, item, header, handled=None)
         self.stills_received += 1
         self.ledger.record_outcome("received", header.reason)
-        self.worker.still(ReceivedStill(header, item.payload, media_type))
+        self.worker.still(ReceivedStill(header, item.payload))
 
     def tracks(self, step: TrackStep, item: Received) -> None:
         """Take a newer step of the edge's tracks. Raises `WireError` where its boxes make no sense."""
@@ -370,6 +370,7 @@ class GroundSession:
     # Events
 
     def _emit(self, event: Event) -> None:
-        self.backlog.note(event)
+        if isinstance(event, Refinement):
+            self.backlog.note(event)
         for sink in self.sinks:
             sink.log(event)

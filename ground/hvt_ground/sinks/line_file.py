@@ -28,7 +28,7 @@ class LineFile:
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self.path = path
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC
-        self._size_bytes = 0
+        self._size_bytes, fresh = 0, not path.exists()
         try:
             self._file = os.open(path, flags, 0o644)
         except OSError as error:
@@ -37,7 +37,8 @@ class LineFile:
             self.log(",".join(columns) + "\n")
         except UserError:
             self.close()
-            path.unlink(missing_ok=True)
+            if fresh:
+                path.unlink(missing_ok=True)
             raise
 
     def log(self, item: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 
 import cv2
@@ -43,10 +42,7 @@ class Sprite:
     def __init__(self, bgra: npt.NDArray[np.uint8], *, height_m: float) -> None:
         self.height_m = height_m
         self._levels: dict[int, tuple[npt.NDArray[np.uint8], float, float]] = {}
-        self._shape = bgra.shape
-        self._packed = zlib.compress(
-            bgra.tobytes(), 1
-        )  # hundreds of them: 30 MB, of which one level is drawn
+        self._bgra = bgra
         self.outline_m = _outline(bgra)
 
     def level(self, m_per_px: float) -> tuple[npt.NDArray[np.uint8], float, float]:
@@ -56,11 +52,10 @@ class Sprite:
         """
         step = max(0, int(np.floor(2 * np.log2(max(m_per_px, SPRITE_M_PER_PX) / SPRITE_M_PER_PX))))
         if step not in self._levels:
-            bgra = np.frombuffer(zlib.decompress(self._packed), np.uint8).reshape(self._shape)
-            high, wide = self._shape[:2]
+            high, wide = self._bgra.shape[:2]
             shrink = 2.0 ** (step / 2)
             size = (max(2, round(wide / shrink)), max(2, round(high / shrink)))
-            small = cv2.resize(bgra, size, interpolation=cv2.INTER_AREA) if step else bgra
+            small = cv2.resize(self._bgra, size, interpolation=cv2.INTER_AREA) if step else self._bgra
             scale = (wide * SPRITE_M_PER_PX / size[0], high * SPRITE_M_PER_PX / size[1])
             self._levels[step] = (np.asarray(small, np.uint8), *scale)
         return self._levels[step]

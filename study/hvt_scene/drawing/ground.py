@@ -26,13 +26,13 @@ class Ground:
     """The painted ground.
 
     Attributes:
-        bgr: (H, W, 3) uint8, the world from its north-west corner.
+        bgra: (H, W, 4) uint8, the world from its north-west corner; the fourth channel means nothing.
         m_per_px: its resolution.
         light: (h, w) float32 at ``light_m_per_px``: 1 in the sun, lower in the shade of roofs and trees.
         light_m_per_px: resolution of ``light``.
     """
 
-    bgr: npt.NDArray[np.uint8]
+    bgra: npt.NDArray[np.uint8]
     m_per_px: float
     light: npt.NDArray[np.float32]
     light_m_per_px: float
@@ -205,7 +205,9 @@ class _Painter:
         size = (round(WORLD_M[0] / step), round(WORLD_M[1] / step))
         shade = cv2.resize(self._shade, size, interpolation=cv2.INTER_AREA)
         light = (1 - self._appearance.shadow_strength * shade / 255.0).astype(np.float32)
-        return Ground(self.bgr, self._m_per_px, light, step)
+        del self._fine, self._middle, self._coarse
+        bgra = np.asarray(cv2.cvtColor(self.bgr, cv2.COLOR_BGR2BGRA), np.uint8)
+        return Ground(bgra, self._m_per_px, light, step)
 
     def _slice(self, rect: Rect) -> tuple[slice, slice]:
         x0, y0, x1, y1 = (max(0, round(v / self._m_per_px)) for v in (rect.x0, rect.y0, rect.x1, rect.y1))

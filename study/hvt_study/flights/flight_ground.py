@@ -178,7 +178,7 @@ class GroundSide:
         elif row is Channel.ROI:
             header = RoiHeader.parse(item.attachment, item.payload)
             self._record.still(header, arrival)
-            self._session.still(header, item, media_type=item.encoding)
+            self._session.still(header, item)
         elif row is Channel.TRACKS:
             self._session.tracks(TrackStep.parse(item.payload), item)
         elif row is Channel.STATUS:

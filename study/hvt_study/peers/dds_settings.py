@@ -54,7 +54,7 @@ class DdsSettings:
     """From which a final result starts a track."""
     nms_iou: float = 0.45
     """Results of both passes that overlap more are one."""
-    camera_motion: Literal["off", "flow", "ecc"] = "flow"
+    camera_motion: Literal["off", "flow"] = "flow"
     """Of the tracker, as at the ground that flies."""
     preset: str = "veryfast"
     """Of x265, both passes."""

@@ -343,6 +343,29 @@ def test_a_full_disk_is_an_error_at_once_and_leaves_what_fits_readable(small_dis
         assert not list(folder.best_stills()), "what has arrived is not sent again"
 
 
+def test_a_full_disk_evicts_nothing_in_vain(small_disk):
+    """Where deleting takes space too, a smaller --store would cost all that is stored, and free nothing."""
+    (small_disk / "filler").unlink()
+    with opened(small_disk, max_bytes=1_000_000) as folder:
+        for part in range(3):
+            add_units(folder, [shifted(unit, 10 * part) for unit in UNITS])
+        stored = numbers(folder.newest_segments())
+    with contextlib.suppress(OSError), (small_disk / "junk").open("wb", buffering=0) as junk:
+        while junk.write(bytes(4096)):
+            pass
+    folder = Store(small_disk, max_bytes=700_000, session_id=8, info=INFO.pack)
+    with pytest.raises(OSError, match="no space is left"):
+        folder.enter()
+    assert numbers(folder.newest_segments()) == stored
+    assert folder.segments == len(stored)
+    (small_disk / "junk").unlink()
+    folder.trial()
+    folder.enter()
+    add_stills(folder, {1: 1.0})
+    assert numbers(folder.newest_segments()) == stored[:1]
+    folder.close()
+
+
 def test_a_folder_that_cannot_be_made_is_an_error_of_the_disk(tmp_path):
     """A traceback in mid-flight."""
     (tmp_path / "file").write_text("in the way")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 from hvt_common.values import AccessUnit
-from hvt_edge.backlog.outage import BaseInFlight, InFlightSettings, Outage
+from hvt_edge.backlog.outage import BaseInFlight, Outage
 
 S = 1_000_000_000
 
@@ -70,9 +70,9 @@ def unit(index: int, size: int = 1_000) -> AccessUnit:
     return AccessUnit(index, index * S // 15, bytes(size), keyframe=index == 0)
 
 
-def flown(count: int, *, each_ns: int = S // 10, settings: InFlightSettings | None = None) -> BaseInFlight:
+def flown(count: int, *, each_ns: int = S // 10, **bounds: int) -> BaseInFlight:
     """So many access units sent."""
-    in_flight = BaseInFlight(settings or InFlightSettings())
+    in_flight = BaseInFlight(**bounds)
     for index in range(count):
         in_flight.sent(index, unit(index), now_ns=index * each_ns)
     return in_flight
@@ -95,7 +95,7 @@ def test_frames_that_no_report_has_named_are_taken_in_order():
 
 def test_frames_in_flight_are_bounded_in_bytes_and_age():
     """A ground that never reports would let the edge grow; or what was lost long ago would count for this outage."""
-    in_flight = flown(60, each_ns=S // 100, settings=InFlightSettings(max_bytes=10_000))
+    in_flight = flown(60, each_ns=S // 100, max_bytes=10_000)
     assert in_flight.size_bytes <= 10_000
     assert lost(in_flight) == list(range(50, 60))
     assert lost(flown(10, each_ns=S)) == [5, 6, 7, 8, 9]

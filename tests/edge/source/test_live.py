@@ -53,8 +53,11 @@ def test_camera_times_without_jitter_and_never_back():
         for number, at in enumerate(arrivals)
     ]
     assert [later - earlier for earlier, later in pairwise(times)] == [40 * MS] * 5
-    back_ns = clock.capture_ns(zero - 3600 * SECOND_NS, now_ns=zero + 300 * MS)
-    assert times[-1] < back_ns <= zero + 300 * MS
+    back = [
+        clock.capture_ns(zero + at * MS - 3600 * SECOND_NS, now_ns=zero + at * MS) for at in (300, 340, 380)
+    ]
+    assert times[-1] < back[0]
+    assert back == [zero + at * MS for at in (300, 340, 380)], "else none would be due for an hour"
     assert clock.capture_ns(None, now_ns=zero + 400 * MS) == zero + 400 * MS
 
 

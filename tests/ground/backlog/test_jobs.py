@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from contextlib import contextmanager
 
 from hvt_common.protocol.messages import parse_backlog_units
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
@@ -14,12 +13,6 @@ from hvt_ground.perception.worker import RealtimeWorker
 from programs.processes import eventually
 from rigs.backlog_chunks import video_object
 from rigs.flight import Flight, RedSquares, SameAnswer
-
-
-@contextmanager
-def models():
-    """A real detector of red squares."""
-    yield RedSquares(), None
 
 
 def test_work_that_was_never_begun_lets_its_recording_go():
@@ -36,7 +29,7 @@ def test_work_that_was_never_begun_lets_its_recording_go():
 
     perception = BacklogPerception(
         info,
-        checkout=models,
+        take_models=lambda: (RedSquares(), None),
         tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader_of=lambda _detector, _classifier: SameAnswer(),
         detect_every=3,

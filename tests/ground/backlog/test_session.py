@@ -33,10 +33,12 @@ from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
+from hvt_ground.sinks.rerun.gallery import SLOTS
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.status import completed, summary, table
 from programs.rrd import Recording
+from programs.small_disk import small_disk
 from rigs.backlog_chunks import chunks, info_object, still_object, video_object
 from rigs.flight import CLASSES, Flight, Port, RedSquares, SameAnswer, pipeline_of, square_box
 from rigs.handled import WatchedInbox, check, end
@@ -102,6 +104,7 @@ class Rig:
         **recorder,
     ):
         self.folder = folder
+        self.backlog_folder: Path | None = None
         self._models = models or Models()
         self._pipeline = pipeline
         self._timing = timing
@@ -127,6 +130,19 @@ class Rig:
         )
         self.thread = EdgeThread(self.receiver, drain_s=drain_s)
 
+    def put_until_taken(self, former: Flight, still: bytes) -> None:
+        """A former session's still, as its edge sends it: again until it is acknowledged."""
+        sid = former.session_id
+
+        def taken() -> bool:
+            self.put(*chunks(sid, "info", 0, info_object(former)), *chunks(sid, "still", 0, still))
+            ranges = self.acknowledged_ranges()
+            return any(
+                (one.session_id, one.kind) == (sid, "still") and one.acknowledged_bytes for one in ranges
+            )
+
+        wait_for(taken)
+
     def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
         path = self.folder / f"{len(self.opened)}.rrd"
         sinks: list[Sink] = [self._sink(info, path)]
@@ -145,7 +161,7 @@ class Rig:
         return session
 
     def _open_backlog(self, info: Info) -> BacklogRecording:
-        path = self.folder / f"backlog-{next(self._backlog_numbers)}.rrd"
+        path = (self.backlog_folder or self.folder) / f"backlog-{next(self._backlog_numbers)}.rrd"
         return BacklogRecording(info, sink=self._sink(info, path), perception=look_of(info))
 
     def _sink(self, info: Info, path: Path) -> QueuedSink:
@@ -320,7 +336,7 @@ def test_stills_of_an_outage_are_shown_at_their_own_time(flight, tmp_path):
     recording = Recording(tmp_path / "0.rrd")
     shown = [frame for frame, _ in recording.stills()]
     assert [frame for frame in shown if 25 < frame < 65] == list(range(27, 39))
-    captions = recording.latest("/stills/captions", "Boxes2D:labels", 33)
+    captions = [recording.latest(f"/stills/{slot}", "Boxes2D:labels", 33) for slot in range(SLOTS)]
     assert sum(bool(text) for text in captions) >= 5
     assert any("12 stills from the outage at " in text for _, _, text in recording.events())
 
@@ -458,14 +474,41 @@ def test_what_a_former_session_kept_has_a_recording_of_its_own(flight, tmp_path)
     assert content["backlog"]["recordings"] == [str(tmp_path / "backlog-0.rrd")]
 
 
+def test_a_full_disk_under_a_former_session_costs_no_more_than_time(flight, tmp_path):
+    """The ground would end, or acknowledge what it could not write: the edge would delete the only copy."""
+    former = Flight(45, keyframes=(20,))
+    sid, video = former.session_id, video_object(former, range(20, 45))
+    whole = AcknowledgedRange(session_id=sid, kind="base", number=20, acknowledged_bytes=len(video))
+    with small_disk(tmp_path / "card") as card:
+        (card / "junk").write_bytes(bytes(1_040_384))
+        with Rig(tmp_path, flight) as rig:
+            rig.backlog_folder = card
+            rig.base(*range(10))
+            rig.put(*chunks(sid, "info", 0, info_object(former)), *chunks(sid, "base", 20, video))
+            assert whole not in rig.acknowledged_ranges()
+            rig.base(*range(10, 25))
+            assert rig.session.frames_decoded == 25, "the flight of now goes on"
+            (part,) = rig.failures.parts
+            assert not part.working
+            assert "No space left" in part.reason
+            (card / "junk").unlink()
+
+            def arrives() -> bool:
+                rig.put(*chunks(sid, "base", 20, video))  # as the edge sends what is not acknowledged
+                return whole in rig.acknowledged_ranges()
+
+            wait_for(arrives)
+        shown = {frame for path in card.glob("backlog-*.rrd") for frame, _, _ in Recording(path).video()}
+        assert shown == set(range(20, 45))
+
+
 def test_recordings_of_former_sessions_are_bounded(flight, tmp_path):
     """An edge that was started over and over would have the ground open files without end."""
     formers = [Flight(2) for _ in range(6)]
     with Rig(tmp_path, flight) as rig:
         rig.base(*range(5))
         for former in formers:
-            rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
-            rig.put(*chunks(former.session_id, "still", 0, still_object(former, 1, 0)))
+            rig.put_until_taken(former, still_object(former, 1, 0))
         assert len(rig.recordings.open_sessions) == 4
     for number in range(6):
         assert [frame for frame, _ in Recording(tmp_path / f"backlog-{number}.rrd").stills()] == [1]
@@ -477,9 +520,10 @@ def test_no_more_files_are_made_than_the_bound(flight, tmp_path):
     stills = [still_object(former, 1, 0) for former in formers]
     with Rig(tmp_path, flight, most_files=2) as rig:
         rig.base(*range(5))
-        for former, still in zip(formers, stills, strict=True):
-            rig.put(*chunks(former.session_id, "info", 0, info_object(former)))
-            rig.put(*chunks(former.session_id, "still", 0, still))
+        for former, still in zip(formers[:2], stills[:2], strict=True):
+            rig.put_until_taken(former, still)
+        rig.put(*chunks(formers[2].session_id, "info", 0, info_object(formers[2])))
+        rig.put(*chunks(formers[2].session_id, "still", 0, stills[2]))
         said = {one.session_id for one in rig.acknowledged_ranges()}
         assert said == {former.session_id for former in formers[:2]}, "of the third nothing is taken"
         assert rig.receiver.unusable >= 2
@@ -490,7 +534,7 @@ def test_no_more_files_are_made_than_the_bound(flight, tmp_path):
 
 def received(item: Received) -> ReceivedStill:
     """A still as it is handed on."""
-    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload, item.encoding)
+    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
 
 def test_a_recording_in_use_stays_open(flight, tmp_path):
@@ -826,6 +870,7 @@ def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path):
         rig.inbox.put(item)
     assert rig.thread.close(timeout_s=60)
     assert rig.thread.error is None
+    rig.outputs.close(within_s=60)
     assert len(Recording(tmp_path / "0.rrd").video()) == 30 + 25
     (last,) = [one for report in rig.port.reports for one in report.backlog if one.acknowledged_bytes][-1:]
     assert last.kind == "base"

@@ -100,7 +100,7 @@ def test_results_that_nobody_fetches_do_not_pile_up(rig, flight):
     for sequence in range(5000):
         item = flight.still(1, sequence, data=b"no picture")
         header = RoiHeader.parse(item.attachment, item.payload)
-        rig.session.still(header, item, media_type="image/jpeg")
+        rig.session.still(header, item)
     assert len(rig.session.take_results(100_000)) <= 4096
     assert rig.session.stills_dropped["undecodable"] > 4900
 
@@ -109,7 +109,7 @@ def test_broken_stills_are_not_all_looked_into(rig, flight):
     """Each costs a line in the recording and one on stderr; a few thousand a second would fill both."""
     for sequence in range(200):
         item = flight.still(1, sequence, data=b"no picture")
-        rig.session.still(RoiHeader.parse(item.attachment, item.payload), item, media_type="image/jpeg")
+        rig.session.still(RoiHeader.parse(item.attachment, item.payload), item)
     rig.session.close()
     assert sum("cannot be decoded" in getattr(one, "text", "") for one in rig.events) == 32
 
@@ -126,10 +126,10 @@ def test_stills_that_wait_to_be_read_have_a_bound_in_bytes():
     flight = Flight(2)
     header = RoiHeader.parse(*((one := flight.still(1, 0)).attachment, one.payload))
     try:
-        worker.still(ReceivedStill(header, b"x", "image/jpeg"))
+        worker.still(ReceivedStill(header, b"x"))
         assert begun.wait(10)
         for _ in range(64):
-            worker.still(ReceivedStill(header, bytes(2**20), "image/jpeg"))
+            worker.still(ReceivedStill(header, bytes(2**20)))
         assert worker.dropped["overflow"] == 32
     finally:
         busy.set()

@@ -51,7 +51,7 @@ class Rig:
 def received(flight: Flight, index: int, sequence: int, **changes) -> ReceivedStill:
     """A still with its header parsed."""
     item = flight.still(index, sequence, **changes)
-    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload, item.encoding)
+    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
 
 
 def test_each_frame_gives_an_overlay_with_the_track_where_the_object_is(pictures):
@@ -199,7 +199,7 @@ def residual(
     crop = tuple(int(side) for side in square_box(index))
     sharp = flight.pictures[index][crop[1] : crop[3], crop[0] : crop[2]]
     view = View.fitted((320, 192), (320, 192), fit="letterbox")
-    base = base_crop(pictures[index].image_bgr, view=view, crop_source_px=crop, size=sharp.shape[1::-1])
+    base = base_crop(pictures[index].picture, view=view, crop_source_px=crop, size=sharp.shape[1::-1])
     coded = still_codec("residual").encode(sharp, quality_pct=80, base_bgr=base)
     fields = {"data": coded.data, "codec": "residual", "parameters": coded.parameters} | changes
     return received(flight, index, sequence, **fields)
@@ -215,7 +215,7 @@ def test_a_residual_is_undone_on_the_frame_that_it_names(flight, pictures):
     (refinement,) = rig.of(Refinement)
     x1, y1, x2, y2 = (int(side) for side in square_box(6))
     sharp = flight.pictures[6][y1:y2, x1:x2].astype(float)
-    base = pictures[6].image_bgr[y1:y2, x1:x2]
+    base = pictures[6].picture[y1:y2, x1:x2]
     assert np.square(refinement.still_bgr - sharp).mean() < 0.7 * np.square(base - sharp).mean()
     assert (refinement.track_id, refinement.class_after) == (1, "bus")
     assert refinement.crop_base_px == square_box(6)
@@ -268,7 +268,7 @@ def test_stills_that_wait_are_bounded(flight, pictures):
     rig = Rig()
     rig.pipeline.analyze(pictures[0], hurry=False)
     one = residual(flight, pictures, 5, 0)
-    rig.pipeline.read([ReceivedStill(replace(one.header, sequence=i), one.data, "") for i in range(70)])
+    rig.pipeline.read([ReceivedStill(replace(one.header, sequence=i), one.data) for i in range(70)])
     assert [result.still_sequence for result in rig.pipeline.take_results()] == list(range(6))
 
 

@@ -108,7 +108,7 @@ def test_a_still_is_shown_though_nobody_can_name_it(tmp_path: Path, classifier: 
     pipeline.analyze(picture(0, value=200), hurry=False)
     item = flight.still(0, 0)
     header = replace(RoiHeader.parse(item.attachment, item.payload), frame_index=0)
-    pipeline.read([ReceivedStill(header, item.payload, "image/jpeg")])
+    pipeline.read([ReceivedStill(header, item.payload)])
     (shown,) = [one for one in events if isinstance(one, Refinement)]
     assert shown.still == item.payload
     assert pipeline.outcomes == {"unread": 1}
@@ -132,10 +132,10 @@ def test_a_model_that_never_works_is_opened_ever_more_seldom(tmp_path: Path) -> 
     detector = RetriedDetector(open_one, "detector", failures, pause=pause)
     until = time.monotonic() + 0.7
     while time.monotonic() < until:
-        assert len(detector.detect(picture(0, value=255).image_bgr)) == 0
+        assert len(detector.detect(picture(0, value=255).picture)) == 0
         time.sleep(0.002)
     assert 3 <= len(opened) <= 6, "after 0, 0.05, 0.15, 0.35 s"
     path.unlink()
     time.sleep(pause.pause_ns / SECOND_NS)
-    assert len(detector.detect(picture(0, value=100).image_bgr)) == 0
+    assert len(detector.detect(picture(0, value=100).picture)) == 0
     assert "d.onnx" in failures.parts[0].reason, "it cannot be opened either"

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.process import limit_malloc_arenas
 from hvt_common.transport.inbox import Received
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import LinkSettings
@@ -20,6 +22,7 @@ from hvt_ground.config import GroundConfig, check
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort, GroundLink
+from hvt_ground.sinks import Outputs
 from hvt_ground.status import status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 from programs.outsider import joined
@@ -85,7 +88,8 @@ class Restarted:
 def served(link: GroundLink, folder: Path, ended: list[str]) -> Iterator[tuple[EdgePort, EdgeSessions]]:
     """The edge's thread with sessions as `hvt-ground` makes them; ``ended`` gets one word a session."""
     config = check(GroundConfig(record=folder, tracks=folder, detector="motion", classifier="none"))
-    factory = SessionFactory(config, Models(config), clock=fast_clock, live_url=None, timing=None)
+    outputs, models = Outputs(Failures(time.time_ns)), Models(config)
+    factory = SessionFactory(config, models, clock=fast_clock, outputs=outputs, view=None)
 
     def note(session: GroundSession) -> None:
         assert summary(session)["frames_decoded"] == FRAMES, summary(session)
@@ -105,11 +109,13 @@ def served(link: GroundLink, folder: Path, ended: list[str]) -> Iterator[tuple[E
         yield port, sessions
     finally:
         assert thread.close(timeout_s=60)
+        outputs.close()
     assert thread.error is None
 
 
 def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Path) -> None:
     """After a night with a drone that restarts every minute the ground would be killed for its memory."""
+    limit_malloc_arenas()  # as hvt-ground does
     endpoint, ended = f"tcp/127.0.0.1:{free_port}", list[str]()
     watching = threading.Event()
 

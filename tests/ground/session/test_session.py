@@ -13,7 +13,7 @@ import pytest
 from hvt_common.protocol.ledger import Account, overhead_bytes
 from hvt_common.protocol.messages import Info
 from hvt_common.transport.inbox import Inbox, Received
-from hvt_ground.perception.worker import RealtimeWorker
+from hvt_ground.perception.worker import LockstepWorker, RealtimeWorker
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
@@ -454,7 +454,7 @@ def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
 
 def test_a_still_before_its_frame_waits_for_its_track(flight):
     """On two links stills overtake pictures: they would refine nothing."""
-    with Rig() as rig:
+    with Rig(worker_of=partial(LockstepWorker, name="uav-1")) as rig:  # a busy machine would pass frames over
         rig.port.flight = flight
         rig.put(*bases(flight, 0, 1, 2), flight.still(6, 0))
         rig.settle()

@@ -9,6 +9,7 @@ import numpy as np
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.config import GroundConfig, check
 from hvt_ground.perception.pipeline import DecodedFrame
+from hvt_ground.perception.retried import RetriedDetector
 from hvt_ground.wiring import Models
 from rigs.flight import Flight, pipeline_of
 
@@ -31,7 +32,8 @@ def test_all_sessions_take_turns_with_the_same_models():
     (detector, classifier), other = models.take(), models.take()
     assert (detector, classifier) == other
     inside, most = [], []
-    model, found = detector.model, detector.model.detect
+    assert isinstance(detector, RetriedDetector)
+    model, found = detector.part, detector.part.detect
 
     def watched(image):
         inside.append(1)

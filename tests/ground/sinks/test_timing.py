@@ -91,6 +91,14 @@ def test_a_file_that_cannot_be_is_one_sentence(tmp_path):
         timing_table(tmp_path)
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_a_device_that_refuses_is_not_removed(tmp_path):
+    """As root a ground would take away what other programs need."""
+    with pytest.raises(UserError, match="No space left"):
+        timing_table(Path("/dev/full"))
+    assert Path("/dev/full").is_char_device()
+
+
 WRITER = r"""
 import sys, time
 from pathlib import Path

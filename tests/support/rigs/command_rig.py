@@ -83,7 +83,7 @@ class Rig:
         self.outbox = Outbox()
         self.maker = maker
         self.on_demand = OnDemand(
-            FrameRing(RingSettings(max_age_ns=round(ring_s * 1e9))),
+            FrameRing(RingSettings(max_bytes=100_000_000, max_age_ns=round(ring_s * 1e9))),
             outbox=self.outbox,
             maker=maker,
             view=VIEW,

@@ -30,6 +30,7 @@ class Strangers:
     def __init__(self, ports: Iterable[int], *, tables: Iterable[Path] = _TABLES) -> None:
         self._ports = frozenset(ports)
         self._tables = [one for one in tables if one.exists()] if self._ports else []
+        self._linked: set[str] = set()
         self._pending: set[str] = set()
         """Connections that are no links, or not yet."""
         self._refused: OrderedDict[str, list[float]] = OrderedDict()
@@ -39,11 +40,12 @@ class Strangers:
     def check(self, links: Callable[[], Iterable[str]], now_s: float) -> list[str]:
         """Return the hosts to be named now; ``links`` gives the far ends of the links that stand."""
         connected = {one for table in self._tables for one in self._connected(table)}
-        if not connected and not self._pending:
+        if connected <= self._linked and not self._pending:
+            self._linked = connected
             return []
         linked = set(links())
         ended = self._pending - connected - linked
-        self._pending = connected - linked
+        self._linked, self._pending = connected & linked, connected - linked
         return [host for host in map(_host, sorted(ended)) if self._note(host, now_s)]
 
     def _note(self, host: str, now_s: float) -> bool:

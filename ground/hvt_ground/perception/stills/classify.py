@@ -158,7 +158,7 @@ class Redetection:
         Objects keep the size that the network sees on the base stream. To enlarge them beyond it, a part of the
         picture at a time, made classes worse.
         """
-        detector = self._detector.model if isinstance(self._detector, RetriedDetector) else self._detector
+        detector = self._detector.part if isinstance(self._detector, RetriedDetector) else self._detector
         if not isinstance(detector, OnnxDetector):
             return 1.0
         width, height = detector.input_size(base_size)

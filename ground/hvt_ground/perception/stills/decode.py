@@ -22,7 +22,6 @@ class ReceivedStill:
 
     header: RoiHeader
     data: bytes
-    media_type: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,6 @@ from hvt_ground.sinks.rerun.gallery import CANVAS
 
 __all__ = [
     "BITRATE",
-    "CAPTIONS",
     "EVENTS",
     "LATENCY",
     "OVERFLOW",
@@ -30,7 +29,6 @@ REFINED = "/base/refined"
 REPORTED = "/base/reported"
 PATCHES = "/base/patches"
 STILLS = "/stills"
-CAPTIONS = "/stills/captions"
 OVERFLOW = "/stills/more"
 BITRATE = "/link/bitrate"
 LATENCY = "/link/latency"

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Literal, Self
 
@@ -27,10 +27,10 @@ from hvt_ground.sinks.rerun.sdk import (
     viewer_program,
 )
 
-__all__ = ["LiveRecording", "LiveView", "free_port", "listening"]
+__all__ = ["LiveRecording", "LiveView", "free_port", "listening", "started_viewer"]
 
 _HOST = "127.0.0.1"
-_START_S = 15.0
+_START_S = 30.0
 _MEMORY_LIMIT = "512MB"
 
 
@@ -69,30 +69,12 @@ class LiveView:
                 self._process = self._start()
 
     def _start(self) -> subprocess.Popen[bytes]:
-        command = [str(viewer_program()), "--bind", _HOST, "--port", str(self._port)]
-        command += ["--server-memory-limit", _MEMORY_LIMIT]
+        options = ["--server-memory-limit", _MEMORY_LIMIT]
         if self.kind == "serve":
-            command += ["--serve-web", "--web-viewer-port", str(self._web_port)]
+            options += ["--serve-web", "--web-viewer-port", str(self._web_port)]
         else:
-            command += ["--memory-limit", "50%", "--hide-welcome-screen"]
-        process = subprocess.Popen(  # noqa: S603  # the SDK's own program, no shell
-            command,
-            env=viewer_environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for us
-        )
-        deadline = time.monotonic() + _START_S
-        while not listening(self._port):
-            if process.poll() is not None or time.monotonic() > deadline:
-                process.kill()
-                process.wait()
-                raise UserError(
-                    f"the Rerun viewer did not start ({viewer_program()}): it needs a display for --view; try --serve"
-                )
-            time.sleep(0.05)
-        return process
+            options += ["--memory-limit", "50%", "--hide-welcome-screen"]
+        return started_viewer(options, port=self._port, needs="a display for --view; try --serve")
 
     def close(self) -> None:
         """End the web viewer; leave a native window to its user."""
@@ -158,6 +140,28 @@ class LiveRecording:
         self._next_check_s = now_s + 1.0
         if not listening(self._port):
             raise UserError(f"the viewer at {self._url} is gone")
+
+
+def started_viewer(
+    options: Sequence[str], *, port: int, needs: str, environment: Mapping[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """The viewer's process, once it listens at ``port``; `UserError` with what it ``needs`` where it never does."""
+    process = subprocess.Popen(  # noqa: S603  # the SDK's own program, no shell
+        [str(viewer_program()), "--bind", _HOST, "--port", str(port), *options],
+        env={**(environment or {}), **viewer_environment()},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for us
+    )
+    deadline = time.monotonic() + _START_S
+    while not listening(port):
+        if process.poll() is not None or time.monotonic() > deadline:
+            process.kill()
+            process.wait()
+            raise UserError(f"the Rerun viewer did not start ({viewer_program()}): it needs {needs}")
+        time.sleep(0.05)
+    return process
 
 
 def listening(port: int) -> bool:

@@ -71,7 +71,7 @@ class LayerUpdate:
     components: Mapping[str, Any]
     """``boxes``: (N, 4) float32 centre and half size, whole or half base pixels; ``identity``: an `Identity`;
     ``labels``: N texts, in the layer ``refined`` only; ``confidences``: N percents; ``origins``: N numbers of
-    `ORIGINS`, once a track was not of the base stream."""
+    `ORIGINS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,23 +89,13 @@ class OverlayEncoder:
 
     Movement is written at the overlay's own rate while it costs less than ``share`` of the bytes received (and
     ``credit_bytes`` before that), and less often beyond; a change of the set of tracks, of a class or of a label is
-    always written. ``afresh`` writes the first overlay whole; ``with_origins`` writes origins from the first
-    overlay on, not only once one is not of the base stream.
+    always written. ``afresh`` writes the first overlay whole.
     """
 
-    def __init__(
-        self,
-        *,
-        share: float = 0.125,
-        credit_bytes: int = 16_384,
-        afresh: bool = False,
-        with_origins: bool = False,
-    ) -> None:
+    def __init__(self, *, share: float = 0.125, credit_bytes: int = 16_384, afresh: bool = False) -> None:
         self._share = share
         self._limit = self._credit = float(credit_bytes)
         self._newest_frame = -1
-        self.with_origins = with_origins
-        """Whether origins are written: a track was not of the base stream."""
         nothing = np.empty((0, 4), np.float32)
         self._screen = _Screen(np.empty(0, np.int64), nothing, np.empty(0, np.int64))
         empty = {"boxes": nothing, "identity": Identity(), "labels": (), "confidences": (), "origins": ()}
@@ -128,9 +118,8 @@ class OverlayEncoder:
         if overlay.frame_index < self._newest_frame:
             return []
         self._newest_frame = overlay.frame_index
-        self.with_origins = self.with_origins or any(origin != "base" for origin in overlay.origins)
         screen = _held(self._screen, overlay)
-        wanted = dict(_layers(overlay, screen, with_origins=self.with_origins))
+        wanted = dict(_layers(overlay, screen))
         updates = []
         for layer, components in wanted.items():
             old = self._written[layer]
@@ -198,7 +187,7 @@ class BacklogOverlays:
         """Credit what came of stored video, as `OverlayEncoder.earn`."""
         self._credit_bytes += received_bytes
 
-    def encode(self, overlay: Overlay, *, with_origins: bool) -> list[tuple[int, int, LayerUpdate]]:
+    def encode(self, overlay: Overlay) -> list[tuple[int, int, LayerUpdate]]:
         """What to write for an overlay of stored video, with frame and capture time; nothing outside a hole."""
         frame = overlay.frame_index
         holes = (
@@ -212,7 +201,7 @@ class BacklogOverlays:
             hole.written = True
             timed += [(hole.after, hole.capture_ns, update) for update in hole.screen]
         if self._encoder is None or not 0 < frame - self._last <= self._continues:
-            self._encoder = OverlayEncoder(afresh=True, with_origins=with_origins)
+            self._encoder = OverlayEncoder(afresh=True)
         self._last = frame
         self._encoder.earn(self._credit_bytes)
         self._credit_bytes = 0
@@ -235,9 +224,7 @@ def _held(screen: _Screen, overlay: Overlay) -> _Screen:
     return result
 
 
-def _layers(
-    overlay: Overlay, screen: _Screen, *, with_origins: bool
-) -> Iterator[tuple[Layer, dict[str, Any]]]:
+def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str, Any]]]:
     """All components of each layer."""
     origins = overlay.origins or ("base",) * len(overlay.track_ids)
     reported = np.array([origin in _REPORTED for origin in origins], np.bool_)
@@ -256,11 +243,10 @@ def _layers(
                 tuple(overlay.classes[row] for row in rows),
             ),
             "confidences": tuple(screen.percents[mask].tolist()),
+            "origins": tuple(ORIGINS.index(origins[row]) for row in rows),
         }
         if layer == "refined":
             components["labels"] = tuple(_label(overlay, screen, row, reported=reported[row]) for row in rows)
-        if with_origins:
-            components["origins"] = tuple(ORIGINS.index(origins[row]) for row in rows)
         yield layer, components
 
 

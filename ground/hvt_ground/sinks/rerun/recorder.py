@@ -238,7 +238,7 @@ class Recorder:
 
     def _backlog_overlay(self, overlay: Overlay) -> list[TableRow | Chunk]:
         """Patches stay away: they ride on tracks of now."""
-        timed = self._backlog_overlays.encode(overlay, with_origins=self._overlays.with_origins)
+        timed = self._backlog_overlays.encode(overlay)
         return [
             row for frame, capture_ns, update in timed for row in self._layer(update, at=(frame, capture_ns))
         ]
@@ -330,7 +330,6 @@ def _output(settings: RecorderSettings) -> RrdFile | LiveRecording:
 def _facts(settings: RecorderSettings, frames: str) -> dict[str, str]:
     width, height = settings.base_size
     return {
-        "edge": settings.edge_id,
         "session": settings.session,
         "base": f"{width}x{height} HEVC, {frames}",
         "budget": bitrate_text(settings.budget_bps),

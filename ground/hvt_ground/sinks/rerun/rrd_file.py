@@ -38,6 +38,7 @@ _STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
 _END = 0
 _SPARE_BYTES = 2 * 2**20
+_FLUSH_S = 10.0
 _filters = threading.Lock()
 """Warning filters are the process's."""
 
@@ -56,6 +57,7 @@ class RrdFile:
         self._id = recording_id
         self._screen = screen
         self._compacted_bytes = self.size_bytes = 0
+        fresh = not path.exists()
         self._file = _created(path)
         self._recording = new_recording(recording_id)
         self._stream = rr.binary_stream(self._recording)
@@ -67,7 +69,8 @@ class RrdFile:
             self._write(stream[:_STREAM_HEADER_BYTES] + _messages(stream), at=0)
         except UserError:
             self._release()
-            path.unlink(missing_ok=True)
+            if fresh:
+                path.unlink(missing_ok=True)
             raise
         self._compacted_bytes = self.size_bytes
 
@@ -108,6 +111,7 @@ class RrdFile:
                 if hurry and hurry.is_set():
                     return
                 recording.send_chunks([chunk])
+                recording.flush(timeout_sec=_FLUSH_S)  # or all would be in memory
             recording.disconnect()
             scratch.replace(self.path)
             self.size_bytes = self.path.stat().st_size

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
@@ -20,8 +19,7 @@ from rerun.experimental import ViewerClient
 
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.units import parse_size
-from hvt_ground.sinks.rerun.live_view import free_port, listening
-from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
+from hvt_ground.sinks.rerun.live_view import free_port, started_viewer
 
 __all__ = ["main", "screenshot"]
 
@@ -44,14 +42,13 @@ def screenshot(
         raise UserError("ffmpeg is not on the PATH: the viewer needs it to show HEVC")
     port = free_port()
     with tempfile.TemporaryDirectory(prefix="hvt-viewer-") as runtime:
-        command = [str(viewer_program()), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1"]
-        command += ["--port", str(port), "--window-size", f"{size[0]}x{size[1]}"]
-        environment = {"XDG_RUNTIME_DIR": runtime} | viewer_environment()
-        process = subprocess.Popen(  # noqa: S603  # the SDK's own program, no shell
-            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        process = started_viewer(
+            ["--headless", "--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}"],
+            port=port,
+            needs="a Vulkan driver, software will do",
+            environment={"XDG_RUNTIME_DIR": runtime},
         )
         try:
-            _wait_until_listening(process, port)
             png = _picture(port, recording, frame=frame, settle_s=settle_s)
         finally:
             process.terminate()
@@ -79,14 +76,6 @@ def _without_menu(png: bytes) -> bytes:
         raise UserError("the headless viewer returned no picture")
     _, cropped = cv2.imencode(".png", picture[_MENU_PX:])
     return cropped.tobytes()
-
-
-def _wait_until_listening(process: subprocess.Popen[bytes], port: int) -> None:
-    deadline = time.monotonic() + _START_S
-    while not listening(port):
-        if process.poll() is not None or time.monotonic() > deadline:
-            raise UserError("the headless viewer did not start: it needs a Vulkan driver, software will do")
-        time.sleep(0.1)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

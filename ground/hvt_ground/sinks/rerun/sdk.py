@@ -1,27 +1,21 @@
 """What the Rerun SDK does not let go of by itself: each recording would leave four threads and two megabytes behind.
 
 A ground opens a recording for each session and each return after a long outage, so this has to be flat over weeks.
-Measured with rerun-sdk 0.41 (which pyproject pins); `tests/ground/sinks/rerun/test_sdk.py` holds it to
-that. The names it takes for that are the SDK's own and may go with another version: then its public way is taken, and
-a long-lived ground grows, but starts and records.
+Measured with rerun-sdk 0.41; `tests/ground/sinks/rerun/test_sdk.py` holds it to that. The names it takes for that
+are the SDK's own, so pyproject pins the version.
 """
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun_bindings as bindings
 
 from hvt_common.errors import UserError
-
-try:
-    import rerun_bindings as bindings
-except ImportError:
-    bindings = None  # type: ignore[assignment]
 
 __all__ = [
     "RecordingId",
@@ -31,8 +25,6 @@ __all__ = [
     "viewer_environment",
     "viewer_program",
 ]
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,33 +52,26 @@ def new_recording(one: RecordingId) -> rr.RecordingStream:
 
 def send_blueprint(recording: rr.RecordingStream, one: RecordingId, blueprint: rrb.Blueprint) -> None:
     """Send the blueprint and make it active: the SDK's own function never frees the stream that it writes it to."""
-    try:
-        _send_and_let_go(recording, one.application, blueprint)
-        release_recordings()
-    except (AttributeError, TypeError) as error:
-        _log.debug("this Rerun SDK has other names inside (%s): a recording leaves its threads behind", error)
-        rr.send_blueprint(blueprint, recording=recording)
-
-
-def _send_and_let_go(recording: rr.RecordingStream, application: str, blueprint: rrb.Blueprint) -> None:
     # As rerun.sinks.send_blueprint has it, but for the last line: stream and storage hold each other until then.
     stream = rr.RecordingStream._from_native(  # noqa: SLF001
         bindings.new_blueprint(
-            application_id=application, make_default=False, make_thread_default=False, default_enabled=True
+            application_id=one.application,
+            make_default=False,
+            make_thread_default=False,
+            default_enabled=True,
         )
     )
     stream.set_time("blueprint", sequence=0)
     blueprint._log_to_stream(stream)  # noqa: SLF001
     bindings.send_blueprint(stream.memory_recording().storage, True, True, recording.to_native())
     stream.disconnect()
+    del stream
+    release_recordings()
 
 
 def release_recordings() -> None:
     """Free every recording that is disconnected and that nobody refers to any more."""
-    try:
-        bindings.flush_and_cleanup_orphaned_recordings()
-    except AttributeError as error:
-        _log.debug("this Rerun SDK has other names inside (%s): recordings are not freed", error)
+    bindings.flush_and_cleanup_orphaned_recordings()
 
 
 def viewer_program() -> Path:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 import rerun as rr
 from rerun.chunk import Chunk
 
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.gallery import SLOTS, frame_of
+from hvt_ground.sinks.rerun.gallery import SLOTS
 from hvt_ground.sinks.rerun.overlays import REPORTED_MARK
 from hvt_ground.sinks.rerun.palette import (
     BASE_LINE,
@@ -46,7 +45,7 @@ def static_chunks(title: str, facts: Mapping[str, str]) -> list[Chunk]:
         static_chunk(names.TRACKS, _box_style(width=1.0, draw_order=10.0, labels=False)),
         static_chunk(names.REPORTED, _ellipse_style(width=1.0, draw_order=15.0)),
         static_chunk(names.REFINED, _box_style(width=2.5, draw_order=20.0, labels=True)),
-        static_chunk(names.CAPTIONS, _gallery_frames()),
+        *(static_chunk(f"{names.STILLS}/{slot}", _caption_style()) for slot in range(SLOTS)),
         static_chunk(names.BITRATE, _lines(_BITRATE)),
         static_chunk(names.LATENCY, _lines(_LATENCY)),
         static_chunk(names.TRACK_COUNT, _lines(_TRACKS)),
@@ -89,14 +88,8 @@ def _ellipse_style(*, width: float, draw_order: float) -> rr.Ellipses2D:
     )
 
 
-def _gallery_frames() -> rr.Boxes2D:
-    frames = np.array([frame_of(slot) for slot in range(SLOTS)])
-    return rr.Boxes2D.from_fields(
-        centers=(frames[:, :2] + frames[:, 2:]) / 2,
-        half_sizes=(frames[:, 2:] - frames[:, :2]) / 2 + 2,
-        radii=rr.Radius.ui_points(1.0),
-        show_labels=True,
-    )
+def _caption_style() -> rr.Boxes2D:
+    return rr.Boxes2D.from_fields(radii=rr.Radius.ui_points(1.0), show_labels=True)
 
 
 def _lines(lines: tuple[tuple[str, tuple[int, int, int], float], ...]) -> rr.SeriesLines:

@@ -6,11 +6,11 @@ from collections import OrderedDict
 
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.gallery import SLOTS, Gallery, placed
+from hvt_ground.sinks.rerun.gallery import Gallery, frame_of, placed
 from hvt_ground.sinks.rerun.palette import GREY, class_colour
 from hvt_ground.sinks.rerun.patches import Patches
 from hvt_ground.sinks.rerun.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
-from hvt_ground.sinks.rerun.tables import Captions, LogText, PlacedJpeg, SizeLimit, TableRow
+from hvt_ground.sinks.rerun.tables import Caption, LogText, PlacedJpeg, SizeLimit, TableRow
 
 __all__ = ["StillRows"]
 
@@ -33,8 +33,7 @@ class StillRows:
 
     def __init__(self, size_limit: SizeLimit) -> None:
         self._size_limit = size_limit
-        empty: Captions = (("", GREY),) * SLOTS
-        self._gallery = Gallery(empty)
+        self._gallery = Gallery()
         self._patches = Patches()
         self._pictured: OrderedDict[int, None] = OrderedDict()
 
@@ -89,21 +88,17 @@ class StillRows:
         cost = sum(len(data) for _, (data, _) in pictures)
         if still[0] is not refinement.still and not self._size_limit.has(cost, ratio=PAIR_RATIO):
             return []
-        words = (caption(refinement), class_colour(refinement.class_after))
         at = refinement.frame_index, refinement.capture_ns
-        if refinement.stored:
-            put = self._gallery.put_stored(*at, words)
-        else:
-            put = self._gallery.put(*at, words, changed=changed)
-        if put is None:
+        gallery = self._gallery
+        slot = gallery.put_stored(*at) if refinement.stored else gallery.put(*at, changed=changed)
+        if slot is None:
             return []
-        rows = []
+        path = f"{names.STILLS}/{slot}"
+        words = Caption(caption(refinement), class_colour(refinement.class_after), frame_of(slot))
+        rows = [TableRow(path, "caption", words)]
         for name, (data, size) in pictures:
-            picture = PlacedJpeg(data, placed(put.slot, size, right=name == "still"))
-            rows.append(TableRow(f"{names.STILLS}/{put.slot}/{name}", "placed jpeg", picture, len(data)))
-        for row in put.rows:
-            time = row.frame_index, row.capture_ns
-            rows.append(TableRow(names.CAPTIONS, "captions", row.captions, 160, time))
+            picture = PlacedJpeg(data, placed(slot, size, right=name == "still"))
+            rows.append(TableRow(f"{path}/{name}", "placed jpeg", picture, len(data)))
         return rows
 
     def _patch(self, refinement: Refinement, still: Coded) -> list[TableRow]:

@@ -20,7 +20,7 @@ __all__ = [
     "COLUMNS",
     "FIXED_BYTES",
     "TABLE_BYTES",
-    "Captions",
+    "Caption",
     "CodedIdentity",
     "LogText",
     "PlacedJpeg",
@@ -39,8 +39,6 @@ _HEAD_START_BYTES = 30_000
 """Beyond the ratio, so that the first pictures of a flight are shown."""
 
 Columns = Iterable[rr.ComponentColumn]
-Captions = tuple[tuple[str, Rgb], ...]
-"""Text and colour for each slot of the gallery; an empty text hides its frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +47,16 @@ class PlacedJpeg:
 
     data: bytes
     place: Placement
+
+
+@dataclass(frozen=True, slots=True)
+class Caption:
+    """Words under a frame."""
+
+    text: str
+    colour: Rgb
+    frame: tuple[float, float, float, float]
+    """x1 y1 x2 y2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,12 +195,14 @@ def _patches(rows: Sequence[PlacedJpeg | None]) -> Columns:
     return [*blobs.partition(lengths), *_places([row.place for row in there]).partition(lengths)]
 
 
-def _captions(rows: Sequence[Captions]) -> Columns:
-    captions = list(chain.from_iterable(rows))
+def _captions(rows: Sequence[Caption]) -> Columns:
+    frames = np.array([row.frame for row in rows])
     return rr.Boxes2D.columns(
-        labels=[text for text, _ in captions],
-        colors=np.array([packed(colour) if text else 0 for text, colour in captions], np.uint32),
-    ).partition([len(row) for row in rows])
+        centers=(frames[:, :2] + frames[:, 2:]) / 2,
+        half_sizes=(frames[:, 2:] - frames[:, :2]) / 2 + 2,
+        labels=[row.text for row in rows],
+        colors=np.array([packed(row.colour) for row in rows], np.uint32),
+    )
 
 
 def _texts(rows: Sequence[LogText]) -> Columns:
@@ -229,7 +239,7 @@ COLUMNS: dict[str, Callable[[Sequence[Any]], Columns]] = {
     ],
     "place": _places,
     "patch": _patches,
-    "captions": _captions,
+    "caption": _captions,
     "text": _texts,
     "lines": _lines,
 }

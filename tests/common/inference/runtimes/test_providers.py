@@ -16,7 +16,7 @@ from onnx import helper
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import OnnxClassifier, open_classifier
 from hvt_common.inference.cli import main
-from hvt_common.inference.detect import open_detector
+from hvt_common.inference.detect import OnnxDetector, open_detector
 from hvt_common.inference.runtimes.model import ModelSettings, open_model
 from hvt_common.inference.runtimes.openvino_model import OpenVinoRunner, find_openvino
 from hvt_common.inference.runtimes.providers import PROVIDERS, OpenVinoCpu, choose_provider
@@ -106,8 +106,9 @@ def test_edge_and_ground_hand_their_provider_on(tmp_path: Path) -> None:
     classifier = str(colour_classifier(tmp_path / "c.onnx"))
     for word in ("cpu", "openvino") if find_openvino() else ("cpu",):
         at_edge = make_detector(EdgeConfig(source="demo", detector=detector, provider=word))
+        assert isinstance(at_edge, OnnxDetector)
         ground = Models(GroundConfig(detector=detector, classifier=classifier, provider=word)).take()
-        models = [at_edge.model, *(one.model.model for one in ground)]
+        models = [at_edge.model, *(one.part.model for one in ground)]
         assert [one.provider.provider for one in models] == [word] * 3
     assert EdgeConfig().provider == GroundConfig().provider == "auto"
     with pytest.raises(UserError, match="is not known"):

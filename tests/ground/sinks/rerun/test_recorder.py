@@ -272,6 +272,7 @@ def test_a_full_disk_is_one_sentence(events: list[Event]) -> None:
         pytest.skip("no /dev/full on this system")
     with pytest.raises(UserError, match="No space left"):
         Recorder(settings(Path("/dev/full")))
+    assert Path("/dev/full").is_char_device(), "what was there before is not removed"
 
 
 KILLED = """
@@ -505,12 +506,12 @@ def test_movement_yields_to_the_allowance_but_news_does_not() -> None:
 
 def test_the_gallery_holds_what_one_is_looking_at() -> None:
     """Pairs that flicker by cannot be compared; a changed class is worth the place of one that was confirmed."""
-    gallery = Gallery(("",) * SLOTS, hold_ns=1_000_000_000)
-    slots = [gallery.put(i, i, "a", changed=i == 0).slot for i in range(SLOTS)]
+    gallery = Gallery(hold_ns=1_000_000_000)
+    slots = [gallery.put(i, i, changed=i == 0) for i in range(SLOTS)]
     assert sorted(slots) == list(range(SLOTS))
-    assert gallery.put(20, 500_000_000, "b", changed=False) is None
-    assert gallery.put(20, 500_000_000, "c", changed=True).slot == slots[1]  # the oldest that only confirmed
-    assert gallery.put(30, 1_200_000_000, "d", changed=False).slot == slots[0]
+    assert gallery.put(20, 500_000_000, changed=False) is None
+    assert gallery.put(20, 500_000_000, changed=True) == slots[1]  # the oldest that only confirmed
+    assert gallery.put(30, 1_200_000_000, changed=False) == slots[0]
 
 
 def test_a_picture_fits_its_half_of_the_slot() -> None:

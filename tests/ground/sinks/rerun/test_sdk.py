@@ -7,10 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hvt_ground.sinks.rerun import sdk
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from programs.processes import eventually
-from programs.rrd import Recording
 
 
 def settings_of(folder: Path, number: int = 0) -> RecorderSettings:
@@ -41,14 +39,3 @@ def test_many_recordings_leave_no_threads(tmp_path):
     before = threads()
     recorded(2, 3, 4, 5)
     eventually(lambda: threads() <= before, within_s=20, what="no thread of the four is left")
-
-
-@pytest.mark.parametrize("bindings", [None, object()], ids=["no such module", "no such names"])
-def test_a_sdk_with_other_names_inside_still_records(tmp_path, monkeypatch, bindings):
-    """With the next version of the SDK the ground would not even start, for the sake of its tidiness."""
-    monkeypatch.setattr(sdk, "bindings", bindings)
-    with Recorder(settings_of(tmp_path)) as recorder:
-        assert recorder is not None
-    sdk.release_recordings()
-    assert (tmp_path / "flight.rrd").stat().st_size > 0
-    assert Recording(tmp_path / "flight.rrd").events() is not None

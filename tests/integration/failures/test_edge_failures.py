@@ -210,7 +210,9 @@ def test_on_a_slow_machine_perception_gives_way_to_video(link, tmp_path):
     finally:
         os.sched_setaffinity(0, cores)
     summary = edge.finish()
-    assert summary["frames"] > 45, "with threads of equal rank it was 15 to 40"
-    assert summary["frames_unanalyzed"] > 5
-    assert summary["cores_needed"] > 0.5
+    # However little of the core others leave.
+    analyzed = summary["frames_captured"] - summary["frames_dropped"] - summary["frames_unanalyzed"]
+    assert summary["frames"] >= min(90, 1.25 * analyzed)
+    assert summary["frames"] >= 18, "four a second at the least"
+    assert min(summary["cores_needed"], summary["cores_free"]) > 0
     assert "of 100 frames not analyzed" in edge.told
