@@ -16,7 +16,7 @@ __all__ = ["load_onnx"]
 def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
     """Put the weights of ``path`` into ``net``, which then computes the same and can be trained further.
 
-    The file's convolutions have swallowed their batch norms, so that a norm's mean and variance are measured on
+    The file's convolutions have absorbed their batch norms, so that a norm's mean and variance are measured on
     ``images`` ((N, 3, H, W) float32 BGR 0…255), and scale and shift are set to undo them.
 
     Raises `ValueError` where the file is of another architecture.
