@@ -227,6 +227,7 @@ def test_an_edge_whose_id_is_taken_does_not_start(link: Link):
     }
 
 
+@pytest.mark.realtime
 def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(link: Link):
     """The picture would jump between two drones, or be another's, without a word."""
     edges = {name: link.edge(*PLAYS, "--wait", "0s", name=name) for name in ("one", "two")}
@@ -250,6 +251,7 @@ def test_of_two_edges_that_meet_later_the_first_is_shown_and_the_other_named(lin
 # Stills that are lost
 
 
+@pytest.mark.realtime
 def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
     """On a radio that loses datagrams the sharp pictures would have holes; or the gallery show some twice."""
     lossy = Script(

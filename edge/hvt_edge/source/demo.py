@@ -10,6 +10,7 @@ import math
 import pickle
 import subprocess
 import sys
+import weakref
 from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -63,6 +64,7 @@ class DemoSource(Source):
             stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is for this process, which then ends that one
         )
+        self._end = weakref.finalize(self, _end, self._drawing)
         self._size: tuple[int, int]
         self._size, self.class_names, duration_s = self._answer()
         self.fps = fps
@@ -87,9 +89,8 @@ class DemoSource(Source):
         self._answer()
 
     def close(self) -> None:
-        """End the drawing."""
-        self._drawing.kill()
-        self._drawing.communicate(timeout=_END_S)
+        """End the drawing; a source that is forgotten ends it too."""
+        self._end()
 
     def _request(self, *request: Any) -> None:
         assert self._drawing.stdin is not None, "it was opened with a pipe"
@@ -106,6 +107,11 @@ class DemoSource(Source):
         if self._drawing.stdout.readinto(picture.data) != picture.nbytes:  # type: ignore[attr-defined]
             raise UserError("--source demo: the process that draws the scene has ended")
         return picture
+
+
+def _end(drawing: subprocess.Popen[bytes]) -> None:
+    drawing.kill()
+    drawing.communicate(timeout=_END_S)
 
 
 def _draw(seed: int) -> None:

@@ -25,7 +25,7 @@ def test_a_search_is_judged_on_what_it_has_not_seen(scene, tmp_path, capsys):
     """Weights that fit the sequences they were found on would be sold as better ones."""
     chosen = list(tunable("M5"))[:2]
     words = ("--method", "M5", "--parameters", ",".join(chosen), "--trials", "2", "--held-out", "0.34")
-    asked = ["tune", *arguments(scene, tmp_path / "out", *words, "--regimes", "150kbps", "--jobs", "2")]
+    asked = ["tune", *arguments(scene, tmp_path / "out", *words, "--regimes", "300kbps", "--jobs", "2")]
     assert main(asked) == 0
     told = capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "tune.json").read_text())
@@ -34,8 +34,8 @@ def test_a_search_is_judged_on_what_it_has_not_seen(scene, tmp_path, capsys):
     assert len(train) == 2
     (row,) = found["held_out"]
     assert 0 < row["default"] <= 1
-    assert 100_000 < row["default_bps"] <= 150_000
-    assert 100_000 < row["tuned_bps"] <= 150_000
+    assert 200_000 < row["default_bps"] <= 300_000
+    assert 200_000 < row["tuned_bps"] <= 300_000
     assert found["held_out_gain"] == pytest.approx(row["tuned"] - row["default"])
     assert found["train_tuned"] >= found["train_default"] > 0
     assert found["trials"] == 2
