@@ -75,7 +75,7 @@ class GroundConfig:
     )
     refine: str = _MODELS.option(
         choice("replace", "fuse"),
-        "replace",
+        "fuse",
         "a still's class replaces the track's, or is weighed with the others",
     )
     threads: int = _MODELS_RARE.option(integer(1, 64), 2, "threads of the detector and the classifier")

@@ -26,7 +26,7 @@ def test_without_flags_it_listens_and_needs_no_model():
     assert (config.detector, config.edges, config.refine, config.once) == (
         "aerial-nano",
         "*",
-        "replace",
+        "fuse",
         False,
     )
     assert (config.listen, config.connect, config.record) == ((), (), None)

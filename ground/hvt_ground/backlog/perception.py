@@ -119,7 +119,7 @@ class BacklogPerception:
         names, edge_classes = unified_names(detector.class_names, info.class_names)
         stage = StillStage(
             reader,
-            Refiner("replace", fps=info.fps, detector_classes=names, classifier_classes=reader.class_names),
+            Refiner("fuse", fps=info.fps, detector_classes=names, classifier_classes=reader.class_names),
             history=History(),
             fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_frames=1)),
             view=info.view,
