@@ -24,17 +24,16 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
     weights = _weights(onnx.load(str(path)).graph)
     hooks, order = [], iter(weights)
 
-    def take(conv: nn.Module, _inputs: object) -> None:
+    def take(layer: nn.Module, _inputs: object) -> None:
         weight, bias = next(order, (np.zeros(0), np.zeros(0)))
-        assert isinstance(conv, nn.Conv2d)
-        if weight.shape != tuple(conv.weight.shape):
-            raise ValueError(
-                f"{path} has weights {weight.shape} where {tuple(conv.weight.shape)} are expected"
-            )
-        conv.weight.data = torch.from_numpy(weight.copy())
+        assert isinstance(layer, (nn.Conv2d, nn.Linear))
+        wanted = tuple(layer.weight.shape)
+        if weight.shape != wanted:
+            raise ValueError(f"{path} has weights {weight.shape} where {wanted} are expected")
+        layer.weight.data = torch.from_numpy(weight.copy())
         pending.append(torch.from_numpy(bias.copy()))
-        if conv.bias is not None:
-            conv.bias.data = pending.pop()
+        if layer.bias is not None:
+            layer.bias.data = pending.pop()
 
     def measure(norm: nn.Module, inputs: tuple[Tensor]) -> None:
         assert isinstance(norm, nn.BatchNorm2d)
