@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.detect import Detector, open_detector
-from hvt_common.values import Boxes, Detections, Image, View
+from hvt_common.values import Boxes, Detections, Image, View, iou
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import BASE_SIZE, HELD_OUT_SEED, Shot, coded, shoot
@@ -25,7 +25,6 @@ __all__ = [
     "drawn_pictures",
     "evaluate_drawn",
     "evaluate_real",
-    "overlaps",
     "well_visible",
 ]
 
@@ -57,15 +56,6 @@ class RealResult:
     precision: float
     objects: int
     frames: int
-
-
-def overlaps(first: Boxes, second: Boxes) -> npt.NDArray[np.float32]:
-    """(N, M) IoU."""
-    low = np.maximum(first[:, None, :2], second[None, :, :2])
-    high = np.minimum(first[:, None, 2:], second[None, :, 2:])
-    inner = (high - low).clip(0).prod(2)
-    areas = [(boxes[:, 2:] - boxes[:, :2]).prod(1) for boxes in (first, second)]
-    return np.asarray(inner / np.maximum(areas[0][:, None] + areas[1][None] - inner, 1e-9), np.float32)
 
 
 def drawn_pictures(
@@ -123,7 +113,7 @@ def _matches(
     wanted, ignored = picture.boxes_px[mine & counts], picture.boxes_px[~counts]
     rows = found.class_ids == kind_found
     boxes, scores = found.boxes_xyxy_px[rows], found.confidences[rows]
-    table = overlaps(boxes, wanted)
+    table = iou(boxes, wanted)
     hits, counted = np.zeros(len(boxes), bool), np.ones(len(boxes), bool)
     for row in range(len(boxes)):
         best = int(table[row].argmax()) if len(wanted) else -1
@@ -183,7 +173,7 @@ def _vehicles(detector: Detector, frame: Image) -> Boxes:
 def _one_each(boxes: Boxes) -> Boxes:
     """Drop what lies over a better box: to "vehicle or not", car and van on one spot are one vehicle."""
     chosen: list[int] = []
-    table = overlaps(boxes, boxes)
+    table = iou(boxes, boxes)
     for row in range(len(boxes)):
         if not chosen or table[row, chosen].max() < 0.6:
             chosen.append(row)
@@ -195,7 +185,7 @@ def evaluate_real(detector: Detector, frames: Sequence[Image], truth: Sequence[B
     hits = found = total = 0
     for frame, wanted in zip(frames, truth, strict=True):
         boxes = _vehicles(detector, frame)
-        table = overlaps(boxes, wanted)
+        table = iou(boxes, wanted)
         for row in range(len(boxes)):
             best = int(table[row].argmax()) if len(wanted) else -1
             if best >= 0 and table[row, best] >= 0.5:

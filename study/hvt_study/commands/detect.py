@@ -26,10 +26,10 @@ from hvt_edge.source.resample import Resizer
 from hvt_study.commands.progress import RunProgress
 from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
 from hvt_study.datasets.labels import NO_ID, inside_frame
-from hvt_study.metrics.detection import detection_score
+from hvt_study.metrics.detection import AveragePrecision, DetectionScore, detection_score
 from hvt_study.metrics.frames import FrameView, LabelledFrame
 from hvt_study.metrics.judged import Judged, judged
-from hvt_study.metrics.operating_point import calibration_error, operating_point, right_boxes
+from hvt_study.metrics.operating_point import OperatingPoint, calibration_error, operating_point, right_boxes
 from hvt_study.report.figures.sheet import Finding, write_sheet
 
 __all__ = ["add_arguments", "run"]
@@ -114,12 +114,16 @@ def run(arguments: argparse.Namespace) -> int:
     if skipped:
         print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
     if frames:
-        result = _score(frames, word=word, classes=classes, confidence=arguments.confidence)
-        about = {"detector": arguments.detector, "pictures": len(frames), "skipped": skipped, **result}
+        used = judged(_above(frames, arguments.confidence), word=word, classes=classes)
+        about = {
+            "detector": arguments.detector,
+            "confidence": arguments.confidence,
+            "pictures": len(frames),
+            "skipped": skipped,
+            **_score(used, detection_score(frames, word=word, classes=classes)),
+        }
         (arguments.out / "score.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-        _write_sheets(
-            arguments.out, paths, frames, word=word, classes=classes, confidence=arguments.confidence
-        )
+        _write_sheets(arguments.out, paths, used, classes=classes)
         _print(about)
     print(f"{arguments.out}: {len(pictures) - skipped} pictures, {len(frames)} of them labelled")
     return 0 if len(pictures) > skipped else 2
@@ -173,39 +177,30 @@ def _counted(pictures: Sequence[LabelledPicture], labelled: Sequence[str], word:
     return tuple(sorted({word(name) for name in names}))
 
 
-def _score(
-    frames: Sequence[LabelledFrame], *, word: _Word, classes: Sequence[str], confidence: float
-) -> dict[str, Any]:
-    whole = detection_score(frames, word=word, classes=classes)
-    used = judged(_above(frames, confidence), word=word, classes=classes)
+def _score(used: Sequence[Judged], curve: DetectionScore) -> dict[str, Any]:
+    """Of what is at or above the confidence of use, and the average precision of the whole curve."""
     seen = sorted({name for one in used for name in (*one.class_names, *one.view.class_names)})
     points = {name: operating_point(used, name=name) for name in seen}
-    total = {
-        field: sum(getattr(one, field) for one in points.values()) for field in ("right", "boxes", "labels")
-    }
-    confidences, right = _sure_and_right(used, seen)
+    counts = ([getattr(one, field) for one in points.values()] for field in ("right", "boxes", "labels"))
     return {
-        "confidence": confidence,
-        "labels": total["labels"],
-        "boxes": total["boxes"],
-        "precision": _share(total["right"], total["boxes"]),
-        "recall": _share(total["right"], total["labels"]),
-        "f1": _share(2 * total["right"], total["boxes"] + total["labels"]),
-        "calibration_error": _number(calibration_error(confidences, right)),
-        "ap50": _number(whole.mean.at_50),
-        "ap50_95": _number(whole.mean.at_50_95),
-        "ap50_by_size": {size: _number(one.at_50) for size, one in whole.by_size.items()},
+        **_shares(OperatingPoint(*map(sum, counts)), curve.mean),
+        "ap50_95": _number(curve.mean.at_50_95),
+        "ap50_by_size": {size: _number(one.at_50) for size, one in curve.by_size.items()},
+        "calibration_error": _number(calibration_error(*_sure_and_right(used, seen))),
         "by_class": {
-            name: {
-                "labels": one.labels,
-                "boxes": one.boxes,
-                "precision": _number(one.precision),
-                "recall": _number(one.recall),
-                "f1": _number(one.f1),
-                "ap50": _number(whole.by_class[name].at_50) if name in whole.by_class else None,
-            }
-            for name, one in points.items()
+            name: _shares(one, curve.by_class.get(name, AveragePrecision())) for name, one in points.items()
         },
+    }
+
+
+def _shares(point: OperatingPoint, curve: AveragePrecision) -> dict[str, Any]:
+    return {
+        "labels": point.labels,
+        "boxes": point.boxes,
+        "precision": _number(point.precision),
+        "recall": _number(point.recall),
+        "f1": _number(point.f1),
+        "ap50": _number(curve.at_50),
     }
 
 
@@ -224,19 +219,11 @@ def _sure_and_right(
 
 
 def _write_sheets(
-    out: Path,
-    paths: Sequence[Path],
-    frames: Sequence[LabelledFrame],
-    *,
-    word: _Word,
-    classes: Sequence[str],
-    confidence: float,
+    out: Path, paths: Sequence[Path], used: Sequence[Judged], *, classes: Sequence[str]
 ) -> None:
     """The surest false alarms, and the largest labels that were missed."""
     false, missed = [], []
-    for path, frame in zip(
-        paths, judged(_above(frames, confidence), word=word, classes=classes), strict=True
-    ):
+    for path, frame in zip(paths, used, strict=True):
         labels, boxes = right_boxes(frame, classes=classes)
         view = frame.view
         for row in np.setdiff1d(np.arange(len(view)), boxes).tolist():
@@ -261,10 +248,6 @@ def _print(score: dict[str, Any]) -> None:
     Console(highlight=False).print(table)
     error = score["calibration_error"]
     print("expected calibration error " + ("-" if error is None else f"{error:.3f}"))
-
-
-def _share(part: int, whole: int) -> float | None:
-    return round(part / whole, 4) if whole else None
 
 
 def _number(value: float) -> float | None:
