@@ -4,7 +4,8 @@ from hvt_common.inference.store.resolve import (
     EMBEDDED_CLASSIFIER,
     EMBEDDED_DETECTOR,
     embedded_models,
+    model_names,
     resolve_model,
 )
 
-__all__ = ["EMBEDDED_CLASSIFIER", "EMBEDDED_DETECTOR", "embedded_models", "resolve_model"]
+__all__ = ["EMBEDDED_CLASSIFIER", "EMBEDDED_DETECTOR", "embedded_models", "model_names", "resolve_model"]
