@@ -112,7 +112,8 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     )
     found = fit_calibration(detector, [*held_out_pictures(arguments.real), *scenes])
     properties = _properties(DETECTOR, arguments.seed) | {
-        "hvt.calibration": f"{found.slope:.4f} {found.shift:.4f}"
+        "hvt.calibration": f"{found.slope:.4f} {found.shift:.4f}",
+        "hvt.confidence": f"{found.confidence:.2f}",
     }
     export_detector(net, path, properties=properties, calibration=found)
 
