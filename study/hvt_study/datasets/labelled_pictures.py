@@ -170,6 +170,14 @@ def _coco_pictures(path: Path) -> list[LabelledPicture]:
     ]
 
 
+def _in_picture(box: Sequence[Any], size: tuple[int, int]) -> bool:
+    """Whether x, y, w, h are numbers that begin in the picture."""
+    if len(box) != len((*size, *size)) or not all(isinstance(side, int | float) for side in box):
+        return False
+    x, y, wide, high = box
+    return 0 <= x <= size[0] and 0 <= y <= size[1] and 0 <= wide < math.inf and 0 <= high < math.inf
+
+
 def _mot_pictures(place: Path) -> list[LabelledPicture]:
     """The frames of one sequence; the rate does not matter."""
     (opened,) = open_mot(place, Options(fps=NOMINAL_FPS)).values()
@@ -192,9 +200,7 @@ def _beside(path: Path, name: str) -> Path:
 def _from_coco(path: Path, rows: Sequence[Mapping[str, Any]], size: tuple[int, int]) -> FrameLabels:
     for row in rows:
         box = row.get("bbox")
-        good = isinstance(box, list) and len(box) == len((*size, *size))
-        good = good and all(isinstance(side, int | float) and math.isfinite(side) for side in box)
-        if not good or min(box[2:]) < 0 or not (0 <= box[0] <= size[0] and 0 <= box[1] <= size[1]):
+        if not (isinstance(box, list) and _in_picture(box, size)):
             raise UserError(
                 f"COCO annotation {row.get('id', '')} of {path.name} has the box {box}; x, y, w, h in the picture of "
                 f"{size[0]}x{size[1]} is accepted"
