@@ -40,7 +40,6 @@ _CODED_FRAMES = 6
 _PLAUSIBLE = (0.1, 10.0)
 """Slopes of a calibration; another one comes of too few boxes."""
 _LOOK_EVERY = 5
-_SIDE = 320
 _WARM_UP, _AVERAGE = 40, 0.99
 
 
@@ -59,6 +58,8 @@ class FineTuneSettings:
     patience: int = 8
     """Measurements without a better one after which it ends."""
     batch: int = 8
+    side: int = 320
+    """Of a view, pixels; a multiple of 32."""
     rate: float = 1e-3
     seed: int = 1
     threads: int = 2
@@ -149,7 +150,7 @@ def fine_tune(
         train_detector(
             pool,
             settings=loop,
-            views=ViewSettings(side=_SIDE),
+            views=ViewSettings(side=settings.side),
             seed=settings.seed,
             batch=settings.batch,
             workers=0,
@@ -165,7 +166,7 @@ def fine_tune(
 def _check(start: Path, classes: int) -> None:
     try:
         load_onnx(DetectorNet(classes), start, torch.zeros(1, 3, 64, 64))
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, KeyError) as error:
         raise UserError(f"--start {start} is not of aerial-nano's network: {error}") from None
 
 
