@@ -29,7 +29,7 @@ _DAMAGE = {
 """Strength and how often the codec is bad. Base pictures have been through x265 already."""
 _STRAIGHT_DOWN = frozenset({"kit", "road"})
 """Have no up; the others are aslant, at least in part, and mostly left upright."""
-_SPECKLED = 0.3
+_SPECKLED = 0.4
 """How often small blobs lie about: stones, litter, chipped paint, which are no people."""
 
 
@@ -49,8 +49,8 @@ class ViewSettings:
 
     side: int = 416
     shares: tuple[tuple[str, float], ...] = (
-        *(("demo", 0.08), ("base", 0.2), ("place", 0.16)),
-        *(("kit", 0.09), ("road", 0.15), ("thermal", 0.23), ("street", 0.09)),
+        *(("demo", 0.1), ("base", 0.22), ("place", 0.14)),
+        *(("kit", 0.09), ("road", 0.15), ("thermal", 0.2), ("street", 0.1)),
     )
     """How often each kind of picture is taken."""
     least_visible: float = 0.3
@@ -154,9 +154,9 @@ def _scale(kind: str, rng: _Rng) -> float:
         "base": (0.35, 1.3),
         "place": (0.26, 2.2),
         "kit": (0.6, 2.6),
-        "road": (0.25, 3.2),
+        "road": (0.25, 3.8),
         "thermal": (0.6, 1.9),
-        "street": (0.3, 1.7),
+        "street": (0.3, 3.0),
     }[kind]
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
