@@ -167,7 +167,7 @@ def run(arguments: argparse.Namespace) -> int:
     out.with_suffix(".json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     _print(about)
     if tuned.calibration is None:
-        print("too few boxes on held-out pictures to calibrate: the scores are no probabilities")
+        print("too few boxes on held-out pictures, or none wrong, to calibrate: scores are no probabilities")
     print(f"{out}: best of {tuned.steps} steps at {tuned.best_step}; fly with --detector {out}")
     return 0
 

@@ -175,7 +175,7 @@ def _in_picture(box: Sequence[Any], size: tuple[int, int]) -> bool:
     if len(box) != len((*size, *size)) or not all(isinstance(side, int | float) for side in box):
         return False
     x, y, wide, high = box
-    return 0 <= x <= size[0] and 0 <= y <= size[1] and 0 <= wide < math.inf and 0 <= high < math.inf
+    return bool(0 <= x <= size[0] and 0 <= y <= size[1] and 0 <= wide < math.inf and 0 <= high < math.inf)
 
 
 def _mot_pictures(place: Path) -> list[LabelledPicture]:

@@ -68,8 +68,11 @@ def start(tmp_path):
     return path
 
 
-def test_a_network_learns_what_it_never_knew(tmp_path, start, water):
+@pytest.mark.realdata
+def test_a_network_learns_what_it_never_knew(tmp_path, data):
     """An hour of training would end in a file that finds nothing."""
+    pytest.importorskip("torch")
+    pytest.importorskip("onnx")
     from hvt_train.fine_tune import FineTuneSettings, fill_own, fine_tune
     from hvt_train.pictures.places import Picture
     from hvt_train.pictures.real import HeldOut
@@ -103,23 +106,24 @@ def test_a_network_learns_what_it_never_knew(tmp_path, start, water):
         fill_own(tmp_path / "pool", pictures(10), seed=1),
         held_out,
         classes=NAMES,
-        start=start,
+        start=data / "models" / "yolox_nano.onnx",
         out=out,
         settings=FineTuneSettings(
-            steps=160, budget_s=50, check_every=40, batch=4, side=160, rate=3e-3, threads=2
+            steps=40, budget_s=600, check_every=20, batch=4, side=128, rate=2e-3, threads=1
         ),
         measure=found,
         on_step=lambda step, quality: told.append((step, quality)),
     )
     measured = [quality for _, quality in told if quality is not None]
-    assert found(start) == 0
-    assert max(measured) == found(out) >= 0.5, told
-    assert told[-1][0] == tuned.steps
+    assert max(measured) == found(out) >= 0.75, told
+    assert told[-1][0] == tuned.steps == 40
     assert open_detector(str(out)).class_names == NAMES
-    metadata = open_model(out).metadata
-    assert tuned.calibration is not None
-    assert metadata["hvt.calibration"] == f"{tuned.calibration.slope:.4f} {tuned.calibration.shift:.4f}"
-    assert metadata["hvt.confidence"] == f"{tuned.calibration.confidence:.2f}"
+    metadata, fitted = open_model(out).metadata, tuned.calibration
+    if fitted is None:  # every box is right: there is nothing to fit
+        assert "hvt.calibration" not in metadata
+    else:
+        assert metadata["hvt.calibration"] == f"{fitted.slope:.4f} {fitted.shift:.4f}"
+        assert metadata["hvt.confidence"] == f"{fitted.confidence:.2f}"
     assert not out.with_suffix(".trial.onnx").exists()
 
 
