@@ -255,20 +255,25 @@ class RealtimeWorker(PerceptionWorker):
                 if stills and self._stills[0].header.frame_index != stills[0].header.frame_index:
                     break
                 stills.append(self._stills.popleft())
+        self._look(hurry=False)
+        while self._steps and not self._given_up.is_set():
+            self._step(*self._steps.popleft())
+        if stills:
+            self._look(hurry=True)  # what came while the detector ran would wait as long again
+            self._read(stills)
+        self._do_jobs()
+        if self._has_news():
+            self._wake.set()
+
+    def _look(self, *, hurry: bool) -> None:
+        """Analyze the pictures that are there: in the newest objects are detected, unless in a ``hurry``."""
         # Those that come meanwhile are not among them, or on a slow machine stills would wait for ever.
         for _ in range(len(self._pictures)):
             if self._given_up.is_set():
                 break
             with self._lock:
                 picture = self._pictures.popleft()
-            self._analyze(picture, len(self._pictures) > 0)  # the newest is detected in, which is shown last
-        while self._steps and not self._given_up.is_set():
-            self._step(*self._steps.popleft())
-        if stills:
-            self._read(stills)
-        self._do_jobs()
-        if self._has_news():
-            self._wake.set()
+            self._analyze(picture, hurry or len(self._pictures) > 0)
 
     def _do_jobs(self) -> None:
         """Do what can wait, until something comes that cannot."""
