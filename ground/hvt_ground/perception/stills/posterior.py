@@ -12,7 +12,8 @@ often it was repeated, because the votes of successive frames are nearly the sam
 all stills alike, class agreement on a car park at 200 kbps was 0.952 in place of 0.983, and 0.785 in place of 0.804
 on small objects.
 
-A class changes only where its probability exceeds that of the old one by `MARGIN`.
+A class changes only where its probability exceeds that of the class on the base by `MARGIN`. There is no memory of
+what was shown: the order in which stills arrive must not matter.
 
 Log-probabilities are summed as integers (in units of 2^-20 nat): the sum does not depend on the order in which
 stills arrive, to the last bit, and does not drift.
@@ -35,9 +36,12 @@ __all__ = ["BASE_WEIGHT", "MARGIN", "PROBABILITY_FLOOR", "SURE", "ClassEstimate"
 PROBABILITY_FLOOR = 1e-4
 BASE_WEIGHT = 1.0
 MARGIN = 0.2
-"""By so much the new class must be more probable than the old one: a toss-up leaves the class as it is."""
+"""By so much another class must be more probable than that on the base: a toss-up leaves the class as it is."""
 SURE = 0.9
 """Above it, a class that stills agree on is certain."""
+LEAST_SURE_PX = 12
+"""The shorter side of an object, source pixels, below which no still makes it certain: on ten pixels a shrub and
+a person are alike, whatever a network says."""
 _NOTHING_SHARE = 0.5
 _UNITS_PER_NAT = 1 << 20
 _Floats = npt.NDArray[np.float64]
@@ -57,39 +61,39 @@ class ClassEstimate:
 
 
 class TrackPosterior:
-    """What is known of one track of the ground; ``class_id`` is what it was shown as before its first still."""
+    """What is known of one track of the ground."""
 
-    __slots__ = ("_log_sum", "_newest", "_order", "held", "last_frame")
+    __slots__ = ("_clear", "_log_sum", "_newest", "_order", "last_frame")
 
-    def __init__(self, frame_index: int, *, class_id: int) -> None:
+    def __init__(self, frame_index: int) -> None:
         self.last_frame = frame_index
         """The newest frame in which the track was there."""
-        self.held = class_id
-        """The class that is shown."""
         self._newest: Posterior | None = None
+        self._clear = False
         self._order = (-1, -1)
         self._log_sum: npt.NDArray[np.int64] | None = None
 
-    def update(self, said: Posterior, *, order: tuple[int, int], news: float = 1.0) -> bool:
+    def update(self, said: Posterior, *, order: tuple[int, int], side_px: float, news: float = 1.0) -> bool:
         """Take a still's vote; True if it is the newest so far by ``order`` (frame index, sequence).
 
-        ``news`` (0…1) is what it counts in the sum.
+        ``side_px`` is the shorter side of the object in source pixels, ``news`` (0…1) what it counts in the sum.
         """
         logs = np.log(np.clip(said.probabilities.astype(np.float64), PROBABILITY_FLOOR, 1.0))
         units = np.rint(logs * news * _UNITS_PER_NAT).astype(np.int64)
         self._log_sum = units if self._log_sum is None else self._log_sum + units
         if order < self._order:
             return False
-        self._order, self._newest = order, said
+        self._order, self._newest, self._clear = order, said, side_px >= LEAST_SURE_PX
         return True
 
-    def newest(self, vocabulary: Vocabulary) -> ClassEstimate:
-        """What the still of the newest frame said; the class that is shown, where it means that one as well."""
+    def newest(self, vocabulary: Vocabulary, *, class_id: int) -> ClassEstimate:
+        """What the still of the newest frame said; the class on the base, where it means that one as well."""
         said = self._said()
         best = vocabulary.names.index(said.class_name)
-        if said.probabilities[self.held] >= said.probabilities[best]:
-            best = self.held
-        return ClassEstimate(best, said.confidence, said.entropy_nats, sure=said.confidence > SURE)
+        if said.probabilities[class_id] >= said.probabilities[best]:
+            best = class_id
+        sure = self._clear and said.confidence > SURE
+        return ClassEstimate(best, said.confidence, said.entropy_nats, sure=sure)
 
     def fused(self, vocabulary: Vocabulary, *, class_id: int, confidence: float) -> ClassEstimate:
         """All stills together with the detector's present vote (its class and confidence on the base)."""
@@ -101,11 +105,12 @@ class TrackPosterior:
         logs -= math.log(np.exp(logs).sum())
         probabilities = np.exp(logs)
         best = int(probabilities.argmax())
-        if probabilities[best] <= probabilities[self.held] + MARGIN:
-            best = self.held
+        if probabilities[best] <= probabilities[class_id] + MARGIN:
+            best = class_id
         entropy_nats = max(0.0, -float(probabilities @ logs))
         now = float(probabilities[best])
-        return ClassEstimate(best, now, entropy_nats, sure=min(now, float(said.probabilities[best])) > SURE)
+        sure = self._clear and min(now, float(said.probabilities[best])) > SURE
+        return ClassEstimate(best, now, entropy_nats, sure=sure)
 
     def _said(self) -> Posterior:
         if self._newest is None:

@@ -169,10 +169,9 @@ class Refiner:
 
     def shown(self, tracks: Tracks) -> ShownClasses:
         """The classes to show for the tracks of one frame; frames must not go back."""
-        for row, track_id in enumerate(tracks.ids.tolist()):
+        for track_id in tracks.ids.tolist():
             class_posterior = self._track_posteriors.get(track_id)
             if class_posterior is not None:
-                class_posterior.held = self._read(class_posterior, tracks, row).class_id
                 self._touch(track_id, class_posterior, tracks.frame_index)
         self._forget(tracks.frame_index)
         return self.preview(tracks)
@@ -280,19 +279,21 @@ class Refiner:
         track_id = int(tracks.ids[row])
         class_posterior = self._track_posteriors.get(track_id)
         if class_posterior is None:
-            class_id = int(tracks.class_ids[row])
-            class_posterior = TrackPosterior(tracks.frame_index, class_id=class_id)
-            self._track_posteriors[track_id] = class_posterior
+            before = int(tracks.class_ids[row])
+            class_posterior = self._track_posteriors[track_id] = TrackPosterior(tracks.frame_index)
             self.counters.tracks_refined += 1
             if len(self._track_posteriors) > MAX_TRACK_POSTERIORS:
                 self._track_posteriors.popitem(last=False)
-        before = class_posterior.held
+        else:
+            before = self._read(class_posterior, tracks, row).class_id
         newest = class_posterior.update(
-            still.posterior, order=(still.frame_index, still.sequence), news=still.news
+            still.posterior,
+            order=(still.frame_index, still.sequence),
+            side_px=still.side_px,
+            news=still.news,
         )
         self._touch(track_id, class_posterior, still.frame_index)
         after = self._read(class_posterior, tracks, row)
-        class_posterior.held = after.class_id
         self.counters.matched += 1
         self.counters.class_changes += after.class_id != before
         names = self._vocabulary.names
@@ -327,7 +328,7 @@ class Refiner:
 
     def _read(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> ClassEstimate:
         if self._mode == "replace":
-            return class_posterior.newest(self._vocabulary)
+            return class_posterior.newest(self._vocabulary, class_id=int(tracks.class_ids[row]))
         return class_posterior.fused(
             self._vocabulary, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
         )

@@ -65,6 +65,8 @@ class StillSeen:
     posterior: Posterior
     """What it says of the object, over `Vocabulary.names`."""
     context: StillContext
+    side_px: float
+    """The shorter side of the object, source pixels."""
     news: float = 1.0
     """How much the still shows that the base did not, 0…1; see `news`."""
     part: int = 0

@@ -184,7 +184,8 @@ class StillStage:
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
             context = StillContext(still, decoded, track_id, box, reading.box_base_px, crop)
-            vote = self._vote(header.class_name, box, reading)
+            side_px = min(box[2] - box[0], box[3] - box[1]) / self._view.scale
+            vote = self._vote(reading, called=header.class_name, side_px=side_px)
             self._answer(header, track_id, vote.posterior)
             if vote.posterior is None:
                 self.outcomes["unread"] += 1
@@ -201,6 +202,7 @@ class StillStage:
                 class_name=header.class_name,
                 posterior=vote.posterior,
                 context=context,
+                side_px=side_px,
                 news=news,
                 part=part,
                 stored=bool(header.flags & Flags.STORED),
@@ -208,11 +210,9 @@ class StillStage:
             for resolved in self._refiner.offer(seen, now_frame=now.frame_index):
                 self._resolved(resolved, now)
 
-    def _vote(self, called: str, box_base_px: Box, reading: ObjectReading) -> Vote:
+    def _vote(self, reading: ObjectReading, *, called: str, side_px: float) -> Vote:
         if reading.posterior is None:
             return Vote(None)
-        x1, y1, x2, y2 = box_base_px
-        side_px = min(x2 - x1, y2 - y1) / self._view.scale
         return self._vocabulary.vote(reading.posterior, called=called, side_px=side_px)
 
     def _news(self, decoded: DecodedStill) -> float:
