@@ -54,9 +54,11 @@ def _parser() -> argparse.ArgumentParser:
             type=Path,
             default=None,
             metavar="DATA",
-            help="folder of kit_ais, hit_uav and cats_madison",
+            help="folder of kit_ais, hit_uav, cats_madison and street",
         )
-        own.add_argument("--start", default=None, metavar="embedded|FOLDER", help="ONNX files to go on from")
+        own.add_argument(
+            "--start", default=None, metavar="embedded|FOLDER|FILE", help="ONNX files to go on from"
+        )
     own = commands.add_parser("eval", help="measure", formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     own.add_argument("--drawn", action="store_true", help="on held-out drawn scenes")
     own.add_argument(

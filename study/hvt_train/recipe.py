@@ -43,8 +43,9 @@ _SUMMARY = {
     CLASSIFIER: "Class of a 96x96 crop (padded by 15 %) of a vehicle or person; other is anything else.",
 }
 _CREDITS = (
-    "Drawn scenes of this project; KIT AIS (CC BY 3.0, labels by jekhor); HIT-UAV (Suo et al., Sci Data 2023,"
-    " CC BY 4.0); CATS-Lab Madison drone-view vehicles, with our marks of people"
+    "Begun from YOLOX-nano's COCO weights (Megvii, Apache-2.0); drawn scenes of this project; KIT AIS (CC BY 3.0,"
+    " labels by jekhor); HIT-UAV (Suo et al., Sci Data 2023, CC BY 4.0); CATS-Lab Madison drone-view vehicles, with"
+    " our marks of people; four clips of intel-iot-devkit/sample-videos (CC BY 4.0)"
 )
 
 
@@ -57,7 +58,12 @@ def run_recipe(arguments: argparse.Namespace) -> None:
     plan = PoolPlan(scenes=arguments.scenes, places=arguments.places)
     pool = fill_pool(out / "pool", plan, workers=arguments.workers)
     if arguments.real is not None:
-        pool += fill_real(out / "pool", arguments.real)
+        start = _started(arguments, DETECTOR)
+        teacher = (
+            None if start is None else open_detector(str(start), confidence=0.08, threads=arguments.threads)
+        )
+        knows_streets = teacher is not None and "person" in teacher.class_names
+        pool += fill_real(out / "pool", arguments.real, teacher=teacher if knows_streets else None)
     if arguments.command in ("detector", "all"):
         _detector(arguments, pool)
     if arguments.command in ("classifier", "all"):
@@ -106,7 +112,8 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     )
     found = fit_calibration(detector, [*held_out_pictures(arguments.real), *scenes])
     properties = _properties(DETECTOR, arguments.seed) | {
-        "hvt.calibration": f"{found.slope:.4f} {found.shift:.4f}"
+        "hvt.calibration": f"{found.slope:.4f} {found.shift:.4f}",
+        "hvt.confidence": f"{found.confidence:.2f}",
     }
     export_detector(net, path, properties=properties, calibration=found)
 
@@ -141,9 +148,11 @@ def _classifier(arguments: argparse.Namespace, pool: list[Path]) -> None:
 
 
 def _started(arguments: argparse.Namespace, name: str) -> Path | None:
-    """``--start embedded`` goes on from the file of the package, ``--start FOLDER`` from the one there."""
+    """``embedded`` goes on from the file of the package, a folder from the one there; a file starts the detector."""
     if arguments.start is None:
         return None
+    if Path(arguments.start).suffix == ".onnx":
+        return Path(arguments.start) if name == DETECTOR else None
     return (
         embedded_models()[name] if arguments.start == "embedded" else Path(arguments.start) / f"{name}.onnx"
     )

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from sklearn.linear_model import LogisticRegression
 
 from hvt_common.inference.detect import Detector
@@ -24,6 +25,8 @@ class Calibration:
 
     slope: float = 1.0
     shift: float = 0.0
+    confidence: float = 0.25
+    """Calibrated score from which on boxes should be shown: where F0.5 is best, precision counting twice as much."""
 
 
 NONE = Calibration()
@@ -34,8 +37,9 @@ def fit_calibration(detector: Detector, pictures: Iterable[HeldOut]) -> Calibrat
 
     ``detector`` should show what it finds from a low confidence on (0.02).
     """
-    scores, right = [], []
+    scores, right, objects = [], [], 0
     for picture in pictures:
+        objects += len(picture.boxes_px)
         found = detector.detect(picture.image_bgr)
         boxes, taken = found.boxes_xyxy_px, np.zeros(len(picture.boxes_px), bool)
         on_label, on_ignored = iou(boxes, picture.boxes_px), iou(boxes, picture.ignored_px)
@@ -51,5 +55,18 @@ def fit_calibration(detector: Detector, pictures: Iterable[HeldOut]) -> Calibrat
             scores.append(float(found.confidences[row]))
             right.append(hit)
     values = np.clip(np.array(scores), _EPSILON, 1 - _EPSILON)
-    line = LogisticRegression(C=1e6).fit(np.log(values / (1 - values))[:, None], np.array(right))
-    return Calibration(float(line.coef_[0, 0]), float(line.intercept_[0]))
+    logits = np.log(values / (1 - values))[:, None]
+    line = LogisticRegression(C=1e6).fit(logits, np.array(right))
+    best = _best_threshold(line.predict_proba(logits)[:, 1], np.array(right), objects)
+    return Calibration(float(line.coef_[0, 0]), float(line.intercept_[0]), best)
+
+
+def _best_threshold(scores: npt.NDArray[np.float64], right: npt.NDArray[np.bool_], objects: int) -> float:
+    """The step of a twentieth where F0.5 = 1.25 PR / (0.25 P + R) is greatest (van Rijsbergen 1979)."""
+
+    def quality(threshold: float) -> float:
+        shown = scores >= threshold
+        hits = float((shown & right).sum())
+        return 1.25 * hits / max(0.25 * objects + float(shown.sum()), 1e-9)
+
+    return max((round(0.05 * step, 2) for step in range(2, 17)), key=quality)

@@ -12,7 +12,6 @@ from torch.nn import functional
 from torch.utils.data import DataLoader, IterableDataset
 
 from hvt_scene.drawing.vehicles import CLASS_NAMES
-from hvt_train.learning.detector import Block, Conv
 from hvt_train.learning.export import export_onnx
 from hvt_train.learning.loop import LoopSettings, Loss, train
 from hvt_train.learning.start import load_onnx
@@ -24,20 +23,45 @@ MEAN, SCALE = 115.0, 1 / 60
 """Network value = (pixel - MEAN) * SCALE on all channels; also written into the file's metadata."""
 
 
+class _Conv(nn.Sequential):
+    """Convolution, batch norm, ReLU."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1) -> None:
+        super().__init__(
+            nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False),
+            nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.03),
+            nn.ReLU(inplace=True),
+        )
+
+
+class _Block(nn.Module):
+    """A residual block: 1x1 to half the width, 3x3 back."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.squeeze = _Conv(width, width // 2)
+        self.spread = _Conv(width // 2, width, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, H, W) to the same shape."""
+        out: Tensor = x + self.spread(self.squeeze(x))
+        return out
+
+
 class ClassifierNet(nn.Sequential):
     """(N, 3, 96, 96) BGR to (N, C) logits."""
 
     def __init__(self, classes: int) -> None:
         super().__init__(
-            Conv(3, 16, 3, 2),
-            Conv(16, 32, 3, 2),
-            Block(32),
-            Conv(32, 64, 3, 2),
-            Block(64),
-            Block(64),
-            Conv(64, 128, 3, 2),
-            Block(128),
-            Block(128),
+            _Conv(3, 16, 3, 2),
+            _Conv(16, 32, 3, 2),
+            _Block(32),
+            _Conv(32, 64, 3, 2),
+            _Block(64),
+            _Block(64),
+            _Conv(64, 128, 3, 2),
+            _Block(128),
+            _Block(128),
             nn.AdaptiveAvgPool2d(1),
             nn.Flatten(),
             nn.Dropout(0.1),

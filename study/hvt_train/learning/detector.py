@@ -1,92 +1,135 @@
-"""The network of ``aerial-nano``: dense convolutions (fast on a CPU), three strides, one anchor-free head each."""
+"""The network of ``aerial-nano``: YOLOX-nano (Ge et al., 2021), so that training can begin from its COCO weights."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["STRIDES", "DetectorNet", "DetectorShape", "ExportedDetector"]
+__all__ = ["STRIDES", "DetectorNet", "ExportedDetector"]
 
 STRIDES = (8, 16, 32)
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorShape:
-    """Widths of the stem and of strides 4, 8, 16, 32; blocks of the last four; width of the neck."""
-
-    widths: tuple[int, int, int, int, int] = (16, 32, 64, 128, 192)
-    blocks: tuple[int, int, int, int] = (1, 2, 3, 2)
-    neck: int = 64
+_HEAD = 64
+"""Width of every head."""
 
 
 class Conv(nn.Sequential):
-    """Convolution, batch norm, ReLU."""
+    """Convolution, batch norm, SiLU."""
 
-    def __init__(self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1) -> None:
+    def __init__(self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> None:
         super().__init__(
-            nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False),
+            nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False),
             nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.03),
-            nn.ReLU(inplace=True),
+            nn.SiLU(inplace=True),
         )
 
 
-class Block(nn.Module):
-    """A residual block: 1x1 to half the width, 3x3 back."""
+class Separable(nn.Sequential):
+    """A 3x3 convolution channel by channel, then a 1x1 across them."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
+        super().__init__(Conv(inputs, inputs, 3, stride, inputs), Conv(inputs, outputs))
+
+
+class Block(nn.Module):
+    """1x1, then separable 3x3; ``residual`` adds the input."""
+
+    def __init__(self, width: int, *, residual: bool) -> None:
         super().__init__()
-        self.squeeze = Conv(width, width // 2)
-        self.spread = Conv(width // 2, width, 3)
+        self.residual, self.mix, self.look = residual, Conv(width, width), Separable(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, H, W) to the same shape."""
-        out: Tensor = x + self.spread(self.squeeze(x))
+        out: Tensor = self.look(self.mix(x))
+        return x + out if self.residual else out
+
+
+class CrossStage(nn.Module):
+    """Half of the channels go through ``blocks``, half past them (CSPNet, Wang et al., 2020)."""
+
+    def __init__(self, inputs: int, outputs: int, blocks: int = 1, *, residual: bool = False) -> None:
+        super().__init__()
+        half = outputs // 2
+        self.through, self.past = Conv(inputs, half), Conv(inputs, half)
+        self.blocks = nn.Sequential(*(Block(half, residual=residual) for _ in range(blocks)))
+        self.join = Conv(outputs, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, H, W) to (N, outputs, H, W)."""
+        # The order of the convolutions is that of the published file: `start.load_onnx` goes by it.
+        through, past = self.through(x), self.past(x)
+        out: Tensor = self.join(torch.cat([self.blocks(through), past], dim=1))
         return out
 
 
-def _stage(inputs: int, outputs: int, blocks: int) -> nn.Sequential:
-    return nn.Sequential(Conv(inputs, outputs, 3, 2), *(Block(outputs) for _ in range(blocks)))
+class Pyramid(nn.Module):
+    """Spatial pyramid pooling: the maxima of 5, 9 and 13 cells beside the values themselves."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.squeeze, self.join = Conv(width, width // 2), Conv(width * 2, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, H, W) to the same shape."""
+        x = self.squeeze(x)
+        pooled = [functional.max_pool2d(x, side, stride=1, padding=side // 2) for side in (5, 9, 13)]
+        out: Tensor = self.join(torch.cat([x, *pooled], dim=1))
+        return out
+
+
+class Head(nn.Module):
+    """Two towers on one stride: class scores, and box with objectness."""
+
+    def __init__(self, inputs: int, classes: int) -> None:
+        super().__init__()
+        self.stem = Conv(inputs, _HEAD)
+        self.naming = nn.Sequential(Separable(_HEAD, _HEAD), Separable(_HEAD, _HEAD))
+        self.classes = nn.Conv2d(_HEAD, classes, 1)
+        self.placing = nn.Sequential(Separable(_HEAD, _HEAD), Separable(_HEAD, _HEAD))
+        self.box, self.objectness = nn.Conv2d(_HEAD, 4, 1), nn.Conv2d(_HEAD, 1, 1)
+        for scores in (self.classes, self.objectness):
+            assert scores.bias is not None
+            nn.init.constant_(scores.bias, -4.6)  # a hundredth at first
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, h, w) to (N, 5 + classes, h, w)."""
+        x = self.stem(x)
+        classes, place = self.classes(self.naming(x)), self.placing(x)
+        return torch.cat([self.box(place), self.objectness(place), classes], dim=1)
 
 
 class DetectorNet(nn.Module):
     """(N, 3, H, W) BGR 0…255 to raw maps (N, 5 + C, h, w) of each stride: x, y, log w, log h, objectness, classes."""
 
-    def __init__(self, classes: int, shape: DetectorShape | None = None) -> None:
+    def __init__(self, classes: int) -> None:
         super().__init__()
-        shape = shape or DetectorShape()
-        w, n, neck = shape.widths, shape.blocks, shape.neck
         self.classes = classes
-        self.stem = Conv(3, w[0], 3, 2)
-        self.stages = nn.ModuleList(_stage(w[i], w[i + 1], n[i]) for i in range(4))
-        self.lateral = nn.ModuleList(Conv(w[i], neck) for i in (2, 3, 4))
-        self.merge = nn.ModuleList(Block(neck) for _ in range(2))
-        self.down = nn.ModuleList(Conv(neck, neck, 3, 2) for _ in range(2))
-        self.towers = nn.ModuleList(Conv(neck, neck, 3) for _ in STRIDES)
-        self.heads = nn.ModuleList(nn.Conv2d(neck, 5 + classes, 1) for _ in STRIDES)
-        for head in self.heads:
-            nn.init.normal_(head.weight, std=0.01)
-            nn.init.zeros_(head.bias)
-            with torch.no_grad():
-                head.bias[:2] = 0.5  # the middle of the cell
-                head.bias[2:4] = 0.7  # two strides
-                head.bias[4:] = -4.0
+        self.stem = Conv(12, 16, 3)
+        self.stages = nn.ModuleList(
+            [
+                nn.Sequential(Separable(16, 32, 2), CrossStage(32, 32, 1, residual=True)),
+                nn.Sequential(Separable(32, 64, 2), CrossStage(64, 64, 3, residual=True)),
+                nn.Sequential(Separable(64, 128, 2), CrossStage(128, 128, 3, residual=True)),
+                nn.Sequential(Separable(128, 256, 2), Pyramid(256), CrossStage(256, 256)),
+            ]
+        )
+        self.narrow = nn.ModuleList([Conv(256, 128), Conv(128, 64)])
+        self.up = nn.ModuleList([CrossStage(256, 128), CrossStage(128, 64)])
+        self.down = nn.ModuleList([Separable(64, 64, 2), Separable(128, 128, 2)])
+        self.out = nn.ModuleList([CrossStage(128, 128), CrossStage(256, 256)])
+        self.heads = nn.ModuleList(Head(width, classes) for width in (64, 128, 256))
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """Maps of strides 8, 16, 32."""
-        x = self.stages[0](self.stem(images * (1 / 255) - 0.45))
+        x = self.stages[0](self.stem(_folded(images)))
         fine = self.stages[1](x)
         middle = self.stages[2](fine)
-        coarse = self.stages[3](middle)
-        p32 = self.lateral[2](coarse)
-        p16 = self.merge[1](self.lateral[1](middle) + _doubled(p32))
-        p8 = self.merge[0](self.lateral[0](fine) + _doubled(p16))
-        p16 = p16 + self.down[0](p8)
-        p32 = p32 + self.down[1](p16)
-        levels = (p8, p16, p32)
-        return [head(tower(p)) for head, tower, p in zip(self.heads, self.towers, levels, strict=True)]
+        coarse = self.narrow[0](self.stages[3](middle))
+        between = self.narrow[1](self.up[0](torch.cat([_doubled(coarse), middle], dim=1)))
+        p8 = self.up[1](torch.cat([_doubled(between), fine], dim=1))
+        p16 = self.out[0](torch.cat([self.down[0](p8), between], dim=1))
+        p32 = self.out[1](torch.cat([self.down[1](p16), coarse], dim=1))
+        return [head(level) for head, level in zip(self.heads, (p8, p16, p32), strict=True)]
 
 
 class ExportedDetector(nn.Module):
@@ -108,6 +151,12 @@ class ExportedDetector(nn.Module):
         score = (objectness * best).clamp(1e-6, 1 - 1e-6)
         true = (self.slope * (score / (1 - score)).log() + self.shift).sigmoid()
         return torch.cat([rows[..., :4], (true / best).clamp(max=1.0), classes], dim=2)
+
+
+def _folded(images: Tensor) -> Tensor:
+    """Each 2x2 square of pixels becomes four times the channels: (N, 3, H, W) to (N, 12, H/2, W/2)."""
+    rows = [images[..., y::2, x::2] for x in (0, 1) for y in (0, 1)]
+    return torch.cat(rows, dim=1)
 
 
 def _doubled(x: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
-"""Go on from an ONNX file of ours: its weights, and batch norms measured anew."""
+"""Go on from an ONNX file: its weights, and batch norms measured anew."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,16 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor, nn
 
+from hvt_train.learning.detector import DetectorNet
+
 __all__ = ["load_onnx"]
 
 
-def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
+def load_onnx(net: nn.Module, path: Path, images: Tensor, *, rows: Sequence[int] | None = None) -> None:
     """Put the weights of ``path`` into ``net``, which then computes the same and can be trained further.
+
+    ``rows`` names for each class of a `DetectorNet` the class of the file that it begins as, -1 for none; without it
+    the file has the same classes.
 
     The file's convolutions have absorbed their batch norms, so that a norm's mean and variance are measured on
     ``images`` ((N, 3, H, W) float32 BGR 0…255), and scale and shift are set to undo them.
@@ -27,6 +33,8 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
     def take(layer: nn.Module, _inputs: object) -> None:
         weight, bias = next(order, (np.zeros(0), np.zeros(0)))
         assert isinstance(layer, (nn.Conv2d, nn.Linear))
+        if rows is not None and layer in named:
+            weight, bias = _chosen(layer, weight, bias, rows)
         wanted = tuple(layer.weight.shape)
         if weight.shape != wanted:
             raise ValueError(f"{path} has weights {weight.shape} where {wanted} are expected")
@@ -46,6 +54,7 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
         norm.bias.data = pending.pop() + mean
 
     pending: list[Tensor] = []
+    named = [head.classes for head in net.heads] if isinstance(net, DetectorNet) else []
     for module in net.modules():
         if isinstance(module, (nn.Conv2d, nn.Linear)):
             hooks.append(module.register_forward_pre_hook(take))
@@ -55,6 +64,18 @@ def load_onnx(net: nn.Module, path: Path, images: Tensor) -> None:
         net.eval()(images)
     for hook in hooks:
         hook.remove()
+
+
+def _chosen(
+    layer: nn.Conv2d | nn.Linear, weight: np.ndarray, bias: np.ndarray, rows: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The file's rows in the order of ours; a class that the file has not keeps what it began with."""
+    assert layer.bias is not None
+    own_weight, own_bias = layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()
+    for row, theirs in enumerate(rows):
+        if theirs >= 0:
+            own_weight[row], own_bias[row] = weight[theirs], bias[theirs]
+    return own_weight, own_bias
 
 
 def _weights(graph: onnx.GraphProto) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from hvt_common.inference.detect import open_detector
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.learning.calibration import NONE, Calibration
 from hvt_train.learning.detector import DetectorNet, ExportedDetector
@@ -21,6 +22,10 @@ from hvt_train.learning.start import load_onnx
 from hvt_train.pictures.views import View, ViewSettings, ViewSource
 
 __all__ = ["Batch", "batch_of", "export_detector", "loss_of", "train_detector"]
+
+
+_LIKE = {"van": "car", "motor": "motorcycle", "pedestrian": "person"}
+"""What of COCO's classes comes closest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +79,15 @@ def train_detector(
     log: Path,
     check: Callable[[nn.Module, int], dict[str, float]] | None = None,
     start: Path | None = None,
+    classes: Sequence[str] = CLASS_NAMES,
 ) -> DetectorNet:
-    """Train on a pool; ``start`` is an ONNX file or a state (``.pt``) to go on from."""
+    """Train on a pool; ``start`` is an ONNX file of this network, of these or other classes, or a state (``.pt``)."""
     torch.manual_seed(seed)
-    net = DetectorNet(len(CLASS_NAMES))
+    net = DetectorNet(len(classes))
     if start is not None and start.suffix == ".onnx":
         source = ViewSource(pool, seed=seed, settings=views)
-        load_onnx(net, start, batch_of([source.next() for _ in range(48)]).images.float())
+        images = batch_of([source.next() for _ in range(48)]).images.float()
+        load_onnx(net, start, images, rows=_rows(classes, open_detector(str(start)).class_names))
     elif start is not None:
         net.load_state_dict(torch.load(start))
     loader = DataLoader(
@@ -93,6 +100,12 @@ def train_detector(
     trained = train(net, loader, loss_of=loss_of, settings=settings, log=log, check=check)
     assert isinstance(trained, DetectorNet)
     return trained
+
+
+def _rows(classes: Sequence[str], theirs: Sequence[str]) -> list[int]:
+    """For each class the one of the file that it begins as; -1: none."""
+    found = [next((n for n in (name, _LIKE.get(name)) if n in theirs), None) for name in classes]
+    return [-1 if name is None else theirs.index(name) for name in found]
 
 
 def export_detector(

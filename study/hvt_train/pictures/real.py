@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvt_common.inference.detect import Detector
 from hvt_common.values import Frame, Image
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.video.encoder_settings import EncoderSettings
@@ -26,6 +27,7 @@ from hvt_edge.video.x265 import BaseEncoder
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import BASE_SIZE, save_picture
+from hvt_train.pictures.street import street_pictures
 
 __all__ = ["LARGE_VEHICLE", "SETS", "HeldOut", "fill_real", "held_out_pictures"]
 
@@ -58,10 +60,11 @@ class HeldOut:
 _Labelled = tuple[Path, npt.NDArray[np.float32], npt.NDArray[np.int32]]
 
 
-def fill_real(folder: Path, data: Path, *, seed: int = 1) -> list[Path]:
+def fill_real(folder: Path, data: Path, *, seed: int = 1, teacher: Detector | None = None) -> list[Path]:
     """Put the sets that lie under ``data`` (``kit_ais``, ``hit_uav``, ``cats_madison``) into the pool ``folder``.
 
-    Flights and sequences that are held out for measuring are left out. What is there already stays.
+    Flights and sequences that are held out for measuring are left out. What is there already stays. With a
+    ``teacher`` the clips of ``street`` too: see `street_pictures`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -79,6 +82,10 @@ def fill_real(folder: Path, data: Path, *, seed: int = 1) -> list[Path]:
                 high, wide = image.shape[:2]
                 inside = boxes.clip(0, (wide, high, wide, high)).astype(np.float32)
                 save_picture(target, Picture(image, inside, kinds, np.ones(len(kinds), np.float32)))
+    if teacher is not None:
+        for number, picture in enumerate(street_pictures(data / "street", teacher)):
+            written.append(folder / f"street-{number:05d}.npz")
+            save_picture(written[-1], picture)
     return written
 
 

@@ -24,9 +24,12 @@ _DAMAGE = {
     "kit": (0.6, 0.15),
     "road": (0.7, 0.2),
     "thermal": (0.5, 0.15),
+    "street": (0.5, 0.2),
 }
 """Strength and how often the codec is bad. Base pictures have been through x265 already."""
-_SPECKLED = 0.3
+_STRAIGHT_DOWN = frozenset({"kit", "road"})
+"""Have no up; the others are aslant, at least in part, and mostly left upright."""
+_SPECKLED = 0.4
 """How often small blobs lie about: stones, litter, chipped paint, which are no people."""
 
 
@@ -46,8 +49,8 @@ class ViewSettings:
 
     side: int = 416
     shares: tuple[tuple[str, float], ...] = (
-        *(("demo", 0.08), ("base", 0.18), ("place", 0.15)),
-        *(("kit", 0.13), ("road", 0.2), ("thermal", 0.26)),
+        *(("demo", 0.1), ("base", 0.22), ("place", 0.14)),
+        *(("kit", 0.09), ("road", 0.15), ("thermal", 0.2), ("street", 0.1)),
     )
     """How often each kind of picture is taken."""
     least_visible: float = 0.3
@@ -80,10 +83,12 @@ class ViewSource:
         picture = read_picture(files[int(rng.integers(len(files)))])
         scale = _scale(kind, rng)
         view = self._cropped(picture, scale)
-        view = _turned(view, rng)
+        view = _turned(
+            view, rng, upright=kind == "street" or (kind not in _STRAIGHT_DOWN and rng.random() < 0.6)
+        )
         if kind == "thermal" and rng.random() < 0.4:  # cameras show heat black or white
             view = View(255 - view.image_bgr, view.boxes_px, view.class_ids)
-        if kind != "thermal" and rng.random() < _SPECKLED:
+        if kind not in {"thermal", "street"} and rng.random() < _SPECKLED:
             view = View(_speckled(view.image_bgr, rng), view.boxes_px, view.class_ids)
         strength, compress = _DAMAGE[kind]
         image = degrade(view.image_bgr, rng, strength=strength, compress=compress)
@@ -149,20 +154,21 @@ def _scale(kind: str, rng: _Rng) -> float:
         "base": (0.35, 1.3),
         "place": (0.26, 2.2),
         "kit": (0.6, 2.6),
-        "road": (0.25, 3.2),
+        "road": (0.25, 3.8),
         "thermal": (0.6, 1.9),
+        "street": (0.3, 3.0),
     }[kind]
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
-def _turned(view: View, rng: _Rng) -> View:
-    """One of the eight ways to lay a square."""
+def _turned(view: View, rng: _Rng, *, upright: bool) -> View:
+    """One of the eight ways to lay a square, or of the two that are ``upright``."""
     image, boxes, side = view.image_bgr, view.boxes_px, len(view.image_bgr)
     if rng.random() < 0.5:
         image, boxes = image[:, ::-1], boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (side, 0, side, 0)
-    if rng.random() < 0.5:
+    if not upright and rng.random() < 0.5:
         image, boxes = image[::-1], boxes[:, [0, 3, 2, 1]] * (1, -1, 1, -1) + (0, side, 0, side)
-    if rng.random() < 0.5:
+    if not upright and rng.random() < 0.5:
         image, boxes = image.transpose(1, 0, 2), boxes[:, [1, 0, 3, 2]]
     return View(np.ascontiguousarray(image), boxes.astype(np.float32), view.class_ids)
 
