@@ -64,7 +64,7 @@ class Models:
             return
         check_common(config.detector, detector.class_names, config.classifier, classifier.class_names)
         if not is_calibrated(config.classifier, role="classifier"):
-            _log.warning("%s, and no class is ticked", uncalibrated("classifier", config.classifier))
+            _log.warning("%s, and no class gets a check mark", uncalibrated("classifier", config.classifier))
 
     def _open(self) -> ModelSet:
         config = self._config

@@ -28,7 +28,7 @@ def test_a_threshold_that_makes_no_sense_is_refused(tmp_path, text):
 
 
 def test_a_model_says_whether_its_scores_are_probabilities(tmp_path):
-    """A tick would stand for nothing."""
+    """A check mark would stand for nothing."""
     plain = colour_detector(tmp_path / "d.onnx", "yolox")
     fitted = colour_detector(tmp_path / "e.onnx", "yolox", metadata={"hvt.calibration": "1.6 0.3"})
     assert not is_calibrated(str(plain), role="detector")

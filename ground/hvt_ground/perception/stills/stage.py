@@ -240,8 +240,8 @@ class StillStage:
                 frame_index = resolved.still.frame_index
                 self._fusion.take_box(track_id, context.found_base_px, frame_index=frame_index)
         before, after = resolved.class_before, resolved.class_after
-        told = self._refinement(context, now, track_id, before, after, resolved.confidence)
-        self._emit(replace(told, doubted=resolved.doubted, sure=resolved.sure))
+        refinement = self._refinement(context, now, track_id, before, after, resolved.confidence)
+        self._emit(replace(refinement, doubted=resolved.doubted, sure=resolved.sure))
 
     def _refinement(
         self,

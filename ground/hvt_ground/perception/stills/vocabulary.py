@@ -64,12 +64,12 @@ class Vocabulary:
             self.nothing = next(place for place, name in enumerate(self.names) if is_nothing(name))
         self._reader = tuple(reader)
         targets = _targets(self.names, self._reader, groups=self.coarse and not kinds)
-        self._speaks = np.zeros((len(self._reader), len(self.names)))
+        self._means = np.zeros((len(self._reader), len(self.names)))
         for row, columns in enumerate(targets):
-            self._speaks[row, list(columns)] = 1.0
+            self._means[row, list(columns)] = 1.0
         cells = {columns: place for place, columns in enumerate(dict.fromkeys([frozenset(), *targets]))}
         self._cells = np.array([cells[columns] for columns in targets])
-        self._unspoken = self._speaks.sum(axis=0) == 0
+        self._unspoken = self._means.sum(axis=0) == 0
         if MOVING in self.names:
             self._unspoken[self.names.index(MOVING)] = False
 
@@ -92,10 +92,10 @@ class Vocabulary:
         best = int(cells.argmax())
         if best == 0 or (self.coarse and side_px < LEAST_SIDE_PX):
             return Vote(None, f"{said.class_name} .{min(99, round(100 * said.confidence)):02d}")
-        likelihoods = given @ self._speaks
+        likelihoods = given @ self._means
         nothing = 0.0 if self.nothing is None else likelihoods[self.nothing]
         likelihoods[self._unspoken] = cells[0] + nothing
-        meant = np.flatnonzero(self._speaks[int(np.flatnonzero(self._cells == best)[0])])
+        meant = np.flatnonzero(self._means[int(np.flatnonzero(self._cells == best)[0])])
         name = next((self.names[k] for k in meant if same_word(self.names[k], called)), self.names[meant[0]])
         sure = cells[cells > 0]
         entropy = max(0.0, -float((sure * np.log(sure)).sum()))

@@ -328,8 +328,8 @@ def _labels(overlay: Overlay, screen: _Screen, size: tuple[int, int], chosen: Co
             continue
         mark = f" {REPORTED_MARK}" if reported[row] else ""
         name = f"{overlay.base_classes[row]}?" if doubted[row] else overlay.classes[row]
-        tick = " ✓" if screen.levels[row] == _SURE else ""
-        words.append(Word(row, f"{track_id} {name}{tick}{mark}"))
+        certain = " ✓" if screen.levels[row] == _SURE else ""
+        words.append(Word(row, f"{track_id} {name}{certain}{mark}"))
     centres, halves = screen.boxes[:, :2].astype(np.float64), screen.boxes[:, 2:].astype(np.float64)
     boxes = np.hstack([centres - halves, centres + halves])
     sides = {row: screen.sides[one] for row, one in enumerate(screen.ids.tolist()) if one in screen.sides}

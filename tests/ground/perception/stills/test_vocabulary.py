@@ -150,7 +150,7 @@ def votes(words, *answers):
 
 @pytest.mark.parametrize("mode", ["fuse", "replace"])
 def test_nothing_of_mine_takes_confidence_until_the_track_is_doubted(mode):
-    """A shrub would be a pedestrian with a tick."""
+    """A shrub would be a pedestrian with a check mark."""
     words = Vocabulary(AERIAL, AERIAL)
     shrub = AERIAL.index("pedestrian")
     before = flown(words, *votes(words, {"pedestrian": 0.6}), base=shrub, confidence=0.5, mode=mode)
@@ -165,7 +165,7 @@ def test_nothing_of_mine_takes_confidence_until_the_track_is_doubted(mode):
     assert (shown.classes, shown.doubted.tolist(), shown.sure.tolist()) == (("other",), [True], [False])
 
 
-def test_a_tick_needs_a_calibrated_probability_on_enough_pixels():
+def test_a_check_mark_needs_a_calibrated_probability_on_enough_pixels():
     """A network that was never calibrated, or saw nine pixels, would be taken at its word."""
     words = Vocabulary(AERIAL, AERIAL)
     (car,) = votes(words, {"car": 0.97})

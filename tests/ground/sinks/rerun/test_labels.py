@@ -111,7 +111,7 @@ def test_words_stand_where_a_still_renamed_or_doubts(tmp_path):
     assert gone.words(1) == {}, "a word whose reason is gone is gone"
 
 
-def test_what_is_not_sure_has_no_tick(tmp_path):
+def test_what_is_not_sure_has_no_check_mark(tmp_path):
     """The .95 of a model that was never calibrated would look like a fact."""
     read = recorded(tmp_path / "a.rrd", overlay(sure=np.zeros(4, np.bool_)))
     assert {text for text, _ in read.words(0).values()} == {"2 van", "3 car?"}

@@ -98,10 +98,10 @@ def _verdict(refinement: Refinement) -> str:
     certainty = confidence_text(round(refinement.confidence * 100))
     if refinement.doubted:
         return f"{refinement.class_before}? {refinement.class_after} {certainty}"
-    tick = "✓ " if refinement.sure else ""
+    certain = "✓ " if refinement.sure else ""
     if refinement.class_before == refinement.class_after:
-        return f"{refinement.class_after} {tick}{certainty}"
-    return f"{refinement.class_before} → {refinement.class_after} {tick}{certainty}"
+        return f"{refinement.class_after} {certain}{certainty}"
+    return f"{refinement.class_before} → {refinement.class_after} {certain}{certainty}"
 
 
 def _jpeg(pixels: Image, *, quality_pct: int) -> bytes:
