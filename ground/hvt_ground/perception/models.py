@@ -6,6 +6,7 @@ from functools import partial
 
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import Detector, open_detector, warm_up
+from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import weak_confidence
@@ -47,7 +48,8 @@ class Models:
             threads=config.threads,
             provider=config.provider,
         )
-        return RetriedDetector(open_one, "detector", self.failures)
+        hint = FewFoundHint(config.detector, confidence=config.confidence)
+        return RetriedDetector(open_one, "detector", self.failures, hint=hint)
 
     def _open(self) -> ModelSet:
         config = self._config
