@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ class Rig:
     """A worker that notes what it does, and waits in the first of it until it may go on."""
 
     def __init__(self) -> None:
-        self.done: list[tuple[str, object]] = []
+        self.done: list[tuple[str, Any]] = []
         self.begun, self.go_on = threading.Event(), threading.Event()
         self.worker = RealtimeWorker(
             lambda one, hurry: self._note("hurry" if hurry else "picture", one.frame_index),
@@ -50,7 +51,7 @@ class Rig:
         self.begun.set()
         assert self.go_on.wait(timeout=20)
 
-    def finish(self) -> list[tuple[str, object]]:
+    def finish(self) -> list[tuple[str, Any]]:
         """All that it did."""
         self.go_on.set()
         eventually(lambda: self.worker.idle, within_s=20, what="all is done")
