@@ -110,6 +110,7 @@ class Edge:
                 info=stages.info.info,
                 control=stages.commands.answer,
                 on_feedback=stages.link_control.on_feedback,
+                reply=stages.transmitter.reply,
             )
             self._on_started()
             if not source.live:

@@ -121,7 +121,6 @@ def pipeline_of(
         refiner=Refiner("replace", fps=15, detector_classes=names, classifier_classes=reader.class_names),
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
-        camera=None,
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
     return Pipeline(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)

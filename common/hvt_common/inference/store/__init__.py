@@ -1,4 +1,7 @@
-"""Gives the path of a model by name: of the package, fetched or added by ``hvt-models``, or a plain file."""
+"""Gives the path of a model by name: of the package, fetched or added by ``hvt-models``, or a plain file.
+
+Others use what is listed here; ``hvt-models`` also opens the `store` itself and shows what its `manifest` says.
+"""
 
 from hvt_common.inference.store.resolve import (
     EMBEDDED_CLASSIFIER,
