@@ -39,7 +39,7 @@ _KBPS = (80, 1400)
 _CODED_FRAMES = 6
 _PLAUSIBLE = (0.1, 10.0)
 """Slopes of a calibration; another one comes of too few boxes."""
-_LOOK_EVERY = 5
+_STEPS_BETWEEN = 5
 _WARM_UP, _AVERAGE = 40, 0.99
 
 
@@ -141,7 +141,7 @@ def fine_tune(
         rate=settings.rate,
         warm_up=_WARM_UP,
         average=_AVERAGE,
-        check_every=_LOOK_EVERY,
+        check_every=_STEPS_BETWEEN,
         budget_s=settings.budget_s,
     )
     log = out.with_suffix(".jsonl")

@@ -11,7 +11,7 @@ from hvt_common.values import Detections
 __all__ = ["FewFoundHint"]
 
 _log = logging.getLogger(__name__)
-_LOOKS = 45
+_RUNS = 45
 """Detections on pictures: 15 s at the defaults (15 fps, every fifth frame)."""
 _LEAST_SHARE = 0.1
 """Of the looks that found something at the confidence of use."""
@@ -28,25 +28,25 @@ class FewFoundHint:
         self._confidence = confidence
         self._lock = threading.Lock()
         self._open = detector == EMBEDDED_DETECTOR
-        self._looks = self._with_something = 0
+        self._runs = self._with_something = 0
 
     def take(self, found: Detections) -> None:
         """Count what was found on one picture; at the last look that counts it may be said."""
         if not self._open:
             return
         with self._lock:
-            self._looks += 1
+            self._runs += 1
             self._with_something += bool((found.confidences >= self._confidence).any())
-            if self._looks < _LOOKS or not self._open:
+            if self._runs < _RUNS or not self._open:
                 return
             self._open = False
-        if self._with_something < _LEAST_SHARE * _LOOKS:
+        if self._with_something < _LEAST_SHARE * _RUNS:
             _log.warning(
                 "%s found something on %d of the first %d pictures: it knows vehicles and people from above; for "
                 "other views try hvt-models fetch %s and --detector %s (hvt-models list says what each is good for)",
                 EMBEDDED_DETECTOR,
                 self._with_something,
-                _LOOKS,
+                _RUNS,
                 _OTHER,
                 _OTHER,
             )

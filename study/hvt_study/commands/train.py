@@ -121,7 +121,7 @@ def run(arguments: argparse.Namespace) -> int:
                 yield Picture(image, boxes, kinds, np.ones(len(kinds), np.float32))
                 progress.update(number, len(train))
 
-    def kept() -> Iterator[HeldOut]:
+    def held_out_base() -> Iterator[HeldOut]:
         for own in held_out:
             image, there = own.base(size)
             yield HeldOut(image, there.boxes_xyxy_px, there.ignored_xyxy_px, frozenset(classes))
@@ -139,7 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
 
             tuned = fine_tune(
                 files,
-                kept,
+                held_out_base,
                 classes=classes,
                 start=start,
                 out=out,
@@ -250,9 +250,9 @@ def _split(data: Sequence[list[_Own]], apart: Sequence[list[_Own]]) -> tuple[lis
         )
     train, held_out = [], [own for pictures in apart for own in pictures]
     for pictures in data:
-        cut = 0 if apart else max(1, len(pictures) // _HELD_OUT_SHARE)
-        train += pictures[: len(pictures) - cut]
-        held_out += pictures[len(pictures) - cut :]
+        last = 0 if apart else max(1, len(pictures) // _HELD_OUT_SHARE)
+        train += pictures[: len(pictures) - last]
+        held_out += pictures[len(pictures) - last :]
     every = math.ceil(len(held_out) / _MOST_HELD_OUT)
     held_out = held_out[::every] if every else held_out
     for name, part in (("train on", train), ("hold out", held_out)):
