@@ -1,4 +1,4 @@
 """Detectors and classifiers: others use `detect`, `tiles`, `motion`, `classify`, `class_names`, `labels`, `nms`.
 
-The room `runtimes` runs a network, `store` gives paths of models.
+`few_found` hints that a detector does not know this view. The room `runtimes` runs a network, `store` gives paths of models.
 """

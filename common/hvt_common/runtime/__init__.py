@@ -1,1 +1,1 @@
-"""What every process needs: `clock`, `failures`, `process` (signals, priority), `reporting`, `statistics`."""
+"""What every process needs: `clock`, `failures`, `process` (signals), `reporting`, `statistics`, `plug_ins`."""

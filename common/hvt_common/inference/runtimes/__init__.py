@@ -1,1 +1,4 @@
-"""Runs a network: `model` opens an ONNX file, `onnx_file` reads what is in one, `providers` names who runs it."""
+"""Runs a network: `model` opens an ONNX file, `onnx_file` reads what is in one, `providers` names who runs it.
+
+`plug_in` is a detector of another package.
+"""
