@@ -35,10 +35,10 @@ test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX mo
 	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder; \
 		together=$$?; $(BIN)/python -m pytest -m realtime && exit $$together
 
-nightly: setup   ## hours: the nightly tests, every scenario at full length, kills, fuzzers, soak; COUNT= RUNS= LASTS=
+nightly: setup   ## hours: the nightly tests, every scenario at full length, kills, fuzzers, soak; fails where a bar is missed; COUNT= RUNS= LASTS=
 	@failed=; for part in nightly-tests link 'kills COUNT=$(or $(COUNT),50)' 'fuzz RUNS=$(or $(RUNS),15000)' \
 		'soak LASTS=$(or $(LASTS),20min)'; do \
-		$(MAKE) --no-print-directory COUNT= RUNS= LASTS= $$part || failed="$$failed, $${part%% *}"; done; \
+		$(MAKE) --no-print-directory COUNT= RUNS= LASTS= STRICT=1 $$part || failed="$$failed, $${part%% *}"; done; \
 		test -z "$$failed" || { echo "failed$$failed"; exit 1; }
 
 nightly-tests: setup ## the tests that `make test` leaves out, and nothing else
@@ -68,15 +68,15 @@ bench-stills: setup ## still codecs on real crops: bytes at equal quality, time 
 bench-compare: setup ## what the ground sees at each bitrate, method by method, on a car park and on small objects
 	@$(BIN)/python -m bench.compare
 
-link: setup      ## edge and ground over bad links; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns|tun SEED=
+link: setup      ## edge and ground over bad links; STRICT=1 fails where a bar is missed; SCENARIO= CLIP= LENGTH=short LASTS=60min CARRIER=netns|tun SEED=
 	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link $(SCENARIO) $(if $(CLIP),--clip $(CLIP)) $(if $(LENGTH),--length $(LENGTH)) \
-		$(if $(LASTS),--lasts $(LASTS)) $(if $(CARRIER),--carrier $(CARRIER)) $(if $(SEED),--seed $(SEED))
+		$(if $(LASTS),--lasts $(LASTS)) $(if $(CARRIER),--carrier $(CARRIER)) $(if $(SEED),--seed $(SEED)) $(if $(STRICT),--strict)
 
 soak: setup      ## an hour of fading link: memory, descriptors, threads, account; LASTS=60min CLIP=
-	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link drone-fade --name soak --lasts $(or $(LASTS),60min) $(if $(CLIP),--clip $(CLIP))
+	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link drone-fade --name soak --lasts $(or $(LASTS),60min) $(if $(CLIP),--clip $(CLIP)) $(if $(STRICT),--strict)
 
 kills: setup     ## kill -9 of edge or ground in the air: what is left is readable; COUNT=50 SEED=
-	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link.kills $(if $(COUNT),--count $(COUNT)) $(if $(SEED),--seed $(SEED))
+	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link.kills $(if $(COUNT),--count $(COUNT)) $(if $(SEED),--seed $(SEED)) $(if $(STRICT),--strict)
 
 fuzz: setup      ## coverage-guided fuzzing of all that comes from outside: RUNS=1000000 TARGET=NAME; needs atheris
 	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.fuzz $(if $(RUNS),--runs $(RUNS)) $(if $(TARGET),--target $(TARGET))

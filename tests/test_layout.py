@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 import pytest
@@ -18,6 +20,7 @@ PACKAGES = (
     "study/hvt_study",
     "study/hvt_train",
 )
+FLIES = PACKAGES[:3]
 MOST_AT_THE_TOP, MOST_IN_A_FOLDER = 8, 14
 
 
@@ -47,3 +50,48 @@ def test_every_folder_of_a_package_says_what_happens_there():
         if not ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text(encoding="utf-8")))
     ]
     assert silent == []
+
+
+def imported(path: PurePosixPath) -> Iterator[str]:
+    """Dotted names of all that a file imports, inside functions too; of a name it may be one too many."""
+    for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            yield from (node.module, *(f"{node.module}.{one.name}" for one in node.names))
+        elif isinstance(node, ast.Import):
+            yield from (one.name for one in node.names)
+
+
+def test_rooms_are_entered_by_the_door():
+    """A part of a room that others quietly rest on could not be changed without looking through the whole tree.
+
+    The first lines of a room's ``__init__`` name in `backticks` the modules that others import. Rooms are the folders
+    of what flies; others are everything but the tests, which look into every corner.
+    """
+    rooms, files = {}, {}
+    for path in modules():
+        if str(path).startswith(FLIES):
+            dotted = ".".join(path.with_suffix("").parts[1:])
+            if path.name == "__init__.py":
+                rooms[dotted.removesuffix(".__init__")] = path
+            else:
+                files[dotted] = path
+    used = defaultdict(set)
+    for path in modules():
+        if path.parts[0] == "tests":
+            continue
+        here = ".".join(path.parts[1:])
+        for name in imported(path):
+            way = name.split(".")
+            for depth in range(2, len(way)):
+                room, inner = ".".join(way[:depth]), ".".join(way[: depth + 1])
+                if room in rooms and not here.startswith(f"{room}.") and name in files:
+                    used[room].add(inner)
+    told = {
+        room: f"{ast.get_docstring(ast.parse((ROOT / path).read_text()))}" for room, path in rooms.items()
+    }
+    named = {
+        room: {f"{room}.{one}" for one in re.findall(r"(?<!`)`(\w+)`(?!`)", text)}
+        for room, text in told.items()
+    }
+    assert {room: sorted(used[room] - named[room]) for room in used if used[room] - named[room]} == {}
+    assert sum(map(len, used.values())) > 50, "the check has found too few imports to mean anything"

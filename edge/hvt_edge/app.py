@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from hvt_common.errors import FlightError, UserError
+from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
 from hvt_common.runtime.process import with_lower_priority
@@ -27,7 +28,7 @@ from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import closing_on
 from hvt_edge.status import StatusReporter
 from hvt_edge.summary import summary
-from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store
+from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store, track_confidence
 from hvt_edge.world import World
 
 __all__ = ["Edge"]
@@ -86,6 +87,7 @@ class Edge:
                     open_again=lambda: world.open_detector(config),
                     failures=self._failures,
                     clock=world.clock,
+                    hint=FewFoundHint(config.detector, confidence=track_confidence(config)),
                 )
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = world.open_link(stack, config)
@@ -108,6 +110,7 @@ class Edge:
                 info=stages.info.info,
                 control=stages.commands.answer,
                 on_feedback=stages.link_control.on_feedback,
+                reply=stages.transmitter.reply,
             )
             self._on_started()
             if not source.live:

@@ -202,7 +202,9 @@ class EdgeConfig:
     preset: str = _SENT_RARE.option(choice(*PRESETS), "veryfast", "x265 preset")
 
     detector: str = _MODELS.option(
-        TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
+        TEXT,
+        EMBEDDED_DETECTOR,
+        "FILE.onnx, a name of hvt-models list (NAME:TEXT for a plug-in), or motion, which needs no model",
     )
     labels: Path | None = _MODELS.option(PATH, None, "class names of the detector, one a line")
     candidates: str = _MODELS.option(

@@ -46,6 +46,8 @@ def summary(
         **{name: round(fact, 2) if isinstance(fact, float) else fact for name, fact in facts.items()},
         "duration_s": round(duration_s, 3),
         **{name: getattr(account, name) for name in _RATES},
+        "replies": ledger.replies,
+        "reply_bytes": ledger.reply_bytes,
         "worst_window_bps": asdict(account.worst_window_bps),
         "stills": stills,
         "cores_needed": round(cores.needed, 2),

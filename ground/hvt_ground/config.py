@@ -51,7 +51,9 @@ class GroundConfig:
     )
 
     detector: str = _MODELS.option(
-        TEXT, EMBEDDED_DETECTOR, "FILE.onnx, a name of hvt-models list, or motion, which needs no model"
+        TEXT,
+        EMBEDDED_DETECTOR,
+        "FILE.onnx, a name of hvt-models list (NAME:TEXT for a plug-in), or motion, which needs no model",
     )
     labels: Path | None = _MODELS.option(PATH, None, "class names of the classifier, one a line")
     detector_labels: Path | None = _MODELS_RARE.option(PATH, None, "class names of the detector, one a line")

@@ -12,7 +12,6 @@ from itertools import count as count_from
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
-from hvt_common.camera_motion import CameraMotion
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import Info
@@ -157,7 +156,6 @@ def make_pipeline(
     """The pipeline of one session."""
     detector, classifier = models.take()
     reader = _reader(config, detector, classifier, info=info)
-    motion = cast('Literal["off", "flow"]', config.camera_motion)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
     vocabulary = Vocabulary(names, reader.class_names, kinds=config.refine == "replace")
     path = CameraPath(ahead_frames=max(1, round(info.fps)))
@@ -174,7 +172,6 @@ def make_pipeline(
         vocabulary=vocabulary,
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
         path=path,
-        camera=None if motion == "off" else CameraMotion(scale=None),
     )
     return Pipeline(
         parts,

@@ -155,7 +155,12 @@ def run_trial(trial: Trial, scene: Path, folder: Path) -> Verdict:
             sys.executable, "-m", "hvt_edge.cli", "--connect", f"tcp/127.0.0.1:{link.port}", "--wait", "60s",
             "--source", str(scene), "--record-base", str(matroska), "--store-folder", str(folder / "store"), *EDGE,
         ]))  # fmt: skip
-        eventually(lambda: read_timing(timing), within_s=_START_S, what="a first frame reaches the ground")
+        # On a busy machine a ground takes a second to open its recording, and a kill before that tells nothing.
+        eventually(
+            lambda: read_timing(timing) and recording.exists() and in_recording(recording),
+            within_s=_START_S,
+            what="a first frame is in the ground's recording",
+        )
         link.begin()
         time.sleep(trial.after_s)
         victim, survivor = (edge, ground) if trial.victim == "edge" else (ground, edge)

@@ -19,8 +19,9 @@ from lab.link.measures.outcome import Outcome
 from lab.link.measures.resources import ResourceSampler
 from lab.link.measures.store_left import store_left
 from lab.link.measures.timing import read_timing
-from lab.link.script import Length, Scenario, Script, Transport
+from lab.link.script import Length, Scenario, Transport
 from lab.link.started import Started
+from lab.link.timeline import Script
 from programs.processes import eventually, free_ports
 
 __all__ = ["CARRIERS", "Carrier", "Run", "run"]

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from lab.link.carriers.relay import Relay
-from lab.link.script import LinkState, Phase, Script
+from lab.link.timeline import LinkState, Phase, Script
 from programs.processes import Link
 
 pytestmark = pytest.mark.integration

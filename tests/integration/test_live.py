@@ -130,6 +130,12 @@ def test_a_keyframe_comes_of_asking(late):
     assert late.keyframes == 1
 
 
+def test_the_edge_counts_what_it_answered(late):
+    """Bytes would leave the edge that its account does not know."""
+    assert late.edge["replies"] >= 4  # info, and the keyframe; info of two grounds
+    assert late.edge["reply_bytes"] >= late.edge["replies"] * (36 + 52 + len(late.keyframe_answer.pack()))
+
+
 def test_a_late_ground_asks_for_its_picture(late):
     """An operator who opens the ground in mid-flight would look at nothing, up to the next scheduled keyframe."""
     recording = Recording(late.folder / "first.rrd")

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from lab.link.carriers.pipe import SEGMENT_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
-from lab.link.script import LinkState, Phase, Script
+from lab.link.timeline import LinkState, Phase, Script
 from media.clips import START_NS
 from rigs.keeping import FRAMES, Ground, Rig
 

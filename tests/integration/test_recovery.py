@@ -18,7 +18,7 @@ import pytest
 from hvt_common.protocol.messages import Feedback
 from lab.link.carriers.relay import Relay
 from lab.link.measures.timing import Arrival, read_timing
-from lab.link.script import LinkState, Phase, Script
+from lab.link.timeline import LinkState, Phase, Script
 from programs.outsider import Tap, joined
 from programs.processes import Link, Running, eventually
 from programs.rrd import Recording

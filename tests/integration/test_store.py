@@ -14,7 +14,7 @@ from hvt_common.protocol.messages import parse_backlog_units
 from hvt_edge.backlog.disk import FILE_NAME, Store
 from hvt_edge.backlog.entry import FIRST_STORED
 from lab.link.carriers.relay import Relay
-from lab.link.script import LinkState, Phase, Script
+from lab.link.timeline import LinkState, Phase, Script
 from programs.processes import Link, eventually
 from programs.rrd import Recording
 

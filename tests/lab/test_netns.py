@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from lab.link.carriers.netns import GROUND_HOST, Namespaces, UnavailableError
-from lab.link.script import LinkState, Phase, Script
+from lab.link.timeline import LinkState, Phase, Script
 
 pytestmark = pytest.mark.integration
 

@@ -15,7 +15,7 @@ import pytest
 
 from lab.link.carriers.pipe import DATAGRAM_HEADER_BYTES, SEGMENT_HEADER_BYTES, Pipe, Segment, Stream
 from lab.link.carriers.relay import Relay
-from lab.link.script import LinkState, Phase, Script
+from lab.link.timeline import LinkState, Phase, Script
 from programs.processes import eventually
 
 PACKET = 1200 + DATAGRAM_HEADER_BYTES

@@ -18,7 +18,8 @@ from lab.link.carriers.pipe import DATAGRAM_HEADER_BYTES, Pipe
 from lab.link.carriers.tunnel import GROUND_HOST, Flight, Tunnel, UnavailableError
 from lab.link.laboratory import Run, run
 from lab.link.measures.outcome import measures
-from lab.link.script import LinkState, Phase, Script, load_scenario
+from lab.link.script import load_scenario
+from lab.link.timeline import LinkState, Phase, Script
 from media.pictures import write_scene
 from programs.processes import eventually
 

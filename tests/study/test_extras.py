@@ -54,6 +54,7 @@ def done(tmp_path, module, words, without):
         ("hvt_ground.cli", ("--help",), ("rerun",), "hvt[ground]"),
         ("hvt_ground.cli", ("keys", "list"), ("cryptography",), "hvt[ground]"),
         ("hvt_train", ("detector", "--out", "out"), ("torch",), "torch onnx"),
+        ("hvt_study.cli", ("train", "--data", "yolo:a", "--out", "b.onnx"), ("torch",), "torch onnx"),
     ],
 )
 def test_a_missing_package_is_one_sentence(tmp_path, module, words, without, install):

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from hvt_common.video.still_codecs.registry import installed_codecs, still_codec
+from hvt_common.runtime.plug_ins import installed
+from hvt_common.video.still_codecs import still_codec
 from hvt_edge.config import EdgeConfig
-from media.third_party_codec import PIXELS, install
+from media.third_party import PIXELS, install
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -323,12 +324,12 @@ def test_a_still_codec_that_does_not_work_here(edge, tmp_path, monkeypatch):
     """The first still of the flight would find out that its library is another build."""
     broken = PIXELS.replace("step = 65 -", 'raise RuntimeError("another build")\n        step = 65 -')
     monkeypatch.syspath_prepend(str(install(tmp_path / "site", {"acme-pixels": "PixelCodec"}, source=broken)))
-    installed_codecs.cache_clear()
+    installed.cache_clear()
     still_codec.cache_clear()
     try:
         assert "--still-codec acme-pixels does not work here (another build)" in edge(
             "--still-codec", "acme-pixels"
         )
     finally:
-        installed_codecs.cache_clear()
+        installed.cache_clear()
         still_codec.cache_clear()

@@ -1,1 +1,5 @@
-"""Detectors and classifiers: others use `detect`, `tiles`, `classify`, `class_names`, and `store` for paths."""
+"""Detectors and classifiers: others use `detect`, `tiles`, `motion`, `classify`, `class_names`, `labels`, `nms`,
+`scores`.
+
+The room `runtimes` runs a network, `store` gives paths of models.
+"""

@@ -12,7 +12,13 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from rich.table import Table
 
 from hvt_common.errors import Parser, UserError, exit_with_sentence
-from hvt_common.inference.store import embedded_models, resolve_model
+from hvt_common.inference.runtimes.plug_in import plug_in_names
+from hvt_common.inference.store import (
+    EMBEDDED_CLASSIFIER,
+    EMBEDDED_DETECTOR,
+    embedded_models,
+    resolve_model,
+)
 from hvt_common.inference.store.manifest import ModelEntry
 from hvt_common.inference.store.store import Store, file_digest
 
@@ -21,6 +27,10 @@ __all__ = ["main"]
 _PROGRAM = "hvt-models"
 _INTERRUPTED = 130
 _SHOWN_CLASSES = 12
+_EMBEDDED = {
+    EMBEDDED_DETECTOR: ("detector", "part of HVT: vehicles and people, aerial"),
+    EMBEDDED_CLASSIFIER: ("classifier", "part of HVT: crops of vehicles and people, aerial"),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -85,7 +95,8 @@ def _list(_: argparse.Namespace) -> int:
     for column in ("name", "task", "MB", "licence", "here", "about"):
         table.add_column(column, justify="right" if column == "MB" else "left", no_wrap=column == "name")
     for name, path in embedded_models().items():
-        table.add_row(name, "", f"{path.stat().st_size / 1e6:.1f}", "Apache-2.0", "yes", "part of HVT")
+        task, about = _EMBEDDED[name]
+        table.add_row(name, task, f"{path.stat().st_size / 1e6:.1f}", "Apache-2.0", "yes", about)
     for name, entry in store.entries.items():
         held = store.held_bytes(name)
         here = "yes" if store.is_there(name) else f"{100 * held // entry.size_bytes} %" if held else "no"
@@ -97,7 +108,10 @@ def _list(_: argparse.Namespace) -> int:
             here,
             entry.about or "added by hand",
         )
+    for name, origin in plug_in_names().items():
+        table.add_row(name, "detector", "", "", "yes", f"plug-in of {origin}")
     Console(highlight=False).print(table)
+    print("hvt-models fetch NAME brings one here; then --detector NAME or --classifier NAME takes it")
     return 0
 
 

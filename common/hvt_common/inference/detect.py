@@ -1,4 +1,4 @@
-"""Detectors: an ONNX network with one of the known heads, or plain motion."""
+"""Detectors: an ONNX network with one of the known heads, plain motion, or what another package brings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from hvt_common.inference.letterbox import Letterboxer, as_bgr
 from hvt_common.inference.motion import MotionDetector
 from hvt_common.inference.nms import MAX_DETECTIONS, suppress
 from hvt_common.inference.runtimes.model import ModelSettings, OnnxModel, open_model
-from hvt_common.inference.store import resolve_model
+from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names, plug_in_of
+from hvt_common.inference.store import model_names, resolve_model
 from hvt_common.values import Detections, Image
 
 __all__ = [
@@ -43,14 +44,21 @@ rider and the bicycle below overlap less."""
 
 
 class Detector(Protocol):
-    """Finds objects in one image after the other; one instance serves one stream."""
+    """Finds objects in one image after the other, of any sizes. One thread at a time calls it.
+
+    This is also the contract of a plug-in (``hvt.detectors``, docs/models.md): its answer depends on the image alone,
+    and it may raise; then the flight goes on without detections, and it is opened again after a pause.
+    """
 
     @property
     def class_names(self) -> tuple[str, ...]:
         """What ``class_ids`` index."""
 
     def detect(self, image_bgr: Image) -> Detections:
-        """Detections in the pixels of this image, inside it, best first."""
+        """Detections in (height, width, 3) uint8, which must not be written to: in its pixels, inside it, best first.
+
+        One box an object (after NMS). A plug-in may give them all: those below the confidence of use are left out.
+        """
 
 
 def open_detector(
@@ -63,20 +71,26 @@ def open_detector(
     threads: int = 2,
     provider: str = "cpu",
 ) -> Detector:
-    """Open a detector: ``motion``, the name of a model (see `resolve_model`), or an ONNX file.
+    """Open a detector: ``motion``, the name of a model (see `resolve_model`), an ONNX file, or a plug-in's name.
 
     ``labels`` are class names, one a line; else those of the metadata, COCO (80), VisDrone (10), or "class 0" and
     so on. ``confidence`` is the least of a detection, ``nms_iou`` the largest overlap of two of one class, both
     0…1. ``size`` is (width, height) of the network's input where the model leaves it free; else each image gets the
-    multiples of 32 that hold it (at most 1920 on the longer side). Raises `UserError` where there is no such model,
-    it is not a detector, its labels do not fit, or a setting is out of its range.
+    multiples of 32 that hold it (at most 1920 on the longer side). A plug-in gets none of these; ``confidence`` is
+    applied to its answer. Raises `UserError` where there is no such model, it is not a detector, its labels do not
+    fit, or a setting is out of its range.
     """
     for name, value in (("confidence", confidence), ("NMS IoU", nms_iou)):
         if not 0 <= value <= 1:
             raise UserError(f"{name} {value} is not accepted; a number from 0 to 1 is")
     if spec == MOTION:
         return MotionDetector(confidence=confidence)
-    path = resolve_model(spec, role="detector", words=(MOTION,))
+    plug_in = plug_in_of(spec, taken=model_names)
+    if plug_in is not None:
+        if labels is not None:
+            raise UserError(f"labels file {labels} has no say: detector {spec!r} brings its own class names")
+        return PlugInDetector(plug_in, spec, confidence=confidence)
+    path = resolve_model(spec, role="detector", words=(MOTION, *plug_in_names()))
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size)
 

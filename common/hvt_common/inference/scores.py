@@ -8,6 +8,7 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import MOTION, USUAL_CONFIDENCE
 from hvt_common.inference.runtimes.onnx_file import onnx_metadata
+from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
 from hvt_common.inference.store import resolve_model
 
 __all__ = ["default_confidence", "is_calibrated", "uncalibrated"]
@@ -22,10 +23,7 @@ def default_confidence(spec: str) -> float:
 
     ``spec`` is as of `open_detector`. Raises `UserError` where there is no such model, or the metadata make no sense.
     """
-    if spec == MOTION:
-        return USUAL_CONFIDENCE
-    path = resolve_model(spec, role="detector", words=(MOTION,))
-    text = onnx_metadata(path).get(_CONFIDENCE)
+    text = _metadata(spec, role="detector").get(_CONFIDENCE)
     if text is None:
         return USUAL_CONFIDENCE
     try:
@@ -34,7 +32,7 @@ def default_confidence(spec: str) -> float:
         value = math.nan
     if not _LEAST_CONFIDENCE <= value <= 1:
         raise UserError(
-            f"model {path} has {_CONFIDENCE} '{text:.80}' in its metadata; a number from {_LEAST_CONFIDENCE} to 1 is"
+            f"model {spec} has {_CONFIDENCE} '{text:.80}' in its metadata; a number from {_LEAST_CONFIDENCE} to 1 is"
             " accepted"
         )
     return value
@@ -43,9 +41,16 @@ def default_confidence(spec: str) -> float:
 def is_calibrated(spec: str, *, role: str) -> bool:
     """Whether a model's scores were fitted to how often they are right: its metadata have ``hvt.calibration``.
 
-    The motion detector's are not. Raises `UserError` where there is no such model.
+    Those of the motion detector and of plug-ins are not. Raises `UserError` where there is no such model.
     """
-    return spec != MOTION and _CALIBRATION in onnx_metadata(resolve_model(spec, role=role, words=(MOTION,)))
+    return _CALIBRATION in _metadata(spec, role=role)
+
+
+def _metadata(spec: str, *, role: str) -> dict[str, str]:
+    """Of a file; the motion detector and plug-ins have none."""
+    if role == "detector" and (spec == MOTION or plug_in_of(spec) is not None):
+        return {}
+    return onnx_metadata(resolve_model(spec, role=role, words=(MOTION, *plug_in_names())))
 
 
 def uncalibrated(role: str, spec: str) -> str:

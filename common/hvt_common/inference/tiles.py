@@ -85,7 +85,7 @@ def tiled(detector: Detector, tiles: str) -> Detector:
     if not isinstance(detector, _Sized):
         if grid == "auto":
             return detector
-        raise UserError(f"tiles {tiles} need a detector that is a network; 'motion' compares whole pictures")
+        raise UserError(f"tiles {tiles} need an ONNX network; motion and plug-ins take whole pictures")
     return TiledDetector(detector, grid=grid)
 
 

@@ -48,6 +48,8 @@ _FRAMING_BYTES = 12
 _STANDARD_ENCODING_BYTES = 1
 _CUSTOM_ENCODING_BYTES = 4
 _TIMESTAMP_BYTES = 26
+_REPLY_BYTES = 36
+"""More than a put: the numbers of query and replier, and the message that ends the query. Measured likewise."""
 STANDARD_ENCODINGS = frozenset(
     {
         "application/octet-stream",
@@ -69,13 +71,20 @@ _SEGMENT_HEADER_BYTES = 52
 
 
 def overhead_bytes(
-    payload_bytes: int, attachment_bytes: int, *, key: str, encoding: str = "", timestamp: bool = False
+    payload_bytes: int,
+    attachment_bytes: int,
+    *,
+    key: str,
+    encoding: str = "",
+    timestamp: bool = False,
+    reply: bool = False,
 ) -> int:
     """Bytes that one Zenoh message over TCP and IPv4 takes on the line beyond its payload and attachment.
 
     ``key`` is the whole key: to a subscriber with a wildcard Zenoh sends it in full each time. ``encoding`` is the
-    encoding's name, empty for Zenoh's default. Headers below IP (14 bytes a packet on Ethernet), acknowledgements
-    and retransmissions are not in it, nor what is saved where Zenoh sends two messages in one batch.
+    encoding's name, empty for Zenoh's default. A ``reply`` is the only one to its query. Headers below IP (14 bytes a
+    packet on Ethernet), acknowledgements and retransmissions are not in it, nor what is saved where Zenoh sends two
+    messages in one batch.
     """
     framing = _FRAMING_BYTES + len(key) + _varint_bytes(payload_bytes)
     if attachment_bytes:
@@ -86,6 +95,8 @@ def overhead_bytes(
         framing += _CUSTOM_ENCODING_BYTES + len(encoding)
     if timestamp:
         framing += _TIMESTAMP_BYTES
+    if reply:
+        framing += _REPLY_BYTES
     message = payload_bytes + attachment_bytes + framing
     if message > _BATCH_BYTES:
         framing += 1 + _FRAGMENT_BYTES * (_ceil(message, _BATCH_BYTES - _FRAGMENT_BYTES) - 1)
@@ -149,6 +160,15 @@ class Ledger:
         self._bytes = dict.fromkeys(Account, 0)
         """Payload by account; of `Account.META` also all attachments."""
         self._overhead_bytes = 0
+        self.replies = 0
+        """Answers to queries. They and their bytes are in no other figure: no two grounds get the same ones."""
+        self.reply_bytes = 0
+        """On the line, with all headers."""
+
+    def count_reply(self, line_bytes: int) -> None:
+        """Add an answer to a query."""
+        self.replies += 1
+        self.reply_bytes += line_bytes
 
     def count(
         self, channel: Account, *, payload_bytes: int, attachment_bytes: int, overhead_bytes: int, at_ns: int

@@ -1,1 +1,1 @@
-"""ByteTrack: others use `bytetrack`; Kalman filter, association and table are its parts."""
+"""ByteTrack: others use `bytetrack`, and `association` of boxes; Kalman filter and table are its parts."""

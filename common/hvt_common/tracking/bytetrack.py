@@ -17,7 +17,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.camera_motion import CameraMotion
+from hvt_common.camera_motion import Affine, CameraMotion
 from hvt_common.tracking import kalman
 from hvt_common.tracking.association import grown, overlaps, pair
 from hvt_common.tracking.track_table import LOST, TRACKED, UNCONFIRMED, TrackerInput, TrackTable
@@ -129,6 +129,8 @@ class ByteTracker:
         self._buffer_frames = int(fps / 30.0 * self._settings.track_buffer)
         method = self._settings.camera_motion
         self._camera = None if method == "off" else CameraMotion(scale=None)
+        self.camera_step: Affine | None = None
+        """The camera's motion from the frame before to the newest, base pixels; None where it is not followed."""
         self.reset()
 
     def reset(self) -> None:
@@ -193,6 +195,7 @@ class ByteTracker:
         elapsed = 1 if self._frame_index is None else frame_index - self._frame_index
         self._frame_index = frame_index
         affine = None if self._camera is None or image_bgr is None else self._camera.step(image_bgr)
+        self.camera_step = affine
         table = self._table
         if elapsed > self._buffer_frames + 1:
             table.retain(np.zeros(len(table), bool))

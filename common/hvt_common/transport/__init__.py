@@ -1,1 +1,4 @@
-"""HVT over Zenoh: `session` opens it, `inbox` queues what arrives, `doctor` explains why there is no link."""
+"""HVT over Zenoh: `session` opens it as `zenoh_config` says, `inbox` queues what arrives, `flood` notices too much.
+
+`doctor` explains why there is no link, `duplicate_edge` refuses a second edge of one id, `rights` are those of a key.
+"""

@@ -58,6 +58,7 @@ class EdgeLink(Outlet, Protocol):
         info: Callable[[int], bytes],
         control: Callable[[ControlRequest], ControlAnswer],
         on_feedback: Callable[[Feedback], None],
+        reply: Callable[[Channel, bytes], bytes] = lambda _channel, payload: payload,
     ) -> None:
         """Answer grounds from now on: all that answers them is there."""
         ...
@@ -119,6 +120,7 @@ class ZenohLink:
         info: Callable[[int], bytes],
         control: Callable[[ControlRequest], ControlAnswer],
         on_feedback: Callable[[Feedback], None],
+        reply: Callable[[Channel, bytes], bytes] = lambda _channel, payload: payload,
     ) -> None:
         """Answer grounds from now on; see `EdgeListener`."""
         listener = EdgeListener(
@@ -127,6 +129,7 @@ class ZenohLink:
             info=info,
             control=control,
             on_feedback=on_feedback,
+            reply=reply,
             failures=self._failures,
             clock=self._clock,
         )
@@ -144,7 +147,8 @@ class EdgeListener:
     """Queryables info and control; a subscriber of feedback; last the alive token, by which grounds find the edge.
 
     ``info(received_ns)``, ``control(request)`` and ``on_feedback(feedback)`` run in Zenoh's callbacks and must be
-    quick; ``clock`` is that of the headers.
+    quick; ``reply(channel, payload)`` gives the payload back as it leaves (`Transmitter.reply`); ``clock`` is that of
+    the headers.
     """
 
     session: zenoh.Session
@@ -153,6 +157,7 @@ class EdgeListener:
     info: Callable[[int], bytes]
     control: Callable[[ControlRequest], ControlAnswer]
     on_feedback: Callable[[Feedback], None]
+    reply: Callable[[Channel, bytes], bytes]
     failures: Failures
     clock: Callable[[], int]
 
@@ -190,7 +195,7 @@ class EdgeListener:
     def _answered(self, channel: Channel, answer: Callable[[], bytes]) -> bytes | None:
         """None where that fails: an error in Zenoh's thread would be nobody's."""
         try:
-            data = answer()
+            data = self.reply(channel, answer())
         except Exception as error:  # noqa: BLE001 - see above
             self.failures.failed(channel, f"a ground got no answer ({type(error).__name__}: {error})")
             return None

@@ -5,7 +5,7 @@ Base first, then metadata, stills by utility, the backlog. Four threads send:
 * the frame loop: `base`, `status`, and what it stores in place of sending;
 * the stills' thread: `tracks` and `still`;
 * the store's thread: `backlog`;
-* the link's callbacks answer ``info`` and ``control`` themselves: a reply leaves with its query, not here.
+* the link's callbacks: `reply`, what grounds asked of ``info`` and ``control``.
 
 The lock covers header, ledger and budget, never a wait or a ``put``. So a still whose ``put`` blocks holds up the
 stills' thread alone; a base frame finds the lock free and a publisher of its own.
@@ -24,26 +24,17 @@ from typing import Protocol
 
 from hvt_common.protocol.channels import DELIVERIES, Channel, EdgeKeys
 from hvt_common.protocol.ledger import Account, Ledger, overhead_bytes
-from hvt_common.protocol.messages import (
-    AlsoShown,
-    BacklogHeader,
-    BacklogStill,
-    BaseHeader,
-    Flags,
-    PackedMessage,
-    RoiHeader,
-    Status,
-    fitted_text,
-)
+from hvt_common.protocol.messages import BacklogHeader, BacklogStill, BaseHeader, Flags, Status
 from hvt_common.units import SECOND_NS
 from hvt_common.values import AccessUnit, Still
 from hvt_edge.backlog.backfill import Chunk
 from hvt_edge.backlog.outage import BaseInFlight
 from hvt_edge.link.budget import RollingBudget
+from hvt_edge.link.envelope import StillEnvelope
 from hvt_edge.link.overhead import BASE_ATTACHMENT_BYTES
 from hvt_edge.link.pacer import Pacer
 
-__all__ = ["PLAIN_ENCODING", "STILL_ATTACHMENT_BYTES", "Outlet", "StillEnvelope", "Transmitter"]
+__all__ = ["STILL_ATTACHMENT_BYTES", "Outlet", "Transmitter"]
 
 STILL_ATTACHMENT_BYTES = 100
 """About what a `RoiHeader` of one track takes with the usual names: for estimates, before there is a still at hand.
@@ -57,11 +48,6 @@ _GROWTH_BYTES = 16
 """By how much metadata may grow when it is made for a later moment: its two times."""
 
 
-PLAIN_ENCODING = "application/octet-stream"
-"""Of formats that only HVT reads; one byte on the wire."""
-_OWN_TYPES = "application/vnd.hvt."
-
-
 class Outlet(Protocol):
     """Where bytes go: the link, or in the study nowhere."""
 
@@ -70,27 +56,6 @@ class Outlet(Protocol):
     ) -> None:
         """Hand over one message; may block while the link is full."""
         ...
-
-
-def _encoding(still: Still) -> str:
-    """What Zenoh is told of the payload: its media type, if there is any program beside HVT that could read it.
-
-    Spelling a type of our own out would cost up to 34 bytes a still, and the header names the codec anyway.
-    """
-    return PLAIN_ENCODING if still.media_type.startswith(_OWN_TYPES) else still.media_type
-
-
-@dataclass(frozen=True, slots=True)
-class StillEnvelope:
-    """A still with its header packed once; send delay, flags and checksum are packed when it goes out."""
-
-    still: Still
-    header: PackedMessage
-    encoding: str
-
-    def header_at(self, send_ns: int, *, flags: int) -> PackedMessage:
-        """The header of a still that goes out at this time."""
-        return self.header.with_fields(send_delay_ns=send_ns - self.still.capture_ns, flags=int(flags))
 
 
 @dataclass(eq=False)
@@ -155,8 +120,7 @@ class Transmitter:
         """The still with its header. The one asked for last is at hand: what was measured is what is sent."""
         newest = self._newest
         if newest is None or newest.still is not still:
-            header = PackedMessage.of(self._still_header(still))
-            self._newest = newest = StillEnvelope(still, header, _encoding(still))
+            self._newest = newest = StillEnvelope.of(still, session_id=self.session_id)
         return newest
 
     def still_allowance_bytes(self, now_ns: int, *, still: Still | None = None, paced: bool = True) -> int:
@@ -283,6 +247,21 @@ class Transmitter:
         """
         self._metadata(Channel.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns)
 
+    def reply(self, channel: Channel, payload: bytes) -> bytes:
+        """Count an answer to a query, and let it go at once: the link puts it on the line as this returns.
+
+        It waits for no window and takes none of the budget. Until a query is answered, those behind it stand still,
+        and with them in the end all that the link takes in, keyframe requests and reports; who asks measures the
+        clock by the time that the answer takes; and if answers took from the budget, anybody who may ask could stop
+        the video. Its bytes have an account of their own, since each ground sees only those that it asked for.
+        """
+        overhead = overhead_bytes(
+            len(payload), 0, key=self._keys.key(channel), encoding=DELIVERIES[channel].encoding, reply=True
+        )
+        with self._lock:
+            self.ledger.count_reply(len(payload) + overhead)
+        return payload
+
     def set_rates(self, total_bps: int, base_bps: int, fps: float, *, now_ns: int) -> None:
         """Total, base stream's share and coded frames a second from now on; see `RollingBudget.set_total`."""
         with self._lock:
@@ -322,27 +301,6 @@ class Transmitter:
                 self.pacer.sent_other(line_bytes, now_ns=at_ns)
         self.wait_until(at_ns)
         self.outlet.put(channel, payload, encoding=DELIVERIES[channel].encoding)
-
-    def _still_header(self, still: Still) -> RoiHeader:
-        """All of it but send delay and flags."""
-        return RoiHeader(
-            session_id=self.session_id,
-            sequence=still.sequence,
-            frame_index=still.frame_index,
-            capture_ns=still.capture_ns,
-            send_delay_ns=0,
-            flags=0,
-            track_id=still.track_id,
-            box_source_px=still.box_source_px,
-            crop_source_px=still.crop_source_px,
-            class_name=fitted_text(still.class_name, 64),
-            confidence=still.confidence,
-            reason=fitted_text(still.reason, 48),
-            codec=still.codec,
-            quality_pct=still.quality_pct,
-            parameters=still.parameters,
-            also=tuple(AlsoShown(track_id=one, box_source_px=box) for one, box in still.also),
-        )
 
     def _still_at_ns(self, envelope: StillEnvelope, now_ns: int) -> int:
         """When it may go: now, unless its allowance is gone."""

@@ -1,1 +1,4 @@
-"""Decoded base and source in, tracks and candidates out: `analyzer`, `candidates`, `frame_ring` (source frames)."""
+"""Decoded base and source in, tracks and candidates out: `analyzer`, `guarded_detector`, `candidates`.
+
+`crop` says where a still is cut, `base_loss` what the base lost there; `frame_ring` keeps source frames.
+"""

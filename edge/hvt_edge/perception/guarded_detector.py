@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from hvt_common.inference.detect import Detector
+from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.values import Detections, Image
 
@@ -12,7 +13,7 @@ __all__ = ["GuardedDetector"]
 
 
 class GuardedDetector(Retried[Detector]):
-    """``opened`` is the first one, ``open_again`` opens the model anew."""
+    """``opened`` is the first one, ``open_again`` opens the model anew; ``hint`` may say that it finds little."""
 
     def __init__(
         self,
@@ -21,8 +22,10 @@ class GuardedDetector(Retried[Detector]):
         open_again: Callable[[], Detector],
         failures: Failures,
         clock: Callable[[], int],
+        hint: FewFoundHint | None = None,
         pause: RetryPause | None = None,
     ) -> None:
+        self._hint = hint
         ready = [opened]
         super().__init__(
             lambda: ready.pop() if ready else open_again(), "detector", failures, clock=clock, pause=pause
@@ -31,4 +34,7 @@ class GuardedDetector(Retried[Detector]):
 
     def detect(self, image_bgr: Image) -> Detections | None:
         """As `Detector.detect`; None while it does not work."""
-        return self.run(lambda model: model.detect(image_bgr))
+        found = self.run(lambda model: model.detect(image_bgr))
+        if found is not None and self._hint is not None:
+            self._hint.take(found)
+        return found

@@ -1,1 +1,5 @@
-"""The base stream: `frame_decision` and `stage` a frame, `x265`, `reconfigure` its rates, `regions` its ROIs."""
+"""The base stream: `stage` takes a frame through `frame_decision` and `x265`, opened by `encoder_settings`.
+
+`keyframes` and `frame_skip` say which frames, `regions` where finer, `rate_model` and `share` at which rate;
+`reconfigure` changes all that with a keyframe. `local_copy` is ``--record-base``.
+"""

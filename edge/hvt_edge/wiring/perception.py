@@ -21,7 +21,7 @@ def make_detector(config: EdgeConfig) -> Detector:
     detector = open_detector(
         config.detector,
         labels=config.labels,
-        confidence=weak_confidence(_confidence(config)),
+        confidence=weak_confidence(track_confidence(config)),
         nms_iou=config.nms_iou,
         threads=config.threads,
         provider=config.provider,
@@ -42,7 +42,7 @@ def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
 def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) -> Analyzer:
     """Decoder, detector and tracker of the edge's own stream."""
     settings = TrackerSettings.starting_at(
-        _confidence(config), camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
+        track_confidence(config), camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
     )
     return Analyzer(
         detector,
@@ -55,5 +55,6 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
     )
 
 
-def _confidence(config: EdgeConfig) -> float:
+def track_confidence(config: EdgeConfig) -> float:
+    """From where a detection starts a track: as given, else as the detector's file says."""
     return default_confidence(config.detector) if config.confidence is None else config.confidence

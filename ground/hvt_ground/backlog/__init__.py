@@ -1,11 +1,5 @@
-"""What an edge stored while its link was down: put together, delivered, shown at its own time."""
+"""What an edge stored while its link was down: put together, delivered, shown at its own time.
 
-from __future__ import annotations
-
-from hvt_ground.backlog.assembly import (
-    BacklogAssembly,
-    BacklogContent,
-    backlog_content,
-)
-
-__all__ = ["BacklogAssembly", "BacklogContent", "backlog_content"]
+`edge_backlog` takes the chunks of one edge; `session_backlog` shows them in the session they belong to, `recordings`
+those of earlier sessions; `perception` analyzes them.
+"""

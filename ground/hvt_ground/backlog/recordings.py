@@ -30,7 +30,7 @@ class BacklogRecording:
 
     def __init__(self, info: Info, *, sink: QueuedSink[Event], perception: BacklogPerception) -> None:
         self.users = 0
-        """Jobs that have it in hand, or wait to."""
+        """Jobs that have it in hand, or wait for it."""
         self.sink = sink
         self._perception = perception
         self.backlog = SessionBacklog(info, log=sink.log, perception=perception, read=self._read)
@@ -57,7 +57,8 @@ class BacklogRecordings:
 
     Where more than ``most`` are open, the one that nothing came for the longest is closed. One that is in use is not:
     should all be, one more is open for the time being. When more comes of a session whose recording is closed, it
-    gets another file; at most ``most_files`` are made in all.
+    gets another file; at most ``most_files`` are made in all. Whoever has one made waits up to ``open_s`` for its
+    file, and for as long nobody else does.
     """
 
     def __init__(
@@ -66,9 +67,11 @@ class BacklogRecordings:
         *,
         most: int = MOST_OPEN,
         most_files: int = MOST_FILES,
+        open_s: float = _OPEN_S,
     ) -> None:
         self._open_one = open_one
         self._most = most
+        self._open_s = open_s
         self._left = most_files
         self._lock = threading.Lock()
         self._open: OrderedDict[int, BacklogRecording] = OrderedDict()
@@ -96,6 +99,7 @@ class BacklogRecordings:
 
         None where `takes` says no, or the recording cannot be written now.
         """
+        wait_s = 0.0
         with self._lock:
             recording = self._open.get(info.session_id)
             if recording is None:
@@ -105,11 +109,14 @@ class BacklogRecordings:
                 self._left -= 1
                 recording = self._open[info.session_id] = self._open_one(info)
                 self._sinks.append(recording.sink)
+                wait_s = self._open_s
             self._open.move_to_end(info.session_id)
-            if not recording.sink.is_open(within_s=_OPEN_S):
-                return None
             recording.users += 1
+        # Not while the lock is held: the receiving thread asks `takes`.
+        if recording.sink.is_open(within_s=wait_s):
             return recording.backlog
+        self.release(recording.backlog)
+        return None
 
     def release(self, backlog: SessionBacklog) -> None:
         """The user is done with it."""

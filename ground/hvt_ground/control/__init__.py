@@ -1,4 +1,7 @@
-"""Asking edges for more: a still, a keyframe, another budget or method. For people and for programs."""
+"""Asking edges for more: a still, a keyframe, another budget or method. For people and for programs.
+
+Programs use what is listed here; `command` gives people the same on the command line.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,5 @@
-"""What comes off the link, put in order and counted: `Reassembler`, statistics, packets, windows of numbers. Pure."""
+"""What comes off the link, put in order and counted. Pure.
+
+`packets` are messages once parsed; `reassemble` makes them decodable, `statistics` says what is missing,
+`sequence_window` remembers numbers, `other_sessions` keeps strangers apart.
+"""

@@ -1,1 +1,4 @@
-"""Decoded base in, tracks out: a `Pipeline` for each session, the worker it runs in, the `Models` they share."""
+"""Decoded base in, tracks out: a `pipeline` for each session, the `worker` it runs in, the `models` they share.
+
+`history` is what was decoded lately; `fusion` makes one list of all tracks, `stills` refines them.
+"""

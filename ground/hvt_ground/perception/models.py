@@ -7,6 +7,7 @@ from functools import partial
 
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import Detector, open_detector, warm_up
+from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
@@ -53,7 +54,8 @@ class Models:
             threads=config.threads,
             provider=config.provider,
         )
-        return RetriedDetector(open_one, "detector", self.failures)
+        hint = FewFoundHint(config.detector, confidence=track_confidence(config))
+        return RetriedDetector(open_one, "detector", self.failures, hint=hint)
 
     def _check(self) -> None:
         """Refuse a classifier that has nothing to say of the detector's tracks; say which scores mean little."""

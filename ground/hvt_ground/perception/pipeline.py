@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hvt_common.camera_motion import CameraMotion
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import DistinctIds
@@ -32,7 +31,8 @@ _FARTHEST_S = 5
 """A step further ahead of all that is known is not plausible: nothing that comes after it could be shown."""
 _GAP_S = 1.0
 """For how long the base stream may leave out frames and still tell where tracks were between."""
-
+_PUT_OFF = 4
+"""So many times the usual pause is the longest between two detections, where one is put off again and again."""
 
 _HISTORY_S = 3.0
 """Of pictures that residual stills may build on."""
@@ -65,8 +65,6 @@ class PipelineParts:
     fusion: Fusion
     path: CameraPath
     """The one that ``fusion`` moves boxes by."""
-    camera: CameraMotion | None
-    """None where the camera's motion is not followed."""
 
 
 class Pipeline:
@@ -109,9 +107,6 @@ class Pipeline:
             emit=emit,
         )
         self._detected_frame: int | None = None
-        self._camera_frame: int | None = None
-        self._leaves_out = False
-        """Whether there are frames without a picture."""
         self._now = Progress()
         self._picture_ns = 0
         self._own: Tracks | None = None
@@ -152,11 +147,10 @@ class Pipeline:
         return self._stills.outcomes
 
     def analyze(self, picture: DecodedFrame, *, hurry: bool) -> None:
-        """Take the next frame; with ``hurry`` detection waits for a later one."""
+        """Take the next frame; with ``hurry`` detection waits for a later one, but not for ever."""
         index = picture.frame_index
         self._history.add_frame(index, picture.picture)
         image = as_bgr(picture.picture)
-        self._estimate_camera(index, image)
         own = self._own = self._track(index, image, hurry=hurry)
         self._picture_ns = picture.capture_ns
         ahead = self._now.frame_index > index
@@ -221,28 +215,20 @@ class Pipeline:
     # The base stream
 
     def _track(self, index: int, image: Image, *, hurry: bool) -> Tracks:
-        due = self._detected_frame is None or index - self._detected_frame >= self._detect_every
-        if hurry or not due:
-            return self._parts.tracker.predict(frame_index=index, image_bgr=image)
-        self._detected_frame = index
-        self.detections_run += 1
-        found = self._parts.detector.detect(image)
-        return self._parts.tracker.update(found, frame_index=index, image_bgr=image)
-
-    def _estimate_camera(self, index: int, image: Image) -> None:
-        """Estimate the camera's motion, but only where boxes have to be moved along between pictures."""
-        camera, parts = self._parts.camera, self._parts
-        last = self._now.picture_index
-        self._leaves_out = self._leaves_out or (last >= 0 and index > last + 1)
-        if camera is None or not (self._leaves_out or parts.fusion.knows_from_afar):
-            self._camera_frame = None
-            return
-        if self._camera_frame is None:
-            camera.reset()
-        affine = camera.step(image)
-        if self._camera_frame is not None:
-            parts.path.add(affine, start=self._camera_frame, end=index)
-        self._camera_frame = index
+        parts, last = self._parts, self._detected_frame
+        frames = None if last is None else index - last
+        due = frames is None or frames >= (_PUT_OFF if hurry else 1) * self._detect_every
+        if due:
+            self._detected_frame = index
+            self.detections_run += 1
+            found = parts.detector.detect(image)
+            own = parts.tracker.update(found, frame_index=index, image_bgr=image)
+        else:
+            own = parts.tracker.predict(frame_index=index, image_bgr=image)
+        before, affine = self._now.picture_index, parts.tracker.camera_step
+        if before >= 0 and affine is not None:  # the tracker has followed it: it is not estimated twice
+            parts.path.add(affine, start=before, end=index)
+        return own
 
     def _own_at(self, frame_index: int) -> Tracks:
         """Our tracker's list at a frame: as it was, or moved on from the newest frame."""

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
-from hvt_common.runtime.failures import Retried
+from hvt_common.inference.few_found import FewFoundHint
+from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.values import Detections, Image, Posterior
 
 __all__ = ["RetriedClassifier", "RetriedDetector"]
 
 
 class RetriedDetector(Retried[Detector]):
-    """Finds nothing while its model fails."""
+    """Finds nothing while its model fails; ``hint`` may say that it finds little."""
+
+    def __init__(
+        self,
+        open_part: Callable[[], Detector],
+        name: str,
+        failures: Failures,
+        *,
+        hint: FewFoundHint | None = None,
+        pause: RetryPause | None = None,
+    ) -> None:
+        super().__init__(open_part, name, failures, pause=pause)
+        self._hint = hint
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -23,7 +36,11 @@ class RetriedDetector(Retried[Detector]):
     def detect(self, image_bgr: Image) -> Detections:
         """As the model does."""
         found = self.run(lambda model: model.detect(image_bgr))
-        return Detections.none() if found is None else found
+        if found is None:
+            return Detections.none()
+        if self._hint is not None:
+            self._hint.take(found)
+        return found
 
 
 class RetriedClassifier(Retried[Classifier]):

@@ -25,8 +25,9 @@ _log = logging.getLogger(__name__)
 
 _MOST_PICTURES = 12
 """How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
-_BEHIND_PICTURES = 1
 _STILLS_AT_ONCE = 16
+"""Of one frame. Between those of two frames come the pictures that have arrived: to read stills may take longer than
+the time between two pictures."""
 _MOST_STILLS = 256
 _MOST_STILL_BYTES = 32 * 2**20
 _MOST_STEPS = 8
@@ -247,23 +248,32 @@ class RealtimeWorker(PerceptionWorker):
                     jobs.popleft().close()
 
     def _work_off(self) -> None:
-        """Analyze the pictures that came before the stills taken here, then take the edge's tracks, then read."""
+        """Analyze the pictures that came before the stills taken here, take the edge's tracks, then read."""
         with self._lock:
-            stills = [self._stills.popleft() for _ in range(min(len(self._stills), _STILLS_AT_ONCE))]
+            stills: list[ReceivedStill] = []
+            while self._stills and len(stills) < _STILLS_AT_ONCE:
+                if stills and self._stills[0].header.frame_index != stills[0].header.frame_index:
+                    break
+                stills.append(self._stills.popleft())
+        self._look(hurry=False)
+        while self._steps and not self._given_up.is_set():
+            self._step(*self._steps.popleft())
+        if stills:
+            self._look(hurry=True)  # what came while the detector ran would wait as long again
+            self._read(stills)
+        self._do_jobs()
+        if self._has_news():
+            self._wake.set()
+
+    def _look(self, *, hurry: bool) -> None:
+        """Analyze the pictures that are there: in the newest objects are detected, unless in a ``hurry``."""
         # Those that come meanwhile are not among them, or on a slow machine stills would wait for ever.
         for _ in range(len(self._pictures)):
             if self._given_up.is_set():
                 break
             with self._lock:
                 picture = self._pictures.popleft()
-            self._analyze(picture, len(self._pictures) > _BEHIND_PICTURES)
-        while self._steps and not self._given_up.is_set():
-            self._step(*self._steps.popleft())
-        if stills:
-            self._read(stills)
-        self._do_jobs()
-        if self._has_news():
-            self._wake.set()
+            self._analyze(picture, hurry or len(self._pictures) > 0)
 
     def _do_jobs(self) -> None:
         """Do what can wait, until something comes that cannot."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 
 from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
-from lab.link.script import LinkState, Script
+from lab.link.timeline import LinkState, Script
 
 __all__ = ["GROUND_HOST", "Namespaces", "UnavailableError"]
 

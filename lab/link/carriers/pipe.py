@@ -23,7 +23,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from lab.link.script import Script
+from lab.link.timeline import Script
 
 __all__ = ["DATAGRAM_HEADER_BYTES", "SEGMENT_BYTES", "SEGMENT_HEADER_BYTES", "Pipe", "Segment", "Stream"]
 

@@ -32,7 +32,8 @@ from lab.link.carriers.pipe import (
     Segment,
     Stream,
 )
-from lab.link.script import LENGTHS, Script, load_scenario
+from lab.link.script import LENGTHS, load_scenario
+from lab.link.timeline import Script
 
 __all__ = ["Protocol", "Relay"]
 

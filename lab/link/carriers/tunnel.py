@@ -17,7 +17,7 @@ from collections.abc import Iterator
 
 from lab.link.carriers.pipe import Pipe
 from lab.link.carriers.sides import EDGE_HOST, GROUND_HOST, Sides, UnavailableError, command
-from lab.link.script import Script
+from lab.link.timeline import Script
 
 __all__ = ["GROUND_HOST", "Flight", "Tunnel", "UnavailableError"]
 

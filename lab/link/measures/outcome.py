@@ -14,7 +14,7 @@ from lab.link.measures.resources import Sample, more_at_the_end, slope_mb_per_ho
 from lab.link.measures.rows import row
 from lab.link.measures.store_left import StoreLeft
 from lab.link.measures.timing import Arrival
-from lab.link.script import Script
+from lab.link.timeline import Script
 
 __all__ = ["ALWAYS", "SOAK", "WARM", "Outcome", "measures", "rate_over_time", "rows"]
 

@@ -15,6 +15,7 @@ COMMANDS: Final = {
     "score": "Score the tracks of hvt-ground --tracks against ground truth.",
     "sweep": "Apply the pilot's four selectors to raw detections and print what each keeps.",
     "detect": "Detect on pictures; score labelled ones and show the worst false alarms and misses.",
+    "train": "Teach the embedded detector your own objects, from your labelled pictures; needs PyTorch.",
     "track": "Run ByteTrack over a MOTChallenge file of detections.",
 }
 """One line each for ``hvt-study --help``. A module is imported when its command is given: needs differ."""

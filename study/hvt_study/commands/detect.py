@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -27,18 +26,18 @@ from hvt_edge.source.resample import Resizer
 from hvt_study.commands.progress import RunProgress
 from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
 from hvt_study.datasets.labels import NO_ID, inside_frame
-from hvt_study.metrics.detection import AveragePrecision, DetectionScore, detection_score
-from hvt_study.metrics.frames import FrameView, LabelledFrame
+from hvt_study.metrics.detection import detection_score
+from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.judged import Judged, judged
-from hvt_study.metrics.operating_point import OperatingPoint, calibration_error, operating_point, right_boxes
+from hvt_study.metrics.operating_point import right_boxes
+from hvt_study.metrics.picture_score import VEHICLES, above, as_one, picture_score
 from hvt_study.report.figures.sheet import Finding, write_sheet
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["add_arguments", "detected", "print_score", "run"]
 
 _LEAST_CONFIDENCE = 0.01
 """Average precision needs the whole curve."""
 _VEHICLE = "vehicle"
-_VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
 _COLUMNS = ("file", "x1", "y1", "x2", "y2", "confidence", "class")
 _Word = Callable[[str], str]
 
@@ -51,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="PICTURES",
         help="pictures, folders of them, a folder with images/ and labels/ (YOLO) or annotations/ (VisDrone), "
-        "or COCO's JSON",
+        "COCO's JSON, or a MOTChallenge sequence (img1/, gt/gt.txt)",
     )
     parser.add_argument("--out", type=Path, required=True, default=argparse.SUPPRESS, metavar="DIR")
     parser.add_argument("--detector", default=EMBEDDED_DETECTOR, metavar="FILE", help="as of hvt-edge")
@@ -100,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
         ),
         arguments.tiles,
     )
-    word: _Word = _as_one if arguments.vehicles_as_one else kind_of
+    word: _Word = as_one if arguments.vehicles_as_one else kind_of
     classes = _counted(pictures, _list(arguments.labelled), word)
     arguments.out.mkdir(parents=True, exist_ok=True)
     paths, frames, skipped = [], [], 0
@@ -120,17 +119,20 @@ def run(arguments: argparse.Namespace) -> int:
     if skipped:
         print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
     if frames:
-        used = judged(_above(frames, confidence), word=word, classes=classes)
+        recall_only = any(picture.one_target for picture in pictures)
+        used = judged(above(frames, confidence), word=word, classes=classes)
         about = {
             "detector": arguments.detector,
             "confidence": confidence,
             "pictures": len(frames),
             "skipped": skipped,
-            **_score(used, detection_score(frames, word=word, classes=classes)),
+            **picture_score(
+                used, detection_score(frames, word=word, classes=classes), recall_only=recall_only
+            ),
         }
         (arguments.out / "score.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-        _write_sheets(arguments.out, paths, used, classes=classes)
-        _print(about)
+        _write_sheets(arguments.out, paths, used, classes=classes, recall_only=recall_only)
+        print_score(about)
     print(f"{arguments.out}: {len(pictures) - skipped} pictures, {len(frames)} of them labelled")
     return 0 if len(pictures) > skipped else 2
 
@@ -141,11 +143,11 @@ def _progress(
     with RunProgress("pictures") as progress:
         for number, picture in enumerate(pictures, start=1):
             image = read_image(picture.path)
-            yield picture, image, FrameView() if image is None else _detected(detector, image, size)
+            yield picture, image, FrameView() if image is None else detected(detector, image, size)
             progress.update(number, len(pictures))
 
 
-def _detected(detector: Detector, image: Image, size: tuple[int, int]) -> FrameView:
+def detected(detector: Detector, image: Image, size: tuple[int, int]) -> FrameView:
     """What the detector says of a picture that is fitted into ``size``, in the picture's pixels."""
     source_size = (image.shape[1], image.shape[0])
     base = Resizer(source_size, size, fit="letterbox").frame(image, index=0, capture_ns=0).base_bgr
@@ -170,64 +172,18 @@ def _list(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def _as_one(name: str) -> str:
-    kind = kind_of(name)
-    return _VEHICLE if kind in _VEHICLES or kind.endswith(_VEHICLE) else kind
-
-
 def _counted(pictures: Sequence[LabelledPicture], labelled: Sequence[str], word: _Word) -> tuple[str, ...]:
     """The words that count: what ``--labelled`` names, else every class that the labels may use."""
     names = labelled or sorted({name for picture in pictures for name in picture.class_names})
     if labelled and _VEHICLE in labelled:
-        names = [*names, *_VEHICLES]
+        names = [*names, *VEHICLES]
     return tuple(sorted({word(name) for name in names}))
 
 
-def _score(used: Sequence[Judged], curve: DetectionScore) -> dict[str, Any]:
-    """Of what is at or above the confidence of use, and the average precision of the whole curve."""
-    seen = sorted({name for one in used for name in (*one.class_names, *one.view.class_names)})
-    points = {name: operating_point(used, name=name) for name in seen}
-    counts = ([getattr(one, field) for one in points.values()] for field in ("right", "boxes", "labels"))
-    return {
-        **_shares(OperatingPoint(*map(sum, counts)), curve.mean),
-        "ap50_95": _number(curve.mean.at_50_95),
-        "ap50_by_size": {size: _number(one.at_50) for size, one in curve.by_size.items()},
-        "calibration_error": _number(calibration_error(*_sure_and_right(used, seen))),
-        "by_class": {
-            name: _shares(one, curve.by_class.get(name, AveragePrecision())) for name, one in points.items()
-        },
-    }
-
-
-def _shares(point: OperatingPoint, curve: AveragePrecision) -> dict[str, Any]:
-    return {
-        "labels": point.labels,
-        "boxes": point.boxes,
-        "precision": _number(point.precision),
-        "recall": _number(point.recall),
-        "f1": _number(point.f1),
-        "ap50": _number(curve.at_50),
-    }
-
-
-def _above(frames: Sequence[LabelledFrame], confidence: float) -> list[LabelledFrame]:
-    return [(labels, view.rows(view.confidences >= confidence)) for labels, view in frames]
-
-
-def _sure_and_right(
-    frames: Sequence[Judged], names: Sequence[str]
-) -> tuple[np.ndarray[Any, np.dtype[np.float64]], np.ndarray[Any, np.dtype[np.bool_]]]:
-    right = [np.zeros(len(frame.view), np.bool_) for frame in frames]
-    for flags, frame in zip(right, frames, strict=True):
-        flags[right_boxes(frame, classes=names)[1]] = True
-    sure = [frame.view.confidences.astype(np.float64) for frame in frames]
-    return np.concatenate([*sure, np.zeros(0)]), np.concatenate([*right, np.zeros(0, np.bool_)])
-
-
 def _write_sheets(
-    out: Path, paths: Sequence[Path], used: Sequence[Judged], *, classes: Sequence[str]
+    out: Path, paths: Sequence[Path], used: Sequence[Judged], *, classes: Sequence[str], recall_only: bool
 ) -> None:
-    """The surest false alarms, and the largest labels that were missed."""
+    """The surest false alarms, where all objects are labelled, and the largest labels that were missed."""
     false, missed = [], []
     for path, frame in zip(paths, used, strict=True):
         labels, boxes = right_boxes(frame, classes=classes)
@@ -239,22 +195,23 @@ def _write_sheets(
         for row in np.setdiff1d(np.arange(len(frame.class_names)), labels).tolist():
             box = frame.boxes_xyxy_px[row].tolist()
             missed.append(Finding(path, box, frame.class_names[row], float(frame.areas_px2[row])))
-    write_sheet(out / "false-alarms.png", false)
+    write_sheet(out / "false-alarms.png", [] if recall_only else false)
     write_sheet(out / "misses.png", missed)
 
 
-def _print(score: dict[str, Any]) -> None:
+def print_score(score: dict[str, Any]) -> None:
+    """The table of one score on standard output."""
     table = Table(title=f"{score['detector']} at confidence {score['confidence']:g}", title_justify="left")
     for column in ("", "labels", "boxes", "precision", "recall", "F1", "AP50"):
         table.add_column(column, justify="left" if not column else "right")
     for name, one in [*score["by_class"].items(), ("all", score)]:
         shares = (one[field] for field in ("precision", "recall", "f1", "ap50"))
         cells = ("-" if value is None else f"{value:.3f}" for value in shares)
-        table.add_row(name, str(one["labels"]), str(one["boxes"]), *cells)
+        boxes = "-" if one["boxes"] is None else str(one["boxes"])
+        table.add_row(name, str(one["labels"]), boxes, *cells)
     Console(highlight=False).print(table)
     error = score["calibration_error"]
+    if "recall_only" in score:
+        print("one target is labelled, all else that is in view is not: recall alone can be said")
+        return
     print("expected calibration error " + ("-" if error is None else f"{error:.3f}"))
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else round(value, 4)

@@ -1,10 +1,11 @@
-"""Pictures beside labels: a YOLO folder, COCO JSON, VisDrone's image layout, or pictures alone.
+"""Pictures beside labels: a YOLO folder, COCO JSON, VisDrone's image layout, a MOTChallenge sequence, or none.
 
 ::
 
     ROOT/images/NAME.jpg, ROOT/labels/NAME.txt, [ROOT/classes.txt]     YOLO: class cx cy w h, 0…1 of the picture
     ROOT/images/NAME.jpg, ROOT/annotations/NAME.txt                    VisDrone-DET
     FILE.json                                                          COCO; pictures lie beside it or in images/
+    ROOT/img1/000001.jpg, ROOT/gt/gt.txt, [ROOT/gt/labels.txt]         MOTChallenge
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.inference.labels import read_labels
 from hvt_common.values import Image
 from hvt_edge.source.folder import sequence_files
+from hvt_study.datasets.clip import NOMINAL_FPS
 from hvt_study.datasets.labels import NO_ID, FrameLabels
+from hvt_study.datasets.layouts.mot import open_mot
+from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.layouts.visdrone import table_of
 from hvt_study.datasets.visdrone_rows import read_image_rows
 
@@ -33,6 +37,9 @@ __all__ = ["IGNORED", "LabelledPicture", "find_pictures", "read_image"]
 IGNORED = frozenset({"dontcare", "ignore", "ignored"})
 """Classes (any case) whose boxes count neither for nor against."""
 _COLUMNS = 5
+_MOST_COLUMNS = 6
+"""With a confidence, as trackers and annotators add it; more is a polygon."""
+_TRUTH = "gt/gt.txt"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +47,12 @@ class LabelledPicture:
     """A picture and where its labels are."""
 
     path: Path
-    labels: Path | Sequence[Mapping[str, Any]] | None
-    """A YOLO or VisDrone file, COCO's annotations of the picture, or None: nobody labelled it."""
+    labels: Path | Sequence[Mapping[str, Any]] | FrameLabels | None
+    """A YOLO or VisDrone file, COCO's annotations of the picture, the labels themselves; None: nobody labelled it."""
     class_names: Sequence[str]
     visdrone: bool = False
+    one_target: bool = False
+    """Of a sequence that labels one object and nothing else that is in view: it can be found or missed, no more."""
 
     def read(self, size: tuple[int, int]) -> FrameLabels | None:
         """The labels in the pixels of the picture, which is (width, height) large.
@@ -53,8 +62,10 @@ class LabelledPicture:
         """
         if self.labels is None:
             return None
+        if isinstance(self.labels, FrameLabels):
+            return self.labels
         if not isinstance(self.labels, Path):
-            return _from_coco(self.labels, self.class_names)
+            return _from_coco(self.path, self.labels, size)
         if self.visdrone:
             return _from_visdrone(self.labels, size)
         return _from_yolo(self.labels, self.class_names, size)
@@ -76,6 +87,8 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
         return [LabelledPicture(place, None, ())]
     if not place.is_dir():
         raise UserError(f"{place} does not exist; a picture, a folder of pictures or a COCO file is expected")
+    if (place / _TRUTH).is_file():
+        return _mot_pictures(place)
     images = place / "images" if (place / "images").is_dir() else place
     files = sequence_files(images)
     if not files:
@@ -118,18 +131,18 @@ def _from_yolo(path: Path, names: Sequence[str], size: tuple[int, int]) -> Frame
 
 def _yolo_row(path: Path, number: int, line: str, classes: int) -> list[float]:
     try:
-        row = [float(word) for word in line.split()[:_COLUMNS]]
+        row = [float(word) for word in line.split()]
     except ValueError:
         row = []
-    if len(row) < _COLUMNS or not all(map(math.isfinite, row)):
+    if not _COLUMNS <= len(row) <= _MOST_COLUMNS or not all(map(math.isfinite, row)):
         raise UserError(f"{path}, line {number} is {line[:60]!r}; accepted is class cx cy w h, all numbers")
     if row[0] not in range(classes):
         raise UserError(f"{path}, line {number} has class {row[0]:g}; there are {classes}, from 0")
-    if not all(0 <= value <= 1 for value in row[1:]):
+    if not all(0 <= value <= 1 for value in row[1:_COLUMNS]):
         raise UserError(
             f"{path}, line {number} has a box outside the picture: {line[:60]!r}; 0 to 1 is accepted"
         )
-    return row
+    return row[:_COLUMNS]
 
 
 def _from_visdrone(path: Path, size: tuple[int, int]) -> FrameLabels:
@@ -157,15 +170,42 @@ def _coco_pictures(path: Path) -> list[LabelledPicture]:
     ]
 
 
+def _in_picture(box: Sequence[Any], size: tuple[int, int]) -> bool:
+    """Whether x, y, w, h are numbers that begin in the picture."""
+    if len(box) != len((*size, *size)) or not all(isinstance(side, int | float) for side in box):
+        return False
+    x, y, wide, high = box
+    return bool(0 <= x <= size[0] and 0 <= y <= size[1] and 0 <= wide < math.inf and 0 <= high < math.inf)
+
+
+def _mot_pictures(place: Path) -> list[LabelledPicture]:
+    """The frames of one sequence; the rate does not matter."""
+    (opened,) = open_mot(place, Options(fps=NOMINAL_FPS)).values()
+    sequence = opened()
+    assert sequence.labels is not None, "annotations were asked for"
+    files = sequence_files(Path(sequence.clip.spec))
+    labels = [sequence.labels(index) for index in range(len(files))]
+    one = len({number for frame in labels for number in frame.ids.tolist()}) == 1
+    return [
+        LabelledPicture(file, frame, sequence.class_set, one_target=one)
+        for file, frame in zip(files, labels, strict=True)
+    ]
+
+
 def _beside(path: Path, name: str) -> Path:
     places = [path.parent / name, path.parent / "images" / name, path.parent.parent / "images" / name]
     return next((place for place in places if place.is_file()), places[0])
 
 
-def _from_coco(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> FrameLabels:
-    boxes = np.array([row.get("bbox", ()) for row in rows], np.float64).reshape(-1, 4)
-    if not np.isfinite(boxes).all() or (boxes[:, 2:] < 0).any():
-        raise UserError(f"COCO annotations {names} have a box that is no x, y, w, h of finite numbers")
+def _from_coco(path: Path, rows: Sequence[Mapping[str, Any]], size: tuple[int, int]) -> FrameLabels:
+    for row in rows:
+        box = row.get("bbox")
+        if not (isinstance(box, list) and _in_picture(box, size)):
+            raise UserError(
+                f"COCO annotation {row.get('id', '')} of {path.name} has the box {box}; x, y, w, h in the picture of "
+                f"{size[0]}x{size[1]} is accepted"
+            )
+    boxes = np.array([row["bbox"] for row in rows], np.float64).reshape(-1, 4)
     kinds = ["ignore" if row.get("iscrowd") else str(row["name"]) for row in rows]
     return _labels(np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]), kinds)
 

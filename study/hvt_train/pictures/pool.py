@@ -34,6 +34,7 @@ __all__ = [
     "fill_pool",
     "save_picture",
     "shoot",
+    "through_x265",
 ]
 
 TRAIN_SEED = 1000
@@ -80,12 +81,13 @@ def coded(shot: Shot, *, bitrates_bps: Sequence[int], frames: int = _CODED_FRAME
         _shrunk(shot.scene.image(max(0.0, shot.t_s - (frames - 1 - index) / _FPS)), BASE_SIZE)
         for index in range(frames)
     ]
-    return [_through_x265(images, bitrate_bps) for bitrate_bps in bitrates_bps]
+    return [through_x265(images, bitrate_bps) for bitrate_bps in bitrates_bps]
 
 
-def _through_x265(images: Sequence[Image], bitrate_bps: int) -> Image:
-    """The last of the pictures, decoded."""
-    encoder = BaseEncoder(EncoderSettings(size=BASE_SIZE, fps=_FPS, bitrate_bps=bitrate_bps))
+def through_x265(images: Sequence[Image], bitrate_bps: int) -> Image:
+    """The last of pictures of one size, x265 at ``bitrate_bps`` having coded them all, as the ground decodes it."""
+    high, wide = images[0].shape[:2]
+    encoder = BaseEncoder(EncoderSettings(size=(wide, high), fps=_FPS, bitrate_bps=bitrate_bps))
     decoder, picture = BaseDecoder(), None
     for index, image in enumerate(images):
         frame = Frame(index=index, capture_ns=0, source_bgr=image, base_bgr=image)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from hvt_common.errors import UserError
-from hvt_common.video.still_codecs import StillError, registry, still_codec, still_codec_names
+from hvt_common.runtime import plug_ins
+from hvt_common.video.still_codecs import StillError, still_codec, still_codec_names
 from media.crops import textured
-from media.third_party_codec import install
+from media.third_party import install
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def installed(tmp_path, monkeypatch):
         forget()
 
     def forget() -> None:
-        registry.installed_codecs.cache_clear()
+        plug_ins.installed.cache_clear()
         still_codec.cache_clear()
 
     yield put
@@ -142,7 +143,7 @@ def test_two_packages_of_one_name_are_refused(installed, tmp_path):
     install(tmp_path / "second", {"acme-pixels": "PixelCodec"}, module="acme_other")
     sys.path.insert(0, str(tmp_path / "second"))
     try:
-        registry.installed_codecs.cache_clear()
+        plug_ins.installed.cache_clear()
         with pytest.raises(UserError, match="comes from both package acme_"):
             still_codec("acme-pixels")
     finally:

@@ -16,7 +16,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_units,
 )
 from hvt_edge.backlog.backfill import Backfill, Chunk
-from hvt_ground.backlog import BacklogAssembly, backlog_content
+from hvt_ground.backlog.assembly import BacklogAssembly, backlog_content
 from rigs.kept import UNITS, S, add_stills, add_units, opened, shifted
 
 RTT = 100_000_000

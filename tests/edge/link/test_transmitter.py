@@ -337,6 +337,21 @@ def test_tracks_wait_for_the_window_and_are_counted_as_metadata():
     assert rig.ledger.line_bytes == sum(rig.budget.sizes)
 
 
+def test_a_reply_goes_at_once_is_counted_and_takes_no_room():
+    """Whoever may ask could stop the video by asking, or bytes would leave that no account knows."""
+    rig = Rig(total_bps=80_000)
+    rig.sender.base(unit(0, 9_400, keyframe=True), now_ns=NOW_NS)
+    before_bytes = rig.ledger.line_bytes
+    for _ in range(100):
+        assert rig.sender.reply(Channel.INFO, bytes(230)) == bytes(230)
+    assert rig.waits == [NOW_NS]
+    assert rig.ledger.replies == 100
+    assert rig.ledger.reply_bytes == 100 * (
+        230 + 65 + 52
+    )  # `ss -ti` says 295 bytes a reply of 230, a segment each
+    assert rig.ledger.line_bytes == before_bytes == sum(rig.budget.sizes)
+
+
 @given(
     sequence=st.integers(-1, 2**32 - 2),
     frame=st.integers(0, 2**32 - 1),

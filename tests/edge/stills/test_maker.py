@@ -19,7 +19,7 @@ from hvt_common.video.still_codecs.jpeg import jpeg_size
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.perception.crop import crop_box
 from hvt_edge.stills.maker import NoStill, StillMaker
-from hvt_edge.stills.policy import Request
+from hvt_edge.stills.policy.base import Request
 from media.base_coded import Hopeless, StandIn
 
 SIZE = (1280, 720)

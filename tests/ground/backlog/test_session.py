@@ -861,15 +861,17 @@ def test_a_ground_that_never_comes_to_rest_still_reads_what_was_kept():
 
 def test_a_ground_that_is_closed_keeps_what_has_come(flight, tmp_path):
     """Ctrl-C would throw away an acknowledged stretch."""
-    # What a second or two are enough for is the machine's affair.
-    patient = partial(RealtimeWorker, name="uav-1", finish_s=20, leave_s=20)
-    rig = Rig(tmp_path, flight, drain_s=20, worker_of=patient)
+    # What a second or two are enough for is the machine's affair: perception runs at low priority, and where others
+    # want all of its processors, twenty seconds were not enough either.
+    patient = partial(RealtimeWorker, name="uav-1", finish_s=100, leave_s=20)
+    rig = Rig(tmp_path, flight, drain_s=60, worker_of=patient)
     rig.base(*range(25))
     rig.base(*range(65, 70))
     for item in backlog(flight, "base", 40, video_object(flight, range(40, 65))):
         rig.inbox.put(item)
-    assert rig.thread.close(timeout_s=60)
+    assert rig.thread.close(timeout_s=200)
     assert rig.thread.error is None
+    assert not rig.receiver.failures.parts
     rig.outputs.close(within_s=60)
     assert len(Recording(tmp_path / "0.rrd").video()) == 30 + 25
     (last,) = [one for report in rig.port.reports for one in report.backlog if one.acknowledged_bytes][-1:]

@@ -77,6 +77,14 @@ def test_in_a_hurry_detection_waits_but_the_track_goes_on(pictures):
     assert all(len(one.track_ids) == 1 for one in rig.of(Overlay)[8:])
 
 
+def test_on_a_machine_that_is_always_behind_something_is_detected_now_and_then(pictures):
+    """Whatever comes into view would never have a box."""
+    rig = Rig(detect_every=2)
+    for picture in pictures:
+        rig.pipeline.analyze(picture, hurry=True)
+    assert rig.pipeline.detections_run == 4, "at 0, 8, 16 and 24"
+
+
 def test_a_still_changes_the_class_of_the_track_at_its_frame(flight, pictures):
     """The whole point: the sharp still says bus, and the track would go on being called car."""
     rig = Rig()

@@ -189,13 +189,12 @@ def test_two_hundred_flights_of_two_seconds(tmp_path: Path) -> None:
             assert edge.finish()["frames"] >= 1
             if number == WARM:
                 before = Use(ground.process.pid)
-        after = Use(ground.process.pid)
+        assert before is not None
+        stays(before, Use(ground.process.pid))
         ground.stop()
         sessions = ground.finish()
-    assert before is not None
     assert len(sessions) == SESSIONS
     assert not any(one["failure"] for one in sessions)
-    stays(before, after)
 
 
 def is_open(sessions: EdgeSessions, edge: Restarted) -> bool:

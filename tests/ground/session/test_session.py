@@ -446,7 +446,8 @@ def test_stills_that_come_with_their_frame_are_read_with_its_picture(flight):
         rig.port.flight = flight
         for index in range(20):
             rig.put(flight.base(index), flight.still(index, index))
-        rig.settle()
+            if index % 10 == 9:  # on a busy machine more in a burst would be passed over
+                rig.settle()
         wait_for(lambda: len(rig.reader.had_base) == 20)
         assert all(rig.reader.had_base)
         assert rig.receiver.session.pipeline.refined >= 1  # a busy machine may lose the track between

@@ -110,6 +110,10 @@ def test_coco_and_yolo_say_the_same(tmp_path: Path) -> None:
         ("9 0.5 0.5 0.1 0.1", "line 1 has class 9; there are 7, from 0"),
         ("0 1.5 0.5 0.1 0.1", "line 1 has a box outside the picture"),
         ("0 nan 0.5 0.1 0.1", "line 1 is '0 nan 0.5 0.1 0.1'; accepted is class cx cy w h, all numbers"),
+        (
+            "0 0.1 0.1 0.9 0.1 0.9 0.9 0.1 0.9",
+            "line 1 is '0 0.1 0.1 0.9 0.1 0.9 0.9 0.1 0.9'; accepted is class cx",
+        ),
         ("car", "line 1 is 'car'; accepted is class cx cy w h, all numbers"),
     ],
 )
@@ -122,6 +126,71 @@ def test_wrong_labels_are_named_with_file_and_line(
     heard = sentence(capsys, folder, "--out", tmp_path / "out")
     assert "labels/0.txt, " in heard
     assert said in heard
+
+
+@pytest.mark.parametrize("box", [[float("nan"), 1, 2, 3], [1, 2, 3], [5, 5, -2, 4], [9000, 5, 20, 20], None])
+def test_wrong_boxes_of_coco_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], box: object
+) -> None:
+    """A traceback in place of the number of the annotation to mend."""
+    folder = draw(tmp_path / "set", moments=1)
+    coco = {
+        "images": [{"id": 7, "file_name": "0.png"}],
+        "categories": [{"id": 1, "name": "car"}],
+        "annotations": [{"id": 31, "image_id": 7, "category_id": 1, "bbox": box}],
+    }
+    (folder / "coco.json").write_text(json.dumps(coco))
+    heard = sentence(capsys, folder / "coco.json", "--out", tmp_path / "out")
+    assert "COCO annotation 31 of 0.png has the box" in heard
+
+
+def write_sequence(folder: Path, *, frames: int, targets: int) -> Path:
+    """Write a MOTChallenge sequence of the drawn scene that labels the ``targets`` largest cars, and nothing else."""
+    scene = Scene(5, size=(1280, 720))
+    (folder / "img1").mkdir(parents=True)
+    (folder / "gt").mkdir()
+    chosen, rows = None, []
+    for number in range(1, frames + 1):
+        truth = scene.truth(1.0 + number / 15)
+        cv2.imwrite(str(folder / f"img1/{number:06d}.png"), scene.image(1.0 + number / 15))
+        if chosen is None:
+            inside = (truth.visible > 0.95) & (truth.class_ids == 0)
+            middle = np.abs(
+                (truth.boxes_source_px[:, :2] + truth.boxes_source_px[:, 2:]) / 2 - (640, 360)
+            ).max(1)
+            chosen = [index for index in np.argsort(middle) if inside[index]][:targets]
+            chosen = truth.ids[chosen].tolist()
+        for target in chosen:
+            x1, y1, x2, y2 = truth.boxes_source_px[truth.ids.tolist().index(target)]
+            rows.append(
+                f"{number},{target + 1},{x1 + 1:.1f},{y1 + 1:.1f},{x2 - x1:.1f},{y2 - y1:.1f},1,1,1\n"
+            )
+    (folder / "gt/gt.txt").write_text("".join(rows))
+    (folder / "gt/labels.txt").write_text("car\n")
+    return folder
+
+
+def test_one_labelled_target_is_found_or_missed_and_no_more(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whoever sees the other cars of UAV123 is not wrong: its labels name one of them."""
+    folder, out = write_sequence(tmp_path / "s", frames=4, targets=1), tmp_path / "out"
+    run = ["detect", str(folder), "--provider", "cpu", "--vehicles-as-one", "--out", str(out)]
+    assert main(run) == 0
+    score = json.loads((out / "score.json").read_text())
+    assert score["recall_only"]
+    assert (score["labels"], score["recall"]) == (4, 1.0)
+    assert (score["precision"], score["f1"], score["ap50"], score["boxes"]) == (None,) * 4
+    assert list(score["by_class"]) == ["vehicle"]
+    assert not (out / "false-alarms.png").exists()
+    assert "recall alone can be said" in capsys.readouterr().out
+    blind = (out / "../blind").resolve()
+    assert main([*run[:-1], str(blind), "--confidence", "1"]) == 0
+    assert json.loads((blind / "score.json").read_text())["recall"] == 0
+    assert (blind / "misses.png").exists()
+    both = write_sequence(tmp_path / "two", frames=2, targets=2)
+    assert main(["detect", str(both), "--provider", "cpu", "--out", str(tmp_path / "o")]) == 0
+    assert json.loads((tmp_path / "o/score.json").read_text())["precision"] is not None
 
 
 def test_what_cannot_be_is_said_before_anything_is_written(

@@ -124,7 +124,6 @@ def pipeline_of(
         vocabulary=vocabulary,
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
-        camera=None,
     )
     view = View.fitted(SIZE, SIZE, fit="letterbox")
     return Pipeline(parts, view=view, fps=15, detect_every=detect_every, emit=emit, wants_base=wants_base)

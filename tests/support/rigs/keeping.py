@@ -45,7 +45,7 @@ from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring.video import make_encoder, reconfiguration_settings
-from hvt_ground.backlog import BacklogAssembly
+from hvt_ground.backlog.assembly import BacklogAssembly
 from media.clips import START_NS, framed, smooth_pictures
 from rigs.kept import INFO, S, opened
 from rigs.messages import feedback

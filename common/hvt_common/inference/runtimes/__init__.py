@@ -1,1 +1,1 @@
-"""What runs a network: `model` opens an ONNX file; settings take the names of providers from `providers`."""
+"""Runs a network: `model` opens an ONNX file, `onnx_file` reads what is in one, `providers` names who runs it."""

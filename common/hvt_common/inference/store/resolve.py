@@ -14,7 +14,7 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.inference.store.store import Store
 
-__all__ = ["EMBEDDED_CLASSIFIER", "EMBEDDED_DETECTOR", "embedded_models", "resolve_model"]
+__all__ = ["EMBEDDED_CLASSIFIER", "EMBEDDED_DETECTOR", "embedded_models", "model_names", "resolve_model"]
 
 EMBEDDED_DETECTOR = "aerial-nano"
 """Finds vehicles and people from straight above or aslant."""
@@ -27,6 +27,11 @@ def embedded_models() -> dict[str, Path]:
     folder = resources.files("hvt_common") / "models"
     assert isinstance(folder, Path), "the package is installed as files, not run from an archive"
     return {name: folder / f"{name}.onnx" for name in (EMBEDDED_DETECTOR, EMBEDDED_CLASSIFIER)}
+
+
+def model_names() -> tuple[str, ...]:
+    """Every name that `resolve_model` knows; of fetched models too, whether they are here or not."""
+    return (*embedded_models(), *Store().entries)
 
 
 def resolve_model(

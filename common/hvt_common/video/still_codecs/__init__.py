@@ -1,4 +1,7 @@
-"""Still codecs behind one small contract (`contract.py`); docs/stills.md has the table of them."""
+"""Still codecs behind one small contract (`contract.py`); docs/stills.md has the table of them.
+
+Those of `plugins` need a library of their own.
+"""
 
 from hvt_common.video.still_codecs.contract import (
     NO_PARAMETERS,

@@ -11,17 +11,19 @@ import re
 from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from types import MappingProxyType
 from typing import Any
 
 from hvt_common.errors import UserError
+from hvt_common.runtime.plug_ins import installed, loaded, origin, the_one
 from hvt_common.video.still_codecs.contract import StillCodec
 
-__all__ = ["GROUP", "installed_codecs", "still_codec", "still_codec_names"]
+__all__ = ["GROUP", "still_codec", "still_codec_names"]
 
 GROUP = "hvt.still_codecs"
 """The entry points' group."""
+_WHAT = "still codec"
 
 _NAME = re.compile(r"[a-z0-9-]{1,24}")
 _MEDIA_TYPE = re.compile(r"[a-z]+/[a-z0-9.+-]{1,60}")
@@ -50,30 +52,21 @@ _REMOVED = ("jpeg-lite", "avif-lite", "hevc-intra")
 def still_codec_names() -> tuple[str, ...]:
     """What `still_codec` takes on this machine: HVT's own first, then the plug-ins of others by name, none loaded."""
     own = [*_BUILT_IN, *(name for name, target in _PLUGINS.items() if _loaded(target).lacking() is None)]
-    return (*own, *sorted(installed_codecs().keys() - _BUILT_IN.keys() - _PLUGINS.keys()))
+    return (*own, *sorted(installed(GROUP).keys() - _BUILT_IN.keys() - _PLUGINS.keys()))
 
 
 @cache
 def still_codec(name: str) -> StillCodec:
     """The codec of that name; `UserError` where there is none, or where it does not work here."""
-    found = installed_codecs().get(name, ())
     target = _BUILT_IN.get(name) or _PLUGINS.get(name)
-    if found and target is not None:
-        raise UserError(
-            f"still codec {name!r} is built in, and {_origin(found[0])} brings another of that name: "
-            "remove that package"
-        )
+    entry = the_one(GROUP, name, what=_WHAT, built_in=target is not None)
     if target is not None:
         return _own(name, target)
-    if len(found) > 1:
-        raise UserError(
-            f"still codec {name!r} comes from both {_origin(found[0])} and {_origin(found[1])}: remove one of them"
-        )
-    if not found and name in _REMOVED:
+    if entry is not None:
+        return _foreign(entry)
+    if name in _REMOVED:
         raise UserError(f"still codec {name!r} is no longer part of HVT: use h264-intra")
-    if not found:
-        raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(still_codec_names())}")
-    return _foreign(name, found[0])
+    raise UserError(f"still codec {name!r} is not known: choose one of {', '.join(still_codec_names())}")
 
 
 def _loaded(target: str) -> Any:
@@ -90,20 +83,16 @@ def _own(name: str, target: str) -> StillCodec:
     return codec
 
 
-def _foreign(name: str, entry: EntryPoint) -> StillCodec:
-    try:
-        codec = entry.load()
-        if isinstance(codec, type) or not hasattr(codec, "encode"):
-            codec = codec()
-    except Exception as error:  # foreign code may raise anything
-        raise UserError(
-            f"still codec {name!r} of {_origin(entry)} does not load: {type(error).__name__}: {error}"
-        ) from error
-    wrong = _faults(name, codec)
+def _foreign(entry: EntryPoint) -> StillCodec:
+    def made(part: Any) -> Any:
+        return part() if isinstance(part, type) or not hasattr(part, "encode") else part
+
+    codec = loaded(entry, made, what=_WHAT)
+    wrong = _faults(entry.name, codec)
     if wrong:
-        raise UserError(f"still codec {name!r} of {_origin(entry)} breaks the contract: {wrong}")
-    loaded: StillCodec = codec
-    return loaded
+        raise UserError(f"still codec {entry.name!r} of {origin(entry)} breaks the contract: {wrong}")
+    chosen: StillCodec = codec
+    return chosen
 
 
 def _faults(name: str, codec: object) -> str | None:
@@ -117,17 +106,3 @@ def _faults(name: str, codec: object) -> str | None:
         return f"its needs_base is {getattr(codec, 'needs_base', None)!r}, and has to be True or False"
     missing = [word for word in ("encode", "decode") if not callable(getattr(codec, word, None))]
     return f"it has no {' and no '.join(missing)}" if missing else None
-
-
-@cache  # unknown names come from the network too, and a search of all packages takes tens of milliseconds
-def installed_codecs() -> dict[str, tuple[EntryPoint, ...]]:
-    """The entry points of third parties by name; more than one where two packages bring the same name."""
-    # One installed package can be found twice, by two paths of sys.path: same value, same codec.
-    found: dict[str, dict[str, EntryPoint]] = {}
-    for entry in entry_points(group=GROUP):
-        found.setdefault(entry.name, {}).setdefault(entry.value, entry)
-    return {name: tuple(entries.values()) for name, entries in found.items()}
-
-
-def _origin(entry: EntryPoint) -> str:
-    return f"package {entry.dist.name} ({entry.value})" if entry.dist is not None else entry.value

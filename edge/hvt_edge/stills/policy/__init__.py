@@ -1,23 +1,5 @@
-"""Scheduling policies: which tracks deserve a still at this step."""
+"""Scheduling policies: which tracks deserve a still at this step. `registry` has every method by name.
 
-from __future__ import annotations
-
-from hvt_edge.stills.policy.base import Method, Request, Step
-from hvt_edge.stills.policy.cost import CostEstimate, CostModel
-from hvt_edge.stills.policy.registry import METHODS, MethodEntry, method, tuning
-from hvt_edge.stills.policy.selectors import SELECTORS, Selector, select
-
-__all__ = [
-    "METHODS",
-    "SELECTORS",
-    "CostEstimate",
-    "CostModel",
-    "Method",
-    "MethodEntry",
-    "Request",
-    "Selector",
-    "Step",
-    "method",
-    "select",
-    "tuning",
-]
+`base` says what a method is (`Step` in, `Request` out), `cost` what a still will take; `m6` is ours, `selectors` the
+pilot's, `paper` the paper's.
+"""

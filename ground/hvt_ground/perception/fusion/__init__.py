@@ -1,1 +1,1 @@
-"""One list of tracks out of base, edge and stills."""
+"""One list of tracks out of base, edge and stills: `fuse`, moved along the `camera_path`."""

@@ -1,1 +1,1 @@
-"""The Rerun recording and live view: `Recorder` writes one session, `LiveView` is the viewer that may watch."""
+"""The Rerun recording and live view: `recorder` writes one session, `live_view` is the viewer that may watch."""

@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 
 from hvt_edge.perception.base_loss import BaseLoss
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
-from hvt_edge.stills.policy import METHODS, CostEstimate, Step, method
+from hvt_edge.stills.policy.base import Step
+from hvt_edge.stills.policy.cost import CostEstimate
 from hvt_edge.stills.policy.m6 import ExpectedGain
+from hvt_edge.stills.policy.registry import METHODS, method
 
 NOW = 20_000_000_000
 M6 = ExpectedGain()

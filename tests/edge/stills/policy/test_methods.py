@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_edge.perception.candidates import Candidate, ClassPosterior
-from hvt_edge.stills.policy import METHODS, CostEstimate, CostModel, Step, method, tuning
+from hvt_edge.stills.policy.base import Step
+from hvt_edge.stills.policy.cost import CostEstimate, CostModel
 from hvt_edge.stills.policy.paper import Small, Utility
+from hvt_edge.stills.policy.registry import METHODS, method, tuning
 
 SECOND = 1_000_000_000
 FPS = 15.0

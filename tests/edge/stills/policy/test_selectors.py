@@ -10,7 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvt_edge.perception.candidates import Candidate
-from hvt_edge.stills.policy import SELECTORS, CostEstimate, Step, method, select
+from hvt_edge.stills.policy.base import Step
+from hvt_edge.stills.policy.cost import CostEstimate
+from hvt_edge.stills.policy.registry import method
+from hvt_edge.stills.policy.selectors import SELECTORS, select
 
 BY_NAME = {row.name: row for row in SELECTORS}
 AREA = 1280 * 720

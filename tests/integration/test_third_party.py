@@ -1,4 +1,4 @@
-"""A still codec that HVT has never heard of, installed beside it, through the whole pipeline."""
+"""A still codec and a detector that HVT has never heard of, installed beside it, through the whole pipeline."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from media.third_party_codec import install
+from media.third_party import BLOBS, install
 from programs.processes import Link
 from programs.rrd import Recording
 
@@ -18,9 +18,11 @@ pytestmark = [pytest.mark.integration, pytest.mark.timeout(120)]
 FRAMES = 60
 
 
-def fly(link: Link, scene: Path, *edge_settings: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def fly(
+    link: Link, scene: Path, *edge_settings: str, detector: str = "aerial-nano"
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Six seconds of the drawn scene with stills of everything that moves; both summaries."""
-    ground = link.ground("--once", "--record", "flight.rrd", "--classifier", "none")
+    ground = link.ground("--once", "--record", "flight.rrd", "--classifier", "none", "--detector", detector)
     edge = link.edge(
         *("--source", str(scene), "--fps", "10", "--max-frames", str(FRAMES), "--pace", "lockstep"),
         *("--size", "640x360", "--budget", "1200kbps", "--preset", "ultrafast", "--detector", "motion"),
@@ -33,6 +35,8 @@ def fly(link: Link, scene: Path, *edge_settings: str) -> tuple[dict[str, Any], d
 def acme(tmp_path, monkeypatch) -> None:
     """Every process that starts now has the package installed."""
     folder = install(tmp_path / "site", {"acme-pixels": "PixelCodec", "acme-broken": "NoSuchThing"})
+    detectors = {"acme-blobs": "BlobDetector", "acme-nothing": "NoSuchThing"}
+    install(folder, detectors, module="acme_blobs", source=BLOBS, group="hvt.detectors")
     old = os.environ.get("PYTHONPATH")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *([old] if old else [])]))
 
@@ -73,3 +77,23 @@ def test_a_ground_without_the_codec_flies_on(link, scene, acme, monkeypatch):
 def test_the_package_is_found_by_its_metadata_alone(acme):
     """The test itself would prove nothing, were the module imported in another way."""
     assert "acme_codecs" not in sys.modules
+
+
+def test_a_detector_of_another_runtime_flies(link, scene, acme):
+    """Who has TensorRT, RKNN, Hailo or NCNN would need a fork of HVT to fly with it."""
+    detector = "acme-blobs:person,crate"
+    edge, ground = fly(link, scene, "--detector", detector, detector=detector)
+    assert edge["stills"]["sent"] == ground["stills"]["received"] > 5
+    assert ground["tracks"] > 2
+    recording = Recording(link.folder / "flight.rrd")
+    shown = {box.class_after for frame in range(FRAMES) for box in recording.boxes(frame).values()}
+    assert shown <= {"person", "crate"}
+    assert shown
+
+
+def test_a_broken_detector_is_one_sentence(link, scene, acme):
+    """A traceback in place of the name of the package to mend."""
+    edge = link.edge("--source", str(scene), "--detector", "acme-nothing")
+    assert edge.wait(within_s=30) == 2
+    assert "detector 'acme-nothing' of package acme_blobs" in edge.said
+    assert "Traceback" not in edge.said

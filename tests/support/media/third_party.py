@@ -1,4 +1,4 @@
-"""A package as a third party would install it, with still codecs behind the entry point."""
+"""A package as a third party would install it, with still codecs or detectors behind the entry point."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["PIXELS", "install"]
+__all__ = ["BLOBS", "PIXELS", "install"]
 
 PIXELS = '''
 """Zlib-packed pixels: a codec that knows nothing of HVT but the contract."""
@@ -43,18 +43,47 @@ class PixelCodec:
 '''
 
 
+BLOBS = '''
+"""Bright blobs: a detector that knows nothing of HVT but the contract, as a runtime of its own would."""
+
+import cv2
+import numpy as np
+
+from hvt_common.values import Detections
+
+
+class BlobDetector:
+    def __init__(self, model="person,vehicle"):
+        self.class_names = tuple(model.split(","))
+
+    def detect(self, image_bgr):
+        grey = cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY)
+        _, mask = cv2.threshold(grey, 170, 255, cv2.THRESH_BINARY)
+        _, _, rows, _ = cv2.connectedComponentsWithStats(mask)
+        rows = rows[1:][rows[1:, 4] >= 60]
+        boxes = np.stack([rows[:, 0], rows[:, 1], rows[:, 0] + rows[:, 2], rows[:, 1] + rows[:, 3]], 1)
+        kinds = (rows[:, 4] > 400).astype(np.int32)
+        return Detections(boxes.astype(np.float32), np.full(len(rows), 0.8, np.float32), kinds)
+'''
+
+
 def install(
-    folder: Path, codecs: Mapping[str, str], *, module: str = "acme_codecs", source: str = PIXELS
+    folder: Path,
+    parts: Mapping[str, str],
+    *,
+    module: str = "acme_codecs",
+    source: str = PIXELS,
+    group: str = "hvt.still_codecs",
 ) -> Path:
     """Lay out ``module`` and its metadata in ``folder``, as pip would; put the folder on the path to install it.
 
-    ``codecs`` maps the names of entry points to objects in the module.
+    ``parts`` maps the names of entry points of ``group`` to objects in the module.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{module}.py").write_text(textwrap.dedent(source))
     information = folder / f"{module}-1.0.dist-info"
     information.mkdir()
     (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
-    rows = [f"{name} = {module}:{target}" for name, target in codecs.items()]
-    (information / "entry_points.txt").write_text("\n".join(["[hvt.still_codecs]", *rows, ""]))
+    rows = [f"{name} = {module}:{target}" for name, target in parts.items()]
+    (information / "entry_points.txt").write_text("\n".join([f"[{group}]", *rows, ""]))
     return folder

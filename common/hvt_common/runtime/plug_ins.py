@@ -1,0 +1,56 @@
+"""Parts that other packages install behind an entry point: found by name, loaded when named, never a traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from hvt_common.errors import UserError
+
+__all__ = ["installed", "loaded", "origin", "the_one"]
+
+
+@cache  # unknown names come from the network too, and a search of all packages takes tens of milliseconds
+def installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:
+    """The entry points of a group by name; more than one where two packages bring the same name."""
+    # One installed package can be found twice, by two paths of sys.path: same value, same part.
+    found: dict[str, dict[str, EntryPoint]] = {}
+    for entry in entry_points(group=group):
+        found.setdefault(entry.name, {}).setdefault(entry.value, entry)
+    return {name: tuple(entries.values()) for name, entries in found.items()}
+
+
+def the_one(group: str, name: str, *, what: str, built_in: bool) -> EntryPoint | None:
+    """The entry point of that name, or None; ``what`` it is stands in the sentence of an error.
+
+    Raises:
+        UserError: several packages bring it, or HVT has one of that name itself (``built_in``).
+    """
+    found = installed(group).get(name, ())
+    if found and built_in:
+        raise UserError(
+            f"{what} {name!r} is built in, and {origin(found[0])} brings another of that name: "
+            "remove that package"
+        )
+    if len(found) > 1:
+        raise UserError(
+            f"{what} {name!r} comes from both {origin(found[0])} and {origin(found[1])}: remove one of them"
+        )
+    return found[0] if found else None
+
+
+def loaded(entry: EntryPoint, make: Callable[[Any], Any], *, what: str) -> Any:
+    """What ``make`` gives of the entry's object; `UserError` for whatever foreign code raises."""
+    try:
+        return make(entry.load())
+    except Exception as error:  # foreign code may raise anything
+        raise UserError(
+            f"{what} {entry.name!r} of {origin(entry)} does not load: {type(error).__name__}: {error}"
+        ) from error
+
+
+def origin(entry: EntryPoint) -> str:
+    """The package that brings it, and the object in it."""
+    return f"package {entry.dist.name} ({entry.value})" if entry.dist is not None else entry.value

@@ -1,0 +1,341 @@
+"""``hvt-study train``: the embedded detector learns a user's own objects from his labelled pictures."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from hvt_common.errors import UserError, needs_extra
+from hvt_common.inference.class_names import kind_of
+from hvt_common.inference.detect import OnnxDetector, open_detector
+from hvt_common.inference.runtimes.model import ModelSettings, open_model
+from hvt_common.inference.store import EMBEDDED_DETECTOR, resolve_model
+from hvt_common.runtime.reporting import check_writable
+from hvt_common.units import parse_size
+from hvt_common.values import Boxes, Image, View
+from hvt_edge.source.resample import Resizer
+from hvt_study.commands.detect import detected
+from hvt_study.commands.progress import RunProgress
+from hvt_study.datasets.labelled_pictures import IGNORED, LabelledPicture, find_pictures, read_image
+from hvt_study.datasets.labels import FrameLabels, inside_frame
+from hvt_study.metrics.detection import detection_score
+from hvt_study.metrics.frames import LabelledFrame
+from hvt_study.metrics.judged import judged
+from hvt_study.metrics.picture_score import above, picture_score
+
+__all__ = ["add_arguments", "run"]
+
+_INSTALL = "torch onnx"
+_CURVE = 0.01
+_USUAL_CONFIDENCE = 0.25
+_HELD_OUT_SHARE, _MOST_HELD_OUT = 5, 120
+_LEAST_PICTURES = 10
+_SCHEMES = ("yolo", "coco")
+_Size = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class _Own:
+    """A picture that can be read, with its labels in its own pixels."""
+
+    path: Path
+    labels: FrameLabels
+
+    def base(self, size: _Size) -> tuple[Image, FrameLabels]:
+        """As the edge fits it into the base stream, with the labels there."""
+        image = read_image(self.path)
+        assert image is not None, "it was read before"
+        source = (image.shape[1], image.shape[0])
+        view = View.fitted(source, size, fit="letterbox")
+        shown = Resizer(source, size, fit="letterbox").frame(image, index=0, capture_ns=0).base_bgr
+
+        def there(boxes: Boxes) -> Boxes:
+            return inside_frame(view.to_base(boxes), size)
+
+        own = self.labels
+        moved = FrameLabels(there(own.boxes_xyxy_px), own.ids, own.class_names, there(own.ignored_xyxy_px))
+        return shown, moved
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Labelled pictures, where to begin, and for how long."""
+    parser.add_argument(
+        "--data",
+        action="append",
+        required=True,
+        default=argparse.SUPPRESS,
+        metavar="yolo:FOLDER|coco:FILE.json",
+        help="labelled pictures: images/, labels/ and classes.txt, or COCO's JSON; may be given several times",
+    )
+    parser.add_argument(
+        "--held-out",
+        action="append",
+        default=[],
+        metavar="yolo:FOLDER|coco:FILE.json",
+        help="pictures to measure on in place of the last fifth of --data",
+    )
+    parser.add_argument("--start", default=EMBEDDED_DETECTOR, metavar="NAME|FILE", help="where to begin")
+    parser.add_argument("--out", type=Path, required=True, default=argparse.SUPPRESS, metavar="FILE.onnx")
+    parser.add_argument("--classes", default="", metavar="NAME,…", help="of YOLO labels without classes.txt")
+    parser.add_argument(
+        "--size", default="1280x720", metavar="WxH", help="of the base stream: pictures are fitted into it"
+    )
+    parser.add_argument("--minutes", type=float, default=45.0, help="end the training by then")
+    parser.add_argument("--steps", type=int, default=1500, help="most steps, of 8 views each")
+    parser.add_argument("--seed", type=int, default=1, help="of everything that is random")
+    parser.add_argument("--threads", type=int, default=2, help="of PyTorch")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, train, measure; writes FILE.onnx, FILE.json (scores) and FILE.jsonl (the course of training)."""
+    with needs_extra(_INSTALL):
+        from hvt_train.fine_tune import FineTuneSettings, fill_own, fine_tune  # noqa: PLC0415 - PyTorch
+        from hvt_train.pictures.places import Picture  # noqa: PLC0415
+        from hvt_train.pictures.real import HeldOut  # noqa: PLC0415
+    size, start = _checked(arguments)
+    out: Path = arguments.out
+    names = [word.strip() for word in arguments.classes.split(",") if word.strip()]
+    data = [_labelled(uri, names) for uri in arguments.data]
+    apart = [_labelled(uri, names) for uri in arguments.held_out]
+    classes = _classes([picture for pictures in (*data, *apart) for picture in pictures])
+    train, held_out = _split([_read(pictures) for pictures in data], [_read(pictures) for pictures in apart])
+    _say(train, held_out, classes)
+
+    def pictures() -> Iterator[Picture]:
+        with RunProgress("pictures through x265") as progress:
+            for number, own in enumerate(train, start=1):
+                image, there = own.base(size)
+                boxes, kinds = _rows(there, classes)
+                yield Picture(image, boxes, kinds, np.ones(len(kinds), np.float32))
+                progress.update(number, len(train))
+
+    def kept() -> Iterator[HeldOut]:
+        for own in held_out:
+            image, there = own.base(size)
+            yield HeldOut(image, there.boxes_xyxy_px, there.ignored_xyxy_px, frozenset(classes))
+
+    before = _scored(start, held_out, size, classes, confidence=_confidence(start))
+    pool = out.with_suffix(".pool")
+    try:
+        files = fill_own(pool, pictures(), seed=arguments.seed)
+        with RunProgress("steps") as progress:
+
+            def step(done: int, quality: float | None) -> None:
+                progress.update(done, arguments.steps)
+                if quality is not None:
+                    progress.note(f"step {done}: AP50 {quality:.3f} on held-out pictures")
+
+            tuned = fine_tune(
+                files,
+                kept,
+                classes=classes,
+                start=start,
+                out=out,
+                settings=FineTuneSettings(
+                    steps=arguments.steps,
+                    budget_s=arguments.minutes * 60,
+                    seed=arguments.seed,
+                    threads=arguments.threads,
+                ),
+                measure=lambda path: _ap50(path, held_out, size, classes),
+                on_step=step,
+            )
+    finally:
+        shutil.rmtree(pool, ignore_errors=True)
+    after = _scored(out, held_out, size, classes, confidence=_confidence(out))
+    about = {
+        "classes": classes,
+        "trained_on": len(train),
+        "held_out": len(held_out),
+        "steps": tuned.steps,
+        "best_step": tuned.best_step,
+        "before": before,
+        "after": after,
+    }
+    out.with_suffix(".json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    _print(about)
+    if tuned.calibration is None:
+        print("too few boxes on held-out pictures, or none wrong, to calibrate: scores are no probabilities")
+    print(f"{out}: best of {tuned.steps} steps at {tuned.best_step}; fly with --detector {out}")
+    return 0
+
+
+def _checked(arguments: argparse.Namespace) -> tuple[_Size, Path]:
+    """Size and start; `UserError` for what cannot be, before an hour is spent."""
+    size = parse_size(arguments.size, name="--size")
+    for name, value, most in (
+        ("--minutes", arguments.minutes, 10_000),
+        ("--steps", arguments.steps, 1_000_000),
+        ("--threads", arguments.threads, 64),
+    ):
+        if not 0 < value <= most:
+            raise UserError(f"{name} {value} is not accepted: more than 0, and {most} at most")
+    if arguments.out.suffix != ".onnx":
+        raise UserError(f"--out {arguments.out} is not accepted: give a file whose name ends with .onnx")
+    if not arguments.out.parent.is_dir():
+        raise UserError(f"--out {arguments.out} cannot be written: there is no folder {arguments.out.parent}")
+    check_writable(arguments.out, name="--out")
+    return size, resolve_model(arguments.start, role="start")
+
+
+def _labelled(uri: str, names: Sequence[str]) -> list[LabelledPicture]:
+    """Pictures that somebody labelled; others are left out, and counted."""
+    scheme, colon, text = uri.partition(":")
+    place = Path(text).expanduser()
+    if not colon or scheme not in _SCHEMES:
+        raise UserError(f"--data {uri} is not accepted: yolo:FOLDER or coco:FILE.json is")
+    if scheme == "yolo" and not (place / "labels").is_dir():
+        raise UserError(f"--data {uri} has no folder {place / 'labels'}: images/NAME.jpg and labels/NAME.txt")
+    if scheme == "coco" and not place.is_file():
+        raise UserError(f"--data {uri} is not a file: COCO's JSON is expected")
+    found = find_pictures(place, classes=names or None)
+    labelled = [picture for picture in found if picture.labels is not None]
+    if len(labelled) < len(found):
+        left = len(found) - len(labelled)
+        print(f"{left} pictures of {place} have no file in labels/; left out", file=sys.stderr)
+    return labelled
+
+
+def _classes(pictures: Sequence[LabelledPicture]) -> list[str]:
+    """In the order of classes.txt; of COCO's categories only those that occur."""
+    found: dict[str, None] = {}
+    for picture in pictures:
+        used = None
+        if not isinstance(picture.labels, Path | FrameLabels | None):
+            used = {str(row["name"]) for row in picture.labels}
+        found |= dict.fromkeys(name for name in picture.class_names if used is None or name in used)
+    names = [name for name in found if name.casefold() not in IGNORED]
+    if not names:
+        raise UserError("the labels name no class: there is nothing to learn")
+    return names
+
+
+def _read(pictures: Sequence[LabelledPicture]) -> list[_Own]:
+    """Every picture and label once, so that what is wrong is said at the start."""
+    read, skipped = [], 0
+    with RunProgress("pictures read") as progress:
+        for number, picture in enumerate(pictures, start=1):
+            image = read_image(picture.path)
+            progress.update(number, len(pictures))
+            if image is None:
+                skipped += 1
+                print(f"{picture.path} cannot be read as a picture; skipped", file=sys.stderr)
+                continue
+            labels = picture.read((image.shape[1], image.shape[0]))
+            assert labels is not None, "only labelled ones are here"
+            read.append(_Own(picture.path, labels))
+    if skipped:
+        print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
+    return read
+
+
+def _split(data: Sequence[list[_Own]], apart: Sequence[list[_Own]]) -> tuple[list[_Own], list[_Own]]:
+    """What is trained on, and what is held out: the last fifth of each, for neighbours of a clip are alike."""
+    total = sum(map(len, (*data, *apart)))
+    if total < _LEAST_PICTURES:
+        raise UserError(
+            f"--data has {total} labelled pictures that can be read: {_LEAST_PICTURES} are needed"
+        )
+    train, held_out = [], [own for pictures in apart for own in pictures]
+    for pictures in data:
+        cut = 0 if apart else max(1, len(pictures) // _HELD_OUT_SHARE)
+        train += pictures[: len(pictures) - cut]
+        held_out += pictures[len(pictures) - cut :]
+    every = math.ceil(len(held_out) / _MOST_HELD_OUT)
+    held_out = held_out[::every] if every else held_out
+    for name, part in (("train on", train), ("hold out", held_out)):
+        if not any(len(own.labels) for own in part):
+            raise UserError(f"the pictures to {name} have no labelled object: label more, or give --held-out")
+    return train, held_out
+
+
+def _say(train: Sequence[_Own], held_out: Sequence[_Own], classes: Sequence[str]) -> None:
+    print(f"{len(train)} pictures to train on, {len(held_out)} held out")
+    for name in classes:
+        counts = [sum(own.labels.class_names.count(name) for own in part) for part in (train, held_out)]
+        note = "" if all(counts) else "; it cannot be learnt" if not counts[0] else "; it cannot be measured"
+        print(f"  {name}: {counts[0]} and {counts[1]} objects{note}")
+
+
+def _rows(labels: FrameLabels, classes: Sequence[str]) -> tuple[Boxes, npt.NDArray[np.int32]]:
+    """Boxes and class ids; -1 where the labels say that nothing counts."""
+    kinds = [classes.index(name) for name in labels.class_names]
+    boxes = np.concatenate([labels.boxes_xyxy_px, labels.ignored_xyxy_px])
+    return boxes, np.array([*kinds, *[-1] * len(labels.ignored_xyxy_px)], np.int32)
+
+
+def _frames(path: Path, held_out: Sequence[_Own], size: _Size) -> list[LabelledFrame]:
+    detector = open_detector(str(path), confidence=_CURVE, provider="auto")
+    frames = []
+    for own in held_out:
+        image = read_image(own.path)
+        assert image is not None, "it was read before"
+        frames.append((own.labels, detected(detector, image, size)))
+    return frames
+
+
+def _ap50(path: Path, held_out: Sequence[_Own], size: _Size, classes: Sequence[str]) -> float:
+    found = detection_score(_frames(path, held_out, size), classes=classes).mean.at_50
+    return 0.0 if math.isnan(found) else found
+
+
+def _scored(
+    path: Path, held_out: Sequence[_Own], size: _Size, classes: Sequence[str], *, confidence: float
+) -> dict[str, Any]:
+    """The score over the classes that the network knows, by own names or by others of the same kind."""
+    known = open_detector(str(path)).class_names
+    words = {kind_of(name): name for name in reversed(classes)}
+
+    def word(name: str) -> str:
+        return name if name in classes else words.get(kind_of(name), name)
+
+    shared = sorted({word(name) for name in known} & set(classes))
+    if not shared:
+        return {"confidence": confidence, "by_class": {}}
+    frames = _frames(path, held_out, size)
+    used = judged(above(frames, confidence), word=word, classes=shared)
+    curve = detection_score(frames, word=word, classes=shared)
+    return {"confidence": confidence, **picture_score(used, curve)}
+
+
+def _confidence(path: Path) -> float:
+    """From where boxes are shown: the file's own threshold, else 0.25."""
+    model = OnnxDetector(open_model(path, settings=ModelSettings(threads=1))).model
+    return float(model.metadata.get("hvt.confidence", _USUAL_CONFIDENCE))
+
+
+def _print(about: dict[str, Any]) -> None:
+    table = Table(
+        title=f"on {about['held_out']} held-out pictures, by which the best step was chosen",
+        title_justify="left",
+    )
+    table.add_column("")
+    table.add_column("labels", justify="right")
+    fields = ("precision", "recall", "ap50")
+    for when in ("before", "after"):
+        for field in fields:
+            table.add_column(f"{when}: {field.replace('ap', 'AP')}", justify="right")
+    rows = {
+        name: [about[when]["by_class"].get(name, {}) for when in ("before", "after")]
+        for name in about["classes"]
+    }
+    for name, pair in rows.items():
+        cells = [one.get(field) for one in pair for field in fields]
+        shown = ("-" if value is None else f"{value:.3f}" for value in cells)
+        table.add_row(name, str(pair[1].get("labels", 0)), *shown)
+    Console(highlight=False).print(table)
+    error = about["after"].get("calibration_error")
+    print(f"boxes are shown from confidence {about['after']['confidence']:g} on", end="")
+    print("" if error is None else f"; expected calibration error {error:.3f}")

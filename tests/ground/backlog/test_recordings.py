@@ -1,0 +1,55 @@
+"""Recordings of former sessions on a disk that does not answer."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+
+from hvt_common.runtime.failures import Failures
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_ground.backlog.perception import BacklogPerception
+from hvt_ground.backlog.recordings import BacklogRecording, BacklogRecordings
+from hvt_ground.backlog.session_backlog import SessionBacklog
+from hvt_ground.sinks import QueuedSink
+from hvt_ground.sinks.line_file import LineFile
+from programs.processes import eventually
+from rigs.flight import Flight, RedSquares, SameAnswer
+
+
+def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
+    """The live picture would stand still until the disk has made a file for what was stored long ago."""
+    info = Flight(1).info()
+    pipe = tmp_path / "recording"
+    os.mkfifo(pipe)  # opening it waits for a reader
+    opened = threading.Event()
+
+    def open_one(info) -> BacklogRecording:
+        failures = Failures(time.time_ns)
+        perception = BacklogPerception(
+            info,
+            take_models=lambda: (RedSquares(), None),
+            tracker_of=lambda: ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
+            reader_of=lambda _detector, _classifier: SameAnswer(),
+            detect_every=3,
+        )
+        sink = QueuedSink("recording", lambda: LineFile(pipe, ("a",)), failures=failures)
+        opened.set()
+        return BacklogRecording(info, sink=sink, perception=perception)
+
+    recordings = BacklogRecordings(open_one, open_s=60.0)
+    acquired: list[SessionBacklog | None] = []
+    worker = threading.Thread(target=lambda: acquired.append(recordings.acquire(info)))
+    worker.start()
+    assert opened.wait(timeout=20)
+    assert recordings.takes(info.session_id), "what the receiving thread asks of each chunk"
+    assert recordings.acquire(info) is None, "nobody else waits for it: it is to come again"
+    assert recordings.open_sessions == [info.session_id]
+    assert not acquired, "it is still being opened"
+    with pipe.open():
+        worker.join(timeout=20)
+        (backlog,) = acquired
+        assert backlog is not None
+        assert recordings.acquire(info) is backlog
+        recordings.close()
+        eventually(lambda: threading.active_count() == 1, within_s=20, what="its thread ends")

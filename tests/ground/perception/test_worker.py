@@ -1,0 +1,83 @@
+"""The order in which perception takes what has come, in real time."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from hvt_common.protocol.messages import RoiHeader
+from hvt_ground.perception.pipeline import DecodedFrame
+from hvt_ground.perception.stills.decode import ReceivedStill
+from hvt_ground.perception.worker import RealtimeWorker
+from programs.processes import eventually
+from rigs.flight import Flight
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """Real stills."""
+    return Flight(3)
+
+
+def picture(index: int) -> DecodedFrame:
+    """A small one."""
+    return DecodedFrame(index, index, index, np.zeros((8, 8, 3), np.uint8))
+
+
+def still(flight: Flight, index: int, sequence: int) -> ReceivedStill:
+    """Of that frame."""
+    item = flight.still(index, sequence)
+    return ReceivedStill(RoiHeader.parse(item.attachment, item.payload), item.payload)
+
+
+class Rig:
+    """A worker that notes what it does, and waits in the first of it until it may go on."""
+
+    def __init__(self) -> None:
+        self.done: list[tuple[str, object]] = []
+        self.begun, self.go_on = threading.Event(), threading.Event()
+        self.worker = RealtimeWorker(
+            lambda one, hurry: self._note("hurry" if hurry else "picture", one.frame_index),
+            lambda tracks, _at_ns: self._note("step", tracks.frame_index),
+            lambda stills: self._note("stills", [one.header.sequence for one in stills]),
+            name="x",
+        )
+
+    def _note(self, what: str, which: object) -> None:
+        self.done.append((what, which))
+        self.begun.set()
+        assert self.go_on.wait(timeout=20)
+
+    def finish(self) -> list[tuple[str, object]]:
+        """All that it did."""
+        self.go_on.set()
+        eventually(lambda: self.worker.idle, within_s=20, what="all is done")
+        assert self.worker.close()
+        self.worker.raise_error()
+        return self.done
+
+
+def test_pictures_come_between_the_stills_of_two_frames(flight):
+    """A handful of stills, a detection each, would hold up the boxes of a second of video."""
+    rig = Rig()
+    for sequence, index in enumerate((0, 0, 1, 2)):
+        rig.worker.still(still(flight, index, sequence))
+    assert rig.begun.wait(timeout=20)
+    rig.worker.picture(picture(7))
+    rest = rig.finish()
+    first = rest.index(("picture", 7))
+    read = [one for what, which in rest if what == "stills" for one in which]
+    assert read == [0, 1, 2, 3]
+    assert first == 1, "the first frame's are in hand when it comes, the others wait for it"
+
+
+def test_detection_is_for_the_newest_picture():
+    """Boxes would be shown late, one detection after the other, on a machine that is a little behind."""
+    rig = Rig()
+    rig.worker.picture(picture(0))
+    assert rig.begun.wait(timeout=20)
+    for index in (1, 2, 3):
+        rig.worker.picture(picture(index))
+    assert rig.finish() == [("picture", 0), ("hurry", 1), ("hurry", 2), ("picture", 3)]
