@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -137,7 +138,9 @@ def test_a_network_of_photographs_makes_no_car_anything_else(flight):
         stills["reasons"]["outcomes"].values()
     )
     assert stills["dropped"] == 0
-    notes = [text for _, _, text in flight.recording.events() if text.startswith("still #") and " (" in text]
+    notes = [
+        text for _, _, text in flight.recording.events() if re.match(r"still #.*: \w+ \(.+ \.\d\d\)  ", text)
+    ]
     assert len(notes) >= 0.5 * len(flight.stills), "what it called them stands beside the still"
 
 

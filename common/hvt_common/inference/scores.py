@@ -8,7 +8,7 @@ from pathlib import Path
 from hvt_common.errors import UserError
 from hvt_common.inference.detect import MOTION, USUAL_CONFIDENCE
 from hvt_common.inference.runtimes.onnx_file import onnx_metadata
-from hvt_common.inference.runtimes.plug_in import plug_in_of
+from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
 from hvt_common.inference.store import resolve_model
 
 __all__ = ["default_confidence", "is_calibrated", "uncalibrated"]
@@ -41,9 +41,16 @@ def default_confidence(spec: str) -> float:
 def is_calibrated(spec: str, *, role: str) -> bool:
     """Whether a model's scores were fitted to how often they are right: its metadata have ``hvt.calibration``.
 
-    The motion detector's are not, and of a plug-in nobody knows. Raises `UserError` where there is no such model.
+    Those of the motion detector and of plug-ins are not. Raises `UserError` where there is no such model.
     """
     return _CALIBRATION in _metadata(spec, role=role)
+
+
+def _metadata(spec: str, *, role: str) -> dict[str, str]:
+    """Of a file; the motion detector and plug-ins have none."""
+    if role == "detector" and (spec == MOTION or plug_in_of(spec) is not None):
+        return {}
+    return onnx_metadata(resolve_model(spec, role=role, words=(MOTION, *plug_in_names())))
 
 
 def uncalibrated(role: str, spec: str) -> str:
@@ -52,10 +59,3 @@ def uncalibrated(role: str, spec: str) -> str:
         f"{role} {Path(spec).name} has no calibration ({_CALIBRATION} in its metadata):"
         " its scores are no probabilities"
     )
-
-
-def _metadata(spec: str, *, role: str) -> dict[str, str]:
-    """Of the model's file; nothing of what has none."""
-    if spec == MOTION or plug_in_of(spec) is not None:
-        return {}
-    return onnx_metadata(resolve_model(spec, role=role, words=(MOTION,)))

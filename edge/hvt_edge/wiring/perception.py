@@ -56,5 +56,5 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
 
 
 def track_confidence(config: EdgeConfig) -> float:
-    """From where a detection starts a track, 0…1: as set, else as the model says."""
+    """From where a detection starts a track: as given, else as the detector's file says."""
     return default_confidence(config.detector) if config.confidence is None else config.confidence
