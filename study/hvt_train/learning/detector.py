@@ -36,11 +36,11 @@ class Block(nn.Module):
 
     def __init__(self, width: int, *, residual: bool) -> None:
         super().__init__()
-        self.residual, self.mix, self.look = residual, Conv(width, width), Separable(width, width)
+        self.residual, self.mix, self.spread = residual, Conv(width, width), Separable(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, H, W) to the same shape."""
-        out: Tensor = self.look(self.mix(x))
+        out: Tensor = self.spread(self.mix(x))
         return x + out if self.residual else out
 
 
@@ -50,15 +50,15 @@ class CrossStage(nn.Module):
     def __init__(self, inputs: int, outputs: int, blocks: int = 1, *, residual: bool = False) -> None:
         super().__init__()
         half = outputs // 2
-        self.through, self.past = Conv(inputs, half), Conv(inputs, half)
+        self.through, self.bypass = Conv(inputs, half), Conv(inputs, half)
         self.blocks = nn.Sequential(*(Block(half, residual=residual) for _ in range(blocks)))
         self.join = Conv(outputs, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, inputs, H, W) to (N, outputs, H, W)."""
         # The order of the convolutions is that of the published file: `start.load_onnx` goes by it.
-        through, past = self.through(x), self.past(x)
-        out: Tensor = self.join(torch.cat([self.blocks(through), past], dim=1))
+        through, bypass = self.through(x), self.bypass(x)
+        out: Tensor = self.join(torch.cat([self.blocks(through), bypass], dim=1))
         return out
 
 
@@ -121,7 +121,7 @@ class DetectorNet(nn.Module):
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """Maps of strides 8, 16, 32."""
-        x = self.stages[0](self.stem(_folded(images)))
+        x = self.stages[0](self.stem(_space_to_depth(images)))
         fine = self.stages[1](x)
         middle = self.stages[2](fine)
         coarse = self.narrow[0](self.stages[3](middle))
@@ -153,7 +153,7 @@ class ExportedDetector(nn.Module):
         return torch.cat([rows[..., :4], (true / best).clamp(max=1.0), classes], dim=2)
 
 
-def _folded(images: Tensor) -> Tensor:
+def _space_to_depth(images: Tensor) -> Tensor:
     """Each 2x2 square of pixels becomes four times the channels: (N, 3, H, W) to (N, 12, H/2, W/2)."""
     rows = [images[..., y::2, x::2] for x in (0, 1) for y in (0, 1)]
     return torch.cat(rows, dim=1)

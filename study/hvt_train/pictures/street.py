@@ -30,7 +30,7 @@ _NAMES = {
     "bicycle": "motor",
 }
 _SURE, _SAME = 0.5, 0.6
-_SCALES = (1.0, 1.75)
+_ENLARGED = (1.0, 1.75)
 
 
 def street_pictures(folder: Path, teacher: Detector, *, every: int = 2) -> Iterator[Picture]:
@@ -50,7 +50,7 @@ def street_pictures(folder: Path, teacher: Detector, *, every: int = 2) -> Itera
 def _named(image: Image, teacher: Detector) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
     """(N, 4) boxes and (N,) classes, -1 where the teacher is unsure, of the picture as it is and enlarged."""
     rows: list[tuple[float, str, npt.NDArray[np.float32]]] = []
-    for scale in _SCALES:
+    for scale in _ENLARGED:
         how = cv2.INTER_CUBIC
         found = teacher.detect(
             np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=how), np.uint8)
