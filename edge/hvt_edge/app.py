@@ -28,7 +28,7 @@ from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import closing_on
 from hvt_edge.status import StatusReporter
 from hvt_edge.summary import summary
-from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store
+from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store, track_confidence
 from hvt_edge.world import World
 
 __all__ = ["Edge"]
@@ -87,7 +87,7 @@ class Edge:
                     open_again=lambda: world.open_detector(config),
                     failures=self._failures,
                     clock=world.clock,
-                    hint=FewFoundHint(config.detector, confidence=config.confidence),
+                    hint=FewFoundHint(config.detector, confidence=track_confidence(config)),
                 )
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = world.open_link(stack, config)

@@ -214,7 +214,12 @@ class EdgeConfig:
         TEXT, "off", "detect in tiles of the source too: CxR, auto, or off; needs --candidates source"
     )
     detect_every: int = _MODELS_RARE.option(integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame")
-    confidence: float = _MODELS.option(number(0.01, 1), 0.25, "confidence of a detection that starts a track")
+    confidence: float | None = _MODELS.option(
+        number(0.01, 1),
+        None,
+        "confidence of a detection that starts a track",
+        shown_default="the detector's own, else 0.25",
+    )
     nms_iou: float = _MODELS_RARE.option(
         number(0.01, 1), 0.45, "overlap above which two boxes of a class are one"
     )

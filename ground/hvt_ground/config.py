@@ -60,8 +60,11 @@ class GroundConfig:
     detect_every: int = _MODELS.option(
         integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame, less when behind"
     )
-    confidence: float = _MODELS.option(
-        number(0.01, 1), 0.25, "confidence from which a detection starts a track"
+    confidence: float | None = _MODELS.option(
+        number(0.01, 1),
+        None,
+        "confidence from which a detection starts a track",
+        shown_default="the detector's own, else 0.25",
     )
     nms_iou: float = _MODELS_RARE.option(
         number(0.01, 1), 0.45, "overlap above which two boxes of a class are one"

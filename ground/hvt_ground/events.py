@@ -68,6 +68,10 @@ class Overlay:
     """N words; empty says ``base`` for all."""
     stored: bool = False
     """Of a `VideoSample` that was."""
+    doubted: npt.NDArray[np.bool_] | None = None
+    """(N,) True where stills say that it is nothing of mine; None is nowhere."""
+    sure: npt.NDArray[np.bool_] | None = None
+    """(N,) True where stills agree on the class with a calibrated probability above .9; None is nowhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +109,12 @@ class Refinement:
     """It was stored at the edge while the link was down: its frame is the one that it shows, long ago."""
     unread: bool = False
     """Nothing could read it: both classes are the edge's word."""
+    note: str = ""
+    """Of an unread still: what the classifier called it, though tracks have no such class."""
+    doubted: bool = False
+    """The still says that the object is nothing of mine."""
+    sure: bool = False
+    """``class_after`` has a calibrated probability above .9."""
 
 
 @dataclass(frozen=True, slots=True)

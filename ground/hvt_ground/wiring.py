@@ -23,10 +23,11 @@ from hvt_ground.config import DETECTOR, GroundConfig
 from hvt_ground.events import Event
 from hvt_ground.perception.fusion.camera_path import CameraPath
 from hvt_ground.perception.fusion.fuse import Fusion, unified_names
-from hvt_ground.perception.models import Models
+from hvt_ground.perception.models import Models, stills_calibrated, track_confidence
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.vocabulary import Vocabulary
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
@@ -156,6 +157,7 @@ def make_pipeline(
     detector, classifier = models.take()
     reader = _reader(config, detector, classifier, info=info)
     names, edge_classes = unified_names(detector.class_names, info.class_names)
+    vocabulary = Vocabulary(names, reader.class_names, kinds=config.refine == "replace")
     path = CameraPath(ahead_frames=max(1, round(info.fps)))
     parts = PipelineParts(
         detector=detector,
@@ -164,9 +166,10 @@ def make_pipeline(
         refiner=Refiner(
             cast('Literal["replace", "fuse"]', config.refine),
             fps=info.fps,
-            detector_classes=names,
-            classifier_classes=reader.class_names,
+            vocabulary=vocabulary,
+            calibrated=stills_calibrated(config),
         ),
+        vocabulary=vocabulary,
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
         path=path,
     )
@@ -193,7 +196,8 @@ def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info)
 
 def _tracker(config: GroundConfig, info: Info) -> ByteTracker:
     motion = cast('Literal["off", "flow"]', config.camera_motion)
-    return ByteTracker(TrackerSettings.starting_at(config.confidence, camera_motion=motion), fps=info.fps)
+    confidence = track_confidence(config)
+    return ByteTracker(TrackerSettings.starting_at(confidence, camera_motion=motion), fps=info.fps)
 
 
 def _reader(

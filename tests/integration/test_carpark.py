@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+import re
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from hvt_common.inference.class_names import group_of
 from hvt_common.protocol.messages import Info, RoiHeader
 from hvt_common.video.hevc import BaseDecoder
 from programs.outsider import Message, Tap, answer, joined
@@ -119,17 +121,27 @@ def test_the_budget_is_used_and_held(flight):
     assert edge["base_bps"] <= 1.02 * edge["budget_base_bps"]
 
 
-def test_stills_refine_tracks(flight):
-    """The second channel would cost bits and teach the ground nothing."""
+def test_a_network_of_photographs_makes_no_car_anything_else(flight):
+    """Cars would be revolvers and waffle irons: a car from above is none of the thousand things that it knows."""
     assert flight.edge["stills"]["sent"] >= 50
     assert flight.ground["tracks"] >= 40
-    assert flight.ground["tracks_refined"] >= 20
-    assert flight.ground["class_changes"] >= 10
+    shown = Counter(
+        (box.class_before, box.class_after)
+        for frame in range(0, FRAMES, 5)
+        for box in flight.recording.boxes(frame).values()
+    )
+    vehicles = {pair: count for pair, count in shown.items() if group_of(pair[0]) == "vehicle"}
+    assert sum(vehicles.values()) >= 1000
+    assert {after for _, after in vehicles if group_of(after) != "vehicle"} == set()
     stills = flight.ground["stills"]
     assert stills["received"] == stills["dropped"] + stills["deferred"] + sum(
         stills["reasons"]["outcomes"].values()
     )
-    assert stills["dropped"] == stills["unread"] == 0
+    assert stills["dropped"] == 0
+    notes = [
+        text for _, _, text in flight.recording.events() if re.match(r"still #.*: \w+ \(.+ \.\d\d\)  ", text)
+    ]
+    assert len(notes) >= 0.5 * len(flight.stills), "what it called them stands beside the still"
 
 
 def test_the_recording_holds_the_flight(flight):
@@ -143,8 +155,6 @@ def test_the_recording_holds_the_flight(flight):
     tracks = [recording.boxes(frame) for frame in range(30, FRAMES, 10)]
     assert all(len(boxes) >= 20 for boxes in tracks)
     last = tracks[-1].values()
-    assert sum(box.refined for box in last) >= 10
-    assert any(box.class_after != box.class_before for box in last if box.refined)
     wide, high = flight.info.base_size
     assert all(0 <= box.box_px[0] < box.box_px[2] <= wide and box.box_px[3] <= high for box in last)
     texts = [text for _, _, text in recording.events()]

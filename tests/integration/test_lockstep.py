@@ -65,8 +65,7 @@ def plays(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Play, P
     folder = tmp_path_factory.mktemp("lockstep")
     opinions = (
         *("--detector", str(data / "models/yolov5su_visdrone_640.onnx"), "--detect-every", "5"),
-        *("--classifier", str(data / "models/mobilenet_v2_imagenet.onnx")),
-        *("--labels", str(data / "models/imagenet_labels_1001.txt")),
+        *("--classifier", "aerial-cls"),
     )
     return (
         play(data, folder / "one", *opinions),

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from media.onnx_models import colour_classifier, colour_detector
+
 pytestmark = pytest.mark.timeout(60)
 
 
@@ -111,3 +113,21 @@ def test_files_of_settings_that_are_wrong(ground, here):
     assert "unknown key 'sauce'" in ground("--config", "ground.toml")
     Path("zenoh.json5").write_text("{ mode: ")
     assert "zenoh.json5:1: not JSON5" in ground("--zenoh-config", "zenoh.json5")
+
+
+def test_a_classifier_with_no_class_in_common(ground, tmp_path):
+    """It would fly, and never say a word of any track."""
+    names = tmp_path / "fruit.txt"
+    names.write_text("apple\npear\nplum\n")
+    fruit = colour_classifier(tmp_path / "fruit.onnx")
+    sentence = ground("--classifier", str(fruit), "--labels", str(names))
+    assert f"--classifier {fruit} has no class in common with --detector aerial-nano" in sentence
+    assert "apple, pear, plum; tracks are car, van" in sentence
+
+
+def test_a_detector_whose_own_threshold_makes_no_sense(ground, tmp_path):
+    """Everything, or nothing, would be an object."""
+    path = colour_detector(tmp_path / "d.onnx", "yolox", metadata={"hvt.confidence": "high"})
+    sentence = ground("--detector", str(path))
+    assert f"{path} has hvt.confidence 'high'" in sentence
+    assert "0.01 to 1" in sentence

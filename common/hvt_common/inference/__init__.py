@@ -1,4 +1,6 @@
 """Detectors and classifiers: others use `detect`, `tiles`, `motion`, `classify`, `class_names`, `labels`, `nms`.
 
-`few_found` says when the embedded one finds little. The room `runtimes` runs a network, `store` gives their paths.
+`few_found` says when the embedded one finds little, `scores` from where scores count and whether they are probabilities.
+
+The room `runtimes` runs a network, `store` gives paths of models.
 """

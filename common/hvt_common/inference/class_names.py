@@ -4,11 +4,15 @@ A *kind* is the word in which classes of different models are compared: ``car``,
 ``motor``, ``bicycle``, ``tricycle``, ``train``, ``boat``, ``aeroplane``; ``names/kinds.toml`` has the table. The
 motion detector's only class, ``moving``, may be any kind and passes every class list. A name that is not in the table
 is a kind of its own.
+
+A *group* is coarser: ``vehicle``, ``person``, ``boat``, ``animal`` (``names/groups.toml``). It is what a classifier
+of photographs can say of an object: ``names/imagenet_groups.txt`` has the group of each synset of ImageNet.
 """
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from importlib.resources import files
 
 __all__ = [
@@ -16,6 +20,9 @@ __all__ = [
     "IMAGENET_NAMES",
     "MOVING",
     "VISDRONE_NAMES",
+    "group_of",
+    "is_imagenet",
+    "is_nothing",
     "kind_of",
     "same_kind",
 ]
@@ -35,6 +42,14 @@ def _list(name: str) -> tuple[str, ...]:
 COCO_NAMES = _list("coco.txt")
 VISDRONE_NAMES = _list("visdrone.txt")
 IMAGENET_NAMES = _list("imagenet.txt")
+_NOTHING = frozenset({"other", "background", "nothing"})
+_IMAGENET_SHARE = 0.9
+_GROUP_OF_KIND = {
+    kind: group for group, kinds in tomllib.loads(_text("groups.toml")).items() for kind in kinds
+}
+_GROUP_OF_SYNSET = {
+    name.casefold(): group for _, group, name in (line.split(" ", 2) for line in _list("imagenet_groups.txt"))
+}
 _KIND_OF_NAME = {name: kind for kind, names in tomllib.loads(_text("kinds.toml")).items() for name in names}
 
 
@@ -43,8 +58,33 @@ def kind_of(name: str) -> str:
 
     Case, and the synonyms that ImageNet writes after a comma, do not matter: ``Beach wagon, station wagon`` is a car.
     """
-    plain = name.partition(",")[0].strip().casefold()
+    plain = _plain(name)
     return str(_KIND_OF_NAME.get(plain, plain))
+
+
+def group_of(name: str) -> str | None:
+    """The group that a class name means; None where it means none.
+
+    ``car`` and ``Beach wagon, station wagon`` are a vehicle, ``Japanese spaniel`` is an animal, ``waffle iron`` none.
+    """
+    return _GROUP_OF_KIND.get(kind_of(name)) or _GROUP_OF_SYNSET.get(_plain(name))
+
+
+def is_nothing(name: str) -> bool:
+    """Whether a class stands for what is none of the others: ``other``, ``background`` or ``nothing``."""
+    return _plain(name) in _NOTHING
+
+
+def is_imagenet(names: Sequence[str]) -> bool:
+    """Whether these are the classes of a network trained on ImageNet: nearly all of its 1000 names are among them."""
+    return len(_IMAGENET.intersection(map(_plain, names))) >= _IMAGENET_SHARE * len(_IMAGENET)
+
+
+def _plain(name: str) -> str:
+    return name.partition(",")[0].strip().casefold()
+
+
+_IMAGENET = frozenset(map(_plain, IMAGENET_NAMES))
 
 
 def same_kind(name: str, wanted: str) -> bool:

@@ -19,10 +19,20 @@ from hvt_common.inference.runtimes.plug_in import PlugInDetector, plug_in_names,
 from hvt_common.inference.store import model_names, resolve_model
 from hvt_common.values import Detections, Image
 
-__all__ = ["MOTION", "Detector", "OnnxDetector", "open_detector", "warm_up"]
+__all__ = [
+    "MOTION",
+    "USUAL_CONFIDENCE",
+    "Detector",
+    "OnnxDetector",
+    "open_detector",
+    "warm_up",
+]
 
 MOTION = "motion"
 """The word that stands for the detector without weights."""
+
+USUAL_CONFIDENCE = 0.25
+"""From where detections count, where neither the user nor the model says."""
 
 _CELL = 32  # input sides are multiples of the largest usual stride
 _TRIAL_SIDE = 256
@@ -55,7 +65,7 @@ def open_detector(
     spec: str,
     *,
     labels: Path | None = None,
-    confidence: float = 0.25,
+    confidence: float = USUAL_CONFIDENCE,
     nms_iou: float = 0.45,
     size: tuple[int, int] | None = None,
     threads: int = 2,
@@ -106,7 +116,7 @@ class OnnxDetector:
         model: OnnxModel,
         *,
         labels: Path | None = None,
-        confidence: float = 0.25,
+        confidence: float = USUAL_CONFIDENCE,
         nms_iou: float = 0.45,
         size: tuple[int, int] | None = None,
     ) -> None:

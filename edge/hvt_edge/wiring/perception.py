@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Literal, cast
 
-from hvt_common.inference.detect import Detector, open_detector, warm_up
+from hvt_common.inference.detect import MOTION, Detector, open_detector, warm_up
+from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
 from hvt_common.inference.tiles import tiled
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings, FailingDetector
+
+_log = logging.getLogger(__name__)
 
 
 def make_detector(config: EdgeConfig) -> Detector:
@@ -17,7 +21,7 @@ def make_detector(config: EdgeConfig) -> Detector:
     detector = open_detector(
         config.detector,
         labels=config.labels,
-        confidence=weak_confidence(config.confidence),
+        confidence=weak_confidence(track_confidence(config)),
         nms_iou=config.nms_iou,
         threads=config.threads,
         provider=config.provider,
@@ -27,6 +31,8 @@ def make_detector(config: EdgeConfig) -> Detector:
 
 def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
     """Run the detector once on what it will be given: a runtime may compile for each shape."""
+    if config.detector != MOTION and not is_calibrated(config.detector, role="detector"):
+        _log.warning("%s", uncalibrated("detector", config.detector))
     if config.candidates == "source":
         warm_up(detector, view.base_size if view.enlarges else view.source_size)
     else:
@@ -36,7 +42,7 @@ def warm_up_for(config: EdgeConfig, detector: Detector, view: View) -> None:
 def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) -> Analyzer:
     """Decoder, detector and tracker of the edge's own stream."""
     settings = TrackerSettings.starting_at(
-        config.confidence, camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
+        track_confidence(config), camera_motion=cast('Literal["off", "flow"]', config.camera_motion)
     )
     return Analyzer(
         detector,
@@ -47,3 +53,8 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
             candidates=cast('Literal["decoded", "source"]', config.candidates),
         ),
     )
+
+
+def track_confidence(config: EdgeConfig) -> float:
+    """From where a detection starts a track: as given, else as the detector's file says."""
+    return default_confidence(config.detector) if config.confidence is None else config.confidence

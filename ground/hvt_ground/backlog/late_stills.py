@@ -57,4 +57,5 @@ class LateStills:
             classes=tuple(still.class_after if still else name for name, still in classes),
             confidences=np.array([s.confidence if s else own for own, s in confidences], np.float32),
             refined=np.array([still is not None for still in stills], np.bool_),
+            doubted=np.array([still is not None and still.doubted for still in stills], np.bool_),
         )

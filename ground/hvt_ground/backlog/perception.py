@@ -24,6 +24,7 @@ from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.stage import Progress, StillStage
+from hvt_ground.perception.stills.vocabulary import Vocabulary
 
 __all__ = ["FIRST_TRACK_ID", "BacklogPerception", "StretchTracker"]
 
@@ -117,9 +118,11 @@ class BacklogPerception:
         detector, classifier = self._take_models()
         reader = self._reader_of(detector, classifier)
         names, edge_classes = unified_names(detector.class_names, info.class_names)
+        vocabulary = Vocabulary(names, reader.class_names)
         stage = StillStage(
             reader,
-            Refiner("fuse", fps=info.fps, detector_classes=names, classifier_classes=reader.class_names),
+            Refiner("fuse", fps=info.fps, vocabulary=vocabulary),
+            vocabulary=vocabulary,
             history=History(),
             fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=CameraPath(ahead_frames=1)),
             view=info.view,

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from functools import partial
 
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import Detector, open_detector, warm_up
 from hvt_common.inference.few_found import FewFoundHint
+from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
 from hvt_ground.perception.retried import RetriedClassifier, RetriedDetector
+from hvt_ground.perception.stills.vocabulary import check_common
 
-__all__ = ["ModelSet", "Models"]
+__all__ = ["ModelSet", "Models", "stills_calibrated", "track_confidence"]
+
+_log = logging.getLogger(__name__)
 
 _USUAL_SIZE = (1280, 720)
 """Of base streams; what an edge really sends is known only when its first picture comes."""
@@ -32,6 +37,7 @@ class Models:
         self.failures = Failures(SteadyClock())
         """Models whose run raised."""
         self._set = self._open()
+        self._check()
 
     def take(self) -> ModelSet:
         """A detector, and a classifier where one is wanted; a motion detector is a new one: it remembers pictures."""
@@ -43,13 +49,24 @@ class Models:
             open_detector,
             config.detector,
             labels=config.detector_labels,
-            confidence=weak_confidence(config.confidence),
+            confidence=weak_confidence(track_confidence(config)),
             nms_iou=config.nms_iou,
             threads=config.threads,
             provider=config.provider,
         )
-        hint = FewFoundHint(config.detector, confidence=config.confidence)
+        hint = FewFoundHint(config.detector, confidence=track_confidence(config))
         return RetriedDetector(open_one, "detector", self.failures, hint=hint)
+
+    def _check(self) -> None:
+        """Refuse a classifier that has nothing to say of the detector's tracks; say which scores mean little."""
+        config, (detector, classifier) = self._config, self._set
+        if config.detector != MOTION and not is_calibrated(config.detector, role="detector"):
+            _log.warning("%s", uncalibrated("detector", config.detector))
+        if classifier is None or config.classifier is None:
+            return
+        check_common(config.detector, detector.class_names, config.classifier, classifier.class_names)
+        if not is_calibrated(config.classifier, role="classifier"):
+            _log.warning("%s, and no class gets a check mark", uncalibrated("classifier", config.classifier))
 
     def _open(self) -> ModelSet:
         config = self._config
@@ -66,3 +83,17 @@ class Models:
             provider=config.provider,
         )
         return detector, RetriedClassifier(open_one, "classifier", self.failures)
+
+
+def track_confidence(config: GroundConfig) -> float:
+    """From where a detection starts a track: as given, else as the detector's file says."""
+    return default_confidence(config.detector) if config.confidence is None else config.confidence
+
+
+def stills_calibrated(config: GroundConfig) -> bool:
+    """Whether what stills are read with gives probabilities."""
+    if config.classifier in (None, NONE):
+        return False
+    if config.classifier == DETECTOR:
+        return is_calibrated(config.detector, role="detector")
+    return is_calibrated(config.classifier, role="classifier")

@@ -23,6 +23,7 @@ from hvt_ground.perception.stills.classify import StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
 from hvt_ground.perception.stills.stage import Progress, StillStage
+from hvt_ground.perception.stills.vocabulary import Vocabulary
 
 __all__ = ["DecodedFrame", "Pipeline", "PipelineParts", "ReceivedStill"]
 
@@ -59,7 +60,8 @@ class PipelineParts:
     tracker: ByteTracker
     reader: StillReader
     refiner: Refiner
-    """Over the unified names of the fused list."""
+    vocabulary: Vocabulary
+    """Of the reader and the unified names of the fused list."""
     fusion: Fusion
     path: CameraPath
     """The one that ``fusion`` moves boxes by."""
@@ -96,6 +98,7 @@ class Pipeline:
         self._stills = StillStage(
             parts.reader,
             parts.refiner,
+            vocabulary=parts.vocabulary,
             history=self._history,
             fusion=parts.fusion,
             view=view,
@@ -274,6 +277,8 @@ def _overlay(fused: FusedTracks, shown: ShownClasses, capture_ns: int) -> Overla
         confidences=shown.confidences,
         refined=shown.refined,
         origins=fused.origins,
+        doubted=shown.doubted,
+        sure=shown.sure,
     )
 
 

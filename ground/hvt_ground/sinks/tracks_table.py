@@ -17,13 +17,14 @@ __all__ = ["COLUMNS", "TrackTable"]
 
 COLUMNS = (
     *("frame", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
-    *("base_class", "class", "refined", "origin", "late"),
+    *("base_class", "class", "refined", "origin", "late", "doubted"),
 )
 """``frame`` counts from 1 and ``x y w h`` are base pixels, as in MOTChallenge; ``capture_utc`` is the time at the
 camera by the edge's clock; ``base_class`` is what the detectors say without stills, ``class`` the same after
 refinement, ``refined`` 1 once a still has refined it; ``origin``: ``base``, ``edge``, ``edge+base`` or ``still``;
-``late``: 1 where it is of stored video that came after an outage, behind later frames. A source frame that the base
-stream left out has lines too where the edge reported it."""
+``late``: 1 where it is of stored video that came after an outage, behind later frames; ``doubted``: 1 where stills
+say that it is nothing of mine. A source frame that the base stream left out has lines too where the edge reported
+it."""
 
 
 class TrackTable:
@@ -64,6 +65,7 @@ def _rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
             int(overlay.refined[row]),
             origins[row],
             int(overlay.stored),
+            0 if overlay.doubted is None else int(overlay.doubted[row]),
         )
 
 

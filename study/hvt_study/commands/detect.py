@@ -17,6 +17,7 @@ from rich.table import Table
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import Detector, open_detector
+from hvt_common.inference.scores import default_confidence
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import tiled
 from hvt_common.units import parse_size
@@ -61,7 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--tiles", default="off", help="as of hvt-edge: off, auto or CxR")
     parser.add_argument(
-        "--confidence", type=float, default=0.25, help="least confidence of what is written and counted"
+        "--confidence",
+        type=float,
+        help="least confidence of what is written and counted (default: the detector's own, else 0.25)",
     )
     parser.add_argument("--classes", default="", metavar="NAME,…", help="of YOLO labels without classes.txt")
     parser.add_argument(
@@ -80,8 +83,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Detect on all pictures; write detections.csv, and score.json and two sheets where there are labels."""
     size = parse_size(arguments.size, name="--size")
-    if not _LEAST_CONFIDENCE <= arguments.confidence <= 1:
-        raise UserError(f"--confidence is {arguments.confidence}, must be from {_LEAST_CONFIDENCE} to 1")
+    confidence = arguments.confidence
+    if confidence is None:
+        confidence = default_confidence(arguments.detector)
+    if not _LEAST_CONFIDENCE <= confidence <= 1:
+        raise UserError(f"--confidence is {confidence}, must be from {_LEAST_CONFIDENCE} to 1")
     names = _list(arguments.classes)
     pictures = [one for place in arguments.pictures for one in find_pictures(place, classes=names or None)]
     detector = tiled(
@@ -105,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
                 skipped += 1
                 print(f"{picture.path} cannot be read as a picture; skipped", file=sys.stderr)
                 continue
-            table.writerows(_rows(picture.path, view, arguments.confidence))
+            table.writerows(_rows(picture.path, view, confidence))
             labels = picture.read((image.shape[1], image.shape[0]))
             if labels is not None:
                 paths.append(picture.path)
@@ -114,10 +120,10 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{skipped} of {len(pictures)} pictures skipped", file=sys.stderr)
     if frames:
         recall_only = any(picture.one_target for picture in pictures)
-        used = judged(above(frames, arguments.confidence), word=word, classes=classes)
+        used = judged(above(frames, confidence), word=word, classes=classes)
         about = {
             "detector": arguments.detector,
-            "confidence": arguments.confidence,
+            "confidence": confidence,
             "pictures": len(frames),
             "skipped": skipped,
             **picture_score(

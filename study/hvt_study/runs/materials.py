@@ -18,6 +18,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.classify import Classifier, open_classifier
 from hvt_common.inference.detect import MOTION
 from hvt_common.inference.labels import first_synonym
+from hvt_common.inference.scores import default_confidence
 from hvt_common.inference.store import resolve_model
 from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, NONE
@@ -31,10 +32,8 @@ from hvt_study.datasets.sequence import Sequence
 from hvt_study.runs.joint_classes import joint_classes
 from hvt_study.runs.spec import ModelChoice, RunSpec
 
-__all__ = ["CONFIDENCE", "Materials", "open_materials", "software_versions"]
+__all__ = ["Materials", "open_materials", "software_versions"]
 
-CONFIDENCE = 0.25
-"""From which a detection counts, at the edge, at the ground and as a reference label."""
 _PACKAGES = (
     *("numpy", "scipy", "opencv-python-headless", "av", "pillow", "pillow-jxl-plugin", "msgpack"),
     *("onnxruntime", "onnxruntime-gpu", "openvino"),
@@ -130,7 +129,8 @@ def _detector(side: str, spec: str, provider: str, memory: Path) -> CachedDetect
     """Each side has one of its own, whose CPU is its account; they share what is remembered."""
     if spec == MOTION:
         raise UserError(f"{MOTION!r} as detector of the {side} remembers pictures: give a detection network")
-    return CachedDetector(spec, confidence=weak_confidence(CONFIDENCE), provider=provider, folder=memory)
+    confidence = weak_confidence(default_confidence(spec))
+    return CachedDetector(spec, confidence=confidence, provider=provider, folder=memory)
 
 
 @lru_cache(maxsize=4)

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from hvt_common.config import load
+from hvt_common.inference.scores import default_confidence
 from hvt_edge.config import REGIMES, EdgeConfig
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
@@ -16,7 +17,6 @@ from hvt_study.flights.flight import FlightPlan, FlightReport, dry_run, fly
 from hvt_study.flights.flight_ground import SharedModels
 from hvt_study.peers.dds import fly_dds
 from hvt_study.peers.dds_settings import DdsSettings
-from hvt_study.runs.materials import CONFIDENCE
 from hvt_study.runs.methods import METHODS, Kind
 from hvt_study.runs.run_context import RunContext
 from hvt_study.runs.spec import RunSpec
@@ -28,10 +28,16 @@ def edge_flags(spec: RunSpec, *, budget_bps: int, fps: float | None) -> tuple[st
     """What ``hvt-edge`` is started with, but for the source; a peer's settings in words of its own."""
     method = METHODS[spec.method]
     if method.kind is Kind.PEER:
-        return (spec.method, f"{spec.size[0]}x{spec.size[1]}", f"{budget_bps}bps", str(_dds_settings(fps)))
+        return (
+            spec.method,
+            f"{spec.size[0]}x{spec.size[1]}",
+            f"{budget_bps}bps",
+            str(_dds_settings(spec, fps)),
+        )
     width, height = spec.size
     flags = ["--pace", "lockstep", "--detector", spec.models.edge_detector, "--size", f"{width}x{height}"]
-    flags += ["--budget", f"{budget_bps}bps", "--threads", "1", "--confidence", f"{CONFIDENCE:g}"]
+    confidence = default_confidence(spec.models.edge_detector)
+    flags += ["--budget", f"{budget_bps}bps", "--threads", "1", "--confidence", f"{confidence:g}"]
     flags += ["--provider", spec.models.provider, "--detect-every", f"{spec.detect_every}", *method.flags]
     if method.sends_stills:
         flags += ["--still-codec", spec.still_codec]
@@ -70,7 +76,7 @@ def flown(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | N
             link_bps=spec.budget_bps,
             size=spec.size,
             detector=context.detector,
-            settings=_dds_settings(fps),
+            settings=_dds_settings(spec, fps),
         )
     plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
     return fly(
@@ -87,7 +93,7 @@ def dry_run_bps(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: flo
 def settings(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> dict[str, Any]:
     """All settings of a flight, as JSON holds them."""
     if METHODS[spec.method].kind is Kind.PEER:
-        peer = {**asdict(_dds_settings(fps)), "budget_bps": budget_bps, "size": list(spec.size)}
+        peer = {**asdict(_dds_settings(spec, fps)), "budget_bps": budget_bps, "size": list(spec.size)}
         return {spec.method: peer}
     plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
     sides = {"edge": asdict(plan.edge), "ground": asdict(plan.ground)}
@@ -95,8 +101,8 @@ def settings(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float 
     return known
 
 
-def _dds_settings(fps: float | None) -> DdsSettings:
-    return DdsSettings(fps=fps)
+def _dds_settings(spec: RunSpec, fps: float | None) -> DdsSettings:
+    return DdsSettings(fps=fps, confidence=default_confidence(spec.models.detector))
 
 
 def _ground_config(spec: RunSpec) -> GroundConfig:
@@ -106,7 +112,7 @@ def _ground_config(spec: RunSpec) -> GroundConfig:
             detector=spec.models.detector,
             classifier=spec.models.classifier,
             refine=spec.models.refine,
-            confidence=CONFIDENCE,
+            confidence=default_confidence(spec.models.detector),
             detect_every=spec.detect_every,
             threads=1,
             provider=spec.models.provider,

@@ -23,6 +23,7 @@ def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
     pipe = tmp_path / "recording"
     os.mkfifo(pipe)  # opening it waits for a reader
     opened = threading.Event()
+    sinks: list[QueuedSink] = []
 
     def open_one(info) -> BacklogRecording:
         failures = Failures(time.time_ns)
@@ -34,6 +35,7 @@ def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
             detect_every=3,
         )
         sink = QueuedSink("recording", lambda: LineFile(pipe, ("a",)), failures=failures)
+        sinks.append(sink)
         opened.set()
         return BacklogRecording(info, sink=sink, perception=perception)
 
@@ -52,4 +54,4 @@ def test_a_recording_that_is_slow_to_open_holds_up_only_who_opens_it(tmp_path):
         assert backlog is not None
         assert recordings.acquire(info) is backlog
         recordings.close()
-        eventually(lambda: threading.active_count() == 1, within_s=20, what="its thread ends")
+        eventually(lambda: sinks[0].ended, within_s=20, what="its thread ends")

@@ -33,8 +33,8 @@ from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink
-from hvt_ground.sinks.rerun.gallery import SLOTS
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.rerun.stills.gallery import SLOTS
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.status import completed, summary, table
 from programs.rrd import Recording
@@ -379,7 +379,7 @@ def test_stills_of_an_outage_name_the_tracks_of_its_video(flight, tmp_path, own)
     assert (after.class_after, after.refined, after.label) == (
         "bus",
         True,
-        f"{FIRST_TRACK_ID} car → bus .90",
+        f"{FIRST_TRACK_ID} bus",
     )
 
 

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from hvt_common.protocol.messages import AlsoShown, RoiHeader
-from hvt_common.values import Detections, Posterior, View
+from hvt_common.values import Detections, View
 from hvt_common.video.base_crop import base_crop
 from hvt_common.video.hevc import BaseDecoder
 from hvt_common.video.still_codecs import still_codec
 from hvt_ground.events import Notice, Overlay, Refinement
 from hvt_ground.perception.pipeline import DecodedFrame, Pipeline, ReceivedStill
-from hvt_ground.perception.stills.classify import FrameReadings, ObjectReading
 from rigs.flight import CLASSES, Flight, RedSquares, SameAnswer, pipeline_of, square_box, tracks_at
 
 
@@ -147,13 +146,8 @@ def test_a_still_that_lies_about_itself_is_dropped(flight, pictures, changes):
 
 def test_a_name_of_any_language_and_length_goes_back_to_the_edge(flight, pictures):
     """A classifier with names in Chinese would end the ground at its first still."""
-
-    class Wordy(SameAnswer):
-        def read(self, stills, base_bgr):
-            wordy = Posterior("乗用車\n" * 30, 1.0, 0.0, np.array([0.0, 1.0], np.float32))
-            return FrameReadings(((ObjectReading(wordy),),) * len(stills))
-
-    rig = Rig(reader=Wordy())
+    wordy = "乗用車\n" * 30
+    rig = Rig(reader=SameAnswer(class_names=("car", wordy)), edge_classes=("car", wordy))
     rig.pipeline.analyze(pictures[0], hurry=False)
     rig.pipeline.read([received(flight, 0, 0)])
     (result,) = rig.pipeline.take_results()

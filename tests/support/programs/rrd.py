@@ -28,6 +28,8 @@ class ReadBox:
     reported: bool
     origin: int | None
     label: str
+    """Empty where there is none."""
+    doubted: bool = False
 
 
 class Recording:
@@ -86,9 +88,18 @@ class Recording:
     def boxes(self, frame: int) -> dict[int, ReadBox]:
         """Every track a viewer shows at a frame, by its id."""
         found: dict[int, ReadBox] = {}
-        for layer in ("tracks", "reported", "refined"):
+        for layer in ("tracks", "reported", "refined", "doubted"):
             found |= self._layer(layer, frame)
         return found
+
+    def words(self, frame: int) -> dict[int, tuple[str, tuple[float, float]]]:
+        """What is written on the picture, and the point that it is centred below, by track."""
+        texts = self.latest("/base/labels", "Points2D:labels", frame) or []
+        places = self.latest("/base/labels", "Points2D:positions", frame) or []
+        return {
+            int(text.split()[0]): (text, (place[0], place[1]))
+            for text, place in zip(texts, places, strict=True)
+        }
 
     def patches(self, frame: int) -> dict[int, tuple[float, float, float, bytes]]:
         """The stills on the enhanced picture at a frame: x, y, scale and JPEG, by slot."""
@@ -103,7 +114,8 @@ class Recording:
         return found
 
     def _layer(self, layer: str, frame: int) -> dict[int, ReadBox]:
-        entity, refined, reported = f"/base/{layer}", layer == "refined", layer == "reported"
+        entity, reported = f"/base/{layer}", layer == "reported"
+        refined, words = layer in ("refined", "doubted"), self.words(frame)
         shape = "Ellipses2D" if reported else "Boxes2D"
         ids = self.latest(entity, "track_id", frame) or []
         centres = self.latest(entity, f"{shape}:centers", frame) or []
@@ -112,9 +124,8 @@ class Recording:
         after = self.latest(entity, f"{shape}:class_ids", frame) or []
         confidences = self.latest(entity, "confidence_pct", frame) or []
         origins = self.latest(entity, "origin", frame) or [None] * len(ids)
-        labels = (self.latest(entity, "Boxes2D:labels", frame) or []) if refined else [""] * len(ids)
         names = self._class_names(entity)
-        rows = zip(ids, centres, halves, before, after, confidences, origins, labels, strict=True)
+        rows = zip(ids, centres, halves, before, after, confidences, origins, strict=True)
         return {
             track: ReadBox(
                 box_px=(c[0] - h[0], c[1] - h[1], c[0] + h[0], c[1] + h[1]),
@@ -124,9 +135,10 @@ class Recording:
                 refined=refined,
                 reported=reported,
                 origin=origin,
-                label=label,
+                label=words.get(track, ("",))[0],
+                doubted=layer == "doubted",
             )
-            for track, c, h, b, a, p, origin, label in rows
+            for track, c, h, b, a, p, origin in rows
         }
 
     def _class_names(self, entity: str) -> dict[int, str]:

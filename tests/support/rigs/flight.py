@@ -32,6 +32,7 @@ from hvt_ground.perception.fusion.fuse import Fusion, unified_names
 from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import DecodedStill, FrameReadings, ObjectReading
 from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.vocabulary import Vocabulary
 from media.clips import START_NS, framed, smooth_pictures
 
 __all__ = ["CLASSES", "Flight", "Port", "RedSquares", "SameAnswer", "pipeline_of", "square_box", "tracks_at"]
@@ -114,11 +115,13 @@ def pipeline_of(
     reader = reader or SameAnswer()
     names, places = unified_names(CLASSES, edge_classes)
     path = CameraPath(ahead_frames=15)
+    vocabulary = Vocabulary(names, reader.class_names)
     parts = PipelineParts(
         detector=detector or RedSquares(),
         tracker=ByteTracker(TrackerSettings.starting_at(0.25, camera_motion="off"), fps=15),
         reader=reader,
-        refiner=Refiner("replace", fps=15, detector_classes=names, classifier_classes=reader.class_names),
+        refiner=Refiner("replace", fps=15, vocabulary=vocabulary),
+        vocabulary=vocabulary,
         fusion=Fusion(fps=15, edge_classes=places, path=path),
         path=path,
     )

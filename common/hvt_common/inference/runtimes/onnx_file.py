@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 from hvt_common.errors import UserError
 
-__all__ = ["MAX_MODEL_BYTES", "check_onnx_file", "opset_versions"]
+__all__ = ["MAX_MODEL_BYTES", "check_onnx_file", "onnx_metadata", "opset_versions"]
 
 MAX_MODEL_BYTES = 1 << 30
 """1 GiB: the largest detectors are a fifth of it, and protobuf itself stops at 2 GiB."""
@@ -29,6 +29,7 @@ _EXTERNAL = 1
 _MODEL_FIELDS = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 14, 20, 25, 26})
 _GRAPH_FIELD = 7
 _OPSET_FIELD = 8
+_METADATA_FIELD = 14
 # Fields of onnx.proto that lead to tensors: message → field number → message.
 _INSIDE: Mapping[str, Mapping[int, str]] = MappingProxyType(
     {
@@ -76,6 +77,17 @@ def opset_versions(path: Path) -> dict[str, int]:
             _opset(data[begin:end])
             for field, _, _, begin, end in _fields(data, 0, len(data))
             if field == _OPSET_FIELD
+        )
+
+
+def onnx_metadata(path: Path) -> dict[str, str]:
+    """What the exporter wrote into a model. Raises `UserError` as `check_onnx_file` does."""
+    check_onnx_file(path)
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        return dict(
+            _metadata_entry(data[begin:end])
+            for field, _, _, begin, end in _fields(data, 0, len(data))
+            if field == _METADATA_FIELD
         )
 
 
@@ -138,6 +150,13 @@ def _opset(data: bytes) -> tuple[str, int]:
         elif field == 2:
             version = value
     return domain, version
+
+
+def _metadata_entry(data: bytes) -> tuple[str, str]:
+    """Decode a StringStringEntryProto: key is field 1, value field 2."""
+    entry = {field: data[begin:end] for field, _, _, begin, end in _fields(data, 0, len(data))}
+    key, value = (entry.get(field, b"").decode(errors="replace") for field in (1, 2))
+    return key, value
 
 
 def _fields(data: _Bytes, start: int, end: int) -> Iterator[tuple[int, int, int, int, int]]:

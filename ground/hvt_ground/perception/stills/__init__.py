@@ -1,1 +1,4 @@
-"""A still at the ground: `stage` takes it through `decode`, `classify` and `refine`, which finds its track."""
+"""A still at the ground: `stage` takes it through `decode`, `classify` and `refine`, which finds its track.
+
+`vocabulary` says what a classifier's words mean for a track.
+"""

@@ -6,7 +6,8 @@ base packet must not refine the wrong object. What cannot be decided yet is held
 when it never will be.
 
 ``replace`` is the paper's rule: the newest still's prediction is the class. ``fuse`` multiplies what all
-stills of the track say (see `TrackPosterior`). Frames are the only clock here.
+stills of the track say (see `TrackPosterior`). Either way a track that is *nothing of mine* is doubted. Frames are
+the only clock here.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from hvt_common.values import Tracks
 from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.match import Matcher, StillToMatch, TrackMatch
-from hvt_ground.perception.stills.posterior import ClassEstimate, ClassNames, TrackPosterior
+from hvt_ground.perception.stills.posterior import ClassEstimate, TrackPosterior
 from hvt_ground.perception.stills.resolved import (
     Outcome,
     ResolvedStill,
@@ -29,6 +30,7 @@ from hvt_ground.perception.stills.resolved import (
     StillContext,
     StillSeen,
 )
+from hvt_ground.perception.stills.vocabulary import Vocabulary
 
 __all__ = [
     "Mode",
@@ -84,6 +86,7 @@ class Refiner:
     a track that was detected but not confirmed then. A track's class is remembered for ``forget_s`` after its last
     frame, more than a lost track may take to be found again. ``iou`` is the least overlap of a still's box with a
     track's: half is the usual threshold of benchmarks, and boxes of two similar neighbours rarely reach it both.
+    ``calibrated``: what the reader of stills says are probabilities; else nothing is ever sure.
     """
 
     def __init__(
@@ -91,8 +94,8 @@ class Refiner:
         mode: Mode,
         *,
         fps: float,
-        detector_classes: tuple[str, ...],
-        classifier_classes: tuple[str, ...],
+        vocabulary: Vocabulary,
+        calibrated: bool = False,
         hold_s: float = 3.0,
         confirm_s: float = 1.0,
         forget_s: float = 10.0,
@@ -100,7 +103,8 @@ class Refiner:
     ) -> None:
         self.counters = RefinementCounters()
         self._mode = mode
-        self._class_names = ClassNames(detector_classes, classifier_classes)
+        self._vocabulary = vocabulary
+        self._calibrated = calibrated
         self._hold_frames = round(hold_s * fps)
         self._confirm_frames = round(confirm_s * fps)
         self._forget_frames = round(forget_s * fps)
@@ -174,17 +178,20 @@ class Refiner:
 
     def preview(self, tracks: Tracks) -> ShownClasses:
         """The classes that would be shown for these tracks; changes nothing, so any frame may be asked for."""
-        base_classes = tuple(self._class_names.detector[class_id] for class_id in tracks.class_ids)
+        names = self._vocabulary.names
+        base_classes = tuple(names[class_id] for class_id in tracks.class_ids)
         classes = list(base_classes)
         confidences = tracks.confidences.astype(np.float32)  # a copy
-        refined = np.zeros(len(tracks), np.bool_)
+        refined, doubted, sure = (np.zeros(len(tracks), np.bool_) for _ in range(3))
         for row, track_id in enumerate(tracks.ids.tolist()):
             class_posterior = self._track_posteriors.get(track_id)
             if class_posterior is None:
                 continue
             reading = self._read(class_posterior, tracks, row)
-            classes[row], confidences[row], refined[row] = reading.class_name, reading.confidence, True
-        return ShownClasses(base_classes, tuple(classes), confidences, refined)
+            classes[row], confidences[row], refined[row] = names[reading.class_id], reading.confidence, True
+            doubted[row] = reading.class_id == self._vocabulary.nothing
+            sure[row] = self._is_sure(reading)
+        return ShownClasses(base_classes, tuple(classes), confidences, refined, doubted, sure)
 
     # One frame's stills.
 
@@ -264,7 +271,7 @@ class Refiner:
         last = min(tracks.frame_index + self._confirm_frames, newest)
         later = (history.tracks(frame_index) for frame_index in range(tracks.frame_index + 1, last + 1))
         return self._matcher.match(
-            wanted, tracks, later=(t for t in later if t is not None), class_names=self._class_names.detector
+            wanted, tracks, later=(t for t in later if t is not None), class_names=self._vocabulary.names
         )
 
     def _apply(self, still: StillSeen, tracks: Tracks, row: int) -> ResolvedStill:
@@ -272,28 +279,34 @@ class Refiner:
         track_id = int(tracks.ids[row])
         class_posterior = self._track_posteriors.get(track_id)
         if class_posterior is None:
-            before = self._class_names.detector[tracks.class_ids[row]]
+            before = int(tracks.class_ids[row])
             class_posterior = self._track_posteriors[track_id] = TrackPosterior(tracks.frame_index)
             self.counters.tracks_refined += 1
             if len(self._track_posteriors) > MAX_TRACK_POSTERIORS:
                 self._track_posteriors.popitem(last=False)
         else:
-            before = self._read(class_posterior, tracks, row).class_name
+            before = self._read(class_posterior, tracks, row).class_id
         newest = class_posterior.update(
-            still.posterior, self._class_names, order=(still.frame_index, still.sequence), news=still.news
+            still.posterior,
+            order=(still.frame_index, still.sequence),
+            side_px=still.side_px,
+            news=still.news,
         )
         self._touch(track_id, class_posterior, still.frame_index)
         after = self._read(class_posterior, tracks, row)
         self.counters.matched += 1
-        self.counters.class_changes += after.class_name != before
+        self.counters.class_changes += after.class_id != before
+        names = self._vocabulary.names
         return ResolvedStill(
             still=still,
             outcome="matched" if newest or self._mode == "fuse" else "superseded",
             track_id=track_id,
-            class_before=before,
-            class_after=after.class_name,
+            class_before=names[before],
+            class_after=names[after.class_id],
             confidence=after.confidence,
             entropy_nats=after.entropy_nats,
+            doubted=after.class_id == self._vocabulary.nothing,
+            sure=self._is_sure(after),
         )
 
     def _unmatched(self, still: StillSeen, outcome: Outcome) -> ResolvedStill:
@@ -308,16 +321,20 @@ class Refiner:
             class_after=said.class_name,
             confidence=said.confidence,
             entropy_nats=said.entropy_nats,
+            doubted=self._vocabulary.says_nothing(said.class_name),
         )
 
     # The posterior of each track.
 
     def _read(self, class_posterior: TrackPosterior, tracks: Tracks, row: int) -> ClassEstimate:
         if self._mode == "replace":
-            return class_posterior.newest()
+            return class_posterior.newest(self._vocabulary, class_id=int(tracks.class_ids[row]))
         return class_posterior.fused(
-            self._class_names, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
+            self._vocabulary, class_id=int(tracks.class_ids[row]), confidence=float(tracks.confidences[row])
         )
+
+    def _is_sure(self, reading: ClassEstimate) -> bool:
+        return self._calibrated and reading.sure and reading.class_id != self._vocabulary.nothing
 
     def _touch(self, track_id: int, class_posterior: TrackPosterior, frame_index: int) -> None:
         class_posterior.last_frame = max(class_posterior.last_frame, frame_index)

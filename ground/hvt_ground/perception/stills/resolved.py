@@ -63,8 +63,10 @@ class StillSeen:
     class_name: str
     """What the edge's detector called it."""
     posterior: Posterior
-    """Of the classifier, over the `Refiner`'s ``classifier_classes``."""
+    """What it says of the object, over `Vocabulary.names`."""
     context: StillContext
+    side_px: float
+    """The shorter side of the object, source pixels."""
     news: float = 1.0
     """How much the still shows that the base did not, 0…1; see `news`."""
     part: int = 0
@@ -95,6 +97,10 @@ class ResolvedStill:
     """Of ``class_after``, 0…1."""
     entropy_nats: float
     """Of the distribution that ``class_after`` was taken from."""
+    doubted: bool = False
+    """``class_after`` is nothing of mine."""
+    sure: bool = False
+    """``class_after`` has a calibrated probability above .9."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,3 +113,7 @@ class ShownClasses:
     """(N,) of ``classes``, 0…1."""
     refined: npt.NDArray[np.bool_]
     """(N,) True once a still has refined it."""
+    doubted: npt.NDArray[np.bool_]
+    """(N,) True where stills say that it is nothing of mine."""
+    sure: npt.NDArray[np.bool_]
+    """(N,) True where stills agree on the class with a calibrated probability above .9."""

@@ -18,6 +18,7 @@ from hvt_ground.perception.history import History
 from hvt_ground.perception.stills.classify import Box, DecodedStill, ObjectReading, StillReader
 from hvt_ground.perception.stills.decode import ReceivedStill, decode_still, needs_base
 from hvt_ground.perception.stills.refine import Refiner, ResolvedStill, StillContext, StillSeen
+from hvt_ground.perception.stills.vocabulary import Vocabulary, Vote
 
 __all__ = ["Progress", "StillStage"]
 
@@ -43,7 +44,8 @@ class Progress:
 class StillStage:
     """One session's stills. Used by one thread; ``emit`` takes the events.
 
-    ``wants_base``: ``reader`` uses the base frame, so all stills wait for theirs, not only residuals.
+    ``vocabulary`` is that of ``reader`` and ``refiner``. ``wants_base``: ``reader`` uses the base frame, so all
+    stills wait for theirs, not only residuals.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class StillStage:
         reader: StillReader,
         refiner: Refiner,
         *,
+        vocabulary: Vocabulary,
         history: History,
         fusion: Fusion,
         view: View,
@@ -60,6 +63,7 @@ class StillStage:
     ) -> None:
         self._reader = reader
         self._refiner = refiner
+        self._vocabulary = vocabulary
         self._history = history
         self._gap_frames = gap_frames
         self._fusion = fusion
@@ -180,12 +184,14 @@ class StillStage:
         shown = zip(_shown(header), decoded.boxes_base_px, objects, strict=True)
         for part, ((track_id, _), box, reading) in enumerate(shown):
             context = StillContext(still, decoded, track_id, box, reading.box_base_px, crop)
-            self._answer(header, track_id, reading.posterior)
-            if reading.posterior is None:
+            side_px = min(box[2] - box[0], box[3] - box[1]) / self._view.scale
+            vote = self._vote(reading, called=header.class_name, side_px=side_px)
+            self._answer(header, track_id, vote.posterior)
+            if vote.posterior is None:
                 self.outcomes["unread"] += 1
                 name = header.class_name
                 unread = self._refinement(context, now, None, name, name, header.confidence)
-                self._emit(replace(unread, unread=True))
+                self._emit(replace(unread, unread=True, note=vote.note))
                 continue
             seen = StillSeen(
                 sequence=header.sequence,
@@ -194,14 +200,20 @@ class StillStage:
                 edge_track_id=track_id,
                 box_base_px=box,
                 class_name=header.class_name,
-                posterior=reading.posterior,
+                posterior=vote.posterior,
                 context=context,
+                side_px=side_px,
                 news=news,
                 part=part,
                 stored=bool(header.flags & Flags.STORED),
             )
             for resolved in self._refiner.offer(seen, now_frame=now.frame_index):
                 self._resolved(resolved, now)
+
+    def _vote(self, reading: ObjectReading, *, called: str, side_px: float) -> Vote:
+        if reading.posterior is None:
+            return Vote(None)
+        return self._vocabulary.vote(reading.posterior, called=called, side_px=side_px)
 
     def _news(self, decoded: DecodedStill) -> float:
         """How much a still shows that the base did not, 0…1.
@@ -228,7 +240,8 @@ class StillStage:
                 frame_index = resolved.still.frame_index
                 self._fusion.take_box(track_id, context.found_base_px, frame_index=frame_index)
         before, after = resolved.class_before, resolved.class_after
-        self._emit(self._refinement(context, now, track_id, before, after, resolved.confidence))
+        refinement = self._refinement(context, now, track_id, before, after, resolved.confidence)
+        self._emit(replace(refinement, doubted=resolved.doubted, sure=resolved.sure))
 
     def _refinement(
         self,

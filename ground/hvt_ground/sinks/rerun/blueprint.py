@@ -5,12 +5,16 @@ from __future__ import annotations
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hvt_ground.sinks.rerun.gallery import CANVAS
+from hvt_ground.sinks.rerun.labels import LEGEND_POINTS, points
+from hvt_ground.sinks.rerun.stills.gallery import CANVAS
 
 __all__ = [
     "BITRATE",
+    "DOUBTED",
     "EVENTS",
+    "LABELS",
     "LATENCY",
+    "LEGEND",
     "OVERFLOW",
     "PATCHES",
     "REFINED",
@@ -27,6 +31,9 @@ VIDEO = "/base/video"
 TRACKS = "/base/tracks"
 REFINED = "/base/refined"
 REPORTED = "/base/reported"
+DOUBTED = "/base/doubted"
+LABELS = "/base/labels"
+LEGEND = "/base/legend"
 PATCHES = "/base/patches"
 STILLS = "/stills"
 OVERFLOW = "/stills/more"
@@ -50,7 +57,7 @@ def screen(
     plotted where ``clocked``; ``live`` follows the newest data rather than play from the beginning.
     """
     left = rrb.Vertical(_videos(base_size), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
-    right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.35, 0.62, 0.93])
+    right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.3, 0.67, 0.93])
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1.72, 1.0]),
         rrb.BlueprintPanel(state="hidden"),
@@ -71,7 +78,12 @@ def _videos(base_size: tuple[int, int]) -> rrb.Tabs:
     return rrb.Tabs(
         _video(base_size, "Base stream and tracks", without=(f"{PATCHES}/**",)),
         # Boxes say which objects a still has spoken on; thin and without words, for the picture is the matter.
-        _video(base_size, "Enhanced: stills in their places", without=(TRACKS, REPORTED), bare=REFINED),
+        _video(
+            base_size,
+            "Enhanced: stills in their places",
+            without=(TRACKS, REPORTED, DOUBTED, LABELS),
+            bare=REFINED,
+        ),
     )
 
 
@@ -84,7 +96,10 @@ def _video(
         contents=["/base/**", *(f"- {path}" for path in without)],
         name=name,
         background=_PAPER,
-        visual_bounds=rrb.VisualBounds2D(x_range=[0, base_size[0]], y_range=[0, base_size[1]]),
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=[0, base_size[0]],
+            y_range=[0, base_size[1] + points(LEGEND_POINTS, base_size[0])],
+        ),
         defaults=[rr.EncodedImage.from_fields(media_type="image/jpeg")],
         overrides={bare: style} if bare is not None else None,
     )

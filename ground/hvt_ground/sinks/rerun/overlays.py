@@ -1,27 +1,30 @@
 """What of an overlay is worth writing: only what a viewer would see change.
 
 A recording answers "what was here at frame N" with the latest value of every component, so a value that did not
-change need not be written again. Tracks are in three layers: those that the base stream shows and whose class rests
-on it alone, those known from reports only, and those that a still has spoken on.
+change need not be written again. Tracks are in four layers: those that the base stream shows and whose class rests
+on it alone, those known from reports only, those that a still has spoken on, and those that stills doubt. Brightness
+follows the probability. Words stand only at tracks that a still renamed or doubts, or that somebody chose.
 
 Boxes are held against jitter: a box keeps the place that is on screen until it has moved more than `CENTRE_STEP_PX`
 or grown more than `HALF_SIZE_STEP_PX`, and is then put on the nearest half pixel. Equal numbers in equal places are
-what the LZ4 compression of a chunk removes. A confidence is held in the same way.
+what the LZ4 compression of a chunk removes. A confidence, its brightness and a label's side are held in the same way.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from hvt_ground.events import Origin, Overlay
+from hvt_ground.sinks.rerun.labels import Label, Word, place_labels
 
 __all__ = [
+    "BRIGHTNESS",
     "CENTRE_STEP_PX",
     "HALF_SIZE_STEP_PX",
     "LAYERS",
@@ -39,8 +42,14 @@ CENTRE_STEP_PX = 0.75
 HALF_SIZE_STEP_PX = 1.0
 CONFIDENCE_STEP_PCT = 5
 
-Layer = Literal["tracks", "reported", "refined"]
-LAYERS: tuple[Layer, ...] = ("tracks", "reported", "refined")
+BRIGHTNESS = (0.45, 0.75, 1.0)
+"""By level: a probability below one half; above; a still said it, and its calibrated probability is above .9."""
+_FAINT, _LIKELY, _SURE = range(3)
+_FAINT_BELOW_PCT, _LIKELY_FROM_PCT = 45, 55
+_MOST_CHOSEN = 8
+
+Layer = Literal["tracks", "reported", "refined", "doubted", "labels"]
+LAYERS: tuple[Layer, ...] = ("tracks", "reported", "refined", "doubted", "labels")
 
 ORIGINS: tuple[Origin, ...] = ("base", "edge", "edge+base", "still")
 """Origins by the number that stands for them in a recording."""
@@ -61,6 +70,8 @@ class Identity:
     track_ids: tuple[int, ...] = ()
     classes_before: tuple[str, ...] = ()
     classes_after: tuple[str, ...] = ()
+    levels: tuple[int, ...] = ()
+    """Of `BRIGHTNESS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +81,8 @@ class LayerUpdate:
     layer: Layer
     components: Mapping[str, Any]
     """``boxes``: (N, 4) float32 centre and half size, whole or half base pixels; ``identity``: an `Identity`;
-    ``labels``: N texts, in the layer ``refined`` only; ``confidences``: N percents; ``origins``: N numbers of
-    `ORIGINS`."""
+    ``confidences``: N percents; ``origins``: N numbers of `ORIGINS`. Of the layer ``labels``: ``places``: (M, 2)
+    float32 points that a text is centred below; ``words``: M texts; ``inks``: M pairs of class and level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +93,10 @@ class _Screen:
     boxes: npt.NDArray[np.float32]
     """(N, 4) centre and half size."""
     percents: npt.NDArray[np.int64]
+    levels: npt.NDArray[np.int64]
+    """(N,) of `BRIGHTNESS`."""
+    sides: Mapping[int, int]
+    """Where labels are, by track."""
 
 
 class OverlayEncoder:
@@ -89,17 +104,30 @@ class OverlayEncoder:
 
     Movement is written at the overlay's own rate while it costs less than ``share`` of the bytes received (and
     ``credit_bytes`` before that), and less often beyond; a change of the set of tracks, of a class or of a label is
-    always written. ``afresh`` writes the first overlay whole.
+    always written. ``afresh`` writes the first overlay whole. ``size`` is (width, height) of the picture.
     """
 
-    def __init__(self, *, share: float = 0.125, credit_bytes: int = 16_384, afresh: bool = False) -> None:
+    def __init__(
+        self,
+        size: tuple[int, int],
+        *,
+        share: float = 0.125,
+        credit_bytes: int = 16_384,
+        afresh: bool = False,
+    ) -> None:
+        self._size = size
+        self._chosen: deque[int] = deque(maxlen=_MOST_CHOSEN)
         self._share = share
         self._limit = self._credit = float(credit_bytes)
         self._newest_frame = -1
         nothing = np.empty((0, 4), np.float32)
-        self._screen = _Screen(np.empty(0, np.int64), nothing, np.empty(0, np.int64))
-        empty = {"boxes": nothing, "identity": Identity(), "labels": (), "confidences": (), "origins": ()}
-        self._written: dict[Layer, Mapping[str, Any]] = {layer: {} if afresh else empty for layer in LAYERS}
+        none = np.empty(0, np.int64)
+        self._screen = _Screen(none, nothing, none, none, {})
+        empty = {"boxes": nothing, "identity": Identity(), "confidences": (), "origins": ()}
+        silent = {"places": nothing[:, :2], "words": (), "inks": ()}
+        self._written: dict[Layer, Mapping[str, Any]] = {
+            layer: {} if afresh else silent if layer == "labels" else empty for layer in LAYERS
+        }
 
     @property
     def screen(self) -> list[LayerUpdate]:
@@ -110,6 +138,10 @@ class OverlayEncoder:
         """Credit the share of what was received on the link."""
         self._credit = min(self._credit + self._share * received_bytes, self._limit)
 
+    def choose(self, track_id: int) -> None:
+        """Somebody asked for this track: it is labelled, as long as it is among the last ones."""
+        self._chosen.append(track_id)
+
     def encode(self, overlay: Overlay) -> list[LayerUpdate]:
         """The updates that bring the screen to ``overlay``; none where nothing visible changed.
 
@@ -119,7 +151,10 @@ class OverlayEncoder:
             return []
         self._newest_frame = overlay.frame_index
         screen = _held(self._screen, overlay)
+        labels = _labels(overlay, screen, self._size, self._chosen)
+        screen = replace(screen, sides={int(screen.ids[one.row]): one.side for one in labels})
         wanted = dict(_layers(overlay, screen))
+        wanted["labels"] = _label_components(overlay, screen, labels)
         updates = []
         for layer, components in wanted.items():
             old = self._written[layer]
@@ -133,10 +168,11 @@ class OverlayEncoder:
 
     def _affordable(self, updates: list[LayerUpdate]) -> bool:
         cost = sum(
-            _movement_bytes(self._written[one.layer].get("boxes"), one.components.get("boxes"))
+            _movement_bytes(self._written[one.layer].get(name), one.components.get(name))
             for one in updates
+            for name in ("boxes", "places")
         )
-        if cost > self._credit and not any({"identity", "labels"} & one.components.keys() for one in updates):
+        if cost > self._credit and not any({"identity", "words"} & one.components.keys() for one in updates):
             return False
         self._credit -= cost
         return True
@@ -162,7 +198,8 @@ class BacklogOverlays:
     base stream leaves out frames. Of one recording; not safe for threads.
     """
 
-    def __init__(self, *, fps: float, least_s: float = 1.0) -> None:
+    def __init__(self, size: tuple[int, int], *, fps: float, least_s: float = 1.0) -> None:
+        self._size = size
         self._least = max(2, round(least_s * fps))
         self._continues = round(_CONTINUES_S * fps)
         self._newest: int | None = None
@@ -201,7 +238,7 @@ class BacklogOverlays:
             hole.written = True
             timed += [(hole.after, hole.capture_ns, update) for update in hole.screen]
         if self._encoder is None or not 0 < frame - self._last <= self._continues:
-            self._encoder = OverlayEncoder(afresh=True)
+            self._encoder = OverlayEncoder(self._size, afresh=True)
         self._last = frame
         self._encoder.earn(self._credit_bytes)
         self._credit_bytes = 0
@@ -213,7 +250,10 @@ def _held(screen: _Screen, overlay: Overlay) -> _Screen:
     corners = overlay.boxes_base_px
     boxes = np.hstack((corners[:, :2] + corners[:, 2:], corners[:, 2:] - corners[:, :2])) / 2
     percents = np.round(overlay.confidences * 100).astype(np.int64)
-    result = _Screen(overlay.track_ids.copy(), (np.round(boxes * 2) / 2).astype(np.float32), percents.copy())
+    sure = np.zeros(len(percents), np.bool_) if overlay.sure is None else overlay.sure
+    levels = np.where(percents < 50, _FAINT, _LIKELY)
+    ids = overlay.track_ids.copy()
+    result = _Screen(ids, (np.round(boxes * 2) / 2).astype(np.float32), percents.copy(), levels, screen.sides)
     _, new, old = np.intersect1d(overlay.track_ids, screen.ids, assume_unique=True, return_indices=True)
     moved = np.abs(boxes[new] - screen.boxes[old])
     for columns, step_px in ((slice(2), CENTRE_STEP_PX), (slice(2, 4), HALF_SIZE_STEP_PX)):
@@ -221,17 +261,21 @@ def _held(screen: _Screen, overlay: Overlay) -> _Screen:
         result.boxes[new[near], columns] = screen.boxes[old[near], columns]
     near = np.abs(percents[new] - screen.percents[old]) < CONFIDENCE_STEP_PCT
     result.percents[new[near]] = screen.percents[old[near]]
+    between = (percents[new] >= _FAINT_BELOW_PCT) & (percents[new] < _LIKELY_FROM_PCT)
+    levels[new[between]] = np.minimum(screen.levels[old[between]], _LIKELY)
+    levels[sure] = _SURE
     return result
 
 
 def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str, Any]]]:
     """All components of each layer."""
     origins = overlay.origins or ("base",) * len(overlay.track_ids)
-    reported = np.array([origin in _REPORTED for origin in origins], np.bool_)
+    reported, doubted = _reported(overlay), _doubted(overlay)
     of_layer: dict[Layer, npt.NDArray[np.bool_]] = {
         "tracks": ~overlay.refined & ~reported,
         "reported": ~overlay.refined & reported,
-        "refined": overlay.refined,
+        "refined": overlay.refined & ~doubted,
+        "doubted": overlay.refined & doubted,
     }
     for layer, mask in of_layer.items():
         rows = np.flatnonzero(mask).tolist()
@@ -241,12 +285,11 @@ def _layers(overlay: Overlay, screen: _Screen) -> Iterator[tuple[Layer, dict[str
                 tuple(overlay.track_ids[mask].tolist()),
                 tuple(overlay.base_classes[row] for row in rows),
                 tuple(overlay.classes[row] for row in rows),
+                tuple(screen.levels[mask].tolist()),
             ),
             "confidences": tuple(screen.percents[mask].tolist()),
             "origins": tuple(ORIGINS.index(origins[row]) for row in rows),
         }
-        if layer == "refined":
-            components["labels"] = tuple(_label(overlay, screen, row, reported=reported[row]) for row in rows)
         yield layer, components
 
 
@@ -262,17 +305,43 @@ def _movement_bytes(old: npt.NDArray[np.float32] | None, new: npt.NDArray[np.flo
         return 0
     if old is None or len(old) != len(new):
         return _ROW_BYTES + _BOX_BYTES * len(new)
-    moved = (old != new).reshape(-1, 2, 2).any(axis=2)  # centre, half size
+    moved = (old != new).reshape(len(new), -1, 2).any(axis=2)  # centre, half size
     return _ROW_BYTES + _BOX_BYTES // 2 * int(moved.sum())
 
 
-def _label(overlay: Overlay, screen: _Screen, row: int, *, reported: bool) -> str:
-    """``17 ✓`` where the still agreed with the base stream, ``17 car → van .93`` where it did not."""
-    mark = f" {REPORTED_MARK}" if reported else ""
-    track_id, before, after = overlay.track_ids[row], overlay.base_classes[row], overlay.classes[row]
-    if before == after:
-        return f"{track_id} ✓{mark}"
-    return f"{track_id} {before} → {after} {confidence_text(int(screen.percents[row]))}{mark}"
+def _reported(overlay: Overlay) -> npt.NDArray[np.bool_]:
+    origins = overlay.origins or ("base",) * len(overlay.track_ids)
+    return np.array([origin in _REPORTED for origin in origins], np.bool_)
+
+
+def _doubted(overlay: Overlay) -> npt.NDArray[np.bool_]:
+    return np.zeros(len(overlay.track_ids), np.bool_) if overlay.doubted is None else overlay.doubted
+
+
+def _labels(overlay: Overlay, screen: _Screen, size: tuple[int, int], chosen: Container[int]) -> list[Label]:
+    """Of the tracks that a still renamed or doubts, or that were chosen, as far as there is room."""
+    doubted, reported = _doubted(overlay), _reported(overlay)
+    words = []
+    for row, track_id in enumerate(screen.ids.tolist()):
+        renamed = overlay.base_classes[row] != overlay.classes[row]
+        if not renamed and track_id not in chosen:
+            continue
+        mark = f" {REPORTED_MARK}" if reported[row] else ""
+        name = f"{overlay.base_classes[row]}?" if doubted[row] else overlay.classes[row]
+        certain = " ✓" if screen.levels[row] == _SURE else ""
+        words.append(Word(row, f"{track_id} {name}{certain}{mark}"))
+    centres, halves = screen.boxes[:, :2].astype(np.float64), screen.boxes[:, 2:].astype(np.float64)
+    boxes = np.hstack([centres - halves, centres + halves])
+    sides = {row: screen.sides[one] for row, one in enumerate(screen.ids.tolist()) if one in screen.sides}
+    return place_labels(words, boxes, size=size, sides=sides)
+
+
+def _label_components(overlay: Overlay, screen: _Screen, labels: Sequence[Label]) -> dict[str, Any]:
+    return {
+        "places": np.round(np.array([one.at_px for one in labels], np.float32).reshape(-1, 2)),
+        "words": tuple(one.text for one in labels),
+        "inks": tuple((overlay.classes[one.row], int(screen.levels[one.row])) for one in labels),
+    }
 
 
 def confidence_text(percent: int) -> str:

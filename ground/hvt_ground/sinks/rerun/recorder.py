@@ -23,6 +23,7 @@ from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, Tr
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.live_view import LiveRecording
 from hvt_ground.sinks.rerun.overlays import (
+    BRIGHTNESS,
     LAYERS,
     BacklogOverlays,
     Identity,
@@ -33,25 +34,26 @@ from hvt_ground.sinks.rerun.overlays import (
 from hvt_ground.sinks.rerun.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun.rrd_file import RrdFile
 from hvt_ground.sinks.rerun.sdk import RecordingId
-from hvt_ground.sinks.rerun.static_data import class_chunk, session_chunk, static_chunks
-from hvt_ground.sinks.rerun.stills import StillRows
+from hvt_ground.sinks.rerun.static_data import class_chunk, legend_chunk, session_chunk, static_chunks
+from hvt_ground.sinks.rerun.stills.rows import StillRows
 from hvt_ground.sinks.rerun.tables import TABLE_BYTES, CodedIdentity, LogText, SizeLimit, Table, TableRow
 
 __all__ = ["Recorder", "RecorderSettings"]
 
 log = logging.getLogger(__name__)
 
+ON_DEMAND = "asked"
+"""The reason of a still that somebody asked for: its track is chosen."""
 _PLOT_GAP_NS = 2_500_000_000
 """Plots have a hole where nothing was measured for longer."""
-DIMMED = 0.75
-"""Brightness of the boxes that no still has spoken on, beside those one has."""
-
-_BYTES_EACH = {"boxes": 6, "identity": 2, "labels": 5}
+_BYTES_EACH = {"boxes": 6, "identity": 2, "places": 4, "words": 5}
 """About what the component costs a track; others cost little more than their row."""
 _LAYER_PATHS: dict[Layer, str] = {
     "tracks": names.TRACKS,
     "reported": names.REPORTED,
     "refined": names.REFINED,
+    "doubted": names.DOUBTED,
+    "labels": names.LABELS,
 }
 _NOTICE_COLOURS: dict[str, Rgb] = {"info": GREY, "warning": AMBER, "error": VERMILLION}
 _NOTICE_LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
@@ -88,11 +90,13 @@ class Recorder:
     """
 
     def __init__(self, settings: RecorderSettings) -> None:
-        self._overlays = OverlayEncoder()
-        self._backlog_overlays = BacklogOverlays(fps=settings.fps)
+        self._overlays = OverlayEncoder(settings.base_size)
+        self._backlog_overlays = BacklogOverlays(settings.base_size, fps=settings.fps)
         self._size_limit = SizeLimit()
         self._stills = StillRows(self._size_limit)
-        self._class_ids: dict[str, int] = {}
+        self._class_ids: dict[tuple[str, int], int] = {}
+        """By name and level of brightness."""
+        self._legend: tuple[str, ...] = ()
         self._classes_written: dict[Layer, int] = dict.fromkeys(LAYERS, 0)
         self._contexts: dict[str, Chunk] = {}
         """Static values since the last compaction, by what they are."""
@@ -251,6 +255,9 @@ class Recorder:
             columns, value, count = name, component, 32
             if name == "boxes":
                 columns, count = shape, len(component)
+            elif name == "inks":
+                value = tuple(self._class_id(*ink) for ink in component)
+                rows += self._new_classes(update.layer)
             elif name == "identity":
                 columns, value, count = (
                     f"identity of {shape}",
@@ -258,28 +265,35 @@ class Recorder:
                     len(component.track_ids),
                 )
                 rows += self._new_classes(update.layer)
-            elif name == "labels":
+            elif name in ("places", "words"):
                 count = len(component)
             rows.append(TableRow(path, columns, value, _BYTES_EACH.get(name, 2) * count, at))
         return rows
 
     def _coded(self, identity: Identity) -> CodedIdentity:
-        before, after = (
-            tuple(self._class_ids.setdefault(name, len(self._class_ids)) for name in classes)
-            for classes in (identity.classes_before, identity.classes_after)
-        )
-        return CodedIdentity(identity.track_ids, before, after)
+        before = tuple(self._class_id(name, len(BRIGHTNESS) - 1) for name in identity.classes_before)
+        shown = zip(identity.classes_after, identity.levels, strict=True)
+        return CodedIdentity(identity.track_ids, before, tuple(self._class_id(*one) for one in shown))
+
+    def _class_id(self, name: str, level: int) -> int:
+        return self._class_ids.setdefault((name, level), len(self._class_ids))
 
     def _new_classes(self, layer: Layer) -> list[Chunk]:
         """Names and colours, where some are new to the layer."""
         if self._classes_written[layer] == len(self._class_ids):
             return []
         self._classes_written[layer] = len(self._class_ids)
-        share = 1.0 if layer == "refined" else DIMMED
-        self._contexts[layer] = class_chunk(_LAYER_PATHS[layer], self._class_ids, share=share)
-        return [self._contexts[layer]]
+        self._contexts[layer] = class_chunk(_LAYER_PATHS[layer], self._class_ids)
+        shown = tuple(dict.fromkeys(name for name, _ in self._class_ids))
+        if shown == self._legend:
+            return [self._contexts[layer]]
+        self._legend = shown
+        self._contexts["legend"] = legend_chunk(shown, size=self._settings.base_size)
+        return [self._contexts[layer], self._contexts["legend"]]
 
     def _refinement(self, refinement: Refinement) -> list[TableRow]:
+        if refinement.reason == ON_DEMAND and refinement.track_id is not None:
+            self._overlays.choose(refinement.track_id)
         before = self._size_limit.received_bytes
         rows = self._stills.refinement(refinement)
         self._overlays.earn(self._size_limit.received_bytes - before)

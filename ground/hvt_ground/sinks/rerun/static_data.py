@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import rerun as rr
 from rerun.chunk import Chunk
 
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.gallery import SLOTS
-from hvt_ground.sinks.rerun.overlays import REPORTED_MARK
+from hvt_ground.sinks.rerun.labels import place_legend
+from hvt_ground.sinks.rerun.overlays import BRIGHTNESS, REPORTED_MARK
 from hvt_ground.sinks.rerun.palette import (
     BASE_LINE,
     BUDGET_LINE,
@@ -19,9 +19,10 @@ from hvt_ground.sinks.rerun.palette import (
     class_colour,
     dimmed,
 )
+from hvt_ground.sinks.rerun.stills.gallery import SLOTS
 from hvt_ground.sinks.rerun.tables import static_chunk
 
-__all__ = ["class_chunk", "session_chunk", "static_chunks"]
+__all__ = ["class_chunk", "legend_chunk", "session_chunk", "static_chunks"]
 
 _BITRATE = (
     ("total", TOTAL_LINE, 1.5),
@@ -33,8 +34,8 @@ _LATENCY = (("to receive", BASE_LINE, 2.0), ("to overlay", STILL_LINE, 2.0))
 _TRACKS = (("tracks", GREY, 2.0), ("refined", STILL_LINE, 2.5))
 
 _LEGEND = (
-    f"□ seen on the base  ·  {REPORTED_MARK} reported by edge or still only  ·  "
-    "**thick** a still spoke  ·  ✓ it agreed"
+    f"□ seen on the base  ·  {REPORTED_MARK} reported only  ·  **thick** a still spoke  ·  "
+    "hairline, **car?** doubted  ·  bright, ✓ above .9  ·  dark below .5"
 )
 
 
@@ -42,9 +43,12 @@ def static_chunks(title: str, facts: Mapping[str, str]) -> list[Chunk]:
     """All static chunks of a recording whose session panel shows ``title`` and ``facts``."""
     return [
         static_chunk(names.VIDEO, rr.VideoStream.from_fields(codec=rr.VideoCodec.H265)),
-        static_chunk(names.TRACKS, _box_style(width=1.0, draw_order=10.0, labels=False)),
+        static_chunk(names.TRACKS, _box_style(width=1.0, draw_order=10.0)),
         static_chunk(names.REPORTED, _ellipse_style(width=1.0, draw_order=15.0)),
-        static_chunk(names.REFINED, _box_style(width=2.5, draw_order=20.0, labels=True)),
+        static_chunk(names.REFINED, _box_style(width=2.0, draw_order=20.0)),
+        static_chunk(names.DOUBTED, _box_style(width=0.6, draw_order=12.0)),
+        static_chunk(names.LABELS, _text_style(points=0.0)),
+        static_chunk(names.LEGEND, _text_style(points=4.0)),
         *(static_chunk(f"{names.STILLS}/{slot}", _caption_style()) for slot in range(SLOTS)),
         static_chunk(names.BITRATE, _lines(_BITRATE)),
         static_chunk(names.LATENCY, _lines(_LATENCY)),
@@ -60,8 +64,8 @@ def session_chunk(title: str, facts: Mapping[str, str]) -> Chunk:
     )
 
 
-def class_chunk(path: str, class_ids: Mapping[str, int], *, share: float) -> Chunk:
-    """Names and colours of classes for the boxes of ``path``, at ``share`` of their brightness.
+def class_chunk(path: str, class_ids: Mapping[tuple[str, int], int]) -> Chunk:
+    """Names and colours of classes at levels of `BRIGHTNESS` for the boxes of ``path``.
 
     Written again when a class is new; the last one holds for the whole recording, so ids must not change.
     """
@@ -69,17 +73,33 @@ def class_chunk(path: str, class_ids: Mapping[str, int], *, share: float) -> Chu
         path,
         rr.AnnotationContext(
             [
-                rr.AnnotationInfo(number, name, dimmed(class_colour(name), share=share))
-                for name, number in class_ids.items()
+                rr.AnnotationInfo(number, name, dimmed(class_colour(name), share=BRIGHTNESS[level]))
+                for (name, level), number in class_ids.items()
             ]
         ),
     )
 
 
-def _box_style(*, width: float, draw_order: float, labels: bool) -> rr.Boxes2D:
-    return rr.Boxes2D.from_fields(
-        radii=rr.Radius.ui_points(width / 2), draw_order=draw_order, show_labels=labels
+def legend_chunk(class_names: Sequence[str], *, size: tuple[int, int]) -> Chunk:
+    """The colours of classes, below a picture of this (width, height); the last one written holds."""
+    return static_chunk(
+        names.LEGEND,
+        rr.Points2D.from_fields(
+            positions=place_legend(class_names, size=size),
+            labels=class_names,
+            colors=[class_colour(name) for name in class_names],
+        ),
     )
+
+
+def _box_style(*, width: float, draw_order: float) -> rr.Boxes2D:
+    return rr.Boxes2D.from_fields(
+        radii=rr.Radius.ui_points(width / 2), draw_order=draw_order, show_labels=False
+    )
+
+
+def _text_style(*, points: float) -> rr.Points2D:
+    return rr.Points2D.from_fields(radii=rr.Radius.ui_points(points), draw_order=30.0, show_labels=True)
 
 
 def _ellipse_style(*, width: float, draw_order: float) -> rr.Ellipses2D:

@@ -13,8 +13,8 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from hvt_ground.sinks.rerun.gallery import Placement
 from hvt_ground.sinks.rerun.palette import Rgb
+from hvt_ground.sinks.rerun.stills.gallery import Placement
 
 __all__ = [
     "COLUMNS",
@@ -175,9 +175,18 @@ def _bytes(name: str, rows: Sequence[tuple[int, ...]]) -> Columns:
     return values.partition([len(row) for row in rows])
 
 
-def _labels(rows: Sequence[tuple[str, ...]]) -> Columns:
+def _points(rows: Sequence[npt.NDArray[np.float32]]) -> Columns:
+    return rr.Points2D.columns(positions=np.concatenate(rows)).partition([len(row) for row in rows])
+
+
+def _words(rows: Sequence[tuple[str, ...]]) -> Columns:
     texts = pa.array(chain.from_iterable(rows), pa.utf8())
-    return rr.Boxes2D.columns(labels=texts).partition([len(row) for row in rows])
+    return rr.Points2D.columns(labels=texts).partition([len(row) for row in rows])
+
+
+def _inks(rows: Sequence[tuple[int, ...]]) -> Columns:
+    numbers = np.array(list(chain.from_iterable(rows)), np.uint16)
+    return rr.Points2D.columns(class_ids=numbers).partition([len(row) for row in rows])
 
 
 def _places(rows: Sequence[Placement]) -> rr.ComponentColumnList:
@@ -229,7 +238,9 @@ COLUMNS: dict[str, Callable[[Sequence[Any]], Columns]] = {
     "ellipses": lambda rows: _shapes(rr.Ellipses2D, rows),
     "identity of boxes": lambda rows: _identities(rr.Boxes2D, rows),
     "identity of ellipses": lambda rows: _identities(rr.Ellipses2D, rows),
-    "labels": _labels,
+    "places": _points,
+    "words": _words,
+    "inks": _inks,
     "confidences": lambda rows: _bytes("confidence_pct", rows),
     "origins": lambda rows: _bytes("origin", rows),
     "jpeg": lambda rows: rr.EncodedImage.columns(blob=list(rows)),

@@ -6,10 +6,10 @@ from collections import OrderedDict
 
 from hvt_ground.events import Overlay, Refinement
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.gallery import Gallery, frame_of, placed
-from hvt_ground.sinks.rerun.palette import GREY, class_colour
-from hvt_ground.sinks.rerun.patches import Patches
-from hvt_ground.sinks.rerun.still_pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
+from hvt_ground.sinks.rerun.palette import AMBER, GREY, class_colour
+from hvt_ground.sinks.rerun.stills.gallery import Gallery, frame_of, placed
+from hvt_ground.sinks.rerun.stills.pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
+from hvt_ground.sinks.rerun.stills.patches import Patches
 from hvt_ground.sinks.rerun.tables import Caption, LogText, PlacedJpeg, SizeLimit, TableRow
 
 __all__ = ["StillRows"]
@@ -42,6 +42,8 @@ class StillRows:
         changed = refinement.class_before != refinement.class_after
         text = event_text(refinement)
         colour = class_colour(refinement.class_after) if changed else GREY
+        if refinement.doubted:
+            colour = AMBER
         rows = [TableRow(names.EVENTS, "text", LogText(text, "INFO", colour), len(text))]
         still = still_picture(refinement) if self._is_new(refinement.still_sequence) else None
         if still is None:

@@ -25,18 +25,22 @@ def caption(refinement: Refinement) -> str:
     whose = str(refinement.track_id) if refinement.track_id is not None else "no track"
     if refinement.stored and refinement.track_id is None:
         whose = "late"
+    elif refinement.unread:
+        whose = f"edge {refinement.edge_track_id}"
     return f"{whose}  {_verdict(refinement)}"
 
 
 def event_text(refinement: Refinement) -> str:
     """The refinement and the still that caused it, for the event log."""
     verdict = _verdict(refinement)
+    if refinement.doubted:
+        verdict = f"doubted, {verdict}"
     if refinement.track_id is not None:
         outcome = f"→ track {refinement.track_id}: {verdict}"
     elif refinement.stored or refinement.unread:
         outcome = f"of edge track {refinement.edge_track_id}: {verdict}"
     else:
-        outcome = f"matches no track (edge track {refinement.edge_track_id}): {refinement.class_after}"
+        outcome = f"matches no track (edge track {refinement.edge_track_id}): {verdict}"
     size = f"{len(refinement.still) / 1000:.1f} kB, q{refinement.quality_pct}"
     number = refinement.still_sequence
     name = f"still #{number}" if number < _FIRST_STORED else f"late still #{number - _FIRST_STORED}"
@@ -89,11 +93,15 @@ def base_picture(refinement: Refinement, *, still_size: tuple[int, int], limit_b
 
 def _verdict(refinement: Refinement) -> str:
     if refinement.unread:
-        return f"{refinement.class_after} unread".strip()
+        why = f"({refinement.note})" if refinement.note else "unread"
+        return f"{refinement.class_after} {why}".strip()
     certainty = confidence_text(round(refinement.confidence * 100))
+    if refinement.doubted:
+        return f"{refinement.class_before}? {refinement.class_after} {certainty}"
+    certain = "✓ " if refinement.sure else ""
     if refinement.class_before == refinement.class_after:
-        return f"{refinement.class_after} ✓ {certainty}"
-    return f"{refinement.class_before} → {refinement.class_after} {certainty}"
+        return f"{refinement.class_after} {certain}{certainty}"
+    return f"{refinement.class_before} → {refinement.class_after} {certain}{certainty}"
 
 
 def _jpeg(pixels: Image, *, quality_pct: int) -> bytes:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_ground.events import Overlay, Refinement
-from hvt_ground.sinks.rerun.gallery import Placement
+from hvt_ground.sinks.rerun.stills.gallery import Placement
 
 __all__ = ["FRESH_NS", "PATCHES", "Moved", "Patches"]
 

@@ -1,0 +1,61 @@
+"""What a model's metadata say of its scores: from where they count, and whether they are probabilities."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from hvt_common.errors import UserError
+from hvt_common.inference.detect import MOTION, USUAL_CONFIDENCE
+from hvt_common.inference.runtimes.onnx_file import onnx_metadata
+from hvt_common.inference.runtimes.plug_in import plug_in_names, plug_in_of
+from hvt_common.inference.store import resolve_model
+
+__all__ = ["default_confidence", "is_calibrated", "uncalibrated"]
+
+_CONFIDENCE = "hvt.confidence"
+_CALIBRATION = "hvt.calibration"
+_LEAST_CONFIDENCE = 0.01
+
+
+def default_confidence(spec: str) -> float:
+    """From where a detector's detections start a track, 0.01…1: ``hvt.confidence`` of its metadata, else 0.25.
+
+    ``spec`` is as of `open_detector`. Raises `UserError` where there is no such model, or the metadata make no sense.
+    """
+    text = _metadata(spec, role="detector").get(_CONFIDENCE)
+    if text is None:
+        return USUAL_CONFIDENCE
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not _LEAST_CONFIDENCE <= value <= 1:
+        raise UserError(
+            f"model {spec} has {_CONFIDENCE} '{text:.80}' in its metadata; a number from {_LEAST_CONFIDENCE} to 1 is"
+            " accepted"
+        )
+    return value
+
+
+def is_calibrated(spec: str, *, role: str) -> bool:
+    """Whether a model's scores were fitted to how often they are right: its metadata have ``hvt.calibration``.
+
+    Those of the motion detector and of plug-ins are not. Raises `UserError` where there is no such model.
+    """
+    return _CALIBRATION in _metadata(spec, role=role)
+
+
+def _metadata(spec: str, *, role: str) -> dict[str, str]:
+    """Of a file; the motion detector and plug-ins have none."""
+    if role == "detector" and (spec == MOTION or plug_in_of(spec) is not None):
+        return {}
+    return onnx_metadata(resolve_model(spec, role=role, words=(MOTION, *plug_in_names())))
+
+
+def uncalibrated(role: str, spec: str) -> str:
+    """What is said, once, of a model whose scores are not calibrated."""
+    return (
+        f"{role} {Path(spec).name} has no calibration ({_CALIBRATION} in its metadata):"
+        " its scores are no probabilities"
+    )

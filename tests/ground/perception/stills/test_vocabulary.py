@@ -1,0 +1,260 @@
+"""A classifier of other words says what its words mean for a track, or nothing."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import cv2
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, group_of
+from hvt_common.inference.classify import open_classifier
+from hvt_common.inference.detect import open_detector
+from hvt_common.values import Posterior, Tracks
+from hvt_ground.perception.stills.refine import Refiner
+from hvt_ground.perception.stills.vocabulary import LEAST_SIDE_PX, Vocabulary, check_common
+
+AERIAL = ("car", "van", "truck", "bus", "motor", "pedestrian", "other")
+VEHICLES = {"car", "van", "truck", "bus", "motor"}
+
+
+def says(names, **probabilities):
+    """A classifier's answer; what is left of 1 goes to all others alike."""
+    p = np.zeros(len(names), np.float32)
+    for name, value in probabilities.items():
+        p[names.index(name.replace("_", " "))] = value
+    p[p == 0] = (1 - p.sum()) / max(1, (p == 0).sum())
+    best = int(p.argmax())
+    return Posterior(names[best], float(p[best]), 1.0, p)
+
+
+def test_the_same_words_mean_the_same():
+    """The embedded pair would lose what it was trained to say."""
+    words = Vocabulary(AERIAL, AERIAL)
+    answer = says(AERIAL, van=0.7, other=0.2)
+    vote = words.vote(answer, called="car", side_px=30)
+    assert words.names == AERIAL
+    assert vote.posterior is not None
+    assert (vote.posterior.class_name, vote.posterior.confidence) == ("van", pytest.approx(0.7))
+    np.testing.assert_allclose(vote.posterior.probabilities, answer.probabilities, rtol=1e-5)
+    entropy = -sum(p * math.log(p) for p in answer.probabilities.tolist())
+    assert vote.posterior.entropy_nats == pytest.approx(entropy, rel=1e-4)
+
+
+def test_imagenet_tells_a_vehicle_from_a_person_and_no_more():
+    """A network of photographs would rename a car seen from above a moving van."""
+    words = Vocabulary(AERIAL, IMAGENET_NAMES)
+    vote = words.vote(says(IMAGENET_NAMES, moving_van=0.5, minivan=0.4), called="bus", side_px=40)
+    assert vote.posterior is not None
+    assert (vote.posterior.class_name, vote.posterior.confidence) == ("bus", pytest.approx(0.905, abs=0.01))
+    likely = dict(zip(words.names, vote.posterior.probabilities.tolist(), strict=True))
+    assert {likely[name] for name in VEHICLES} == {likely["car"]}
+    assert likely["pedestrian"] < 0.01
+    kinds = Vocabulary(AERIAL, IMAGENET_NAMES, kinds=True)
+    paper = kinds.vote(says(IMAGENET_NAMES, moving_van=0.9), called="bus", side_px=40)
+    assert paper.posterior is not None
+    assert paper.posterior.class_name == "truck"
+
+
+def test_what_means_no_class_is_a_note():
+    """A car would become a waffle iron."""
+    words = Vocabulary(AERIAL, IMAGENET_NAMES)
+    for name, text in (("waffle_iron", "waffle iron .31"), ("Japanese_spaniel", "Japanese spaniel .31")):
+        vote = words.vote(says(IMAGENET_NAMES, **{name: 0.31}), called="car", side_px=40)
+        assert (vote.posterior, vote.note) == (None, text)
+    dogs = Vocabulary(COCO_NAMES, IMAGENET_NAMES)
+    vote = dogs.vote(says(IMAGENET_NAMES, Japanese_spaniel=0.8), called="cat", side_px=40)
+    assert vote.posterior is not None, "a detector that knows animals may hear of one"
+    assert vote.posterior.class_name == "cat"
+
+
+def test_a_small_object_gets_no_vote_of_imagenet():
+    """Ten pixels blown up to 224 look like anything; the embedded classifier was trained on them."""
+    answer = says(IMAGENET_NAMES, minivan=0.9)
+    words = Vocabulary(AERIAL, IMAGENET_NAMES)
+    assert words.vote(answer, called="car", side_px=LEAST_SIDE_PX - 0.1).posterior is None
+    assert words.vote(answer, called="car", side_px=LEAST_SIDE_PX).posterior is not None
+    small = Vocabulary(AERIAL, AERIAL).vote(says(AERIAL, car=0.9), called="car", side_px=10)
+    assert small.posterior is not None
+
+
+def test_other_names_of_a_kind_are_understood():
+    """A user's classifier would have to be trained on our words."""
+    words = Vocabulary(AERIAL, ("automobile", "lorry", "person", "tree"))
+    for said, meant in (("automobile", "car"), ("lorry", "truck"), ("person", "pedestrian")):
+        vote = words.vote(
+            says(("automobile", "lorry", "person", "tree"), **{said: 0.9}), called="x", side_px=9
+        )
+        assert vote.posterior is not None
+        assert vote.posterior.class_name == meant
+    tree = words.vote(says(("automobile", "lorry", "person", "tree"), tree=0.9), called="car", side_px=9)
+    assert (tree.posterior, tree.note) == (None, "tree .90")
+
+
+def test_a_class_that_the_classifier_cannot_say_is_left_alone():
+    """A dog would be doubted because a classifier of vehicles knows none."""
+    words = Vocabulary(COCO_NAMES, AERIAL)
+    vote = words.vote(says(AERIAL, other=0.95), called="dog", side_px=30)
+    assert vote.posterior is not None
+    likely = dict(zip(words.names, vote.posterior.probabilities.tolist(), strict=True))
+    assert likely["dog"] == pytest.approx(0.95, abs=0.01)
+    assert likely["car"] < 0.05
+    shown = flown(words, vote.posterior, base=COCO_NAMES.index("dog"), confidence=0.8)
+    assert (shown.classes, shown.doubted.tolist()) == (("dog",), [False])
+
+
+def flown(words, *posteriors, base, confidence, side_px=30.0, calibrated=True, mode="fuse"):
+    """What is shown of a track after these stills."""
+    from hvt_ground.perception.history import History
+    from hvt_ground.perception.stills.refine import StillSeen
+
+    tracks = Tracks(
+        frame_index=0,
+        ids=np.array([1]),
+        boxes_xyxy_px=np.array([[10, 10, 50, 40]], np.float32),
+        confidences=np.array([confidence], np.float32),
+        class_ids=np.array([base], np.int32),
+        born_frames=np.zeros(1, np.int64),
+        seen_frames=np.zeros(1, np.int64),
+        started=np.zeros(1, np.bool_),
+    )
+    history = History(track_frames=10)
+    history.add_tracks(tracks)
+    refiner = Refiner(mode, fps=15, vocabulary=words, calibrated=calibrated)
+    for sequence, posterior in enumerate(posteriors):
+        seen = StillSeen(
+            sequence=sequence,
+            frame_index=0,
+            capture_ns=0,
+            edge_track_id=1,
+            box_base_px=(10, 10, 50, 40),
+            class_name="car",
+            posterior=posterior,
+            context=None,  # type: ignore[arg-type]
+            side_px=side_px,
+        )
+        refiner.offer(seen, now_frame=0)
+        refiner.settle(history, now_frame=0)
+    return refiner.shown(tracks)
+
+
+def votes(words, *answers):
+    """The votes of these answers over `AERIAL`."""
+    found = [words.vote(says(AERIAL, **answer), called="car", side_px=30).posterior for answer in answers]
+    assert all(found)
+    return found
+
+
+@pytest.mark.parametrize("mode", ["fuse", "replace"])
+def test_nothing_of_mine_takes_confidence_until_the_track_is_doubted(mode):
+    """A shrub would be a pedestrian with a check mark."""
+    words = Vocabulary(AERIAL, AERIAL)
+    shrub = AERIAL.index("pedestrian")
+    before = flown(words, *votes(words, {"pedestrian": 0.6}), base=shrub, confidence=0.5, mode=mode)
+    assert (before.classes, before.doubted.tolist()) == (("pedestrian",), [False])
+    if mode == "fuse":
+        weak = votes(words, {"pedestrian": 0.6}, {"pedestrian": 0.3, "other": 0.65})
+        shown = flown(words, *weak, base=shrub, confidence=0.5)
+        assert shown.classes == ("pedestrian",)
+        assert shown.confidences[0] < before.confidences[0]
+    strong = votes(words, {"pedestrian": 0.6}, {"other": 0.97})
+    shown = flown(words, *strong, base=shrub, confidence=0.5, mode=mode)
+    assert (shown.classes, shown.doubted.tolist(), shown.sure.tolist()) == (("other",), [True], [False])
+
+
+def test_a_check_mark_needs_a_calibrated_probability_on_enough_pixels():
+    """A network that was never calibrated, or saw nine pixels, would be taken at its word."""
+    words = Vocabulary(AERIAL, AERIAL)
+    (car,) = votes(words, {"car": 0.97})
+    assert flown(words, car, base=0, confidence=0.8).sure.tolist() == [True]
+    assert flown(words, car, base=0, confidence=0.8, calibrated=False).sure.tolist() == [False]
+    assert flown(words, car, base=0, confidence=0.8, side_px=9).sure.tolist() == [False]
+    unsure = votes(words, *({"car": 0.8},) * 5)
+    shown = flown(words, *unsure, base=0, confidence=0.8)
+    assert shown.confidences[0] > 0.99
+    assert shown.sure.tolist() == [False], "five answers of .8 on one object are not one of .99"
+
+
+def test_a_toss_up_leaves_the_class_as_it_is():
+    """A class would flip with every still."""
+    words = Vocabulary(AERIAL, AERIAL)
+    even = flown(words, *votes(words, {"truck": 0.55, "car": 0.4}), base=0, confidence=1 / 7)
+    assert even.classes == ("car",)
+    clear = flown(words, *votes(words, {"truck": 0.75, "car": 0.2}), base=0, confidence=1 / 7)
+    assert clear.classes == ("truck",)
+
+
+def test_a_classifier_with_no_class_in_common_is_refused():
+    """It would fly, and never say a word."""
+    check_common("d", AERIAL, "c", IMAGENET_NAMES)
+    check_common("motion", ("moving",), "c", ("apple", "pear"))
+    with pytest.raises(
+        UserError, match=r"--classifier c\.onnx has no class in common with --detector d"
+    ) as error:
+        check_common("d", AERIAL, "c.onnx", ("apple", "pear", "other"))
+    assert "apple, pear, other; tracks are car, van" in str(error.value)
+
+
+def test_what_only_moves_is_named_by_the_classifier():
+    """With the motion detector every track would stay "moving"."""
+    words = Vocabulary(("moving",), AERIAL)
+    assert words.names == ("moving", *AERIAL)
+    vote = words.vote(says(AERIAL, van=0.9), called="moving", side_px=30)
+    assert vote.posterior is not None
+    assert flown(words, vote.posterior, base=0, confidence=0.9).classes == ("van",)
+    groups = Vocabulary(("moving",), IMAGENET_NAMES)
+    assert set(groups.names) == {"moving", "vehicle", "person", "boat", "animal"}
+    vote = groups.vote(says(IMAGENET_NAMES, minivan=0.9), called="moving", side_px=30)
+    assert vote.posterior is not None
+    assert flown(groups, vote.posterior, base=0, confidence=0.9).classes == ("vehicle",)
+
+
+@pytest.mark.realdata
+def test_a_network_of_photographs_renames_no_car_of_a_car_park(data):
+    """Half the car park would be revolvers and waffle irons, as the first user saw it."""
+    detector = open_detector("aerial-nano", threads=1)
+    classifier = open_classifier(
+        str(data / "models/mobilenet_v2_imagenet.onnx"), labels=data / "models/imagenet_labels_1001.txt"
+    )
+    words = Vocabulary(detector.class_names, classifier.class_names)
+    clip = cv2.VideoCapture(str(data / "clips/drone_carpark.mp4"))
+    shown: Counter[tuple[str, str]] = Counter()
+    noted = 0
+    for _ in range(5):
+        for _ in range(40):
+            clip.grab()
+        picture = clip.retrieve()[1]
+        found = detector.detect(picture)
+        for row, box in enumerate(found.boxes_xyxy_px.astype(int).tolist()):
+            x1, y1, x2, y2 = box
+            name = detector.class_names[found.class_ids[row]]
+            if name not in VEHICLES:
+                continue
+            (answer,) = classifier.classify([picture[y1:y2, x1:x2]])
+            vote = words.vote(answer, called=name, side_px=min(x2 - x1, y2 - y1))
+            noted += bool(vote.note)
+            if vote.posterior is None:
+                continue
+            after = flown(
+                words,
+                *[vote.posterior] * 4,  # again and again the same
+                base=int(found.class_ids[row]),
+                confidence=float(found.confidences[row]),
+            )
+            shown[name, after.classes[0]] += 1
+    clip.release()
+    assert noted > 50, "most of what it says is no class of a track"
+    assert shown
+    assert {after for _, after in shown} <= VEHICLES
+    assert all(before == after for before, after in shown)
+
+
+def test_every_synset_of_the_table_is_a_class_of_imagenet():
+    """A slip in the table would be a class that never speaks."""
+    groups = Counter(group_of(name) for name in IMAGENET_NAMES)
+    assert groups == {"animal": 397, "vehicle": 46, "boat": 14, "person": 3, None: 540}
+    assert group_of("crane") is None, "a bird and a machine"
+    assert group_of("Cardigan") is None, "a dog and a garment"
