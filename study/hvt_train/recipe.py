@@ -19,15 +19,23 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_common.inference.store import embedded_models
+from hvt_common.values import Image
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.evaluate import CLEAN, drawn_pictures, evaluate_drawn, well_visible
-from hvt_train.learning.calibration import fit_calibration
-from hvt_train.learning.classifier import export_classifier, train_classifier
+from hvt_train.learning.calibration import fit_calibration, fit_temperature
+from hvt_train.learning.classifier import ClassifierNet, export_classifier, train_classifier
 from hvt_train.learning.detector import DetectorNet
 from hvt_train.learning.export import metadata
 from hvt_train.learning.loop import LoopSettings
 from hvt_train.learning.train_detector import export_detector, train_detector
-from hvt_train.pictures.crops import CropSource, held_out_crops, pool_crops, real_crops, scene_crops
+from hvt_train.pictures.crops import (
+    CropSource,
+    held_out_crops,
+    held_out_real_crops,
+    pool_crops,
+    real_crops,
+    scene_crops,
+)
 from hvt_train.pictures.pool import PoolPlan, fill_pool
 from hvt_train.pictures.real import HeldOut, fill_real, held_out_pictures
 from hvt_train.pictures.views import ViewSettings
@@ -145,6 +153,20 @@ def _classifier(arguments: argparse.Namespace, pool: list[Path]) -> None:
         start=_started(arguments, CLASSIFIER),
         check=_Best(arguments, CLASSIFIER, export_classifier, measure).check,
     )
+    if arguments.real is not None:
+        _calibrate_classifier(arguments, stills)
+
+
+def _calibrate_classifier(arguments: argparse.Namespace, drawn: list[tuple[Image, str]]) -> None:
+    """Export the best weights again, with probabilities that are true on held-out stills, drawn and real."""
+    path = (arguments.out / CLASSIFIER).with_suffix(".onnx")
+    net = ClassifierNet(len(CLASS_NAMES))
+    net.load_state_dict(torch.load(path.with_suffix(".pt")))
+    finds_too_much = open_detector(DETECTOR, confidence=0.12, threads=arguments.threads)
+    stills = [*drawn, *held_out_real_crops(arguments.real, finds_too_much)]
+    temperature = fit_temperature(open_classifier(str(path), threads=arguments.threads), stills)
+    properties = _properties(CLASSIFIER, arguments.seed) | {"hvt.calibration": f"{temperature:.4f}"}
+    export_classifier(net.eval(), path, properties=properties, temperature=temperature)
 
 
 def _started(arguments: argparse.Namespace, name: str) -> Path | None:

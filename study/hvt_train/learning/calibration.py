@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import log_softmax
 from sklearn.linear_model import LogisticRegression
 
+from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
-from hvt_common.values import iou
+from hvt_common.values import Image, iou
 from hvt_train.pictures.real import HeldOut
 
-__all__ = ["NONE", "Calibration", "fit_calibration"]
+__all__ = ["NONE", "Calibration", "fit_calibration", "fit_temperature"]
 
 _LEAST_IOU = 0.5
 _EPSILON = 1e-4
@@ -59,6 +61,19 @@ def fit_calibration(detector: Detector, pictures: Iterable[HeldOut]) -> Calibrat
     line = LogisticRegression(C=1e6).fit(logits, np.array(right))
     best = _best_threshold(line.predict_proba(logits)[:, 1], np.array(right), objects)
     return Calibration(float(line.coef_[0, 0]), float(line.intercept_[0]), best)
+
+
+def fit_temperature(classifier: Classifier, stills: Iterable[tuple[Image, str]]) -> float:
+    """The number by which logits are divided so that probabilities are true on ``stills`` (Guo et al., 2017)."""
+    images, names = zip(*stills, strict=True)
+    truth = np.array([classifier.class_names.index(name) for name in names])
+    logits = np.log(np.array([said.probabilities for said in classifier.classify(list(images))]) + 1e-9)
+
+    def surprise(temperature: float) -> float:
+        """Mean negative log likelihood."""
+        return float(-log_softmax(logits / temperature, axis=1)[np.arange(len(truth)), truth].mean())
+
+    return min((float(one) for one in np.geomspace(0.3, 6, 61)), key=surprise)
 
 
 def _best_threshold(scores: npt.NDArray[np.float64], right: npt.NDArray[np.bool_], objects: int) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -123,8 +124,16 @@ def train_classifier(
     return trained
 
 
-def export_classifier(net: ClassifierNet, path: Path, *, properties: dict[str, str]) -> None:
-    """Write the ONNX file: (N, 3, 96, 96) prepared pixels in, (N, C) logits out."""
+def export_classifier(
+    net: ClassifierNet, path: Path, *, properties: dict[str, str], temperature: float = 1.0
+) -> None:
+    """Write the ONNX file: (N, 3, 96, 96) prepared pixels in, (N, C) logits, divided by ``temperature``, out."""
+    net = copy.deepcopy(net)
+    last = net[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        last.weight /= temperature
+        last.bias /= temperature
     own = {"hvt.mean": str(MEAN), "hvt.scale": repr(SCALE), "hvt.channel_order": "BGR"}
     export_onnx(
         net,

@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.detect import Detector
-from hvt_common.values import Image
+from hvt_common.values import Boxes, Image
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.perception.crop import PADDING, crop_box
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import HELD_OUT_SEED, SOURCE_SIZE, TRAIN_SEED, Shot, shoot
-from hvt_train.pictures.real import SETS
+from hvt_train.pictures.real import SETS, held_out_labelled
 from hvt_train.pictures.views import degrade, read_picture
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "Crops",
     "collect_crops",
     "held_out_crops",
+    "held_out_real_crops",
     "pool_crops",
     "real_crops",
     "scene_crops",
@@ -79,13 +80,7 @@ def real_crops(pool: list[Path], detector: Detector, *, most: int) -> Iterator[C
         rng = np.random.default_rng([TRAIN_SEED, 4, number])
         picture = read_picture(path)
         yield collect_crops(picture, most=most, rng=rng)
-        found = detector.detect(picture.image_bgr).boxes_xyxy_px
-        begins, ends = (
-            found[:, None, :2] < picture.boxes_px[:, 2:],
-            found[:, None, 2:] > picture.boxes_px[:, :2],
-        )
-        touches = np.logical_and(begins, ends).all(axis=2)
-        alarms = found[~np.any(touches, axis=1)][: 2 * most]
+        alarms = _alarms(detector, picture)[: 2 * most]
         crops = [_stored(picture.image_bgr, box) for box in alarms]
         inner = np.array([box for _, box in crops], np.float32).reshape(-1, 4)
         other = np.full(len(crops), CLASS_NAMES.index("other"), np.int32)
@@ -135,19 +130,41 @@ def pool_crops(pool: list[Path], *, most: int) -> Iterator[Crops]:
 
 def held_out_crops(seeds: range, *, moments: int, quality_pct: int = 65) -> Iterator[tuple[Image, str]]:
     """Stills of held-out scenes as the ground decodes them, each with its true class."""
-    codec = JpegCodec()
     for seed in seeds:
         scene = shoot(HELD_OUT_SEED + seed, demo_appearance=seed % 2 == 0)
         for t_s in np.linspace(1.0, scene.duration_s - 1, moments):
-            picture = Shot(scene, float(t_s)).picture(SOURCE_SIZE)
-            for box, kind, share in zip(picture.boxes_px, picture.class_ids, picture.visible, strict=True):
-                if share < _LEAST_VISIBLE or (box[2:] - box[:2]).max() < _LEAST_SIDE_PX:
-                    continue
-                corners = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
-                x0, y0, x1, y1 = crop_box(corners, padding=PADDING, source_size=SOURCE_SIZE)
-                crop = np.ascontiguousarray(picture.image_bgr[y0:y1, x0:x1])
-                coded = codec.encode(crop, quality_pct=quality_pct)
-                yield codec.decode(coded.data, size=(x1 - x0, y1 - y0)), CLASS_NAMES[kind]
+            yield from _stills(Shot(scene, float(t_s)).picture(SOURCE_SIZE), quality_pct)
+
+
+def held_out_real_crops(
+    data: Path, detector: Detector, *, quality_pct: int = 65
+) -> Iterator[tuple[Image, str]]:
+    """Stills of held-out real pictures, and as "other" what ``detector`` finds where no label is."""
+    other = CLASS_NAMES.index("other")
+    for picture in held_out_labelled(data):
+        yield from _stills(picture, quality_pct)
+        alarms = _alarms(detector, picture)
+        kinds, seen = np.full(len(alarms), other, np.int32), np.ones(len(alarms), np.float32)
+        yield from _stills(Picture(picture.image_bgr, alarms, kinds, seen), quality_pct)
+
+
+def _stills(picture: Picture, quality_pct: int) -> Iterator[tuple[Image, str]]:
+    codec, size = JpegCodec(), (picture.image_bgr.shape[1], picture.image_bgr.shape[0])
+    for box, kind, share in zip(picture.boxes_px, picture.class_ids, picture.visible, strict=True):
+        if kind < 0 or share < _LEAST_VISIBLE or (box[2:] - box[:2]).max() < _LEAST_SIDE_PX:
+            continue
+        corners = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
+        x0, y0, x1, y1 = crop_box(corners, padding=PADDING, source_size=size)
+        crop = np.ascontiguousarray(picture.image_bgr[y0:y1, x0:x1])
+        coded = codec.encode(crop, quality_pct=quality_pct)
+        yield codec.decode(coded.data, size=(x1 - x0, y1 - y0)), CLASS_NAMES[kind]
+
+
+def _alarms(detector: Detector, picture: Picture) -> Boxes:
+    """(N, 4) boxes that touch no label, surest first."""
+    found, boxes = detector.detect(picture.image_bgr).boxes_xyxy_px, picture.boxes_px
+    touches = (found[:, None, :2] < boxes[:, 2:]) & (found[:, None, 2:] > boxes[:, :2])
+    return np.asarray(found[~touches.all(axis=2).any(axis=1)], np.float32)
 
 
 class CropSource:

@@ -29,7 +29,7 @@ from hvt_train.pictures.places import Picture
 from hvt_train.pictures.pool import BASE_SIZE, save_picture
 from hvt_train.pictures.street import street_pictures
 
-__all__ = ["LARGE_VEHICLE", "SETS", "HeldOut", "fill_real", "held_out_pictures"]
+__all__ = ["LARGE_VEHICLE", "SETS", "HeldOut", "fill_real", "held_out_labelled", "held_out_pictures"]
 
 LARGE_VEHICLE = -2
 _ID = {name: number for number, name in enumerate(CLASS_NAMES)}
@@ -175,6 +175,15 @@ def _road(data: Path) -> Iterator[_Labelled]:
         edge += [[0, 0, _BORDER_PX, high], [wide - _BORDER_PX, 0, wide, high]]
         boxes = np.array([*vehicles.tolist(), *[box for _, box in people], *edge], np.float32)
         yield path, boxes, np.array([*kinds, *[kind for kind, _ in people], -1, -1, -1, -1], np.int32)
+
+
+def held_out_labelled(data: Path, *, every: int = 4) -> Iterator[Picture]:
+    """Every n-th picture that training never sees, as it is, with classes as in the pool."""
+    for read in (_kit, _thermal):
+        for path, boxes, kinds in list(read(data, held_out=True))[::every]:
+            image = cv2.imread(str(path))
+            assert image is not None, path
+            yield Picture(np.asarray(image, np.uint8), boxes, kinds, np.ones(len(kinds), np.float32))
 
 
 def held_out_pictures(data: Path) -> Iterator[HeldOut]:
