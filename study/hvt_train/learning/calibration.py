@@ -28,7 +28,7 @@ class Calibration:
     slope: float = 1.0
     shift: float = 0.0
     confidence: float = 0.25
-    """Calibrated score from which on boxes should be shown: where F0.5 is best, precision counting twice as much."""
+    """Calibrated score from which on boxes should be shown: where F1 is best on what was held out."""
 
 
 NONE = Calibration()
@@ -77,11 +77,11 @@ def fit_temperature(classifier: Classifier, stills: Iterable[tuple[Image, str]])
 
 
 def _best_threshold(scores: npt.NDArray[np.float64], right: npt.NDArray[np.bool_], objects: int) -> float:
-    """The step of a twentieth where F0.5 = 1.25 PR / (0.25 P + R) is greatest (van Rijsbergen 1979)."""
+    """The step of a twentieth where F1 = 2 PR / (P + R) is greatest."""
 
     def quality(threshold: float) -> float:
         shown = scores >= threshold
         hits = float((shown & right).sum())
-        return 1.25 * hits / max(0.25 * objects + float(shown.sum()), 1e-9)
+        return 2 * hits / max(objects + float(shown.sum()), 1e-9)
 
     return max((round(0.05 * step, 2) for step in range(2, 17)), key=quality)

@@ -164,7 +164,8 @@ def _alarms(detector: Detector, picture: Picture) -> Boxes:
     """(N, 4) boxes that touch no label, surest first."""
     found, boxes = detector.detect(picture.image_bgr).boxes_xyxy_px, picture.boxes_px
     touches = (found[:, None, :2] < boxes[:, 2:]) & (found[:, None, 2:] > boxes[:, :2])
-    return np.asarray(found[~touches.all(axis=2).any(axis=1)], np.float32)
+    beside = ~np.any(np.logical_and.reduce(touches, axis=2), axis=1)
+    return np.asarray(found[beside], np.float32)
 
 
 class CropSource:
