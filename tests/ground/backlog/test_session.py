@@ -488,6 +488,7 @@ def test_a_full_disk_under_a_former_session_costs_no_more_than_time(flight, tmp_
             assert whole not in rig.acknowledged_ranges()
             rig.base(*range(10, 25))
             assert rig.session.frames_decoded == 25, "the flight of now goes on"
+            wait_for(lambda: rig.failures.parts)
             (part,) = rig.failures.parts
             assert not part.working
             assert "No space left" in part.reason
@@ -510,8 +511,9 @@ def test_recordings_of_former_sessions_are_bounded(flight, tmp_path):
         for former in formers:
             rig.put_until_taken(former, still_object(former, 1, 0))
         assert len(rig.recordings.open_sessions) == 4
-    for number in range(6):
-        assert [frame for frame, _ in Recording(tmp_path / f"backlog-{number}.rrd").stills()] == [1]
+    # A file that a busy machine was slow to open may have stayed empty, and its session got another.
+    shown = [frame for path in tmp_path.glob("backlog-*.rrd") for frame, _ in Recording(path).stills()]
+    assert shown == [1] * 6
 
 
 def test_no_more_files_are_made_than_the_bound(flight, tmp_path):

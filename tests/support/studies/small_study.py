@@ -32,7 +32,7 @@ __all__ = [
 
 PATIENT_S = 200.0
 """How long a study may take on a busy machine."""
-SIZE = (320, 180)
+SIZE = (480, 270)
 _MAIN = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"  # a shell's background job ignores it
     "from hvt_study.cli import main; raise SystemExit(main())"
