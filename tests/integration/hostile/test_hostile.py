@@ -161,6 +161,7 @@ def attack(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Attack:
         edge = link.edge(
             *("--source", str(scene), "--source-fps", "10", "--fps", "10", "--size", "640x360"),
             *("--preset", "ultrafast", "--budget", "300kbps", "--edge-id", "uav-1", "--max-frames", "240"),
+            *("--detector", "motion"),  # these are no objects that a network knows
             listens=True,
         )
         with joined(link.edge_endpoint) as to_edge, joined(link.ground_endpoint) as to_ground:

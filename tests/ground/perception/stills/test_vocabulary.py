@@ -14,6 +14,7 @@ from hvt_common.inference.class_names import COCO_NAMES, IMAGENET_NAMES, group_o
 from hvt_common.inference.classify import open_classifier
 from hvt_common.inference.detect import open_detector
 from hvt_common.values import Posterior, Tracks
+from hvt_edge.perception.crop import PADDING
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import LEAST_SIDE_PX, Vocabulary, check_common
 
@@ -233,7 +234,9 @@ def test_a_network_of_photographs_renames_no_car_of_a_car_park(data):
             name = detector.class_names[found.class_ids[row]]
             if name not in VEHICLES:
                 continue
-            (answer,) = classifier.classify([picture[y1:y2, x1:x2]])
+            aside, above = int(PADDING * (x2 - x1)), int(PADDING * (y2 - y1))
+            cut = picture[max(y1 - above, 0) : y2 + above, max(x1 - aside, 0) : x2 + aside]
+            (answer,) = classifier.classify([cut])
             vote = words.vote(answer, called=name, side_px=min(x2 - x1, y2 - y1))
             noted += bool(vote.note)
             if vote.posterior is None:
