@@ -16,6 +16,7 @@ from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.status import completed, status_text, summary, table
+from programs.processes import eventually
 from programs.rrd import Recording
 from rigs.flight import Flight, Port, pipeline_of
 
@@ -91,7 +92,7 @@ def test_a_link_that_carries_nothing_is_lost_in_the_line(ground):
 def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
     """Whoever looks for a recording after the flight would learn only then that there is none, and never why."""
     ground.sessions.close()
-    assert "second recording of uav-1 FAILED at " in ground.line()
+    eventually(lambda: "second recording of uav-1 FAILED at " in ground.line(), within_s=20, what="it failed")
     ground.outputs.close()
     content = completed(
         summary(ground.ended[0]), ground.sessions, sinks=ground.ended[0].sinks, failures=ground.failures

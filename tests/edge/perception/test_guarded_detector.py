@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from hvt_common.inference.detect import open_detector
@@ -39,4 +41,5 @@ def test_a_model_whose_run_raises_is_opened_again_with_growing_pauses(tmp_path, 
     now_ns[0] = 40 * SECOND_NS
     assert detector.detect(DARK) is not None
     assert failures.parts[0].working
-    assert len(caplog.records) <= 2, "said once"
+    said = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(said) <= 2, "said once"
