@@ -32,7 +32,7 @@ from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
 from hvt_common.video.still_codecs import still_codec
 from hvt_edge.operating.point import base_rate_bps
-from hvt_edge.profiles import PROFILES
+from hvt_edge.profiles import PROFILES, REGIMES
 from hvt_edge.source.contract import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_edge.video.encoder_settings import PRESETS, least_base_bps
@@ -41,9 +41,7 @@ from hvt_edge.video.share import FIRST_SHARE
 __all__ = [
     "DEFAULT_SIZE",
     "LEAST_FPS",
-    "REGIMES",
     "EdgeConfig",
-    "Regime",
     "check",
     "check_rate",
     "with_profile",
@@ -61,20 +59,6 @@ LEAST_FPS = 2.0
 """To this ``--fps auto`` may fall: two frames in a window of a second."""
 TRACKS_BPS = 8_000
 """What ``--send-tracks`` takes of the budget: about that for 45 boxes three times a second."""
-
-
-@dataclass(frozen=True, slots=True)
-class Regime:
-    """A budget of the paper: so much in all, so much of it for video."""
-
-    budget_bps: int
-    video_share: float
-
-
-REGIMES = {
-    "low": Regime(budget_bps=800_000, video_share=0.8125),  # 0.65 + 0.15 Mbps
-    "moderate": Regime(budget_bps=1_400_000, video_share=1.2 / 1.4),  # 1.20 + 0.20 Mbps
-}
 
 
 _REFRESH_GONE = "give --fps auto, which shows more for the same bits, or --roi-depth 0.1 for the tracks alone"

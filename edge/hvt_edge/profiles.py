@@ -1,12 +1,13 @@
-"""Settings in one word: what ``--profile`` stands for. A flag or a file that says otherwise wins."""
+"""Settings in one word: what ``--profile`` and ``--regime`` stand for. A flag or a file that says otherwise wins."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-__all__ = ["PROFILES"]
+__all__ = ["PROFILES", "REGIMES", "Regime"]
 
 PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
@@ -28,3 +29,17 @@ PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         ),
     }
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Regime:
+    """A budget of the paper: so much in all, so much of it for video."""
+
+    budget_bps: int
+    video_share: float
+
+
+REGIMES = {
+    "low": Regime(budget_bps=800_000, video_share=0.8125),  # 0.65 + 0.15 Mbps
+    "moderate": Regime(budget_bps=1_400_000, video_share=1.2 / 1.4),  # 1.20 + 0.20 Mbps
+}

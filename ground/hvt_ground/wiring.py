@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -115,11 +116,11 @@ class SessionFactory:
         """A sink with a file; a name that could not be used is free again."""
         with self._naming:
             path = name(taken=self._paths)
-        try:
-            return make(path)
-        except Exception:
-            self._paths.discard(path)
-            raise
+        with ExitStack() as undo:
+            undo.callback(self._paths.discard, path)
+            sink = make(path)
+            undo.pop_all()
+        return sink
 
     def _recorder_settings(self, info: Info) -> RecorderSettings:
         config = self._config

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import datetime as dt
-import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,6 @@ from torch import nn
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import kind_of
 from hvt_common.inference.detect import open_detector
-from hvt_common.values import Image
 from hvt_train.learning.calibration import NONE, Calibration, fit_calibration
 from hvt_train.learning.detector import DetectorNet
 from hvt_train.learning.export import metadata
@@ -27,7 +25,7 @@ from hvt_train.learning.loop import LoopSettings
 from hvt_train.learning.start import load_onnx
 from hvt_train.learning.train_detector import export_detector, train_detector
 from hvt_train.pictures.places import Picture
-from hvt_train.pictures.pool import save_picture, through_x265
+from hvt_train.pictures.pool import in_flight, save_picture, thin_kbps
 from hvt_train.pictures.real import HeldOut
 from hvt_train.pictures.views import ViewSettings
 
@@ -35,8 +33,6 @@ __all__ = ["FineTuneSettings", "FineTuned", "fill_own", "fine_tune"]
 
 _CODED_SHARE = 0.65
 """Of the pictures that go through x265: what a detector on a thin base meets. The others stay as they are."""
-_KBPS = (80, 1400)
-_CODED_FRAMES = 6
 _PLAUSIBLE = (0.1, 10.0)
 """Slopes of a calibration; another one comes of too few boxes."""
 _STEPS_BETWEEN = 5
@@ -85,24 +81,11 @@ def fill_own(folder: Path, pictures: Iterable[Picture], *, seed: int) -> list[Pa
     for number, picture in enumerate(pictures):
         rng = np.random.default_rng([seed, number])
         thin = rng.random() < _CODED_SHARE
-        image = _coded(picture.image_bgr, rng) if thin else picture.image_bgr
+        image = in_flight(picture.image_bgr, rng, kbps=thin_kbps(rng)) if thin else picture.image_bgr
         path = folder / f"{'base' if thin else 'demo'}-{number:05d}.npz"
         save_picture(path, Picture(image, picture.boxes_px, picture.class_ids, picture.visible))
         written.append(path)
     return written
-
-
-def _coded(image: Image, rng: np.random.Generator) -> Image:
-    """The picture under a slowly moving camera, after x265."""
-    high, wide = image.shape[:2]
-    step = rng.uniform(-4, 4, 2)
-    moved = []
-    for back in range(_CODED_FRAMES - 1, -1, -1):
-        shift = np.array([[1, 0, step[0] * back], [0, 1, step[1] * back]], np.float32)
-        shown = cv2.warpAffine(image, shift, (wide, high), borderMode=cv2.BORDER_REFLECT)
-        moved.append(np.asarray(shown, np.uint8))
-    low, most = map(math.log, _KBPS)
-    return through_x265(moved, round(1000 * math.exp(rng.uniform(low, most))))
 
 
 def fine_tune(

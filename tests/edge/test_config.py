@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
-from hvt_edge.config import REGIMES, EdgeConfig, check
+from hvt_edge.config import EdgeConfig, check
+from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.policy.registry import METHODS
 
 

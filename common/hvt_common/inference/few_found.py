@@ -14,12 +14,12 @@ _log = logging.getLogger(__name__)
 _RUNS = 45
 """Detections on pictures: 15 s at the defaults (15 fps, every fifth frame)."""
 _LEAST_SHARE = 0.1
-"""Of the looks that found something at the confidence of use."""
+"""Of the runs that found something at the confidence of use."""
 _OTHER = "yolox-s"
 
 
 class FewFoundHint:
-    """Says so after the first looks, for ``aerial-nano`` alone: who chose a model of his own needs no advice.
+    """Says so after the first runs, for ``aerial-nano`` alone: who chose a model of his own needs no advice.
 
     ``confidence`` is that from which a detection starts a track. For any thread.
     """
@@ -31,7 +31,7 @@ class FewFoundHint:
         self._runs = self._with_something = 0
 
     def take(self, found: Detections) -> None:
-        """Count what was found on one picture; at the last look that counts it may be said."""
+        """Count what was found on one picture; at the last run that counts it may be said."""
         if not self._open:
             return
         with self._lock:

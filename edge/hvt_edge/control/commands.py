@@ -17,9 +17,10 @@ from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Command, ControlAnswer, ControlRequest, TrackNow, fitted_text
 from hvt_common.units import SECOND_NS, bitrate_text
 from hvt_edge.backlog.stage import BacklogStage
-from hvt_edge.config import LEAST_FPS, REGIMES, EdgeConfig
+from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.point import Operating, base_rate_bps
+from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.on_demand import OnDemand
 from hvt_edge.stills.on_demand_crop import OnDemandRequest, RefusedError
 from hvt_edge.stills.policy.registry import method

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from hvt_common.errors import UserError
 from hvt_common.units import parse_bitrate
-from hvt_edge.config import REGIMES
+from hvt_edge.profiles import REGIMES
 from hvt_study.runs.methods import METHODS, Kind, Method
 from hvt_study.runs.spec import ModelChoice, RunSpec, Target
 

@@ -8,8 +8,9 @@ from typing import Any
 
 from hvt_common.config import load
 from hvt_common.inference.scores import default_confidence
-from hvt_edge.config import REGIMES, EdgeConfig
+from hvt_edge.config import EdgeConfig
 from hvt_edge.config import check as check_edge
+from hvt_edge.profiles import REGIMES
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
 from hvt_study.datasets.clip import NOMINAL_FPS

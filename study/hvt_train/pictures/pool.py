@@ -32,8 +32,10 @@ __all__ = [
     "Shot",
     "coded",
     "fill_pool",
+    "in_flight",
     "save_picture",
     "shoot",
+    "thin_kbps",
     "through_x265",
 ]
 
@@ -94,6 +96,23 @@ def through_x265(images: Sequence[Image], bitrate_bps: int) -> Image:
         picture = decoder.decode(encoder.encode(frame).data)
     assert picture is not None
     return picture
+
+
+def in_flight(image: Image, rng: np.random.Generator, *, kbps: float) -> Image:
+    """A picture under a slowly moving camera, after x265 at ``kbps``; its sides are cut to multiples of 8."""
+    high, wide = (side - side % 8 for side in image.shape[:2])
+    step = rng.uniform(-4, 4, 2)
+    moved = []
+    for back in range(_CODED_FRAMES - 1, -1, -1):
+        shift = np.array([[1, 0, step[0] * back], [0, 1, step[1] * back]], np.float32)
+        shown = cv2.warpAffine(image[:high, :wide], shift, (wide, high), borderMode=cv2.BORDER_REFLECT)
+        moved.append(np.asarray(shown, np.uint8))
+    return through_x265(moved, round(1000 * kbps))
+
+
+def thin_kbps(rng: np.random.Generator) -> float:
+    """A rate of a thin base of `BASE_SIZE`: 80 to 1400 kbps, every octave as often."""
+    return math.exp(rng.uniform(math.log(80), math.log(1400)))
 
 
 def fill_pool(folder: Path, plan: PoolPlan, *, workers: int = 1) -> list[Path]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import resources
@@ -20,13 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from hvt_common.inference.detect import Detector
-from hvt_common.values import Frame, Image
-from hvt_common.video.hevc import BaseDecoder
-from hvt_edge.video.encoder_settings import EncoderSettings
-from hvt_edge.video.x265 import BaseEncoder
+from hvt_common.values import Image
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_train.pictures.places import Picture
-from hvt_train.pictures.pool import BASE_SIZE, save_picture
+from hvt_train.pictures.pool import BASE_SIZE, in_flight, save_picture, thin_kbps
 from hvt_train.pictures.street import street_pictures
 
 __all__ = ["LARGE_VEHICLE", "SETS", "HeldOut", "fill_real", "held_out_labelled", "held_out_pictures"]
@@ -38,7 +34,6 @@ _HIT = (_ID["pedestrian"], _ID["car"], _ID["motor"], LARGE_VEHICLE, -1)
 _HIT_JUDGES = {"20210115", "20210123"}
 _HIT_HELD_OUT = {"20210114", "20210119"}
 _KIT_HELD_OUT = "MunichStreet02"
-_FPS, _CODED_FRAMES = 15.0, 6
 _CODED_SHARE = 0.65
 _BORDER_PX = 26  # Madison leaves out vehicles that the border cuts
 _LARGE_PX = 128  # a car is 96 pixels long there, one in twenty vehicles longer than 118
@@ -90,26 +85,10 @@ def fill_real(folder: Path, data: Path, *, seed: int = 1, teacher: Detector | No
 
 
 def _coded(image: Image, rng: np.random.Generator) -> Image:
-    """The picture under a slowly moving camera, after x265 at the bits a pixel of a thin base."""
-    high, wide = (side - side % 8 for side in image.shape[:2])
-    image = image[:high, :wide]
-    kbps = math.exp(rng.uniform(math.log(80), math.log(1400)))
-    share = wide * high / (BASE_SIZE[0] * BASE_SIZE[1]) * float(rng.uniform(0.7, 1.5))
-    encoder = BaseEncoder(
-        EncoderSettings(size=(wide, high), fps=_FPS, bitrate_bps=max(20_000, round(kbps * 1000 * share)))
-    )
-    decoder, picture = BaseDecoder(), image
-    step = rng.uniform(-4, 4, 2)
-    for index in range(_CODED_FRAMES):
-        back = step * (_CODED_FRAMES - 1 - index)
-        shift = np.array([[1, 0, back[0]], [0, 1, back[1]]], np.float32)
-        moved = np.asarray(
-            cv2.warpAffine(image, shift, (wide, high), borderMode=cv2.BORDER_REFLECT), np.uint8
-        )
-        frame = Frame(index=index, capture_ns=0, source_bgr=moved, base_bgr=moved)
-        decoded = decoder.decode(encoder.encode(frame).data)
-        picture = picture if decoded is None else decoded
-    return picture
+    """After x265 at about the bits a pixel of a thin base."""
+    kbps = thin_kbps(rng)
+    share = image.shape[0] * image.shape[1] / (BASE_SIZE[0] * BASE_SIZE[1]) * float(rng.uniform(0.7, 1.5))
+    return in_flight(image, rng, kbps=max(20.0, kbps * share))
 
 
 def _yolo(path: Path, size: tuple[int, int]) -> npt.NDArray[np.float64]:

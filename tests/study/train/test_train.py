@@ -188,7 +188,7 @@ def test_training_lowers_the_loss(torch, batch):
     net = DetectorNet(len(CLASSES)).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=2e-3)
     losses = []
-    for _ in range(12):
+    for _ in range(40):
         loss, _ = loss_of(net, batch)
         optimizer.zero_grad()
         loss.backward()

@@ -137,25 +137,28 @@ def ink(read: Recording, entity: str, frame: int) -> list[int]:
     ]
 
 
+REFINED = Refinement(
+    frame_index=0,
+    capture_ns=1_790_000_000_000_000_000,
+    still_sequence=0,
+    track_id=4,
+    edge_track_id=9,
+    box_base_px=(700, 300, 760, 340),
+    still=b"",
+    media_type="image/jpeg",
+    base_crop_bgr=None,
+    class_before="car",
+    class_after="car",
+    confidence=0.95,
+    reason="utility",
+    quality_pct=65,
+)
+"""A still of a car that is one."""
+
+
 def test_an_object_that_somebody_chose_is_named(tmp_path):
     """The operator asked for a still of track 4 and would have to look for it among sixty."""
-    asked = Refinement(
-        frame_index=0,
-        capture_ns=1_790_000_000_000_000_000,
-        still_sequence=0,
-        track_id=4,
-        edge_track_id=9,
-        box_base_px=(700, 300, 760, 340),
-        still=b"",
-        media_type="image/jpeg",
-        base_crop_bgr=None,
-        class_before="car",
-        class_after="car",
-        confidence=0.95,
-        reason="asked",
-        quality_pct=65,
-        sure=True,
-    )
+    asked = dataclasses.replace(REFINED, reason="asked", sure=True)
     read = recorded(tmp_path / "a.rrd", asked, overlay(1))
     assert read.words(1)[4][0] == "4 car ✓"
     other = recorded(tmp_path / "b.rrd", dataclasses.replace(asked, reason="utility"), overlay(1))
@@ -177,22 +180,7 @@ def test_an_object_that_somebody_chose_is_named(tmp_path):
 )
 def test_the_log_says_what_a_still_did(tmp_path, changes, text):
     """What is doubted would be found nowhere, and a note of the classifier would pass for a class."""
-    values = {"track_id": 4, "class_after": "car"} | changes
-    still = Refinement(
-        frame_index=0,
-        capture_ns=1_790_000_000_000_000_000,
-        still_sequence=0,
-        edge_track_id=9,
-        box_base_px=(700, 300, 760, 340),
-        still=b"",
-        media_type="image/jpeg",
-        base_crop_bgr=None,
-        class_before="car",
-        confidence=0.95,
-        reason="utility",
-        quality_pct=65,
-        **values,
-    )
+    still = dataclasses.replace(REFINED, **changes)
     ((_, _, line),) = recorded(tmp_path / "a.rrd", still).events()
     assert text in line
     assert ("✓" in line) == bool(changes.get("sure"))
