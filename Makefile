@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test check lint type format docs bench bench-stills bench-compare bench-peers link soak kills fuzz clean help
+.PHONY: setup demo test check lint type format docs bench bench-stills bench-compare bench-peers link soak kills failures fuzz clean help
 
 .PHONY: nightly nightly-tests
 
@@ -35,9 +35,9 @@ test: setup      ## all tests but the nightly ones, on real x265, Zenoh, ONNX mo
 	@$(BIN)/python -m pytest -m 'not realtime' --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder; \
 		together=$$?; $(BIN)/python -m pytest -m realtime && exit $$together
 
-nightly: setup   ## hours: the nightly tests, every scenario at full length, kills, fuzzers, soak; fails where a bar is missed; COUNT= RUNS= LASTS=
+nightly: setup   ## hours: the nightly tests, every scenario at full length, kills, fuzzers, parts taken away, soak; fails where a bar is missed; COUNT= RUNS= LASTS=
 	@failed=; for part in nightly-tests link 'kills COUNT=$(or $(COUNT),50)' 'fuzz RUNS=$(or $(RUNS),15000)' \
-		'soak LASTS=$(or $(LASTS),20min)'; do \
+		failures 'soak LASTS=$(or $(LASTS),20min)'; do \
 		$(MAKE) --no-print-directory COUNT= RUNS= LASTS= STRICT=1 $$part || failed="$$failed, $${part%% *}"; done; \
 		test -z "$$failed" || { echo "failed$$failed"; exit 1; }
 
@@ -77,6 +77,9 @@ soak: setup      ## an hour of fading link: memory, descriptors, threads, accoun
 
 kills: setup     ## kill -9 of edge or ground in the air: what is left is readable; COUNT=50 SEED=
 	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.link.kills $(if $(COUNT),--count $(COUNT)) $(if $(SEED),--seed $(SEED)) $(if $(STRICT),--strict)
+
+failures: setup  ## a flight of the demo scene loses disk, model, viewer and link, one after the other: watch it (the disk needs root)
+	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.failures
 
 fuzz: setup      ## coverage-guided fuzzing of all that comes from outside: RUNS=1000000 TARGET=NAME; needs atheris
 	@PYTHONPATH=.:tests/support $(BIN)/python -m lab.fuzz $(if $(RUNS),--runs $(RUNS)) $(if $(TARGET),--target $(TARGET))

@@ -1,1 +1,1 @@
-"""Programs that try HVT hard: a laboratory of bad links (`link`) and fuzzers of all foreign input (`fuzz`)."""
+"""Programs that try HVT hard: bad links (`link`), failing parts (`failures`), fuzzers of foreign input (`fuzz`)."""

@@ -124,12 +124,14 @@ def number(low: float, high: float, *, unit: str = "") -> SettingType:
     return SettingType("X", parse, float)
 
 
-def choice(*accepted: str) -> SettingType:
-    """One of a few words."""
+def choice(*accepted: str, elsewhere: Mapping[str, str] | None = None) -> SettingType:
+    """One of a few words; of words that another option takes, ``elsewhere`` names that option."""
 
     def parse(text: str, *, name: str) -> str:
         if text not in accepted:
-            raise UserError(f"{name} {text!r} is not known: choose one of {', '.join(accepted)}")
+            option = (elsewhere or {}).get(text)
+            hint = f"; or give {option} {text}" if option else ""
+            raise UserError(f"{name} {text!r} is not known: choose one of {', '.join(accepted)}{hint}")
         return text
 
     return SettingType("|".join(accepted), parse)

@@ -57,6 +57,8 @@ _STORE_BYTES = 200_000_000
 _LEAST_STORE_BYTES = 10_000_000
 LEAST_FPS = 2.0
 """To this ``--fps auto`` may fall: two frames in a window of a second."""
+_AUTO_FIRST_SHARE = 0.95
+"""With ``--profile auto`` stills begin with the least."""
 TRACKS_BPS = 8_000
 """What ``--send-tracks`` takes of the budget: about that for 45 boxes three times a second."""
 
@@ -83,10 +85,15 @@ class EdgeConfig:
         }
     )
 
-    source: str | None = _SOURCE.option(TEXT, None, "clip.mp4, folder/, rtsp://…, /dev/video0 or demo")
+    source: str | None = _SOURCE.option(
+        TEXT, None, "clip.mp4, folder/, rtsp://…, /dev/video0, demo or demo:codes,4k"
+    )
     edge_id: str = _SOURCE.option(TEXT, "edge-1", "name of this edge: 1 to 32 of a-z, 0-9 and -")
-    size: tuple[int, int] | str = _SOURCE.option(
-        or_auto(SIZE), DEFAULT_SIZE, "size of the base stream in pixels; auto: as large as the rate carries"
+    size: tuple[int, int] | str | None = _SOURCE.option(
+        or_auto(SIZE),
+        None,
+        "size of the base stream in pixels; auto: as large as the rate carries",
+        shown_default="1280x720, or what the source fills of it",
     )
     fps: float | str = _SOURCE.option(
         or_auto(number(0.1, 240, unit=" frames a second")),
@@ -141,9 +148,13 @@ class EdgeConfig:
     insecure: bool = _LINK_RARE.switch("allow listening beyond this machine without keys")
     wait: float = _LINK.option(DURATION, 15.0, "how long a clip waits for its first ground before it plays")
 
-    method: str = _SENT.option(choice(*METHODS), "M5", "who gets a still, and when")
+    method: str = _SENT.option(
+        choice(*METHODS, elsewhere=dict.fromkeys(PROFILES, "--profile")), "M5", "who gets a still, and when"
+    )
     profile: str | None = _SENT.option(
-        choice(*PROFILES), None, "settings in one word: thin is everything that helps on a thin link"
+        choice(*PROFILES),
+        None,
+        "settings in one word: auto, thin, paper (docs/methods.md), or a method of hvt-study compare",
     )
     tune: tuple[str, ...] = _SENT_RARE.option(
         TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True
@@ -279,12 +290,19 @@ class EdgeConfig:
     def share(self) -> float:
         """Share of the budget for the base stream; where it is to follow the scene, the one to begin with."""
         assert self.video_share is not None, "check() fills it"
-        return FIRST_SHARE if isinstance(self.video_share, str) else self.video_share
+        if not isinstance(self.video_share, str):
+            return self.video_share
+        return _AUTO_FIRST_SHARE if self.measures else FIRST_SHARE
 
     @property
     def fixed_share(self) -> float | None:
         """The same; None where it is to track the scene."""
         return None if isinstance(self.video_share, str) else self.share
+
+    @property
+    def measures(self) -> bool:
+        """Whether tracks and stills are sent only while they are measured to pay (`hvt_edge.operating.levers`)."""
+        return self.profile == "auto"
 
     @property
     def metadata_bps(self) -> int:
@@ -308,7 +326,7 @@ class EdgeConfig:
 
     @property
     def fixed_size(self) -> tuple[int, int] | None:
-        """(width, height) of the base stream; None where the rate decides."""
+        """(width, height) of the base stream; None where the rate or the source decides."""
         return None if isinstance(self.size, str) else self.size
 
 
@@ -318,9 +336,9 @@ def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
         return config
     settings = dict(PROFILES[config.profile])
     if config.regime is not None:  # which sets the share itself
-        del settings["video_share"]
+        settings.pop("video_share", None)
     if "candidates" in given and config.candidates != "source":
-        del settings["tiles"]
+        settings.pop("tiles", None)
     return replace(config, **{name: value for name, value in settings.items() if name not in given})
 
 

@@ -9,24 +9,33 @@ from typing import Any
 
 __all__ = ["PROFILES", "REGIMES", "Regime"]
 
+_TRACKS = {"candidates": "source", "tiles": "auto", "send_tracks": True}
+_THIN = {
+    "method": "M6",
+    "still_codec": "residual",
+    **_TRACKS,
+    "fps": "auto",
+    "video_share": "auto",
+    "borrow_unused": True,
+    "group_stills": True,
+    "gate": 32.0,
+    "fidelity": 36.0,
+    "roi_depth": 0.1,
+}
+_PAPER = {"method": "M5", "still_codec": "jpeg", "video_share": 0.8125}
+
 PROFILES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
-        "thin": MappingProxyType(
-            {
-                "method": "M6",
-                "still_codec": "residual",
-                "candidates": "source",
-                "tiles": "auto",
-                "send_tracks": True,
-                "fps": "auto",
-                "video_share": "auto",
-                "borrow_unused": True,
-                "group_stills": True,
-                "gate": 32.0,
-                "fidelity": 36.0,
-                "roi_depth": 0.1,
-            }
-        ),
+        "auto": MappingProxyType(_THIN),  # and what pays of it is measured (`EdgeConfig.measures`)
+        "paper": MappingProxyType(_PAPER),
+        "thin": MappingProxyType(_THIN),
+        # What hvt-study compare calls so (docs/compare.md); M0 and R0 are methods.
+        "M0-fps": MappingProxyType({"method": "M0", "fps": "auto"}),
+        "M0-best": MappingProxyType({"method": "M0", "fps": "auto", "size": "auto"}),
+        "M5-jpeg": MappingProxyType({"method": "M5", "still_codec": "jpeg"}),
+        "M5-residual": MappingProxyType({"method": "M5", "still_codec": "residual"}),
+        "tracks": MappingProxyType({"method": "M0", **_TRACKS}),
+        "M6": MappingProxyType(_THIN),
     }
 )
 

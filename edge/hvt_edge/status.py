@@ -23,13 +23,14 @@ from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.operating.keyframes import KeyframeRequests
-from hvt_edge.operating.point import LoopClock, Operating
+from hvt_edge.operating.point import Levers, LoopClock, Operating
 from hvt_edge.stills.stage import StillStage
 
 __all__ = ["InfoReporter", "StatusReporter"]
 
 _MILLION = 1_000_000
-_PART_BYTES, _REASON_BYTES = 24, 160
+_PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
+_LEVERS_REST = 10
 
 
 @dataclass(eq=False)
@@ -91,12 +92,23 @@ class StatusReporter:
 
     def __post_init__(self) -> None:
         self._sequence = 0
+        self._reported: Levers | None = None
+        self._reported_sequence = 0
 
     def send(self, state: str) -> None:
         """Send the report, made for the moment at which it may go."""
         self.counts.measure_cpu(perception_ns=self.stills.analyzer.spent_ns)
         self.transmitter.status(lambda at_ns: self._status(state, at_ns), now_ns=self.loop_clock())
         self._sequence += 1
+
+    def _levers_text(self) -> str:
+        """Where a lever was moved, and now and then: on a thin link a sentence a second is not free."""
+        levers, sent = self.operating.now.levers, self._reported
+        moved = sent is None or (levers.tracks, levers.stills) != (sent.tracks, sent.stills)
+        if not moved and self._sequence - self._reported_sequence < _LEVERS_REST:
+            return ""
+        self._reported, self._reported_sequence = levers, self._sequence
+        return fitted_text(levers.says, _LEVERS_BYTES)
 
     def line(self, link: str) -> str:
         """The status line."""
@@ -110,8 +122,12 @@ class StatusReporter:
             f"tracks {self.stills.analyzer.tracks}",
             link,
         ]
+        if now.levers.says:
+            parts.append(now.levers.says)
         if counts.dropped_cpu:
             parts.append(f"{counts.dropped_cpu} frames dropped: slow machine")
+        if counts.paused_ns:
+            parts.append(f"clip {counts.paused_ns / SECOND_NS:.0f} s longer: slow machine")
         parts += [f"{one.part.upper()} FAILED" for one in self.failures.parts if not one.working]
         return "  ".join(parts)
 
@@ -122,7 +138,7 @@ class StatusReporter:
         """
         counts, stills, transmitter = self.counts, self.stills, self.transmitter
         account = self.ledger.summary(counts.duration_s(self.config.nominal_fps))
-        worst = account.worst_window_bps
+        worst, now = account.worst_window_bps, self.operating.now
         measured = self.config.pace != "lockstep"
         reported_ns = self.inbox.received_ns
         age_ms = -1 if reported_ns is None else max(0, (self.clock() - reported_ns) // _MILLION)
@@ -131,7 +147,7 @@ class StatusReporter:
             sequence=self._sequence,
             state=state,
             send_ns=at_ns,
-            media_ns=max(0, at_ns - self.operating.now.started_ns),
+            media_ns=max(0, at_ns - now.started_ns),
             last_base_sequence=transmitter.base_sequence,
             last_still_sequence=transmitter.still_sequence,
             base_bytes=account.base_bytes,
@@ -173,4 +189,5 @@ class StatusReporter:
                 )
                 for one in self.failures.parts[:MOST_FAILED_PARTS]
             ),
+            levers=self._levers_text(),
         )

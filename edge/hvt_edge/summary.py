@@ -32,8 +32,8 @@ def summary(
 ) -> dict[str, Any]:
     """The JSON summary; rates count every byte on the line: payload, attachments, transport overhead.
 
-    ``duration_s`` is from the first frame sent to the last; ``cores`` of the times in which frames were left out for
-    want of time. ``facts`` are numbers that the ledger does not hold, as they are.
+    ``duration_s`` is from the first frame sent to the last, by their capture; ``cores`` of the times in which frames
+    were left out for want of time. ``facts`` are numbers that the ledger does not hold, as they are.
     """
     account = ledger.summary(duration_s)
     reasons = {outcome: account.outcomes[outcome] for outcome in ("sent", "deferred", "dropped")}
@@ -105,6 +105,8 @@ def _left_out(content: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("", f"{link} of {captured} frames dropped: the link had no room"))
     if cpu:
         rows.append(("", f"{cpu} of {captured} frames dropped{cores}"))
+    if longer := content["clip_paused_s"]:
+        rows.append(("", f"the clip took {longer:.0f} s longer than it is: this machine is too slow for it"))
     if skipped:
         rows.append(("", f"{skipped} of {captured} frames not analyzed{'' if cpu else cores}"))
     return rows

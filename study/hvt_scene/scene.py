@@ -15,7 +15,7 @@ from hvt_scene.drawing.cast import Cast
 from hvt_scene.drawing.foliage import Grove
 from hvt_scene.drawing.ground import paint_ground
 from hvt_scene.drawing.vehicles import CLASS_NAMES
-from hvt_scene.truth import Truth, write_truth
+from hvt_scene.truth import CodeInView, Truth, write_truth
 from hvt_scene.view.camera import Camera, Matrix
 from hvt_scene.view.compose import Bgra, blend, darken
 from hvt_scene.view.project import (
@@ -46,23 +46,35 @@ class Scene:
     Args:
         seed: of layout, traffic, paint and camera.
         size: (width, height) of the pictures in pixels; the width of ground seen does not depend on it.
-        look: light, surfaces, altitude, tilt; the default is the demo's.
+        appearance: light, surfaces, altitude, tilt; the default is the demo's.
+        codes: paint codes on the roofs of vans, trucks and buses (`hvt_scene.drawing.codes`); the rest is the same.
     """
 
     class_names = CLASS_NAMES
     duration_s = 20.0
 
     def __init__(
-        self, seed: int = 0, *, size: tuple[int, int] = (1920, 1080), appearance: Appearance | None = None
+        self,
+        seed: int = 0,
+        *,
+        size: tuple[int, int] = (1920, 1080),
+        appearance: Appearance | None = None,
+        codes: bool = False,
     ) -> None:
         self.size = size
         self._appearance = appearance = appearance or Appearance()
         # Separate streams: a change in how a car is drawn must not move the trees.
-        streams = np.random.SeedSequence(seed).spawn(5)
-        plans, moves, paints, grounds, flight = (np.random.Generator(np.random.PCG64(s)) for s in streams)
+        streams = np.random.SeedSequence(seed).spawn(6)
+        plans, moves, paints, grounds, flight, letters = (
+            np.random.Generator(np.random.PCG64(s)) for s in streams
+        )
         layout = plan(plans, appearance)
         movers = set_in_motion(layout, appearance, rng=moves, duration_s=self.duration_s)
         self.cast = Cast(movers, layout.parked, rng=paints)
+        if codes:
+            self.cast.paint_codes(
+                letters, m_per_px=sum(appearance.width_m) / len(appearance.width_m) / size[0]
+            )
         self._camera = _flight(layout, appearance, size=size, rng=flight, duration_s=self.duration_s)
         self._grove = Grove(layout, appearance, rng=grounds)
         finest = max(min(appearance.width_m) / size[0], 0.05)
@@ -92,7 +104,26 @@ class Scene:
             ids=chosen[large] + 1,
             boxes_source_px=boxes[large].astype(np.float32),
             class_ids=self.cast.class_ids[chosen[large]],
-            visible=self._visible(chosen[large], places[large], local[large]),
+            visible=self._visible(_half(self.cast.outlines_m[chosen[large]]), places[large], local[large]),
+        )
+
+    def codes(self, t_s: float) -> tuple[CodeInView, ...]:
+        """The codes that the picture at ``t_s`` shows, by object; none where none were painted."""
+        _, chosen, places, local = self._view(t_s)
+        marked = np.array([index in self.cast.codes for index in chosen.tolist()], bool)
+        chosen, places, local = chosen[marked], places[marked], local[marked]
+        codes = [self.cast.codes[index] for index in chosen.tolist()]
+        if not codes:
+            return ()
+        world = turns(places).transpose(0, 2, 1)
+        corners_m = np.stack([code.corners_m for code in codes])
+        corners = project(corners_m @ world, local)
+        centres_m = corners_m.mean(1)
+        visible = self._visible(_half(corners_m - centres_m[:, None]), places, local, centres_m=centres_m)
+        return tuple(
+            CodeInView(index + 1, code.text, spots.astype(np.float32), float(share))
+            for index, code, spots, share in zip(chosen.tolist(), codes, corners, visible, strict=True)
+            if share > 0
         )
 
     def write_truth(self, path: Path, *, fps: float, view: View) -> int:
@@ -163,16 +194,26 @@ class Scene:
             blend(frame, box, picture, matrix=matrix, gain=self._appearance.exposure)
 
     def _visible(
-        self, chosen: npt.NDArray[np.int64], places: Floats, local: Floats
+        self, half_m: Floats, places: Floats, local: Floats, *, centres_m: Floats | None = None
     ) -> npt.NDArray[np.float32]:
-        """(K,) share of each body in the frame and not under a crown, from a grid of points over it."""
-        half = np.abs(self.cast.outlines_m[chosen]).max(1) * 0.92
+        """(K,) share of each rectangle in the frame and not under a crown, from a grid of points over it.
+
+        ``half_m`` (K, 2) are half its sides and ``centres_m`` (K, 2) its middle (None: the origin), in body axes.
+        """
         grid = np.stack(np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 9)), axis=-1).reshape(1, -1, 2)
-        points = (grid * half[:, None]) @ turns(places).transpose(0, 2, 1)
+        inner = grid * (0.92 * half_m[:, None])
+        if centres_m is not None:
+            inner = inner + centres_m[:, None]
+        points = inner @ turns(places).transpose(0, 2, 1)
         pixels = project(points, local)
         inside = ((pixels >= 0) & (pixels < np.array(self.size))).all(2)
         covered = self._grove.cover_at(points + places[:, None, :2])
         return np.asarray((inside * (1 - covered)).mean(1), np.float32)
+
+
+def _half(bodies_m: Floats) -> Floats:
+    """(K, 2) half the sides of the rectangles about the origin that hold (K, M, 2) points."""
+    return np.asarray(np.abs(bodies_m).max(1), np.float64)
 
 
 def _flight(

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from hvt_common.units import exact_rate
 from hvt_common.values import Boxes, View
 
-__all__ = ["Truth", "TruthSource", "frame_times", "write_truth"]
+__all__ = ["CodeInView", "Truth", "TruthSource", "frame_times", "write_truth"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +31,30 @@ class Truth:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class CodeInView:
+    """A code painted on a roof, at one moment."""
+
+    object_id: int
+    """As in `Truth.ids`."""
+    text: str
+    corners_source_px: npt.NDArray[np.float32]
+    """(4, 2) of the characters: where reading begins, then along the line, and round. They may lie outside."""
+    visible: float
+    """Share that is inside the frame and not under a canopy, 0…1."""
+
+    @property
+    def height_px(self) -> float:
+        """Of the characters, source pixels."""
+        return float(np.linalg.norm(self.corners_source_px[3] - self.corners_source_px[0]))
+
+    @property
+    def box_source_px(self) -> Boxes:
+        """(4,) float32 x1 y1 x2 y2 around the characters."""
+        corners = self.corners_source_px
+        return np.concatenate([corners.min(0), corners.max(0)])
 
 
 class TruthSource(Protocol):

@@ -31,7 +31,7 @@ def test_what_is_said_without_flags_is_the_low_regime():
     """The defaults of the manual would not be those of the program."""
     config = settled()
     assert (config.budget_bps, config.base_bps) == (800_000, 650_000)
-    assert (config.size, config.fps, config.method) == ((1280, 720), 15.0, "M5")
+    assert (config.size, config.fps, config.method) == (None, 15.0, "M5")
     assert (config.jpeg_quality, config.padding, config.cooldown, config.detect_every) == (65, 0.15, 2.0, 5)
 
 
@@ -65,8 +65,8 @@ def test_the_regimes_are_the_papers():
         (["--regime", "low", "--budget", "1Mbps"], "--regime low already sets"),
         (["--regime", "low", "--video-share", "0.5"], "--regime low already sets"),
         (["--video-share", "0"], "--video-share 0 leaves no base stream"),
-        (["--budget", "60kbps"], "raise --budget, or lower --size or --fps"),
-        (["--budget", "500kbps", "--video-share", "0.1"], "leaves 50 kbps for video"),
+        (["--budget", "60kbps", "--size", "1280x720"], "raise --budget, or lower --size or --fps"),
+        (["--budget", "500kbps", "--video-share", "0.1", "--size", "1280x720"], "leaves 50 kbps for video"),
         (["--window", "10ms"], "--window 0.01s is not accepted"),
         (["--window", "61s"], "--window 61s is not accepted"),
         (["--size", "1281x720"], "size 1281x720 is impossible"),
@@ -143,7 +143,7 @@ def test_every_flag_explains_itself(capsys):
         optional = one.default is None or one.default == ()
         assert shown or optional, f"{flag} does not say its default"
     assert "[800kbps]" in out
-    assert "[1280x720]" in out
+    assert "[1280x720, or what the source fills of it]" in out
     assert "[15.0]" in out
 
 

@@ -23,6 +23,7 @@ def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
         frames_dropped=70,
         frames_dropped_cpu=66,
         frames_unanalyzed=8,
+        clip_paused_s=14.2,
         cores=Cores(needed=1.63, free=1.1),
         duration_s=5.3,
         budget_bps=800_000,
@@ -39,5 +40,6 @@ def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
     said = [text for _, text in table(content)]
     assert "66 of 80 frames dropped: encoder and detector need 1.6 cores, 1.1 were free" in said
     assert "4 of 80 frames dropped: the link had no room" in said
+    assert "the clip took 14 s longer than it is: this machine is too slow for it" in said
     assert "8 of 80 frames not analyzed" in said
     assert said[-1] == "local copy at 2026-09-21T14:13:20+00:00, 3 times: card.mkv is full; works again"

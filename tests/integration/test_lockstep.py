@@ -16,8 +16,8 @@ pytestmark = [pytest.mark.integration, pytest.mark.realdata, pytest.mark.timeout
 
 FRAMES = 60
 
-MEASURED = ("session", "encode_ms", "perception_ms")
-"""What a run measures of the machine; all else follows from the input."""
+MEASURED = ("session", "encode_ms", "perception_ms", "replies", "reply_bytes")
+"""What a run measures of the machine, and how often a ground has asked; all else follows from the input."""
 
 
 @dataclass(frozen=True)

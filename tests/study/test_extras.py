@@ -50,6 +50,7 @@ def done(tmp_path, module, words, without):
         ("hvt_study.cli", ("plan", "demo:0"), ("rerun",), "hvt[study]"),
         ("hvt_study.cli", ("tune", "demo:0-1", "--method", "M5", "--out", "out"), ("optuna",), "hvt[study]"),
         ("hvt_study.cli", ("report", "out"), ("jinja2",), "hvt[study]"),
+        ("hvt_study.cli", ("read", "demo:codes", "--out", "out"), ("rapidocr",), "hvt[reading]"),
         ("hvt_study.cli", ("score", "a.csv", "--truth", "gt.txt"), ("sklearn",), "hvt[study]"),
         ("hvt_ground.cli", ("--help",), ("rerun",), "hvt[ground]"),
         ("hvt_ground.cli", ("keys", "list"), ("cryptography",), "hvt[ground]"),

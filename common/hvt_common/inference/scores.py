@@ -55,7 +55,8 @@ def _metadata(spec: str, *, role: str) -> dict[str, str]:
 
 def uncalibrated(role: str, spec: str) -> str:
     """What is said, once, of a model whose scores are not calibrated."""
+    plug_in = role == "detector" and plug_in_of(spec) is not None
     return (
-        f"{role} {Path(spec).name} has no calibration ({_CALIBRATION} in its metadata):"
+        f"{role} {spec if plug_in else Path(spec).name} has no calibration ({_CALIBRATION} in its metadata):"
         " its scores are no probabilities"
     )

@@ -23,6 +23,7 @@ __all__ = [
     "Grid",
     "TiledDetector",
     "auto_grid",
+    "detect_whole",
     "parse_tiles",
     "tile_boxes",
     "tiled",
@@ -128,6 +129,15 @@ def tile_boxes(
     return [(x, y, x + sides[0], y + sides[1]) for y in starts[1] for x in starts[0]]
 
 
+def detect_whole(detector: Detector, image_bgr: Image) -> Detections:
+    """What the detector finds in the whole picture, without the tiles that `tiled` may have given it."""
+    return (
+        detector.detect_whole(image_bgr)
+        if isinstance(detector, TiledDetector)
+        else detector.detect(image_bgr)
+    )
+
+
 class TiledDetector:
     """Another detector on the whole picture and on ``grid`` overlapping tiles; itself a `Detector`.
 
@@ -165,6 +175,10 @@ class TiledDetector:
                 )
             }
         return self._auto[source_size]
+
+    def detect_whole(self, image_bgr: Image) -> Detections:
+        """As `detect`, without tiles."""
+        return self._detector.detect(image_bgr)
 
     def detect(self, image_bgr: Image) -> Detections:
         """Detections in the pixels of this image, best first; at most `MAX_DETECTIONS`."""

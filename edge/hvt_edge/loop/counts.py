@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Frame
 from hvt_edge.loop.cpu import CpuMeter
 
 __all__ = ["FrameCounts"]
@@ -22,8 +24,11 @@ class FrameCounts:
     unanalyzed: int = 0
     """Coded, or left out by frame decimation, and skipped by perception, because stills or detection were behind."""
     encode_ns: int = 0
-    first_index: int | None = None
+    paused_ns: int = 0
+    """How long the clock of a clip stood still, because the machine was too slow to play it in real time."""
     last_index: int = -1
+    first_capture_ns: int | None = None
+    last_capture_ns: int = 0
     cpu: CpuMeter = field(default_factory=CpuMeter)
     _measured: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0)
     """Captured, dropped for want of time, not analyzed, time of encoding and of perception when it was measured."""
@@ -38,11 +43,11 @@ class FrameCounts:
         """Mean of one frame."""
         return self.encode_ns / max(1, self.encoded) / 1e6
 
-    def note(self, index: int, *, encode_ns: int) -> None:
-        """A frame of this index was encoded."""
-        if self.first_index is None:
-            self.first_index = index
-        self.last_index = index
+    def note(self, frame: Frame, *, encode_ns: int) -> None:
+        """This frame was encoded."""
+        if self.first_capture_ns is None:
+            self.first_capture_ns = frame.capture_ns
+        self.last_index, self.last_capture_ns = frame.index, frame.capture_ns
         self.encoded += 1
         self.encode_ns += encode_ns
 
@@ -59,5 +64,7 @@ class FrameCounts:
         self.cpu.measure(scale=scale, short=bool(dropped or unanalyzed))
 
     def duration_s(self, fps: float) -> float:
-        """From the first frame sent to the last, with one frame's length."""
-        return 0.0 if self.first_index is None else (self.last_index - self.first_index + 1) / fps
+        """From the first frame sent to the last by their capture, with one frame's length."""
+        if self.first_capture_ns is None:
+            return 0.0
+        return (self.last_capture_ns - self.first_capture_ns) / SECOND_NS + 1 / fps

@@ -82,7 +82,7 @@ class LockstepPace:
         decision = self.base.decide(frame.index, now_ns=now_ns)
         unit = self.base.encode(frame, decision, now_ns=now_ns, tracks=self.stills.latest_tracks)
         if unit is not None:
-            self.counts.note(frame.index, encode_ns=time.perf_counter_ns() - began_ns)
+            self.counts.note(frame, encode_ns=time.perf_counter_ns() - began_ns)
         self._finish_analysis()
         self.clock.advance(now_ns)
         if unit is not None:

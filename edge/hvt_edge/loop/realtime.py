@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Self
 
 from hvt_common.runtime.failures import Failures
@@ -21,7 +20,11 @@ from hvt_edge.video.stage import BaseStage
 __all__ = ["RealtimePace"]
 
 _MOST_GAP_NS = SECOND_NS // 4
-"""Of a clip that cannot be read in time so much is left out in a row, and no more: else nothing would be shown."""
+"""Of a clip that cannot be read in time so much is left out in a row, and no more, of its own time and of time as it
+passes: else nothing would be shown."""
+_MOST_LATE_NS = SECOND_NS
+"""A clip that is later than that, and not because of the link, is played slower."""
+_MOST_LINK_LATE_NS = 10 * SECOND_NS
 _LINK_BOUND_NS = SECOND_NS // 100
 _BEHIND_SHARE = 0.5
 """Of the time between two frames: later than that the loop is late."""
@@ -30,6 +33,9 @@ _BEHIND_SHARE = 0.5
 @dataclass(eq=False)
 class RealtimePace:
     """Takes frames when they are due; what it cannot code in time is dropped before it is encoded, never after.
+
+    A clip is dropped from like a camera, and pauses for what that does not make up: its clock stands still for so
+    long, and capture times stay those at which a camera would have taken the frames.
 
     Video waits for nothing behind it: frames for which the stills' thread has no place are coded and sent all the
     same, and only their analysis is skipped. ``before_frame(now_ns)`` runs first, so that rates can track the link.
@@ -50,6 +56,8 @@ class RealtimePace:
     def __post_init__(self) -> None:
         self._missed: int | None = None
         self._must_code_ns = 0
+        self._sent_ns = self._link_late_ns = 0
+        """When the last frame was sent; how late a clip is because the link took its time, not yet made up."""
         self._link_bound = False
         """Sending the last frame took longer than coding it."""
         self._worker = StillWorker(
@@ -71,23 +79,28 @@ class RealtimePace:
         self._drop(newly_missed)
         behind = newly_missed > 0
         if not self.live:
-            if not self._in_time(frame) and frame.capture_ns < self._must_code_ns:
+            frame = self._by_clip_clock(frame)
+            in_time = self._in_time(frame)
+            shown_lately = self.clock() - self._sent_ns < _MOST_GAP_NS
+            if not in_time and frame.capture_ns < self._must_code_ns and shown_lately:
                 self._drop(1)
                 return
             self._must_code_ns = frame.capture_ns + _MOST_GAP_NS
             behind = self.clock() - frame.capture_ns > _BEHIND_SHARE * SECOND_NS / self.fps
         now_ns = self.clock()
         self.before_frame(now_ns)
-        began_ns = time.perf_counter_ns()
+        began_ns = self.clock()
         decision = self.base.decide(frame.index, now_ns=now_ns)
         unit = self.base.encode(frame, decision, now_ns=now_ns, tracks=self.stills.latest_tracks)
-        encoded_ns = time.perf_counter_ns()
+        encoded_ns = self.clock()
         if unit is not None:
-            self.counts.note(frame.index, encode_ns=encoded_ns - began_ns)
-            self.base.send(unit, decision, now_ns=self.clock())
+            self.counts.note(frame, encode_ns=encoded_ns - began_ns)
+            self.base.send(unit, decision, now_ns=encoded_ns)
         elif decision.action is Action.HOLD:
             self.counts.dropped_link += 1
-        sending_ns = time.perf_counter_ns() - encoded_ns
+        self._sent_ns = self.clock()
+        sending_ns = self._sent_ns - encoded_ns
+        self._link_late_ns = min(_MOST_LINK_LATE_NS, self._link_late_ns + sending_ns)
         self._link_bound = sending_ns > max(encoded_ns - began_ns, _LINK_BOUND_NS)
         # Video goes first: perception gets no frame while the loop is late.
         self.counts.unanalyzed += not self._worker.take(frame, unit, late=behind)
@@ -104,6 +117,18 @@ class RealtimePace:
             self.counts.dropped_link += count
         else:
             self.counts.dropped_cpu += count
+
+    def _by_clip_clock(self, frame: Frame) -> Frame:
+        """The frame of a clip with the time at which it is due, which is later where the machine is too slow.
+
+        What the link took is made up for by dropping frames, at twice the speed of the clip.
+        """
+        now_ns = self.clock()
+        self._link_late_ns = max(0, self._link_late_ns - (now_ns - self._sent_ns))
+        late_ns = now_ns - frame.capture_ns - self.counts.paused_ns - self._link_late_ns
+        if late_ns > _MOST_LATE_NS:
+            self.counts.paused_ns += late_ns
+        return replace(frame, capture_ns=frame.capture_ns + self.counts.paused_ns)
 
     def _in_time(self, frame: Frame) -> bool:
         """Wait until the frame of a clip is due; False where it is so late that the next is due already."""

@@ -1,7 +1,8 @@
 """The operating point: budget, split, method and frame rate as they are now.
 
-Settings are frozen; what commands and the link change lives here. Two write: `hvt_edge.control.commands` what a
-ground commanded, and the frame loop (`hvt_edge.video.reconfigure`) what the link allows and what x265 was opened for.
+Settings are frozen; what commands, the link and measurements change lives here. Three write:
+`hvt_edge.control.commands` what a ground commanded, the frame loop (`hvt_edge.video.reconfigure`) what the link
+allows and what x265 was opened for, and `hvt_edge.operating.levers` what is worth sending beside the video.
 The encoder, the budget, ``info``, status and summary all read the same.
 """
 
@@ -11,7 +12,18 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-__all__ = ["LoopClock", "Operating", "OperatingPoint", "base_rate_bps"]
+__all__ = ["Levers", "LoopClock", "Operating", "OperatingPoint", "base_rate_bps"]
+
+
+@dataclass(frozen=True, slots=True)
+class Levers:
+    """What is sent beside the video, where the settings allow it."""
+
+    tracks: bool = True
+    stills: bool = True
+    """Those of the method; a still that a ground requests is always sent."""
+    says: str = ""
+    """Why, in one line for people; empty where nothing is measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +43,7 @@ class OperatingPoint:
     """Each n-th source frame is coded."""
     highest_budget_bps: int
     """Of all budgets that were in force."""
+    levers: Levers = Levers()
     started_ns: int = 0
     """When the first frame was taken; 0 before."""
 
@@ -75,6 +88,10 @@ class Operating:
     def open(self, *, total_bps: int, base_bps: int, decimation: int) -> None:
         """What x265 is opened for, and the total that goes with it."""
         self._set(total_bps=total_bps, base_bps=base_bps, decimation=decimation)
+
+    def pull(self, levers: Levers) -> None:
+        """What was measured decides anew what is sent beside the video."""
+        self._set(levers=levers)
 
     def _set(self, **changes: object) -> None:
         with self._lock:

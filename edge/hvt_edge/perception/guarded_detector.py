@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from hvt_common.inference.detect import Detector
 from hvt_common.inference.few_found import FewFoundHint
+from hvt_common.inference.tiles import detect_whole
 from hvt_common.runtime.failures import Failures, Retried, RetryPause
 from hvt_common.values import Detections, Image
 
@@ -38,3 +39,7 @@ class GuardedDetector(Retried[Detector]):
         if found is not None and self._hint is not None:
             self._hint.take(found)
         return found
+
+    def detect_whole(self, image_bgr: Image) -> Detections | None:
+        """As `hvt_common.inference.tiles.detect_whole`; None while it does not work."""
+        return self.run(lambda model: detect_whole(model, image_bgr))

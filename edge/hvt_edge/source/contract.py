@@ -10,10 +10,12 @@ from typing import Self
 from hvt_common.errors import UserError
 from hvt_common.values import Frame, View
 
-__all__ = ["BaseSize", "Source", "check_shape"]
+__all__ = ["BaseSize", "Source", "check_shape", "size_within"]
 
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
 """(width, height) of the base frames, or how they follow from those of the source."""
+
+_LEAST_SIDE_PX, _MOST_SIDE_PX = 64, 8192
 
 
 class Source(ABC):
@@ -57,13 +59,24 @@ class Source(ABC):
         self.close()
 
 
+def size_within(source_size: tuple[int, int], box: tuple[int, int]) -> tuple[int, int]:
+    """The largest (width, height) of the source's aspect ratio within a box: even, and 64 on a side at least."""
+    scale = min(box[0] / source_size[0], box[1] / source_size[1])
+    wide, high = (
+        max(_LEAST_SIDE_PX, min(round(side * scale / 2) * 2, most // 2 * 2))
+        for side, most in zip(source_size, box, strict=True)
+    )
+    return wide, high
+
+
 def check_shape(*, size: BaseSize, fps: float, source_fps: float | None = None) -> None:
     """Raise `UserError` for a size or rate that no base stream can have, with what is accepted."""
-    wide, high = (64, 64) if callable(size) else size
+    wide, high = (_LEAST_SIDE_PX, _LEAST_SIDE_PX) if callable(size) else size
     # HEVC codes 4:2:0 pictures in even sizes only.
-    if wide % 2 or high % 2 or not (64 <= wide <= 8192 and 64 <= high <= 8192):
+    if wide % 2 or high % 2 or not all(_LEAST_SIDE_PX <= side <= _MOST_SIDE_PX for side in (wide, high)):
         raise UserError(
-            f"size {wide}x{high} is impossible: width and height must be even and between 64 and 8192"
+            f"size {wide}x{high} is impossible: width and height must be even and between {_LEAST_SIDE_PX} and "
+            f"{_MOST_SIDE_PX}"
         )
     if not (math.isfinite(fps) and 0 < fps <= 240):
         raise UserError(f"fps {fps:g} is impossible: accepted is above 0 and at most 240 frames a second")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -76,15 +77,15 @@ class FolderSource(Source):
         """The sequence from its beginning."""
         rate = exact_rate(self.fps)
         places = ((place * self._period_s, place) for place in range(len(self._files)))
-        shown, image = -1, self._first
+        shown, image, frame = -1, self._first, None
         for index, place in hold(places, fps=rate, tail_s=self._period_s):
             if index == self.frame_count:
                 return
-            if place != shown:
+            capture_ns = capture_time_ns(index, fps=rate, start_ns=start_ns)
+            if place != shown or frame is None:
                 image, shown = self._readable(place, held=image), place
-            yield self._resizer.frame(
-                image, index=index, capture_ns=capture_time_ns(index, fps=rate, start_ns=start_ns)
-            )
+                frame = self._resizer.frame(image, index=index, capture_ns=capture_ns)
+            yield replace(frame, index=index, capture_ns=capture_ns)
 
     def _readable(self, place: int, *, held: Image) -> Image:
         image = _read(self._files[place])

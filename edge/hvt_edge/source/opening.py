@@ -12,7 +12,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
 from hvt_edge.source.contract import BaseSize, Source, check_shape
-from hvt_edge.source.demo import DemoSource
+from hvt_edge.source.demo import DemoSource, is_demo
 from hvt_edge.source.folder import FolderSource
 from hvt_edge.source.live import LiveSource
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber
@@ -20,7 +20,9 @@ from hvt_edge.source.video import VideoSource
 
 __all__ = ["Source", "check_shape", "open_source"]
 
-_ACCEPTED = "a video file, a folder of images, rtsp://…, http://…, udp://…, /dev/videoN or demo"
+_ACCEPTED = (
+    "a video file, a folder of images, rtsp://…, http://…, udp://…, /dev/videoN, demo or demo:codes,4k"
+)
 
 
 def open_source(
@@ -44,8 +46,8 @@ def open_source(
     Raises `UserError` if nothing usable is there, or size or rate are impossible.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
-    if spec == "demo":
-        return DemoSource(size=size, fps=fps, fit=fit, seed=seed, max_frames=max_frames)
+    if is_demo(spec):
+        return DemoSource(spec, size=size, fps=fps, fit=fit, seed=seed, max_frames=max_frames)
     live = partial(
         LiveSource, size=size, fps=fps, fit=fit, max_frames=max_frames, clock=clock, failures=failures
     )

@@ -104,20 +104,14 @@ class Resizer:
         size = base_size(source_size) if callable(base_size) else base_size
         self.view = View.fitted(source_size, size, fit=fit)
         self._fit = fit
-        self._last: tuple[Image, Image] | None = None
 
     def frame(self, source_bgr: Image, *, index: int, capture_ns: int) -> Frame:
-        """The base frame of a picture, which is first fitted to the source size if it has another. Both read-only.
-
-        The same picture again, as the same object, is not resized again.
-        """
-        if self._last is None or self._last[0] is not source_bgr:
-            whole = into_canvas(source_bgr, self.view.source_size)
-            whole.flags.writeable = False
-            base = self._resized(whole)
-            base.flags.writeable = False
-            self._last, self._whole = (source_bgr, base), whole
-        return Frame(index=index, capture_ns=capture_ns, source_bgr=self._whole, base_bgr=self._last[1])
+        """The base frame of a picture, which is first fitted to the source size if it has another. Both read-only."""
+        whole = into_canvas(source_bgr, self.view.source_size)
+        whole.flags.writeable = False
+        base = self._resized(whole)
+        base.flags.writeable = False
+        return Frame(index=index, capture_ns=capture_ns, source_bgr=whole, base_bgr=base)
 
     def _resized(self, source: Image) -> Image:
         if self.view.source_size == self.view.base_size:

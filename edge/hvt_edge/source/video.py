@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Generator, Iterator
 from contextlib import closing
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -90,14 +91,17 @@ class VideoSource(Source):
         with container, closing(_decoded(container, stream, spec=self._spec)) as decoded:
             slack_s = Fraction(0) if self._override else Fraction(stream.time_base or 0)
             stamped = self._stamped(decoded)
-            held: tuple[av.VideoFrame, Image] | None = None
+            held: tuple[av.VideoFrame, Frame] | None = None
             for index, frame in hold(stamped, fps=base_rate, tail_s=1 / self._rate, slack_s=slack_s):
                 if index == self._limit:
                     return
-                if held is None or held[0] is not frame:  # only what is shown is converted
-                    held = (frame, upright_bgr(frame))
                 capture_ns = capture_time_ns(index, fps=base_rate, start_ns=start_ns)
-                yield self._resizer.frame(held[1], index=index, capture_ns=capture_ns)
+                if held is None or held[0] is not frame:  # only what is shown is converted
+                    held = (
+                        frame,
+                        self._resizer.frame(upright_bgr(frame), index=index, capture_ns=capture_ns),
+                    )
+                yield replace(held[1], index=index, capture_ns=capture_ns)
 
     def _stamped(self, decoded: Iterator[av.VideoFrame]) -> Iterator[tuple[Fraction, av.VideoFrame]]:
         """Frames with their times; one without a time stamp follows its predecessor by the clip's mean period."""

@@ -80,8 +80,10 @@ class Chooser:
 
     # Which candidates get a still
 
-    def consider(self, analyzed: AnalyzedFrame, *, now_ns: int, allowance_bytes: int) -> None:
-        """Take in one frame's tracks; at a decision step let the method request stills.
+    def consider(
+        self, analyzed: AnalyzedFrame, *, now_ns: int, allowance_bytes: int, paused: bool = False
+    ) -> None:
+        """Take in one frame's tracks; at a decision step let the method request stills, unless it is ``paused``.
 
         Where stills build on the base, a step that falls on a frame without one is put off to the next that has one.
         """
@@ -92,7 +94,7 @@ class Chooser:
         due = analyzed.detected or self._put_off
         able = analyzed.base_bgr is not None or not self.maker.codec.needs_base
         self._put_off = due and not able
-        if not (due and able):
+        if paused or not (due and able):
             self.memory.observe(analyzed.tracks, now_ns=now_ns)
             return
         step = Step(

@@ -5,24 +5,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 
+from hvt_common.inference.class_names import same_kind
 from hvt_common.protocol.messages import StillResult
 from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.operating.levers import LeverControl
+from hvt_edge.operating.point import Levers
 from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer
+from hvt_edge.perception.shadow import ShadowGround
 from hvt_edge.stills.outbox import Outbox
 from hvt_edge.stills.scheduler import Chooser
 from hvt_edge.stills.sending import StillSender
 
 __all__ = ["StillStage"]
 
+_ALL = Levers()
+
 
 @dataclass(eq=False)
 class StillStage:
     """Takes each frame with its access unit, if it has one, after the unit was sent.
 
-    With a ``reporter`` the edge's own tracks go out at each decision step, before the stills of it.
+    With a ``reporter`` the edge's own tracks go out at each decision step, before the stills of it. With ``levers``
+    both depend on what they were measured to give.
     """
 
     analyzer: Analyzer
@@ -33,9 +40,13 @@ class StillStage:
     transmitter: Transmitter
     keyframes: KeyframeRequests
     reporter: TrackReporter | None = None
+    shadow: ShadowGround | None = None
+    levers: LeverControl | None = None
+    """Decides by what ``shadow`` and the grounds say; None: tracks and stills are sent as the settings allow."""
 
     def __post_init__(self) -> None:
         self._latest_tracks: Tracks | None = None
+        self._scene_changes = 0
 
     @property
     def latest_tracks(self) -> Tracks | None:
@@ -67,7 +78,10 @@ class StillStage:
 
         ``skipped`` are units before it, of frames that were not analyzed.
         """
-        return self.analyzer.analyze(frame, unit, skipped=skipped, hurry=hurry)
+        analyzed = self.analyzer.analyze(frame, unit, skipped=skipped, hurry=hurry)
+        if self.shadow is not None and not hurry:
+            self.shadow.compare(analyzed)
+        return analyzed
 
     def send(self, analyzed: AnalyzedFrame, *, now_ns: int, held: bool | None = None) -> set[int]:
         """Choose, and send the stills that may go now; return their sequence numbers.
@@ -76,13 +90,16 @@ class StillStage:
         asks the plan.
         """
         self._latest_tracks = analyzed.tracks
-        if self.reporter is not None and analyzed.detected:
+        levers = self._decided(now_ns)
+        if self.reporter is not None and analyzed.detected and levers.tracks:
             self.reporter.report(analyzed, now_ns=now_ns)
         if most_bytes := self.transmitter.most_still_bytes():
             self.chooser.set_most_bytes(most_bytes)
         # What is requested waits until the link is free, which right behind a base frame it never is.
         allowance_bytes = self.transmitter.still_allowance_bytes(now_ns, paced=False)
-        self.chooser.consider(analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes)
+        self.chooser.consider(
+            analyzed, now_ns=now_ns, allowance_bytes=allowance_bytes, paused=not levers.stills
+        )
         return self.send_pending(now_ns=now_ns, held=held)
 
     def send_pending(self, *, now_ns: int, held: bool | None = None) -> set[int]:
@@ -108,12 +125,45 @@ class StillStage:
             if result.again:
                 self.outbox.on_undecodable(result.still_sequence)
             if result.class_name:
+                self._note_change(result)
                 self.chooser.record_feedback(
                     result.track_id,
                     class_name=result.class_name,
                     confidence=result.confidence,
                     entropy_nats=result.entropy_nats,
                 )
+
+    def note_load(self, captured: int, unanalyzed: int, *, now_ns: int) -> None:
+        """How many frames came so far, and how many of them `analyze` never saw; about once a second."""
+        if self.levers is not None:
+            self.levers.take_load(captured, unanalyzed, now_ns=now_ns)
+
+    def _decided(self, now_ns: int) -> Levers:
+        """What is to be sent beside the video, from this step on."""
+        if self.levers is None:
+            return _ALL
+        if self.shadow is not None:
+            if self.shadow.scene_changes != self._scene_changes:
+                self._scene_changes = self.shadow.scene_changes
+                self.levers.forget()
+            seen = self.shadow.now
+            self.levers.take_shadow(
+                gain=seen.gain,
+                hidden=seen.hidden,
+                misnamed_share=seen.misnamed_share,
+                comparisons=seen.comparisons,
+            )
+        return self.levers.decide(now_ns)
+
+    def _note_change(self, result: StillResult) -> None:
+        """A still changed something where the ground now calls the object other than the edge does."""
+        if self.levers is None or self._latest_tracks is None:
+            return
+        tracks = self._latest_tracks
+        rows = (tracks.ids == result.track_id).nonzero()[0]
+        if len(rows):
+            name = self.chooser.class_names[int(tracks.class_ids[rows[0]])]
+            self.levers.take_answer(changed=not same_kind(result.class_name, name))
 
     def close(self) -> None:
         """Give up what is pending."""

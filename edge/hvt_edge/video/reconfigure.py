@@ -175,7 +175,7 @@ class EncoderReconfiguration:
         """The base's part of so much in all; never less than x265 can follow at its lowest frame rate."""
         settings = self.settings
         least_bps = least_base_bps(settings.size, settings.least_fps, edge_id=settings.edge_id)
-        return max(least_bps, base_rate_bps(total_bps, self._share, metadata_bps=settings.metadata_bps))
+        return max(least_bps, base_rate_bps(total_bps, self._share, metadata_bps=self._metadata_bps))
 
     @property
     def _share(self) -> float:
@@ -184,6 +184,11 @@ class EncoderReconfiguration:
         if commanded is not None:
             return commanded
         return FIRST_SHARE if self.split is None else self.split.share
+
+    @property
+    def _metadata_bps(self) -> int:
+        """What is kept for tracks, while they are sent."""
+        return self.settings.metadata_bps if self.operating.now.levers.tracks else 0
 
     @property
     def _moving(self) -> bool:
@@ -202,6 +207,7 @@ class EncoderReconfiguration:
             return self._base_of_budget() if changed else now.base_bps
         total_bps = now.budget_bps if self.pacer is None else self.pacer.steady_bps
         with self._lock:
+            self.split.set_beside(metadata_bps=self._metadata_bps, stills=now.levers.stills)
             if changed or self.pacer is not None:
                 self.split.set_total(total_bps)
             share = self.split.propose()
@@ -209,6 +215,4 @@ class EncoderReconfiguration:
         return now.base_bps if share is None else round(now.budget_bps * share)
 
     def _base_of_budget(self) -> int:
-        return base_rate_bps(
-            self.operating.now.budget_bps, self._share, metadata_bps=self.settings.metadata_bps
-        )
+        return base_rate_bps(self.operating.now.budget_bps, self._share, metadata_bps=self._metadata_bps)

@@ -64,6 +64,7 @@ class Split:
         self._gain = gain or ExpectedGain()
         self.share = first_share
         """Of the budget, for the base: the first, then what was last proposed."""
+        self._stills = True
         self._need_bytes = 0.0
         self._shown = 1.0
         self._observed_ns: int | None = None
@@ -88,6 +89,11 @@ class Split:
         """Another budget from now on; the share stays as it is, unless x265 could not follow it any more."""
         self._settings = replace(self._settings, total_bps=total_bps)
         self.share = max(self.share, min(1.0, self._settings.least_base_bps / total_bps))
+
+    def set_beside(self, *, metadata_bps: int, stills: bool) -> None:
+        """What is sent beside the base from now on; without stills theirs is the base's."""
+        self._settings = replace(self._settings, metadata_bps=metadata_bps)
+        self._stills = stills
 
     def propose(self) -> float | None:
         """The base's share of the budget from the keyframe that is due now; None to leave it as it is."""
@@ -115,6 +121,8 @@ class Split:
     def _still_share(self) -> float:
         """What stills want, within what they may have, within what the base can spare."""
         settings = self._settings
+        if not self._stills:
+            return 0.0
         wanted = 8 * self._need_bytes / settings.horizon_s / settings.total_bps
         wanted = min(settings.most_still_share, max(settings.least_still_share, wanted))
         return max(0.0, min(wanted, 1 - self._metadata_share() - self._floor_bps() / settings.total_bps))

@@ -5,7 +5,7 @@ from hvt_edge.wiring.perception import make_detector, track_confidence, warm_up_
 from hvt_edge.wiring.stages import Stages, build_stages
 from hvt_edge.wiring.stills import check_codecs
 from hvt_edge.wiring.storing import check_files, check_store
-from hvt_edge.wiring.video import base_size
+from hvt_edge.wiring.video import base_size, default_size
 
 __all__ = [
     "Stages",
@@ -14,6 +14,7 @@ __all__ = [
     "check_codecs",
     "check_files",
     "check_store",
+    "default_size",
     "make_detector",
     "make_link_settings",
     "track_confidence",

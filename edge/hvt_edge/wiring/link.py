@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import LEAST_FPS, EdgeConfig
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.pacer import Pacer
 from hvt_edge.link.rate_control import RateController, RateSettings
+from hvt_edge.operating.levers import LeverControl, LeverSettings
+from hvt_edge.operating.point import Operating
 from hvt_edge.video.encoder_settings import least_base_bps
 from hvt_edge.video.share import Split, SplitSettings
+
+_AUTO_STILL_SHARE = 0.15
+"""Of the budget, at most, for stills that are not known to pay: what the base loses by it is .015 of F1."""
+_AUTO_REST_S = 8.0
+"""Between two keyframes for the sake of another split."""
 
 
 def make_link_settings(config: EdgeConfig) -> LinkSettings:
@@ -44,13 +53,22 @@ def make_split(config: EdgeConfig, size: tuple[int, int]) -> Split | None:
     if not isinstance(config.video_share, str):
         return None
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps
-    return Split(
-        SplitSettings(
-            total_bps=config.budget_bps,
-            least_base_bps=least_base_bps(size, fps, edge_id=config.edge_id),
-            metadata_bps=config.metadata_bps,
-        )
+    settings = SplitSettings(
+        total_bps=config.budget_bps,
+        least_base_bps=least_base_bps(size, fps, edge_id=config.edge_id),
+        metadata_bps=config.metadata_bps,
     )
+    if config.measures:  # stills have to earn more
+        settings = replace(settings, most_still_share=_AUTO_STILL_SHARE, own_rest_s=_AUTO_REST_S)
+        return Split(settings, first_share=config.share)
+    return Split(settings)
+
+
+def make_levers(config: EdgeConfig, operating: Operating) -> LeverControl | None:
+    """Who decides what is sent beside the video; None where the settings do."""
+    if not config.measures:
+        return None
+    return LeverControl(operating, LeverSettings(tracks_bps=config.metadata_bps))
 
 
 def make_pacer(config: EdgeConfig) -> Pacer | None:

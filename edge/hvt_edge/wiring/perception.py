@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import logging
+import time
+from functools import partial
 from typing import Literal, cast
 
 from hvt_common.inference.detect import MOTION, Detector, open_detector, warm_up
 from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
-from hvt_common.inference.tiles import tiled
+from hvt_common.inference.tiles import detect_whole, tiled
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
 from hvt_edge.perception.analyzer import Analyzer, AnalyzerSettings, FailingDetector
+from hvt_edge.perception.guarded_detector import GuardedDetector
+from hvt_edge.perception.shadow import ShadowGround, ShadowSettings
 
 _log = logging.getLogger(__name__)
 
@@ -52,6 +56,22 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
             detect_every=config.detect_every,
             candidates=cast('Literal["decoded", "source"]', config.candidates),
         ),
+    )
+
+
+def make_shadow(config: EdgeConfig, detector: FailingDetector) -> ShadowGround | None:
+    """What measures how much of the source the base stream shows; None where nothing depends on it."""
+    if not config.measures:
+        return None
+    whole = (
+        detector.detect_whole
+        if isinstance(detector, GuardedDetector)
+        else partial(detect_whole, cast("Detector", detector))
+    )
+    return ShadowGround(
+        whole,
+        settings=ShadowSettings(confidence=track_confidence(config)),
+        spent_ns=None if config.pace == "lockstep" else time.thread_time_ns,
     )
 
 

@@ -33,8 +33,8 @@ from hvt_edge.video.frame_skip import LimitedFrameSkip
 from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
-from hvt_edge.wiring.link import make_budget, make_pacer, make_split
-from hvt_edge.wiring.perception import make_analyzer
+from hvt_edge.wiring.link import make_budget, make_levers, make_pacer, make_split
+from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.stills import make_chooser, make_on_demand, make_still_maker
 from hvt_edge.wiring.storing import make_backlog
 from hvt_edge.wiring.video import (
@@ -199,6 +199,8 @@ def build_stages(
         transmitter=transmitter,
         keyframes=keyframes,
         reporter=TrackReporter(transmitter, session_id=session_id) if config.send_tracks else None,
+        shadow=make_shadow(config, detector),
+        levers=make_levers(config, operating),
     )
     commands = Commands(
         config,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from typing import cast
 
 from hvt_common.units import SECOND_NS
+from hvt_common.values import Fit
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.source.contract import BaseSize
+from hvt_edge.source.contract import BaseSize, size_within
 from hvt_edge.video.encoder_settings import encoder_settings, payload_bps
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.keyframes import keyframe_interval_s
@@ -18,6 +20,8 @@ from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.x265 import BaseEncoder
 
 _MOST_ENCODER_THREADS = 4  # a 720p picture has twelve rows of blocks, each some steps behind the one above
+_AUTO_LEAST_FPS = 5.0
+"""With ``--profile auto``: frames that are larger arrive later, and nobody asked for delay."""
 _REST_S = 10.0
 """How often ``--fps auto`` may think again."""
 
@@ -26,7 +30,18 @@ def base_size(config: EdgeConfig) -> BaseSize:
     """The base stream's size, or how it follows from the source's."""
     if config.fixed_size is not None:
         return config.fixed_size
+    if config.size is None:
+        return lambda source_size: default_size(source_size, fit=cast("Fit", config.fit))
     return lambda source_size: _chosen(config, source_size, size=None)[0]
+
+
+def default_size(source_size: tuple[int, int], *, fit: Fit) -> tuple[int, int]:
+    """What ``--size`` is unless it is given: at most 1280x720, and never larger than the source.
+
+    With ``letterbox`` it has the source's aspect ratio, which leaves no border; ``crop`` cuts to that of 1280x720.
+    """
+    box = (min(source_size[0], DEFAULT_SIZE[0]), min(source_size[1], DEFAULT_SIZE[1]))
+    return size_within(source_size if fit == "letterbox" else DEFAULT_SIZE, box)
 
 
 def first_decimation(config: EdgeConfig, size: tuple[int, int]) -> int:
@@ -49,15 +64,20 @@ def _chosen(
         size=size,
         fps=None if config.auto_fps else config.nominal_fps,
         most_fps=config.nominal_fps,
-        least_fps=LEAST_FPS,
+        least_fps=_least_fps(config),
     )
+
+
+def _least_fps(config: EdgeConfig) -> float:
+    """The lowest rate of coded frames that is chosen; a thin link may enforce less."""
+    return _AUTO_LEAST_FPS if config.measures else LEAST_FPS
 
 
 def make_frame_skip(config: EdgeConfig, decimation: int) -> FrameSkip:
     """Which source frames are coded."""
     if not config.auto_fps:
         return FrameSkip(decimation)
-    most = most_decimation(config.nominal_fps, least_fps=LEAST_FPS)
+    most = most_decimation(config.nominal_fps, least_fps=_least_fps(config))
     return MeasuredFrameSkip(
         decimation, most_decimation=most, rest_frames=round(_REST_S * config.nominal_fps)
     )
@@ -71,7 +91,8 @@ def make_encoder(
         size=size,
         fps=config.nominal_fps / decimation,
         preset=config.preset,
-        total_bps=total_bps - config.metadata_bps,
+        # What is kept for tracks may be the base's while none are sent.
+        total_bps=max(total_bps - config.metadata_bps, base_bps),
         base_bps=base_bps,
         edge_id=config.edge_id,
         side_data=config.roi_depth > 0,

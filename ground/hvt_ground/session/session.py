@@ -98,10 +98,11 @@ class GroundSession:
         self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
         self.last_status: Status | None = None
+        self._levers = ""
         self._last_step = -1
         self._stepped_ns = self._status_ns = 0
         """When the newest report of tracks came, and the newest status."""
-        self._first_index: int | None = None
+        self._first_capture_ns: int | None = None
         self._last_index = -1
         self._last_capture_ns = 0
         self._results: list[StillResult] = []
@@ -143,8 +144,8 @@ class GroundSession:
         at_ns = header.send_ns
         self._account.count(Channel.BASE, Account.BASE, item, at_ns=at_ns)
         self.frames_received += 1
-        if self._first_index is None:
-            self._first_index = header.frame_index
+        if self._first_capture_ns is None:
+            self._first_capture_ns = header.capture_ns
         self._last_index, self._last_capture_ns = header.frame_index, header.capture_ns
         if not decode:
             return True
@@ -204,6 +205,9 @@ class GroundSession:
         self._account.count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
         self._account.time(Channel.STATUS, item, status, handled=True)
         self.last_status = status
+        if status.levers and status.levers != self._levers:
+            self._levers = status.levers
+            self.note("info", status.levers)
 
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
         """Count a chunk, of whichever session; ``delivered``: with it an object was whole, and is of use."""
@@ -270,10 +274,11 @@ class GroundSession:
 
     @property
     def duration_s(self) -> float:
-        """From the first frame received to the last."""
-        if self._first_index is None:
+        """From the first frame received to the last by their capture, with one frame's length."""
+        if self._first_capture_ns is None:
             return 0.0
-        return (self._last_index - self._first_index + 1) / self.info.fps
+        span_ns = max(0, self._last_capture_ns - self._first_capture_ns)
+        return span_ns / SECOND_NS + 1 / self.info.fps
 
     @property
     def is_whole(self) -> bool:

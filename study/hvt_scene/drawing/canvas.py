@@ -42,7 +42,7 @@ class Sprite:
     def __init__(self, bgra: npt.NDArray[np.uint8], *, height_m: float) -> None:
         self.height_m = height_m
         self._levels: dict[int, tuple[npt.NDArray[np.uint8], float, float]] = {}
-        self._bgra = bgra
+        self.bgra = bgra
         self.outline_m = _outline(bgra)
 
     def level(self, m_per_px: float) -> tuple[npt.NDArray[np.uint8], float, float]:
@@ -52,10 +52,10 @@ class Sprite:
         """
         step = max(0, int(np.floor(2 * np.log2(max(m_per_px, SPRITE_M_PER_PX) / SPRITE_M_PER_PX))))
         if step not in self._levels:
-            high, wide = self._bgra.shape[:2]
+            high, wide = self.bgra.shape[:2]
             shrink = 2.0 ** (step / 2)
             size = (max(2, round(wide / shrink)), max(2, round(high / shrink)))
-            small = cv2.resize(self._bgra, size, interpolation=cv2.INTER_AREA) if step else self._bgra
+            small = cv2.resize(self.bgra, size, interpolation=cv2.INTER_AREA) if step else self.bgra
             scale = (wide * SPRITE_M_PER_PX / size[0], high * SPRITE_M_PER_PX / size[1])
             self._levels[step] = (np.asarray(small, np.uint8), *scale)
         return self._levels[step]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from collections.abc import Sequence as Many
 from contextlib import AbstractContextManager
@@ -38,10 +39,12 @@ __all__ = [
     "make_out",
     "open_pool",
     "open_sequences",
+    "parse_rates",
     "study_plan",
 ]
 
 _LEAST_FRAMES = 30
+_LEAST_KBPS, _MOST_KBPS = 20.0, 100_000.0
 _MOST_JOBS = 256
 _ALL_AT_ONCE = 10_000
 """A cluster has a queue of its own."""
@@ -161,6 +164,23 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
         metavar="DIR",
         help="finished flights (default: DIR/cache)",
     )
+
+
+def parse_rates(text: str) -> tuple[int, ...]:
+    """``150,300`` kbps as bits a second, rising, each once; `UserError` for what is no such rate."""
+    rates: set[int] = set()
+    for word in text.split(","):
+        try:
+            kbps = float(word)
+        except ValueError:
+            kbps = math.nan
+        if not _LEAST_KBPS <= kbps <= _MOST_KBPS:
+            raise UserError(
+                f"--rates {word.strip()!r} is not accepted: give kbps from {_LEAST_KBPS:g} to {_MOST_KBPS:g}, "
+                "for example 150,300"
+            )
+        rates.add(round(kbps * 1000))
+    return tuple(sorted(rates))
 
 
 def open_sequences(arguments: argparse.Namespace) -> tuple[tuple[str, Sequence], ...]:

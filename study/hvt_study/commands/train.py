@@ -28,8 +28,9 @@ from hvt_common.values import Boxes, Image, View
 from hvt_edge.source.resample import Resizer
 from hvt_study.commands.detect import detected
 from hvt_study.commands.progress import RunProgress
-from hvt_study.datasets.labelled_pictures import IGNORED, LabelledPicture, find_pictures, read_image
+from hvt_study.datasets.labelled_pictures import LabelledPicture, find_pictures, read_image
 from hvt_study.datasets.labels import FrameLabels, inside_frame
+from hvt_study.datasets.yolo_labels import IGNORED
 from hvt_study.metrics.detection import detection_score
 from hvt_study.metrics.frames import LabelledFrame
 from hvt_study.metrics.judged import judged

@@ -15,7 +15,7 @@ from hvt_common.errors import UserError
 from hvt_common.inference.class_names import MOVING, kind_of
 from hvt_common.inference.labels import first_synonym
 
-__all__ = ["ClassMap", "map_classes"]
+__all__ = ["ClassMap", "map_classes", "of_kinds"]
 
 _VEHICLE = "vehicle"
 _VEHICLES = frozenset({"car", "truck", "bus", _VEHICLE})
@@ -68,6 +68,13 @@ def map_classes(model_names: Iterable[str], dataset_classes: Iterable[str]) -> C
             "common: give a model of one of these kinds, or labels=reference"
         )
     return ClassMap({name: spoken[name] for name in models if name in spoken}, words)
+
+
+def of_kinds(names: Iterable[str], kinds: Iterable[str]) -> tuple[str, ...]:
+    """Those of some class names that are of these kinds, in their order; ``vehicle`` is a car, truck or bus too."""
+    wanted = {kind_of(kind) for kind in kinds}
+    wanted |= _VEHICLES if _VEHICLE in wanted else set()
+    return tuple(name for name in names if kind_of(name) in wanted)
 
 
 def _pair(

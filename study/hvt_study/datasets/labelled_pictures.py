@@ -22,23 +22,18 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import VISDRONE_NAMES
-from hvt_common.inference.labels import read_labels
 from hvt_common.values import Image
 from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.clip import NOMINAL_FPS
-from hvt_study.datasets.labels import NO_ID, FrameLabels
+from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.mot import open_mot
 from hvt_study.datasets.layouts.options import Options
 from hvt_study.datasets.layouts.visdrone import table_of
 from hvt_study.datasets.visdrone_rows import read_image_rows
+from hvt_study.datasets.yolo_labels import labels_of, read_text, read_yolo, yolo_names
 
-__all__ = ["IGNORED", "LabelledPicture", "find_pictures", "read_image"]
+__all__ = ["LabelledPicture", "find_pictures", "read_image"]
 
-IGNORED = frozenset({"dontcare", "ignore", "ignored"})
-"""Classes (any case) whose boxes count neither for nor against."""
-_COLUMNS = 5
-_MOST_COLUMNS = 6
-"""With a confidence, as trackers and annotators add it; more is a polygon."""
 _TRUTH = "gt/gt.txt"
 
 
@@ -68,7 +63,7 @@ class LabelledPicture:
             return _from_coco(self.path, self.labels, size)
         if self.visdrone:
             return _from_visdrone(self.labels, size)
-        return _from_yolo(self.labels, self.class_names, size)
+        return read_yolo(self.labels, self.class_names, size)
 
 
 def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[LabelledPicture]:
@@ -96,7 +91,7 @@ def find_pictures(place: Path, *, classes: Sequence[str] | None) -> list[Labelle
     for folder in ("labels", "annotations"):
         if (place / folder).is_dir():
             visdrone = folder == "annotations"
-            names = VISDRONE_NAMES if visdrone else _yolo_names(place, classes)
+            names = VISDRONE_NAMES if visdrone else yolo_names(place, classes)
             found = {file.stem: file for file in (place / folder).glob("*.txt")}
             return [LabelledPicture(file, found.get(file.stem), names, visdrone) for file in files]
     return [LabelledPicture(file, None, ()) for file in files]
@@ -108,43 +103,6 @@ def read_image(path: Path) -> Image | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-def _yolo_names(root: Path, classes: Sequence[str] | None) -> Sequence[str]:
-    if classes is not None:
-        return classes
-    if not (root / "classes.txt").is_file():
-        raise UserError(f"{root} has labels, but no classes.txt: add one, one name a line, or give --classes")
-    return read_labels(root / "classes.txt")
-
-
-def _from_yolo(path: Path, names: Sequence[str], size: tuple[int, int]) -> FrameLabels:
-    boxes, kinds = [], []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
-        if line.strip():
-            kind, *sides = _yolo_row(path, number, line, len(names))
-            boxes.append(sides)
-            kinds.append(names[int(kind)])
-    middle_sides = np.array(boxes, np.float64).reshape(-1, 4)
-    half = middle_sides[:, 2:] / 2
-    corners = np.hstack([middle_sides[:, :2] - half, middle_sides[:, :2] + half]) * [*size, *size]
-    return _labels(corners, kinds)
-
-
-def _yolo_row(path: Path, number: int, line: str, classes: int) -> list[float]:
-    try:
-        row = [float(word) for word in line.split()]
-    except ValueError:
-        row = []
-    if not _COLUMNS <= len(row) <= _MOST_COLUMNS or not all(map(math.isfinite, row)):
-        raise UserError(f"{path}, line {number} is {line[:60]!r}; accepted is class cx cy w h, all numbers")
-    if row[0] not in range(classes):
-        raise UserError(f"{path}, line {number} has class {row[0]:g}; there are {classes}, from 0")
-    if not all(0 <= value <= 1 for value in row[1:_COLUMNS]):
-        raise UserError(
-            f"{path}, line {number} has a box outside the picture: {line[:60]!r}; 0 to 1 is accepted"
-        )
-    return row[:_COLUMNS]
-
-
 def _from_visdrone(path: Path, size: tuple[int, int]) -> FrameLabels:
     return table_of(read_image_rows(path), size=size).at(0)
 
@@ -152,7 +110,7 @@ def _from_visdrone(path: Path, size: tuple[int, int]) -> FrameLabels:
 def _coco_pictures(path: Path) -> list[LabelledPicture]:
     """COCO's ``images``, ``annotations`` (also ``annotation``) and ``categories``."""
     try:
-        about = json.loads(_text(path))
+        about = json.loads(read_text(path))
         names = {row["id"]: str(row["name"]) for row in about["categories"]}
         rows = about["annotations"] if "annotations" in about else about["annotation"]
         of: dict[Any, list[dict[str, Any]]] = {image["id"]: [] for image in about["images"]}
@@ -185,9 +143,8 @@ def _mot_pictures(place: Path) -> list[LabelledPicture]:
     assert sequence.labels is not None, "annotations were asked for"
     files = sequence_files(Path(sequence.clip.spec))
     labels = [sequence.labels(index) for index in range(len(files))]
-    one = len({number for frame in labels for number in frame.ids.tolist()}) == 1
     return [
-        LabelledPicture(file, frame, sequence.class_set, one_target=one)
+        LabelledPicture(file, frame, sequence.class_set, one_target=sequence.one_target)
         for file, frame in zip(files, labels, strict=True)
     ]
 
@@ -207,22 +164,4 @@ def _from_coco(path: Path, rows: Sequence[Mapping[str, Any]], size: tuple[int, i
             )
     boxes = np.array([row["bbox"] for row in rows], np.float64).reshape(-1, 4)
     kinds = ["ignore" if row.get("iscrowd") else str(row["name"]) for row in rows]
-    return _labels(np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]), kinds)
-
-
-def _labels(corners: np.ndarray[Any, np.dtype[np.float64]], names: Sequence[str]) -> FrameLabels:
-    passed = np.array([name.casefold() in IGNORED for name in names], bool)
-    boxes = corners.astype(np.float32)
-    return FrameLabels(
-        boxes_xyxy_px=boxes[~passed],
-        ids=np.full(np.count_nonzero(~passed), NO_ID, np.int64),
-        class_names=tuple(name for name, skip in zip(names, passed, strict=True) if not skip),
-        ignored_xyxy_px=boxes[passed],
-    )
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read as text: {error}") from None
+    return labels_of(np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]), kinds)

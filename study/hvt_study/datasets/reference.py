@@ -1,8 +1,9 @@
 """Reference labels: what a detector, and a classifier if wanted, say of the untouched source frames.
 
 The protocol of DDS, AccMPEG and Reducto: such labels say how much of what the model *could* have seen survives the
-link, not that the model was right. Answers are remembered by the pixels that were asked about (`CachedDetector`), so
-that a run that was killed does not ask twice.
+link, not that the model was right. A detector in tiles (`hvt_common.inference.tiles`) sees the source as finely as
+the edge may. Answers are remembered by the pixels that were asked about (`CachedDetector`), so that a run that was
+killed does not ask twice.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def reference_labels(
 
 def with_labels(sequence: Sequence, labels: ReferenceLabels) -> Sequence:
     """The sequence with these labels in place of its own."""
-    return replace(sequence, labels=labels, class_set=labels.class_set)
+    return replace(sequence, labels=labels, class_set=labels.class_set, one_target=False)
 
 
 def _label(

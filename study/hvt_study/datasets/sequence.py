@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hvt_common.units import exact_rate
+from hvt_scene import CodeInView
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.labels import NO_ID, FrameLabels
 
@@ -34,10 +35,15 @@ class Sequence:
     class_set: tuple[str, ...]
     """Classes that the annotations may use, sorted: the same for all sequences of a dataset, whether each has them or
     not, so that names are compared alike in all of them."""
+    one_target: bool = False
+    """One object is labelled and nothing else that is in view: it is found or missed, and no box is known to be
+    wrong."""
     attributes: Mapping[str, str] = field(default_factory=dict)
     """What else is known, such as ``weather: fog``."""
     files: tuple[Path, ...] = ()
     """Everything that its pictures and labels are made from: files, and folders of images."""
+    codes: Callable[[int], tuple[CodeInView, ...]] | None = None
+    """Codes that can be read in a source frame; None where none were painted."""
     source_frames: tuple[int, ...] | None = None
     """Source frame of each frame of the clip where the rate is not constant; None where `shown_frame` says it."""
 

@@ -8,14 +8,15 @@ The same file and seed give the same pixels, always.
 
 Annotations are those of VisDrone-DET, in a text file of the same name beside the picture, or in ``annotations``
 where the picture lies in ``images``: ``x,y,w,h,score,category,truncation,occlusion``; category 0 is an ignored region
-and 11 is "others", of both of which nothing is asked. Without such a file the clip has no exact labels.
+and 11 is "others", of both of which nothing is asked. Or they are YOLO's, in ``labels`` beside ``images``
+(`hvt_study.datasets.yolo_labels`). Without such a file the clip has no exact labels.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_common.values import Boxes, Image
 from hvt_study.datasets.labels import FrameLabels, covered_share
 from hvt_study.datasets.visdrone_rows import read_image_rows
+from hvt_study.datasets.yolo_labels import IGNORED, read_yolo, yolo_names
 
 __all__ = [
     "SCHEME",
@@ -54,6 +56,8 @@ _NOISE_LEVELS = 2.0
 _LEAST_VISIBLE = 0.6
 """An object of which the window shows less is not asked for."""
 _LEAST_SIDE_PX = 64
+_YOLO = "labels"
+"""Folder of YOLO's label files."""
 _ACROSS, _DOWN = range(-3, 4), range(-2, 3)
 """Mirror images on each axis: enough for the widest view on its whole way."""
 _COVERED = 0.5
@@ -106,18 +110,44 @@ class Annotations:
     """(K, 4): regions of which nothing is known."""
     beside_px: Boxes
     """(P, 4): single objects that are not asked for."""
+    class_set: tuple[str, ...] = tuple(sorted(VISDRONE_NAMES))
+    """All classes that the annotations may use, sorted."""
 
 
 def annotation_file(picture: Path) -> Path:
     """Where the annotations of a picture are, or would be."""
     beside = picture.with_suffix(".txt")
-    if picture.parent.name == "images" and not beside.is_file():
-        return picture.parent.parent / "annotations" / beside.name
-    return beside
+    if picture.parent.name != "images" or beside.is_file():
+        return beside
+    yolo = picture.parent.parent / _YOLO / beside.name
+    return yolo if yolo.is_file() else picture.parent.parent / "annotations" / beside.name
 
 
-def read_annotations(path: Path) -> Annotations:
-    """Read a VisDrone-DET annotation file; `UserError` names the first line that is not one.
+def read_annotations(
+    path: Path, *, classes: Sequence[str] = (), size: tuple[int, int] = (0, 0)
+) -> Annotations:
+    """Read what `annotation_file` names; `UserError` names the first line that is wrong.
+
+    Args:
+        path: of VisDrone-DET, or of YOLO in a folder ``labels``.
+        classes: names of YOLO's classes; none: those of ``classes.txt`` beside that folder.
+        size: (width, height) of the picture, of which YOLO's numbers are shares.
+    """
+    if path.parent.name != _YOLO:
+        return _visdrone(path)
+    names = yolo_names(path.parent.parent, tuple(classes) or None)
+    found = read_yolo(path, names, size)
+    return Annotations(
+        boxes_px=found.boxes_xyxy_px,
+        classes=found.class_names,
+        ignored_px=found.ignored_xyxy_px,
+        beside_px=found.beside_xyxy_px,
+        class_set=tuple(sorted({name for name in names if name.casefold() not in IGNORED})),
+    )
+
+
+def _visdrone(path: Path) -> Annotations:
+    """Of a VisDrone-DET file.
 
     Objects that lie mostly in ignored regions are left out, as in VisDrone's toolkit; empty boxes, too.
     """
@@ -149,6 +179,8 @@ class VirtualCamera:
     """Of the way that it takes."""
     annotated: bool = True
     """False: the annotations are not looked at."""
+    classes: tuple[str, ...] = ()
+    """Of YOLO's labels; none: those of ``classes.txt``."""
     annotations: Annotations | None = field(init=False)
     """Of the picture and of all its mirror images that may come into view."""
     size: tuple[int, int] = field(init=False)
@@ -171,8 +203,10 @@ class VirtualCamera:
         across = min(wide, high * 16 / 9) * self.view_heights
         self.size = (int(across) // 2 * 2, int(across * 9 / 16) // 2 * 2)
         file = annotation_file(self.picture_path)
-        known = self.annotated and file.is_file()
-        self.annotations = _mirrored(read_annotations(file), size=(wide, high)) if known else None
+        self.annotations = None
+        if self.annotated and file.is_file():
+            found = read_annotations(file, classes=self.classes, size=(wide, high))
+            self.annotations = _mirrored(found, size=(wide, high))
         self._way = _Way.of(self.seed)
 
     @property
@@ -273,7 +307,8 @@ def _mirrored(found: Annotations, *, size: tuple[int, int]) -> Annotations:
     boxes = [_in_tile(found.boxes_px, tile, size=size) for tile in tiles]
     ignored = [_in_tile(found.ignored_px, tile, size=size) for tile in tiles]
     beside = [_in_tile(found.beside_px, tile, size=size) for tile in tiles]
-    return Annotations(
+    return replace(
+        found,
         boxes_px=np.concatenate(boxes),
         classes=found.classes * len(tiles),
         ignored_px=np.concatenate(ignored),

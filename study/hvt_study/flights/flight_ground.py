@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
@@ -36,11 +36,23 @@ from hvt_study.metrics.frames import FrameView
 from hvt_study.metrics.observed import ObservedFrame
 from hvt_study.serial_link import Arrival, SerialLink
 
-__all__ = ["GroundSide", "InlineExecutor", "SharedModels"]
+__all__ = ["FlightObserver", "GroundSide", "InlineExecutor", "SharedModels"]
 
 _MOST_RESULTS = 1024
 _RECEIVER = 1 << 40  # as many bytes on the wire as a random one
 _T = TypeVar("_T")
+
+
+class FlightObserver(Protocol):
+    """Is shown what a flight's ground has received, at the media time ``at_ns``; changes nothing."""
+
+    def picture(self, picture: DecodedFrame, *, at_ns: int) -> None:
+        """A base picture has arrived and been decoded."""
+        ...
+
+    def stills(self, stills: Sequence[ReceivedStill], *, at_ns: int) -> None:
+        """Stills have arrived; the base pictures that they build on may come later."""
+        ...
 
 
 class InlineExecutor(ThreadPoolExecutor):
@@ -98,13 +110,20 @@ class _Worker(LockstepWorker):
 class GroundSide:
     """Takes what arrives over ``link`` as time goes on; keeps the list of every frame, in source pixels.
 
-    ``info`` is the edge's, with the rate of frames as its frame rate.
+    ``info`` is the edge's, with the rate of frames as its frame rate; ``observer`` is shown what arrives.
     """
 
     def __init__(
-        self, info: Info, *, config: GroundConfig, models: Models, link: SerialLink[Received]
+        self,
+        info: Info,
+        *,
+        config: GroundConfig,
+        models: Models,
+        link: SerialLink[Received],
+        observer: FlightObserver | None = None,
     ) -> None:
         self._link = link
+        self._observer = observer
         self._info = info
         self._now_ns = info.started_ns
         detector, classifier = models.take()
@@ -166,7 +185,19 @@ class GroundSide:
             self.lists[last] = self._record.complete(self.lists[last], lists=self.lists)
 
     def _make_worker(self, analyze: Analyze, step: Step, read: Read) -> _Worker:
-        self._worker = _Worker(analyze, step, read, name=self._info.edge)
+        observer = self._observer
+
+        def analyze_observed(picture: DecodedFrame, hurry: bool) -> None:  # noqa: FBT001 - as `Analyze` says
+            if observer is not None:
+                observer.picture(picture, at_ns=self._now_ns)
+            analyze(picture, hurry)
+
+        def read_observed(stills: Sequence[ReceivedStill]) -> None:
+            if observer is not None:
+                observer.stills(stills, at_ns=self._now_ns)
+            read(stills)
+
+        self._worker = _Worker(analyze_observed, step, read_observed, name=self._info.edge)
         return self._worker
 
     def _receive(self, arrival: Arrival[Received]) -> None:

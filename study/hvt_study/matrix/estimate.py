@@ -97,7 +97,8 @@ def _variants(method: Method, plan: StudyPlan) -> int:
 
 
 def _flights(method: Method) -> int:
-    return max(1, len(method.fps_choices))
+    """At most: of sizes two more at three rates each are usual (`hvt_study.runs.video_shape`)."""
+    return max(1, len(method.fps_choices)) + (6 if method.any_size else 0)
 
 
 def _size(path: Path) -> int:

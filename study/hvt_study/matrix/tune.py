@@ -202,7 +202,7 @@ def _rounded(value: float) -> float:
 
 
 def _worth(row: Mapping[str, Any]) -> float:
-    return 0.0 if row["failed"] or row["top1_all"] is None else float(row["top1_all"])
+    return 0.0 if row["failed"] or row["named_f1"] is None else float(row["named_f1"])
 
 
 def _pairs(default: Sequence[Mapping[str, Any]], tuned: Sequence[Mapping[str, Any]]) -> Iterable[HeldOut]:

@@ -4,6 +4,9 @@ Boxes and labels are matched at each frame (`judged.matched_rows`), whatever the
 pair are compared. A still that names one track right for the rest of its life counts at every frame from then on, and
 a track that was never refined counts as often as one that was.
 
+Named F1 is the headline of the study: a box is right where it is matched with a label and bears its class, every
+other box is false and every other label missed, so that nothing is won by listing more.
+
 Macro-F1 is scikit-learn's ``f1_score(average="macro")`` over the classes of the labels.
 """
 
@@ -57,7 +60,9 @@ class ClassScore:
 
     counts: ClassCounts
     boxes: int
-    """Shown, as judged."""
+    """Shown, as judged, over all frames."""
+    frames: int
+    """Judged, also those that show nothing."""
     macro_f1_found: float
     """Over the matched pairs alone: how well the classes are told apart. NaN where nothing was found."""
     macro_f1_all: float
@@ -81,6 +86,17 @@ class ClassScore:
         """2 found / (labels + boxes), whatever the classes; 1 where nothing was there and nothing shown."""
         total = self.counts.labels + self.boxes
         return 2 * self.counts.found / total if total else 1.0
+
+    @property
+    def named_f1(self) -> float:
+        """2 right / (labels + boxes); 1 where nothing was there and nothing shown."""
+        total = self.counts.labels + self.boxes
+        return 2 * self.counts.right / total if total else 1.0
+
+    @property
+    def false_per_frame(self) -> float:
+        """Boxes on no label, or of another class than theirs, a frame; NaN without frames."""
+        return (self.boxes - self.counts.right) / self.frames if self.frames else math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +143,7 @@ def class_score(
     return ClassScore(
         counts=pairs.counts(every),
         boxes=sum(len(one.view) for one in frames),
+        frames=len(frames),
         macro_f1_found=_macro_f1(pairs, everything=False),
         macro_f1_all=_macro_f1(pairs, everything=True),
         by_size={size: pairs.counts(of_size(size, pairs.areas_px2, limits_px2=limits_px2)) for size in SIZES},

@@ -4,6 +4,9 @@ CLEAR MOT: Bernardin and Stiefelhagen, "Evaluating Multiple Object Tracking Perf
 "Performance Measures and a Data Set for Multi-Target, Multi-Camera Tracking", 2016. A box is on a label from an IoU
 of 0.5 on, whatever the classes. All figures of several sequences are pooled by adding up their counts, as the
 benchmarks do.
+
+Continuity says how steadily labelled objects are held. A gap is a run of an object's frames in which it is missed
+after it was found once; the time before is no gap: recall has it.
 """
 
 from __future__ import annotations
@@ -20,9 +23,9 @@ import numpy as np
 from hvt_common.values import iou
 from hvt_study.metrics.frames import NO_ID, LabelledFrames
 from hvt_study.metrics.hota import Hota, IdBoxes, hota
-from hvt_study.metrics.judged import LEAST_IOU, judged
+from hvt_study.metrics.judged import LEAST_IOU, judged, matched_rows
 
-__all__ = ["TrackingScore", "compare_tracks", "tracking_score"]
+__all__ = ["Continuity", "TrackingScore", "compare_tracks", "continuity", "tracking_score"]
 
 _COUNTS: Final = {
     "num_objects": "objects",
@@ -130,3 +133,47 @@ def _counts(events: Any) -> dict[str, int]:
 @cache
 def _judge() -> Any:
     return motmetrics.metrics.create()
+
+
+@dataclass(frozen=True, slots=True)
+class Continuity:
+    """Of the labelled objects of one sequence."""
+
+    objects: int
+    found_share: float
+    """Mean over objects of the share of their frames at which they are found, 0…1; NaN without objects."""
+    gaps: int
+    longest_gap: int
+    """Frames."""
+
+
+def continuity(
+    labelled: LabelledFrames,
+    *,
+    word: Callable[[str], str] = str,
+    classes: Collection[str] | None = None,
+    least_iou: float = LEAST_IOU,
+) -> Continuity:
+    """Follow every object with an id through its frames; ``word`` and ``classes`` as in `judged.judged`."""
+    lives: dict[int, list[bool]] = {}
+    for one in judged(labelled, word=word, classes=classes):
+        pairs = matched_rows(one.boxes_xyxy_px, one.view.boxes_xyxy_px, least_iou=least_iou)
+        found = set(pairs[:, 0].tolist())
+        for row, number in enumerate(one.ids.tolist()):
+            if number != NO_ID:
+                lives.setdefault(number, []).append(row in found)
+    gaps = [gap for life in lives.values() for gap in _gaps(life)]
+    shares = [sum(life) / len(life) for life in lives.values()]
+    return Continuity(
+        objects=len(lives),
+        found_share=sum(shares) / len(shares) if shares else math.nan,
+        gaps=len(gaps),
+        longest_gap=max(gaps, default=0),
+    )
+
+
+def _gaps(life: list[bool]) -> list[int]:
+    """Lengths of the runs of misses after the first find."""
+    known = life[life.index(True) :] if True in life else []
+    runs = "".join("+" if found else "-" for found in known).split("+")
+    return [len(run) for run in runs if run]

@@ -14,9 +14,9 @@ from hvt_study.report.figures.pair_figures import difference_figures
 
 __all__ = ["DECIDES", "REFERENCES", "answer", "forests"]
 
-DECIDES = "top1_all"
+DECIDES = "named_f1"
 """The figure by which methods are held against video."""
-REFERENCES = ("M0", "M0-fps", "R0")
+REFERENCES = ("M0", "M0-fps", "M0-best", "R0")
 
 
 def answer(found: Sequence[Setting]) -> Iterator[str | Drawing]:

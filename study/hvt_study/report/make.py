@@ -31,7 +31,7 @@ from hvt_study.report.tables.pair_tables import differences_table, equal_table
 
 __all__ = ["make_report"]
 
-_MATRICES = ("top1_all", "map_50", "hota")
+_MATRICES = ("named_f1", "map_50", "hota")
 
 
 def make_report(

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from hvt_common.errors import UserError
 from hvt_study.cache.results import CacheError, ResultCache, content_key
 from hvt_study.runs.columns import COLUMNS
-from hvt_study.runs.match_total import match, within
+from hvt_study.runs.match_total import first_budget, match, within
 from hvt_study.runs.materials import Materials, open_materials
 from hvt_study.runs.methods import METHODS
 from hvt_study.runs.paths import located
@@ -22,6 +22,7 @@ from hvt_study.runs.run_context import RunContext, open_run_context
 from hvt_study.runs.run_settings import dry_run_bps, edge_flags, flown, settings
 from hvt_study.runs.scoring import figures
 from hvt_study.runs.spec import RunSpec
+from hvt_study.runs.video_shape import VideoShape, competing_sizes, search_shape
 
 __all__ = ["run_spec"]
 
@@ -76,29 +77,46 @@ class _Flights:
         """What all of them took, whenever that was."""
 
     def best(self) -> RunRow:
-        """The flight that counts; of several frame rates the one that shows most."""
-        choices: tuple[float | None, ...] = METHODS[self._spec.method].fps_choices or (None,)
-        done: list[RunRow] = []
-        refused: list[_RefusedError] = []
-        for fps in choices:
-            try:
-                done.append(self._at_rate(fps))
-            except _RefusedError as error:  # at this frame rate; others may do
-                refused.append(error)
-        matching = [row for row in done if _matches(self._spec, row)] or done
-        if not matching:
-            raise refused[-1]  # of the slowest, for which there was most hope
-        return max(matching, key=_worth)
+        """The flight that counts; of several frame rates and sizes the one that shows most.
 
-    def _at_rate(self, fps: float | None) -> RunRow:
+        Where sizes are tried too, each shape is flown at about the total to be matched, and the best one alone is
+        matched: several codings of each would take a study's whole time.
+        """
+        method, spec = METHODS[self._spec.method], self._spec
+        if not method.fps_choices:
+            return self._in_shape(VideoShape())
+        about = first_budget(spec.target.total_bps) if method.any_size and spec.target is not None else None
+        tried: dict[VideoShape, RunRow] = {}
+        refused: list[_RefusedError] = []
+
+        def fly(shape: VideoShape) -> tuple[float, float] | None:
+            try:
+                row = self._in_shape(shape) if about is None else self._flight(about, shape)
+            except _RefusedError as error:  # in this shape; others may do
+                refused.append(error)
+                return None
+            tried[shape] = row
+            return _worth(row) if about is not None or _matches(spec, row) else None
+
+        sizes = (
+            competing_sizes(spec.size, self._found.sequence.source_size) if method.any_size else (spec.size,)
+        )
+        search_shape(fly, rates=method.fps_choices, sizes=sizes, nominal=spec.size)
+        if not tried:
+            raise refused[-1]  # of the slowest, for which there was most hope
+        fitting = [shape for shape, row in tried.items() if about is not None or _matches(spec, row)]
+        shape = max(fitting or tried, key=lambda one: _worth(tried[one]))
+        return tried[shape] if about is None else self._in_shape(shape)
+
+    def _in_shape(self, shape: VideoShape) -> RunRow:
         spec = self._spec
         if spec.target is None:
-            return self._flight(spec.budget_bps, fps)
+            return self._flight(spec.budget_bps, shape)
         refused: list[_RefusedError] = []
 
         def spends(budget_bps: int) -> float | None:
             try:
-                return self._weight(budget_bps, fps)
+                return self._weight(budget_bps, shape)
             except _RefusedError as error:
                 refused.append(error)
                 return None
@@ -106,26 +124,37 @@ class _Flights:
         found = match(spends, target_bps=spec.target.total_bps)
         if found is None:
             raise refused[0]
-        return self._flight(found.budget_bps, fps)
+        return self._flight(found.budget_bps, shape)
 
-    def _flight(self, budget_bps: int, fps: float | None) -> RunRow:
+    def _flight(self, budget_bps: int, shape: VideoShape) -> RunRow:
         def fly(context: RunContext) -> RunRow:
-            report = _or_refused(lambda: flown(self._spec, context, budget_bps=budget_bps, fps=fps))
-            used = settings(self._spec, context, budget_bps=budget_bps, fps=fps)
-            return {**figures(report, context), "settings": used}
+            report = _or_refused(lambda: flown(self._spec, context, budget_bps=budget_bps, shape=shape))
+            used = settings(self._spec, context, budget_bps=budget_bps, shape=shape)
+            wide, high = shape.size or self._spec.size
+            return {
+                **figures(report, context),
+                "set_fps": shape.fps,
+                "base_width": wide,
+                "base_height": high,
+                "settings": used,
+            }
 
         spec, words = self._spec, dict(self._found.classes.words)
-        return self._known(self._key("flight", budget_bps, fps, spec.budget_bps, spec.labels, words), fly)
+        return self._known(
+            self._key("flight", budget_bps, shape, spec.size, spec.budget_bps, spec.labels, words), fly
+        )
 
-    def _weight(self, budget_bps: int, fps: float | None) -> float:
+    def _weight(self, budget_bps: int, shape: VideoShape) -> float:
         """What a flight at this budget spends; without a ground, which has no say in it."""
 
         def dry_run(context: RunContext) -> RunRow:
             return {
-                "bps": _or_refused(lambda: dry_run_bps(self._spec, context, budget_bps=budget_bps, fps=fps))
+                "bps": _or_refused(
+                    lambda: dry_run_bps(self._spec, context, budget_bps=budget_bps, shape=shape)
+                )
             }
 
-        return float(self._known(self._key("weight", budget_bps, fps), dry_run)["bps"])
+        return float(self._known(self._key("weight", budget_bps, shape), dry_run)["bps"])
 
     def _known(self, key: str, make: Callable[[RunContext], RunRow]) -> RunRow:
         """Out of the cache; else it is made, which alone needs pictures."""
@@ -148,9 +177,9 @@ class _Flights:
             said = str(error).strip().partition("\n")[0]
             raise _BrokenError(f"{type(error).__name__}: {said}".rstrip(": ")) from None
 
-    def _key(self, what: str, budget_bps: int, fps: float | None, *more: Any) -> str:
+    def _key(self, what: str, budget_bps: int, shape: VideoShape, *more: Any) -> str:
         spec, found = self._spec, self._found
-        flags = edge_flags(spec, budget_bps=budget_bps, fps=fps)
+        flags = edge_flags(spec, budget_bps=budget_bps, shape=shape)
         frames = found.sequence.clip_frames
         said = (asdict(spec.models), spec.detect_every, found.content, found.software)
         return content_key(what, flags, frames, *said, *more)
@@ -167,8 +196,10 @@ def _or_refused(fly: Callable[[], _T]) -> _T:
 
 
 def _worth(row: RunRow) -> tuple[float, float]:
-    """By this the best frame rate is chosen: objects found and named, and of equal ones the boxes."""
-    return row["top1_all"] or 0.0, row["f1"] or 0.0
+    """By this the best frame rate and size are chosen: named F1, then the boxes; of one target recall."""
+    if row["named_f1"] is None:
+        return row["recall"] or 0.0, row["top1_all"] or 0.0
+    return row["named_f1"], row["f1"] or 0.0
 
 
 def _matches(spec: RunSpec, row: RunRow) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from hvt_study.runs.spec import MATCH_TOLERANCE
 
-__all__ = ["Matched", "grid_target", "match", "within"]
+__all__ = ["Matched", "first_budget", "grid_target", "match", "within"]
 
 _STEP = 1.01
 _CLOSE = 0.003
@@ -36,6 +36,11 @@ def grid_target(total_bps: float) -> float:
     return float(_STEP ** round(math.log(total_bps, _STEP)))
 
 
+def first_budget(total_bps: float) -> int:
+    """The budget of which video usually spends this total."""
+    return round(grid_target(total_bps) / _USUAL_RATIO)
+
+
 def within(total_bps: float, target_bps: float) -> bool:
     """Whether a total counts as equal."""
     return abs(total_bps / target_bps - 1) <= MATCH_TOLERANCE
@@ -51,7 +56,7 @@ def match(spends: Callable[[int], float | None], *, target_bps: float) -> Matche
     """
     target = grid_target(target_bps)
     seen: dict[int, float] = {}
-    budget = round(target / _USUAL_RATIO)
+    budget = first_budget(target_bps)
     while len(seen) < _TRIES and budget not in seen:
         total = spends(budget)
         if total is None:

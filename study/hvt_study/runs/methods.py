@@ -39,6 +39,8 @@ class Method:
     """Whether ``--still-codecs`` multiplies it."""
     fps_choices: tuple[float, ...] = ()
     """Fixed frame rates of which the best counts; none: as the flags say."""
+    any_size: bool = False
+    """Whether the best size of the base stream counts, too (`hvt_study.runs.video_shape`)."""
 
 
 _VIDEO = ("--method", "M0")
@@ -49,6 +51,7 @@ _ADAPTIVE = (
     *("--method", "M6", *_SOURCE, "--fps", "auto", "--video-share", "auto", "--borrow-unused"),
     *("--group-stills", "--gate", "32", "--fidelity", "36", "--roi-depth", "0.1"),
 )
+_AUTO = (*_ADAPTIVE, "--profile", "auto")
 _FPS_CHOICES = (15.0, 7.5, 5.0, 3.0, 2.0)
 
 
@@ -65,7 +68,15 @@ _ALL = (
         _BLIND,
         fps_choices=(*_FPS_CHOICES, 1.0),
     ),
-    Method("R0", Kind.VIDEO, "video that spends more on tracks", (*_VIDEO, "--roi-depth", "0.1")),
+    Method(
+        "M0-best",
+        Kind.VIDEO,
+        "video alone at the fixed frame rate and size that name most",
+        _BLIND,
+        fps_choices=(*_FPS_CHOICES, 1.0),
+        any_size=True,
+    ),
+    Method("R0", Kind.VIDEO, "video that spends more on tracks", ("--method", "R0")),
     _stills("M1", "a still of each track every second"),
     _stills("M2", "a still when a track begins"),
     _stills("M3", "a still of tracks that are uncertain"),
@@ -73,6 +84,12 @@ _ALL = (
     _stills("M5", "most utility per byte"),
     _stills(
         "M6", "most expected gain per byte, with tracks, tiles, frame rate and split by measure", _ADAPTIVE
+    ),
+    Method(
+        "auto",
+        Kind.HYBRID,
+        "M6 whose tracks and stills are sent while they pay",
+        (*_AUTO, "--still-codec", "residual"),
     ),
     Method("tracks", Kind.HYBRID, "video, and what the edge detects in the source", (*_VIDEO, *_SOURCE)),
     _stills("permissive", "the pilot's selector of that name"),

@@ -15,6 +15,7 @@ from filelock import FileLock
 from hvt_common.errors import UserError
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
+from hvt_common.inference.tiles import tiled
 from hvt_study.cache.results import CacheError, ResultCache, content_key
 from hvt_study.datasets.class_map import ClassMap
 from hvt_study.datasets.clip import Clip, stage_clip
@@ -114,11 +115,13 @@ def _with_reference(
     """The sequence in the words of the ground's models; processes that ask for the same wait for the first.
 
     Frames are looked at as they are, but never smaller than the ground sees them: of a clip that is smaller than the
-    base stream the detector would find less in the source than in what the link delivers.
+    base stream the detector would find less in the source than in what the link delivers. And they are looked at in
+    the tiles of ``--tiles auto``: without them the edge would find more in the source than the labels know, and what
+    it finds would be called false.
     """
     smaller = any(side < base for side, base in zip(sequence.source_size, base_size, strict=True))
     size = base_size if smaller else None
-    name = content_key("labels", found.content, found.software, sequence.clip_frames, size)
+    name = content_key("labels", "tiles", found.content, found.software, sequence.clip_frames, size)
     store = ResultCache(cache / "labels")
     try:
         with FileLock(cache / "labels" / f"{name}.lock"):
@@ -126,7 +129,7 @@ def _with_reference(
             if known is not None:
                 return with_labels(sequence, ReferenceLabels.unpack(known))
             labels = reference_labels(
-                sequence, detector=found.detector, classifier=found.classifier, size=size
+                sequence, detector=tiled(found.detector, "auto"), classifier=found.classifier, size=size
             )
             store.put(name, labels.pack())
     except OSError as error:

@@ -21,11 +21,12 @@ from hvt_study.peers.dds_settings import DdsSettings
 from hvt_study.runs.methods import METHODS, Kind
 from hvt_study.runs.run_context import RunContext
 from hvt_study.runs.spec import RunSpec
+from hvt_study.runs.video_shape import VideoShape
 
 __all__ = ["dry_run_bps", "edge_flags", "flight_plan", "flown", "settings"]
 
 
-def edge_flags(spec: RunSpec, *, budget_bps: int, fps: float | None) -> tuple[str, ...]:
+def edge_flags(spec: RunSpec, *, budget_bps: int, shape: VideoShape) -> tuple[str, ...]:
     """What ``hvt-edge`` is started with, but for the source; a peer's settings in words of its own."""
     method = METHODS[spec.method]
     if method.kind is Kind.PEER:
@@ -33,9 +34,9 @@ def edge_flags(spec: RunSpec, *, budget_bps: int, fps: float | None) -> tuple[st
             spec.method,
             f"{spec.size[0]}x{spec.size[1]}",
             f"{budget_bps}bps",
-            str(_dds_settings(spec, fps)),
+            str(_dds_settings(spec, shape.fps)),
         )
-    width, height = spec.size
+    width, height = shape.size or spec.size
     flags = ["--pace", "lockstep", "--detector", spec.models.edge_detector, "--size", f"{width}x{height}"]
     confidence = default_confidence(spec.models.edge_detector)
     flags += ["--budget", f"{budget_bps}bps", "--threads", "1", "--confidence", f"{confidence:g}"]
@@ -46,19 +47,20 @@ def edge_flags(spec: RunSpec, *, budget_bps: int, fps: float | None) -> tuple[st
             flags += ["--video-share", f"{REGIMES[spec.regime].video_share:.6f}"]
     for parameter in spec.tune:
         flags += ["--tune", parameter]
+    fps = shape.fps
     if fps is not None and fps != NOMINAL_FPS:
         # The budget's window has to hold two frames.
         flags += ["--fps", f"{fps:g}", "--window", f"{max(1.0, 2 / fps):g}s"]
     return tuple(flags)
 
 
-def flight_plan(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> FlightPlan:
+def flight_plan(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape) -> FlightPlan:
     """The flight of this run at a budget; its link carries what the regime allows, whatever the budget.
 
     Raises:
         UserError: the edge does not take these settings.
     """
-    flags = ["--source", context.sequence.clip.spec, *edge_flags(spec, budget_bps=budget_bps, fps=fps)]
+    flags = ["--source", context.sequence.clip.spec, *edge_flags(spec, budget_bps=budget_bps, shape=shape)]
     config, _ = load(EdgeConfig, flags, program="hvt-edge", description="")
     return FlightPlan(
         clip=context.sequence.clip,
@@ -68,7 +70,7 @@ def flight_plan(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: flo
     )
 
 
-def flown(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> FlightReport:
+def flown(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape) -> FlightReport:
     """Fly it."""
     if METHODS[spec.method].kind is Kind.PEER:
         return fly_dds(
@@ -77,26 +79,26 @@ def flown(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | N
             link_bps=spec.budget_bps,
             size=spec.size,
             detector=context.detector,
-            settings=_dds_settings(spec, fps),
+            settings=_dds_settings(spec, shape.fps),
         )
-    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
+    plan = flight_plan(spec, context, budget_bps=budget_bps, shape=shape)
     return fly(
         plan, detector=context.edge_detector, models=SharedModels(context.detector, context.classifier)
     )
 
 
-def dry_run_bps(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> float:
+def dry_run_bps(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape) -> float:
     """Line bits a second of a method that no ground's answer changes."""
-    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
+    plan = flight_plan(spec, context, budget_bps=budget_bps, shape=shape)
     return dry_run(plan, detector=context.edge_detector)
 
 
-def settings(spec: RunSpec, context: RunContext, *, budget_bps: int, fps: float | None) -> dict[str, Any]:
+def settings(spec: RunSpec, context: RunContext, *, budget_bps: int, shape: VideoShape) -> dict[str, Any]:
     """All settings of a flight, as JSON holds them."""
     if METHODS[spec.method].kind is Kind.PEER:
-        peer = {**asdict(_dds_settings(spec, fps)), "budget_bps": budget_bps, "size": list(spec.size)}
+        peer = {**asdict(_dds_settings(spec, shape.fps)), "budget_bps": budget_bps, "size": list(spec.size)}
         return {spec.method: peer}
-    plan = flight_plan(spec, context, budget_bps=budget_bps, fps=fps)
+    plan = flight_plan(spec, context, budget_bps=budget_bps, shape=shape)
     sides = {"edge": asdict(plan.edge), "ground": asdict(plan.ground)}
     known: dict[str, Any] = json.loads(json.dumps(sides, default=str))
     return known

@@ -22,17 +22,26 @@ from hvt_study.metrics.observed import (
 )
 from hvt_study.metrics.proxy import proxies
 from hvt_study.metrics.stills import still_delays_ms
-from hvt_study.metrics.tracking import tracking_score
+from hvt_study.metrics.tracking import continuity, tracking_score
 from hvt_study.runs.run_context import RunContext
 
 __all__ = ["figures"]
 
 _DIGITS = 6
+_SAYS_OF_ONE = {
+    *("recall", "recall_half_1", "recall_half_2", "top1_before", "top1", "top1_half_1", "top1_half_2"),
+    *("top1_all_before", "top1_all", "found_share", "gaps", "longest_gap_s", "id_switches"),
+    *("first_correct_p50_s", "first_correct_p90_s", "first_correct_never"),
+}
+"""What labels of one target can say: of the rest of the list nobody knows whether it is right."""
 
 
 def figures(report: FlightReport, context: RunContext) -> dict[str, Any]:
     """Every metric column of `hvt_study.runs.columns.COLUMNS`; None where a run has none."""
-    found = {**_bits(report, context), **_labelled(report, context), **_delays(report), **_proxies(report)}
+    labelled = _labelled(report, context)
+    if context.sequence.one_target:
+        labelled = {name: value if name in _SAYS_OF_ONE else None for name, value in labelled.items()}
+    found = {**_bits(report, context), **labelled, **_delays(report), **_proxies(report)}
     found |= {"digest": report.digest, "edge_cpu_ms": report.edge_cpu_ms}
     return {name: _plain(value) for name, value in found.items()}
 
@@ -79,16 +88,22 @@ def _back_bytes(report: FlightReport) -> int:
 
 def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
     words: dict[str, Any] = {"word": context.classes.word, "classes": context.classes.classes}
+    if context.sequence.one_target:  # a box of any class finds it
+        words["classes"] = None
     labelled = refined_frames(report.lists, context.labels)
     detection = detection_score(detected_frames(report.lists, context.labels), **words)
     after = class_score(labelled, **words)
     before = class_score(labelled, refined=False, **words)
     tracking = tracking_score(labelled, **words)
+    held = continuity(labelled, **words)
     first = first_correct(labelled, fps=NOMINAL_FPS, shown_s=shown_times_s(report.lists), **words)
     return {
         "map_50": detection.mean.at_50,
         "map_50_95": detection.mean.at_50_95,
         **{f"map_50_{size}": one.at_50 for size, one in detection.by_size.items()},
+        "named_f1_before": before.named_f1,
+        "named_f1": after.named_f1,
+        "false_per_frame": after.false_per_frame,
         "recall": after.recall,
         "precision": after.precision,
         "f1": after.f1,
@@ -107,6 +122,9 @@ def _labelled(report: FlightReport, context: RunContext) -> dict[str, Any]:
         "idf1": tracking.idf1,
         "hota": tracking.hota,
         "id_switches": tracking.switches if tracking.objects else None,
+        "found_share": held.found_share,
+        "gaps": held.gaps if held.objects else None,
+        "longest_gap_s": held.longest_gap / NOMINAL_FPS if held.objects else None,
         "first_correct_p50_s": first.median_s,
         "first_correct_p90_s": first.p90_s,
         "first_correct_never": first.never / first.tracks if first.tracks else None,
@@ -120,6 +138,8 @@ def _halves(labelled: LabelledFrames, words: dict[str, Any]) -> dict[str, float]
     for half, part in enumerate((labelled[:middle], labelled[middle:]), start=1):
         one = class_score(part, **words)
         figures = {
+            "named_f1": one.named_f1,
+            "false_per_frame": one.false_per_frame,
             "recall": one.recall,
             "precision": one.precision,
             "f1": one.f1,

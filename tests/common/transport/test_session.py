@@ -421,6 +421,7 @@ def test_interrupting_a_subscriber_ends_it(endpoint):
     """A callback subscriber that is not closed hangs at exit."""
     listener = start(LISTENER, endpoint)
     assert listener.stdout.readline() == "up\n"
+    time.sleep(0.5)  # until it sleeps: in a finaliser Python would drop the interrupt
     listener.send_signal(signal.SIGINT)
     _, err = listener.communicate(timeout=20)
     assert err.rstrip().endswith("KeyboardInterrupt")

@@ -160,6 +160,7 @@ def status(at_ns: int, *, reasons: int = 0, name: str = "reason") -> Status:
             cores_free=1.1,
         ),
         failed=(),
+        levers="",
     )
 
 

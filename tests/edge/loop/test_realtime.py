@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
+from hvt_common.protocol.messages import BaseHeader
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
 from hvt_common.units import SECOND_NS
@@ -25,7 +26,7 @@ from hvt_edge.stills.worker import SkippedUnits
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.stage import BaseStage
 from hvt_edge.video.x265 import BaseEncoder
-from media.clips import framed, smooth_pictures
+from media.clips import START_NS, framed, smooth_pictures
 
 SIZE = (320, 192)
 
@@ -129,20 +130,97 @@ def test_frames_missed_count_for_the_link_or_for_the_machine():
         assert counts.unanalyzed == 2, "perception gave way where video was late"
 
 
-@pytest.mark.timeout(60)
-def test_a_clip_that_cannot_be_read_in_time_is_shown_all_the_same():
-    """A slow disk, or a scene that is slow to draw, would give a flight without a picture."""
-    out, stills, counts, clock = Out(), BlockedStills(), FrameCounts(), SteadyClock()
+class SteppedTime(threading.Event):
+    """A clock that stands still but for what is put into it, and the wait of a loop that goes by it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now_ns = START_NS
+
+    def __call__(self) -> int:
+        """The clock."""
+        return self.now_ns
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Sleep."""
+        assert timeout is not None
+        self.pass_s(timeout)
+        return self.is_set()
+
+    def pass_s(self, seconds: float) -> None:
+        """Time goes by."""
+        self.now_ns += round(seconds * SECOND_NS)
+
+
+class TimedOut(Out):
+    """Keeps the headers of base frames; ``blocks_s(count)`` is how long the link takes for the next."""
+
+    def __init__(self, time_: SteppedTime, blocks_s=lambda _count: 0.0) -> None:
+        super().__init__()
+        self.time, self.blocks_s = time_, blocks_s
+        self.headers: list[BaseHeader] = []
+
+    def put(self, channel, payload, *, attachment=None, encoding="") -> None:
+        """One message, which takes its time."""
+        self.time.pass_s(self.blocks_s(len(self.headers)))
+        self.headers.append(BaseHeader.parse(attachment, payload))
+
+
+def play_clip(*, reading_s: float, frames: int, out: TimedOut) -> FrameCounts:
+    """A clip at 15 fps of which each frame takes so long to read, through the loop and x265."""
+    stills, counts, pictures = BlockedStills(), FrameCounts(), smooth_pictures(1, size=SIZE)
     stills.released.set()
-    late_ns = clock() - 60 * SECOND_NS
     with RealtimePace(
-        base_stage(out), stills, inbox=FeedbackInbox(), clock=clock, fps=15, live=False, counts=counts,
-        stop=threading.Event(), failures=Failures(time.time_ns),
+        base_stage(out), stills, inbox=FeedbackInbox(), clock=out.time, fps=15, live=False, counts=counts,
+        stop=out.time, failures=Failures(out.time),
     ) as pace:  # fmt: skip
-        for frame in framed(smooth_pictures(30, size=SIZE)):
-            pace.step(replace(frame, capture_ns=late_ns + frame.index * SECOND_NS // 15))
-    assert 6 <= out.units <= 10, "about four a second"
-    assert counts.dropped == 30 - out.units
+        for index, frame in enumerate(framed(pictures * frames)):
+            out.time.pass_s(reading_s)
+            pace.step(frame)
+            assert counts.captured == index + 1
+    return counts
+
+
+@pytest.mark.parametrize("reading_s", [0.1, 0.4, 3.0])
+@pytest.mark.timeout(60)
+def test_a_clip_that_cannot_be_read_in_real_time_is_played_slower(reading_s):
+    """The delay grew for ever (161 s were seen); or capture times, rates and length would be untrue."""
+    frames = 150
+    out = TimedOut(SteppedTime())
+    counts = play_clip(reading_s=reading_s, frames=frames, out=out)
+    took_s = (out.time.now_ns - START_NS) / SECOND_NS
+    assert took_s == pytest.approx(frames * reading_s), "nothing waits where all is late"
+    assert counts.paused_ns / SECOND_NS == pytest.approx(took_s - frames / 15, abs=1.1)
+    assert counts.duration_s(15) == pytest.approx(took_s, abs=max(1.3, reading_s))
+    captures = [one.capture_ns for one in out.headers]
+    assert max(one.send_delay_ns for one in out.headers) <= SECOND_NS
+    assert [one.frame_index for one in out.headers] == sorted({one.frame_index for one in out.headers})
+    assert all(new > old for old, new in pairwise(captures))
+    shown_at = [one.capture_ns + one.send_delay_ns for one in out.headers]
+    most_s = 0.25 + reading_s
+    assert max(new - old for old, new in pairwise(shown_at)) / SECOND_NS <= most_s + 1e-6, (
+        "none is left out for long"
+    )
+
+
+@pytest.mark.timeout(60)
+def test_a_clip_that_can_be_read_in_real_time_keeps_its_time():
+    """A short hiccup would shift all that follows, and the summary would blame the machine."""
+    out = TimedOut(SteppedTime(), blocks_s=lambda count: 0.8 if count == 20 else 0.02)
+    counts = play_clip(reading_s=0.03, frames=90, out=out)
+    assert counts.paused_ns == 0
+    assert {one.capture_ns - START_NS for one in out.headers} <= {round(n * 1e9 / 15) for n in range(90)}
+
+
+@pytest.mark.timeout(60)
+def test_a_clip_behind_a_link_that_stood_still_catches_up():
+    """The machine would be called too slow for an outage of the link."""
+    out = TimedOut(SteppedTime(), blocks_s=lambda count: 6.0 if count == 20 else 0.0)
+    counts = play_clip(reading_s=0.005, frames=300, out=out)
+    assert counts.paused_ns == 0
+    delays_ns = [one.send_delay_ns for one in out.headers]
+    assert max(delays_ns) > 5 * SECOND_NS
+    assert max(delays_ns[-30:]) < SECOND_NS // 15
 
 
 def unit(index: int, *, keyframe: bool = False, size: int = 1_000) -> AccessUnit:

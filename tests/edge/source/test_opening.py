@@ -326,6 +326,17 @@ def test_the_demo_is_a_source_with_truth(tmp_path):
         assert source.frame_count == 250
 
 
+def test_the_demo_has_codes_and_4k_when_told():
+    """Nobody could fly what the study reads, and a 4K flight would be one of an enlarged picture."""
+    with open_source("demo:codes,4k", size=(640, 360), fps=15, seed=1, max_frames=1) as source:
+        assert source.view.source_size == (3840, 2160)
+        (frame,) = source.frames(start_ns=0)
+    assert np.array_equal(frame.source_bgr, Scene(1, size=(3840, 2160), codes=True).image(0.0))
+    said = refused("demo:codes,8k")
+    assert "'8k'" in said
+    assert "demo:codes,4k" in said
+
+
 # -- live ------------------------------------------------------------
 
 

@@ -83,11 +83,12 @@ def test_the_picture_goes_on_without_boxes_and_they_come_back(tmp_path: Path, ca
     time.sleep(1.05)
     assert max(boxes(index, 200) for index in range(12, 24)) >= 1, "it was opened again"
     assert models.failures.parts[0].working
-    lines = [one.getMessage() for one in caplog.records if one.name.endswith("failures")]
+    said = [one for one in caplog.records if one.name.endswith("failures")]
+    lines = [one.getMessage() for one in said]
     assert len(lines) == 2
     assert lines[0].startswith("detector: ")
     assert lines[1] == "detector: works again"
-    assert caplog.records[0].levelno == logging.WARNING
+    assert said[0].levelno == logging.WARNING
     pipeline.end()
 
 

@@ -17,8 +17,8 @@ from hvt_study.report.figures.compare_plot import STYLES, plot
 from hvt_study.runs.methods import DDS, METHODS
 
 FIRST_COLUMNS = [
-    *("clip", "rate_kbps", "method", "half", "f1", "class_agreement", "total_bps", "base_bps", "roi_bps"),
-    *("track_bps", "max_frame_bytes", "delay_p95_ms", "edge_cpu_ms"),
+    *("clip", "rate_kbps", "method", "half", "named_f1", "false_per_frame", "f1", "class_agreement"),
+    *("total_bps", "base_bps", "roi_bps", "track_bps", "max_frame_bytes", "delay_p95_ms", "edge_cpu_ms"),
 ]
 CHEAP = ("--size", "640x360", "--max-frames", "30", "--jobs", "1")
 
@@ -38,6 +38,8 @@ CHEAP = ("--size", "640x360", "--max-frames", "30", "--jobs", "1")
         (("demo", "--max-frames", "3"), "--max-frames 3"),
         (("demo", "--size", "13x7"), "13x7"),
         (("demo", "--detector", "no-such.onnx"), "no-such.onnx"),
+        (("demo", "--labelled", "vehicle"), "--labelled vehicle"),
+        (("demo", "--classes", "car"), "--classes car"),
     ],
 )
 def test_what_cannot_be_flown_is_one_sentence(tmp_path, capsys, arguments, said):
@@ -58,21 +60,46 @@ def test_a_comparison_end_to_end(tmp_path, capsys):
     assert main([*arguments, "--out", str(tmp_path), *CHEAP]) == 0
     rows = json.loads((tmp_path / "compare.json").read_text())
     assert [(row["method"], row["half"]) for row in rows] == [
-        *(("M0", 1), ("M0", 2)),
-        *(("M5-jpeg", 1), ("M5-jpeg", 2)),
+        *(("M0", 0), ("M0", 1), ("M0", 2)),
+        *(("M5-jpeg", 0), ("M5-jpeg", 1), ("M5-jpeg", 2)),
     ]
     for row in rows:
         assert list(row)[: len(FIRST_COLUMNS)] == FIRST_COLUMNS
         assert row["labels"] == "reference"
-        assert 0 < row["f1"] <= 1
+        assert 0 < row["named_f1"] <= row["f1"] <= 1
+        assert row["false_per_frame"] >= 0
         assert 0.3 * 300_000 < row["total_bps"] < 1.1 * 300_000
         assert row["total_bps"] > row["base_bps"] + row["roi_bps"]
         assert row["edge_cpu_ms"] > 0
-    assert rows[0]["roi_bps"] == 0 < rows[2]["roi_bps"]
+    assert rows[0]["roi_bps"] == 0 < rows[3]["roi_bps"]
     assert (tmp_path / "compare.png").read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr().out
     assert "reference labels" in said
     assert "M5-jpeg" in said
+
+
+def test_a_picture_with_labels_is_judged_in_what_it_labels(tmp_path):
+    """People on a set that labels none would be called false; a detector that finds them would look worse."""
+    for folder in ("images", "labels"):
+        (tmp_path / folder).mkdir()
+    scene = Scene(0)
+    cv2.imwrite(str(tmp_path / "images" / "scene.png"), cv2.resize(scene.image(0.0), (720, 404)))
+    truth = scene.truth(0.0)
+    shares = truth.boxes_source_px / [1920, 1080, 1920, 1080]
+    lines = [
+        f"{kind} {(x1 + x2) / 2:.6f} {(y1 + y2) / 2:.6f} {x2 - x1:.6f} {y2 - y1:.6f}"
+        for kind, (x1, y1, x2, y2) in zip(truth.class_ids.tolist(), shares.tolist(), strict=True)
+    ]
+    (tmp_path / "labels" / "scene.txt").write_text("\n".join(lines))
+    arguments = ["compare", f"still:{tmp_path / 'images' / 'scene.png'}", "--detector", "aerial-nano"]
+    arguments += ["--rates", "300", "--methods", "M0", "--classes", ",".join(Scene.class_names)]
+    found = []
+    for more in ([], ["--labelled", "vehicle"]):
+        assert main([*arguments, *more, "--out", str(tmp_path), *CHEAP]) == 0
+        found.append(json.loads((tmp_path / "compare.json").read_text())[0])
+    assert {row["labels"] for row in found} == {"exact"}
+    assert found[0]["total_bps"] == found[1]["total_bps"]
+    assert found[0]["recall"] < found[1]["recall"], "small people are missed at this size"
 
 
 @pytest.mark.parametrize("name", [name for name in METHODS if name != DDS])
@@ -94,11 +121,11 @@ def test_names_of_methods():
 
 def test_a_plot_of_what_there_is(tmp_path):
     """A method that is missing at some rates must not take the plot with it."""
-    shown = {"f1": 0.9, "class_agreement": None}
+    shown = {"named_f1": 0.9, "false_per_frame": None}
     rows = [
         {"clip": "clip", "rate_kbps": rate, "method": method, "half": half, "total_bps": rate * 990, **shown}
         for rate, method in ((150.0, "M0"), (800.0, "M0"), (800.0, "M6"))
-        for half in (1, 2)
+        for half in (0, 1, 2)
     ]
     plot(CompareResult(tuple(rows), (Missing(150.0, "M6", "why"),), "exact", "clip"), tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 20_000

@@ -18,6 +18,7 @@ from hvt_study.matrix.tuning import tuned_methods
 from hvt_study.runs.methods import chosen_methods
 from hvt_study.runs.run_settings import edge_flags
 from hvt_study.runs.spec import ModelChoice
+from hvt_study.runs.video_shape import VideoShape
 from studies.layouts import write_visdrone
 from studies.small_study import SIZE, arguments
 
@@ -123,7 +124,7 @@ def test_parameters_are_those_of_the_runs(tmp_path):
     tunes = {spec.method: spec.tune for spec in first_runs(plan)}
     assert tunes == {"M0": (), "M5": ("min_cost=0.5", "small_weight=0.75"), "M6": ("again=2",)}
     tuned = next(spec for spec in first_runs(plan) if spec.method == "M5")
-    flags = edge_flags(tuned, budget_bps=300_000, fps=None)
+    flags = edge_flags(tuned, budget_bps=300_000, shape=VideoShape())
     assert [flags[at + 1] for at, flag in enumerate(flags) if flag == "--tune"] == list(tuned.tune)
     (video,) = matched_runs(plan, tuned, {"failed": "", "total_bps": 250_000})
     assert (video.method, video.target.total_bps, video.tune) == ("M0", 250_000, ())

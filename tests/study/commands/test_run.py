@@ -20,6 +20,7 @@ from hvt_study.runs.methods import chosen_methods
 from hvt_study.runs.run_context import open_run_context
 from hvt_study.runs.run_settings import flown
 from hvt_study.runs.spec import ModelChoice
+from hvt_study.runs.video_shape import VideoShape
 from media.onnx_models import colour_classifier, colour_detector
 from studies.layouts import write_images, write_visdrone
 from studies.small_study import PATIENT_S, SIZE, arguments, entries, flights, said, study, table
@@ -117,7 +118,9 @@ def test_totals_are_of_the_bytes_that_were_sent(scene, done, tmp_path):
     asked = parser.parse_args(arguments(scene, tmp_path, *METHODS, "--max-frames", "30"))
     plan = study_plan(asked, open_sequences(asked))
     spec = next(one for one in first_runs(plan) if one.method == "M5")
-    report = flown(spec, open_run_context(spec, cache=done / "cache"), budget_bps=spec.budget_bps, fps=None)
+    report = flown(
+        spec, open_run_context(spec, cache=done / "cache"), budget_bps=spec.budget_bps, shape=VideoShape()
+    )
     row = next(row for row in table(done) if row["method"] == "M5")
     assert row["digest"] == report.digest
     assert row["total_bps"] == round(sum(report.line_bytes.values()) * 8 / 2)

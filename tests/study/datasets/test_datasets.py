@@ -420,6 +420,25 @@ def test_demo_seeds():
     assert np.array_equal(next(last.clip.images()), scene.image(0.0))
 
 
+def test_demo_scenes_with_codes():
+    """Codes are read against the very picture that is flown, and kept apart from the plain scene's results."""
+    first, _ = open_dataset("demo:1,3,codes")
+    assert first.name == "demo-1-codes"
+    assert first.codes is not None
+    drawn = Scene(1, codes=True).codes(2.0)
+    assert [code.text for code in first.codes(30)] == [code.text for code in drawn]
+    assert np.array_equal(first.codes(30)[0].corners_source_px, drawn[0].corners_source_px)
+    (plain,) = open_dataset("demo:1")
+    assert plain.codes is None
+    assert content_hash(plain) != content_hash(first)
+    (large,) = open_dataset("demo:codes,4k")
+    assert (large.name, large.source_size, large.clip.spec) == (
+        "demo-0-codes-4k",
+        (3840, 2160),
+        "demo:codes,4k",
+    )
+
+
 def test_a_clip_is_staged_once(tmp_path):
     """Flights map the pixels in place of decoding them again; a full disk costs time, not the study."""
     write_visdrone(tmp_path / "root", "a")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import cv2
 import numpy as np
 import pytest
@@ -109,3 +111,30 @@ def test_a_bad_annotation_is_named_with_its_line(picture):
     picture.with_suffix(".txt").write_text("1,2,3,4,1,4,0,0\n1;2;3\n")
     with pytest.raises(UserError, match="line 2"):
         VirtualCamera(picture)
+
+
+def test_yolo_labels_lie_where_visdrones_do(picture):
+    """Most aerial sets have YOLO's files: without them their pictures could be flown with reference labels only."""
+    root = picture.parent
+    for folder in ("images", "labels"):
+        (root / folder).mkdir()
+    moved = picture.rename(root / "images" / "street.png")
+    x, y, w, h = BOX
+    (root / "labels" / "street.txt").write_text(
+        f"1 {(x + w / 2) / 960} {(y + h / 2) / 540} {w / 960} {h / 540}\n0 0.9 0.9 0.1 0.1\n"
+    )
+    with pytest.raises(UserError, match=r"no classes\.txt"):
+        open_dataset(f"still:{root}")
+    (sequence,) = open_dataset(f"still:{moved}?classes=dontcare,truck,person&view=0.9")
+    found = sequence.labels(105)
+    image = next(islice(open_camera(f"still:{moved}@0.9", fps=15, annotated=False).images(), 105, None))
+    assert (sequence.class_set, set(found.class_names)) == (("person", "truck"), {"truck"})
+    ys, xs = np.nonzero(image[:, :, 0] > 145)
+    assert any(
+        np.allclose(box, (xs.min(), ys.min(), xs.max() + 1, ys.max() + 1), atol=1.01)
+        for box in found.boxes_xyxy_px
+    )
+    (only,) = open_dataset(f"still:{root}?classes=dontcare,truck,person&labelled=vehicle")
+    assert only.class_set == ("truck",)
+    with pytest.raises(UserError, match="labels none of boat"):
+        open_dataset(f"still:{root}?classes=dontcare,truck,person&labelled=boat")

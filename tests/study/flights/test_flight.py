@@ -31,14 +31,14 @@ def clip(tmp_path_factory):
     return Clip("drawn", SIZE, FRAMES, path)
 
 
-def flown(clip, *flags, link_bps=200_000):
+def flown(clip, *flags, link_bps=200_000, detector=None):
     width, height = SIZE
     base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}", "--detector", "motion"]
     base += ["--budget", "200kbps", "--preset", "ultrafast"]
     edge, _ = load(EdgeConfig, [*base, *flags], program="hvt-edge", description="")
     ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
     plan = FlightPlan(clip, check_edge(edge), ground, link_bps)
-    return fly(plan, detector=RedSquares(), models=SharedModels(RedSquares()))
+    return fly(plan, detector=detector or RedSquares(), models=SharedModels(RedSquares()))
 
 
 def f1_of(report, frames):
@@ -60,9 +60,23 @@ def test_video_alone_shows_the_square_at_every_frame(clip):
     assert report.edge_cpu_ms > 0
 
 
-def test_the_same_flight_twice(clip):
+AUTO = (
+    "--method",
+    "M6",
+    "--candidates",
+    "source",
+    "--send-tracks",
+    "--profile",
+    "auto",
+    "--video-share",
+    "auto",
+)
+
+
+@pytest.mark.parametrize("flags", [("--method", "M5"), AUTO], ids=["M5", "auto"])
+def test_the_same_flight_twice(clip, flags):
     """A table that changes from run to run proves nothing."""
-    first, second = flown(clip, "--method", "M5"), flown(clip, "--method", "M5")
+    first, second = flown(clip, *flags), flown(clip, *flags)
     assert first.digest == second.digest
     assert first.messages == second.messages
     assert first.link == second.link
@@ -98,6 +112,23 @@ def test_stills_cross_and_are_counted(clip):
     assert report.messages["roi"] > 0
     assert sum(report.account.outcomes["sent"].values()) == report.messages["roi"]
     assert report.bps("roi") == report.account.roi_bps
+
+
+def test_tracks_are_sent_while_the_base_hides_what_they_tell(clip):
+    """On a large object that any video shows, tracks and their bits are wasted; where it is hidden they are all."""
+
+    class Blind(RedSquares):
+        """Sees the square on untouched pixels only: coded ones are never exactly as red."""
+
+        def detect(self, image_bgr):
+            untouched = (image_bgr == np.array([30, 60, 230], np.uint8)).all(axis=2).sum() > 500
+            return super().detect(image_bgr if untouched else np.zeros_like(image_bgr))
+
+    shown = flown(clip, *AUTO)
+    assert shown.messages.get("tracks", 0) <= 2
+    hidden = flown(clip, *AUTO, detector=Blind())
+    assert hidden.messages["tracks"] >= 5
+    assert hidden.account.total_bps <= 200_000
 
 
 def test_coded_frames():

@@ -34,10 +34,24 @@ def test_after_refinement():
     assert score.counts.top1_found == pytest.approx(2 / 3)
     assert score.counts.top1_all == 0.5
     assert (score.recall, score.precision, score.f1) == (0.75, 0.75, 0.75)
+    # Two of four boxes are right, two of four labels missed or misnamed; two boxes of one frame are false.
+    assert (score.named_f1, score.false_per_frame) == (0.5, 2.0)
     # Of all: car 2·1/(1+2), bus 2·1/(1+2) with the one on nothing, truck 0, van 0.
     assert score.macro_f1_all == pytest.approx((2 / 3 + 2 / 3) / 4)
     # Of those found: car 2·1/(1+2), bus 1, truck 0.
     assert score.macro_f1_found == pytest.approx((2 / 3 + 1) / 3)
+
+
+def test_listing_more_wins_nothing():
+    """A method that lists three boxes for each vehicle shows as many with their class as one that lists one."""
+    truth = labels((square(0), "car"), (square(200), "bus"))
+    one = view((square(0), "car", 1, 0.9), (square(200), "bus", 2, 0.9))
+    more = ((square(at), name, 9 + at, 0.9) for at, name in ((3, "car"), (203, "car"), (400, "bus")))
+    three = view((square(0), "car", 1, 0.9), (square(200), "bus", 2, 0.9), *more)
+    few, many = class_score([(truth, one)] * 2), class_score([(truth, three)] * 2)
+    assert few.counts.top1_all == many.counts.top1_all == 1.0
+    assert (few.named_f1, few.false_per_frame) == (1.0, 0.0)
+    assert (many.named_f1, many.false_per_frame) == (pytest.approx(4 / 7), 3.0)
 
 
 def test_before_refinement():

@@ -82,7 +82,7 @@ def test_the_table_comes_back_as_it_was_written(tmp_path):
     assert first["first_correct_p90_s"] == math.inf
     assert first["target_bps"] is None
     assert first["matched_to"] == ""
-    assert second["top1_all"] == 0.25
+    assert second["named_f1"] == 0.25
     assert second["matched"] is False
     assert second["failed"] == "no: it cannot"
     assert [one.name for one in tmp_path.iterdir()] == ["results.parquet"]
@@ -158,7 +158,7 @@ def test_means_are_of_the_runs_that_count():
     table = named_table(setting)
     assert [(cells[1].text, cells[3].text) for cells in table.rows] == [("M0", "3 of 5"), ("M5", "4 of 5")]
     assert "Means of fewer sequences (n) are not to be compared" in table.caption
-    assert [cell.text for cell in column(table, "found & named")] == [
+    assert [cell.text for cell in column(table, "named F1")] == [
         "0.900",
         "0.450",
     ]  # (.5 + .6 + .7 + 0) / 4
@@ -175,17 +175,17 @@ def test_differences_are_of_pairs_at_matched_totals():
     (setting,) = settings(study())
     against_m0, against_r0 = pairs(setting)
     assert (against_m0.reference, against_r0.reference) == ("M0", "R0")
-    gaps = against_m0.gaps("top1_all")
+    gaps = against_m0.gaps("named_f1")
     assert gaps == pytest.approx({"demo:0-9#a": 0.1, "demo:0-9#b": 0.2, "demo:0-9#c": 0.3})
-    assert against_m0.interval("top1_all").mean == pytest.approx(0.2)
-    assert against_r0.interval("top1_all").mean == pytest.approx(-0.1)
+    assert against_m0.interval("named_f1").mean == pytest.approx(0.2)
+    assert against_r0.interval("named_f1").mean == pytest.approx(-0.1)
     assert against_m0.most_off_pct() == pytest.approx(100 / 600)
     table = differences_table(setting, [against_m0, against_r0])
     assert [cell.text for cell in column(table, "n")] == ["3 of 4", "3 of 4"]
-    assert [cell.text for cell in column(table, "Δ found & named")] == ["+0.200", "\N{MINUS SIGN}0.100"]
+    assert [cell.text for cell in column(table, "Δ named F1")] == ["+0.200", "\N{MINUS SIGN}0.100"]
     assert [cell.text for cell in column(table, "ahead")] == ["3 : 0", "0 : 3"]
     assert [cell.text for cell in column(table, "kbps")] == ["600.0 / 601.0", "600.0 / 599.0"]
-    assert not any(cell.strong for cell in column(table, "Δ found & named"))
+    assert not any(cell.strong for cell in column(table, "Δ named F1"))
 
 
 def test_runs_of_other_networks_and_labels_are_never_averaged_together():
@@ -204,7 +204,7 @@ def test_runs_of_other_networks_and_labels_are_never_averaged_together():
         ("demo 0-9", "reference", "nano", 1),
         ("demo 0-9", "annotations", "large", 1),
     ]
-    means = [column(named_table(one), "found & named")[0].text for one in found]
+    means = [column(named_table(one), "named F1")[0].text for one in found]
     assert means == ["0.500", "0.200", "0.800", "0.400", "0.600"]
     assert (
         "labels: reference (the detector on source frames before they are coded"
@@ -227,7 +227,7 @@ def test_the_method_matrix_has_methods_by_regimes():
     """The paper's matrix, with results."""
     rows = [*study(), row("a", "M5", 1_300_000, 0.95, regime="moderate", budget_bps=1_400_000)]
     (setting,) = settings(rows)
-    table = matrix_table(setting, "top1_all")
+    table = matrix_table(setting, "named_f1")
     assert [head.text for head in table.heads][3:] == ["low, 800 kbps", "moderate, 1400 kbps"]
     assert [(cells[0].text, cells[3].text, cells[4].text) for cells in table.rows] == [
         ("M0", "0.900", "\N{EN DASH}"),
@@ -237,7 +237,7 @@ def test_the_method_matrix_has_methods_by_regimes():
     assert [[cell.strong for cell in cells[3:]] for cells in table.rows] == [[False, False], [False, False]]
     assert [[cell.under for cell in cells[3:]] for cells in table.rows] == [["n = 3", ""], ["n = 4", "n = 1"]]
     (same,) = settings([one for one in rows if one["sequence"] in "abc"])
-    strong = [[cell.strong for cell in cells[3:]] for cells in matrix_table(same, "top1_all").rows]
+    strong = [[cell.strong for cell in cells[3:]] for cells in matrix_table(same, "named_f1").rows]
     assert strong == [[True, False], [False, False]]
     assert matrix_table(setting, "hota") is None
 
@@ -251,7 +251,7 @@ def test_bits_at_equal_accuracy_are_read_between_points_only():
     assert needed_bps(curve, level=0.1) == 0
     assert math.isnan(needed_bps(curve[:1], level=0.3))
     (setting,) = settings(study())
-    one = equal_quality(setting, Arm("low", "M5", "jpeg"), reference="M0", column="top1_all")
+    one = equal_quality(setting, Arm("low", "M5", "jpeg"), reference="M0", column="named_f1")
     # M0 has 0.4 at 601 kbps and 0.9 at 800; sequence d has no curve.
     share = [(level - 0.4) / 0.5 for level in (0.5, 0.6, 0.7)]
     assert one.ratios == pytest.approx([601 * (800 / 601) ** part / 600 for part in share])
@@ -435,7 +435,7 @@ def test_the_page_has_all_that_the_paper_has(written):
             *("Runs that do not count", "What it was run with"),
         ):
             assert heading in text
-        assert "+0.200 found" in text  # the answer
+        assert "+0.200 named F1" in text  # the answer
         assert "That is no verdict" in text
         assert "permissive" in text
         assert "hvt 0.1.0" in text
@@ -515,12 +515,12 @@ def test_several_studies_are_joined_to_one(tmp_path, capsys):
         [mine, row("b", "M5", 700_000, 0.6, accounting="span", clip_s=20.0)], one / "results.parquet"
     )
     theirs = {**row("c", "M5", 600_000, 0.7, accounting="span", clip_s=20.0)}
-    write_results(in_accounting([theirs, {**mine, "top1_all": 0.1}], "pilot"), two / "results.parquet")
+    write_results(in_accounting([theirs, {**mine, "named_f1": 0.1}], "pilot"), two / "results.parquet")
     assert cli.main(["report", str(one), str(two)]) == 2
     assert "2 studies are given, and no place for the one: add --out DIR" in capsys.readouterr().err
     assert cli.main(["report", str(one), str(two), "--out", str(tmp_path / "all")]) == 0
     found = read_results(tmp_path / "all" / "results.parquet")
     totals = {line["sequence"]: line["total_bps"] for line in found}
     assert totals == {"a": 800_000, "b": 700_000, "c": 600_000}
-    assert (len(found), found[0]["top1_all"]) == (3, 0.5), "of a run that both have the first counts"
+    assert (len(found), found[0]["named_f1"]) == (3, 0.5), "of a run that both have the first counts"
     assert "3 sequences" in (tmp_path / "all" / "report.md").read_text()

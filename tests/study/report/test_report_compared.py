@@ -62,14 +62,14 @@ def many(count, **own):
 def test_runs_under_other_conditions_are_not_averaged_together():
     """Two studies joined: the last run of a sequence would take the place of the first, without a word."""
     often = [
-        {**one, "key": f"{one['key']}-often", "top1_all": 0.1, "config": config(detect_every=1)}
+        {**one, "key": f"{one['key']}-often", "named_f1": 0.1, "config": config(detect_every=1)}
         for one in many(2)
     ]
     for rows in (many(2) + often, often + many(2)):
         found = {one.conditions.detect_every: one for one in settings(rows)}
         assert set(found) == {5, 1}
-        assert [cell.text for cell in column(named_table(found[5]), "found & named")] == ["0.500"]
-        assert [cell.text for cell in column(named_table(found[1]), "found & named")] == ["0.100"]
+        assert [cell.text for cell in column(named_table(found[5]), "named F1")] == ["0.500"]
+        assert [cell.text for cell in column(named_table(found[1]), "named F1")] == ["0.100"]
         assert "detection on every frame" in named_table(found[1]).caption
         assert "detection" not in named_table(found[5]).caption
 
@@ -142,7 +142,7 @@ def test_a_follower_of_another_total_is_no_match():
     for ordered in (rows, rows[::-1]):
         (setting,) = settings(ordered)
         (pair,) = pairs(setting)
-        assert pair.gaps("top1_all") == pytest.approx({"demo:0-9#b": 0.1})
+        assert pair.gaps("named_f1") == pytest.approx({"demo:0-9#b": 0.1})
         assert pair.most_off_pct() < 1
         assert (
             "2 runs of video were coded to the total of a run that is not the one"
@@ -152,7 +152,7 @@ def test_a_follower_of_another_total_is_no_match():
     # Rounded on its way through the other accounting, a total is still the same.
     back = in_accounting(in_accounting([{**one, "clip_s": 33.0} for one in rows], "pilot"), "span")
     (pair,) = pairs(settings([rows[2] | {"clip_s": 33.0}, *back[3:]])[0])
-    assert list(pair.gaps("top1_all")) == ["demo:0-9#b"]
+    assert list(pair.gaps("named_f1")) == ["demo:0-9#b"]
 
 
 # What is enough
@@ -162,11 +162,11 @@ def test_no_verdict_is_drawn_from_few_sequences():
     """Of two sequences an interval is their range, and leaves out 0 half of the time where nothing is to be found."""
     few = make_report(many(4))
     (text,) = [part for part in few.sections[0].parts if isinstance(part, str)]
-    assert "+0.100 found & named (n = 4)" in text
+    assert "+0.100 named F1 (n = 4)" in text
     assert "That is no verdict: 1 pair of method and regime has fewer than 5 sequences" in text
     enough = make_report(many(5))
     (text,) = [part for part in enough.sections[0].parts if isinstance(part, str)]
-    assert "+0.100 [+0.100, +0.100] found & named (n = 5)" in text
+    assert "+0.100 [+0.100, +0.100] named F1 (n = 5)" in text
     assert (
         "Of 1 pair of method and regime the interval lies above 0 in 1, below in 0, and holds 0 in 0." in text
     )
@@ -178,11 +178,11 @@ def test_brackets_and_bold_are_of_enough_sequences():
     """What is printed bold is believed."""
     for count, shown in ((4, False), (5, True)):
         (setting,) = settings(many(count))
-        (cell,) = column(differences_table(setting, list(pairs(setting))), "Δ found & named")
+        (cell,) = column(differences_table(setting, list(pairs(setting))), "Δ named F1")
         assert (bool(cell.under), cell.strong) == (shown, shown)
-        assert bool(column(named_table(setting), "found & named")[0].under) is shown
+        assert bool(column(named_table(setting), "named F1")[0].under) is shown
         one = EqualQuality(Arm("low", "M5", "jpeg"), "M0", (1.5,) * count, 0)
-        assert column(equal_table(setting, [one], column="top1_all"), "bits needed")[0].strong is shown
+        assert column(equal_table(setting, [one], column="named_f1"), "bits needed")[0].strong is shown
 
 
 def test_a_figure_of_fewer_sequences_says_so():
@@ -343,7 +343,7 @@ def test_a_figure_is_of_one_regime():
     (setting,) = settings(rows)
     names = [
         one.name
-        for one in difference_figures(setting, list(pairs(setting)), name="answer", column="top1_all")
+        for one in difference_figures(setting, list(pairs(setting)), name="answer", column="named_f1")
     ]
     assert names == ["answer-high-1", "answer-low"]
 

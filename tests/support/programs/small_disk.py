@@ -1,4 +1,4 @@
-"""A disk of a megabyte, for tests of what happens when it is full."""
+"""A small disk, for seeing what happens when it is full."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["small_disk"]
 
 
 @contextmanager
-def small_disk(folder: Path) -> Iterator[Path]:
-    """A tmpfs of 1 MB at this new folder; the test is skipped where mounting is not permitted."""
+def small_disk(folder: Path, *, size: str = "1m") -> Iterator[Path]:
+    """A tmpfs, of 1 MB by default, at this new folder; the test is skipped where mounting is not permitted."""
     folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
     try:
         done = subprocess.run(mount, capture_output=True, check=False, text=True)
     except FileNotFoundError as error:

@@ -263,6 +263,7 @@ class Flight:
                 cores_free=0.0,
             ),
             failed=(),
+            levers="",
         )
         return _received("status", report.pack(), b"", "")
 

@@ -109,6 +109,7 @@ STATUS = Status(
             working=False,
         ),
     ),
+    levers="tracks: 31 objects the base does not show",
 )
 INFO = Info(
     session_id=7,

@@ -8,7 +8,7 @@ from hvt_study.runs.columns import COLUMNS
 EMPTY = {"text": "", "int": None, "real": None, "yes": None}
 
 
-def row(sequence, method, total_bps, top1_all=None, **own):
+def row(sequence, method, total_bps, named_f1=None, **own):
     """One run; a follower of M5 where ``own`` says ``matched_to``."""
     filled = {column.name: EMPTY[column.type] for column in COLUMNS}
     codec = "jpeg" if method == "M5" else ""
@@ -28,7 +28,7 @@ def row(sequence, method, total_bps, top1_all=None, **own):
         "accounting": "span",
         "duration_s": 10.0,
         "total_bps": total_bps,
-        "top1_all": top1_all,
+        "named_f1": named_f1,
     }
     assert set(own) <= set(filled), "only columns of the table"
     return filled | own
@@ -44,7 +44,7 @@ def study():
     for name, m5, m0 in (("a", 0.5, 0.4), ("b", 0.6, 0.4), ("c", 0.7, 0.4)):
         rows += [
             row(name, "M0", 800_000, 0.9),
-            row(name, "M5", 600_000, m5, roi_bps=90_000, base_bps=500_000, top1_all_before=0.1),
+            row(name, "M5", 600_000, m5, roi_bps=90_000, base_bps=500_000, named_f1_before=0.1),
             row(name, "M0", 601_000, m0, **to_m5(target_bps=600_000)),
             row(name, "R0", 599_000, m5 + 0.1, **to_m5(target_bps=600_000)),
         ]

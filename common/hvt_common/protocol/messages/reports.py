@@ -168,6 +168,8 @@ class Status(Message):
     dropped: Mapping[str, int] = wire_field(_REASONS)
     health: Health = wire_field(Nested(Health))  # noqa: RUF009 - a dataclass field, not a default
     failed: tuple[FailedPart, ...] = wire_field(ListOf(Nested(FailedPart), MOST_FAILED_PARTS))
+    levers: str = wire_field(Text(120))
+    """What is sent beside the video and why, one line for people; empty where settings alone decide."""
 
     @property
     def outcomes(self) -> Mapping[str, int]:

@@ -1,10 +1,12 @@
 """M6: stills by expected gain per byte on the line.
 
-    gain = P(the still helps) · [ (1 - k) · P(wrong before) + k · P(wrong after the last still) · better ]
+    gain = P(the still helps) · [ (1 - k) · P(wrong before) + k · P(wrong after the last still) · better + detail ]
     score = 1000 · gain / (expected payload + what a still takes beside it)
 
 ``gain`` is the chance that the class which the ground shows of a track becomes right by a still of it now, and ``k``
-fades with the time since the last still. docs/methods.md says what the terms are and where their numbers come from.
+fades with the time since the last still. ``detail`` is what a still shows beside the class, such as a code on a roof;
+it counts for nothing unless ``detail_weight`` says so. docs/methods.md says what the terms are and where their
+numbers come from.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ __all__ = ["ExpectedGain"]
 
 _SIDE_PX = 32.0
 """The size at which ``size_weight`` adds nothing."""
+_MOST_WEIGHT = 1000.0
+"""Beyond it classes count for nothing."""
 _MOST_LOGIT = 50.0
 """Surer than that nothing is; keeps the exponential finite whatever weights a user tries."""
 
@@ -60,6 +64,10 @@ class ExpectedGain:
     """At least so much where ground and edge name different kinds."""
     again: float = 0.1
     """The use of another still of the same view, against the first."""
+    detail_weight: float = 0.0
+    """What a large object's details are worth that the base does not show at all, in classes that are set right."""
+    detail_px: float = 48.0
+    """Side in source pixels at which an object has half of the details that a large one has."""
     min_gain: float = 0.02
     """Nothing below it is sent: about twice the rate at which a still spoils a class that was right."""
     lookahead: float = 3.0
@@ -82,18 +90,27 @@ class ExpectedGain:
         return wanted
 
     def gain(self, candidate: Candidate, step: Step) -> float:
-        """Chance that a still now sets the class right that the ground shows; 0…1."""
+        """Chance that a still now sets the class right that the ground shows, 0…1, and the worth of its details."""
         faded = self._faded(candidate, now_ns=step.now_ns)
         before = faded * self.doubt(candidate, from_source=step.from_source)
         after = (1 - faded) * self._doubt_left(candidate) * self._better(candidate)
-        wrong = before + after
+        worth = before + after
+        if self.detail_weight > 0:
+            news = faded + (1 - faded) * self._better(candidate)
+            worth += min(_MOST_WEIGHT, self.detail_weight) * news * self.hidden_detail(candidate)
         # Sharpness reads pixels: only where it can matter.
-        return wrong * self.use(candidate, from_source=step.from_source) if wrong >= self.min_gain else 0.0
+        return worth * self.use(candidate, from_source=step.from_source) if worth >= self.min_gain else 0.0
+
+    def hidden_detail(self, candidate: Candidate) -> float:
+        """0…1: what a still shows of an object that the base, at its size and rate, does not: pixels on target."""
+        area_px = max(0.0, candidate.area_px)
+        half = max(1.0, self.detail_px)
+        return self._lost(candidate) * area_px / (area_px + half * half)
 
     def doubt(self, candidate: Candidate, *, from_source: bool) -> float:
         """P(wrong before any still): the ground misses the object on the base, or calls it something else."""
         weight = self.lost_weight_source if from_source else self.lost_weight
-        lost = self.unknown_lost if candidate.loss is None else candidate.loss().detail_lost
+        lost = self._lost(candidate)
         x1, y1, x2, y2 = candidate.box_base_px
         side_px = math.sqrt(max(1.0, (x2 - x1) * (y2 - y1)))
         logit = (
@@ -117,6 +134,9 @@ class ExpectedGain:
             sharp = candidate.sharpness()
             use *= sharp / (sharp + self.sharp_half)
         return use
+
+    def _lost(self, candidate: Candidate) -> float:
+        return self.unknown_lost if candidate.loss is None else candidate.loss().detail_lost
 
     def _faded(self, candidate: Candidate, *, now_ns: int) -> float:
         """``1 - k``: 1 where nothing was sent yet."""

@@ -1,4 +1,4 @@
 """A still at the ground: `stage` takes it through `decode`, `classify` and `refine`, which finds its track.
 
-`vocabulary` says what a classifier's words mean for a track.
+`vocabulary` says what a classifier's words mean for a track; `composite` lays stills over the base picture.
 """

@@ -1,4 +1,7 @@
-"""The drawn demo scene, a sequence a seed, with exact labels: ``demo:0-4``, ``demo:1,5``."""
+"""The drawn demo scene, a sequence a seed, with exact labels: ``demo:0-4``, ``demo:1,5``.
+
+Words of the edge's source may stand among the seeds: ``demo:0-4,codes,4k`` (`hvt_edge.source.demo`).
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,16 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 
 from hvt_common.units import exact_rate
+from hvt_edge.source.demo import SCENE_WORDS, demo_scene
 from hvt_edge.source.resample import base_frame_count
-from hvt_scene import Scene
+from hvt_scene import CodeInView, Scene
 from hvt_scene.drawing.vehicles import CLASS_NAMES
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.labels import FrameLabels
 from hvt_study.datasets.layouts.options import parse_numbers
 from hvt_study.datasets.sequence import Sequence
 
-__all__ = ["DemoLabels", "open_demo"]
+__all__ = ["DemoCodes", "DemoLabels", "open_demo"]
 
 _SIZE = (1920, 1080)
 _LEAST_VISIBLE = 0.5
@@ -27,10 +31,11 @@ class DemoLabels:
     """The drawn truth of a seed. Objects of which less than half is to be seen are passed over."""
 
     seed: int
+    spec: str = "demo"
 
     def __call__(self, index: int) -> FrameLabels:
         """Of the frame at ``index / 15`` seconds."""
-        truth = _scene(self.seed).truth(index / NOMINAL_FPS)
+        truth = _scene(self.seed, self.spec).truth(index / NOMINAL_FPS)
         judged = truth.visible >= _LEAST_VISIBLE
         return FrameLabels(
             boxes_xyxy_px=truth.boxes_source_px[judged],
@@ -40,25 +45,51 @@ class DemoLabels:
         )
 
 
-def open_demo(uri: str, seeds: str) -> Mapping[str, Callable[[], Sequence]]:
-    """The scenes of these seeds by name; `UserError` where they are no seeds."""
-    return {f"demo-{seed}": partial(_open, seed) for seed in parse_numbers(uri, seeds)}
+@dataclass(frozen=True, slots=True)
+class DemoCodes:
+    """The codes on the roofs of a scene that has some."""
+
+    seed: int
+    spec: str
+
+    def __call__(self, index: int) -> tuple[CodeInView, ...]:
+        """In the frame at ``index / 15`` seconds, by object."""
+        return _scene(self.seed, self.spec).codes(index / NOMINAL_FPS)
 
 
-def _open(seed: int) -> Sequence:
+def open_demo(uri: str, place: str) -> Mapping[str, Callable[[], Sequence]]:
+    """The scenes of these seeds by name; seed 0 where words stand alone. `UserError` where they are neither."""
+    parts = [part.strip() for part in place.split(",")]
+    words = [part for part in parts if part in SCENE_WORDS]
+    seeds = ",".join(part for part in parts if part not in words)
+    spec = f"demo:{','.join(words)}" if words else "demo"
+    numbers = (0,) if words and not seeds else parse_numbers(uri, seeds)
+    return {_name(seed, words): partial(_open, seed, spec) for seed in numbers}
+
+
+def _name(seed: int, words: list[str]) -> str:
+    return "-".join(["demo", f"{seed}", *words])
+
+
+def _open(seed: int, spec: str) -> Sequence:
     count = base_frame_count(exact_rate(Scene.duration_s), fps=exact_rate(NOMINAL_FPS))
+    _, colon, words = spec.partition(":")
+    drawn = demo_scene(spec)
+    size = drawn.get("size", _SIZE)
     return Sequence(
-        name=f"demo-{seed}",
+        name=_name(seed, words.split(",") if colon else []),
         dataset="demo",
-        clip=Clip("demo", _SIZE, count, seed=seed),
+        clip=Clip(spec, size, count, seed=seed),
         frame_count=count,
         fps=NOMINAL_FPS,
-        source_size=_SIZE,
-        labels=DemoLabels(seed),
+        source_size=size,
+        labels=DemoLabels(seed, spec),
         class_set=tuple(sorted(CLASS_NAMES)),
+        attributes={"scene": words} if words else {},
+        codes=DemoCodes(seed, spec) if drawn.get("codes") else None,
     )
 
 
 @lru_cache(maxsize=1)
-def _scene(seed: int) -> Scene:
-    return Scene(seed)
+def _scene(seed: int, spec: str) -> Scene:
+    return Scene(seed, **demo_scene(spec))

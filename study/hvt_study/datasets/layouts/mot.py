@@ -22,6 +22,7 @@ from __future__ import annotations
 import configparser
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -129,7 +130,13 @@ def _open(name: str, folder: Path, options: Options) -> Sequence:
     images = _images(folder, said)
     fps = options.fps or _rate(folder / _INFO, said)
     labels = _labels(folder, said, images) if options.annotated else None
-    return images.sequence(name=name, dataset="mot", fps=fps, labels=labels)
+    sequence = images.sequence(name=name, dataset="mot", fps=fps, labels=labels)
+    return sequence if labels is None else replace(sequence, one_target=_one_target(labels.table()))
+
+
+def _one_target(table: LabelTable) -> bool:
+    """Whether it is a single-object set: one id, and nothing marked as not counting."""
+    return len(np.unique(table.ids)) == 1 and not len(table.ignored.frames)
 
 
 def _images(folder: Path, info: Mapping[str, str]) -> ImageSequence:

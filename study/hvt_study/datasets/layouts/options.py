@@ -30,6 +30,11 @@ class Options:
     """Height that the virtual camera sees at its lowest, in heights of the picture."""
     seeds: tuple[int, ...] = (0,)
     """Of the virtual camera's ways; each gives sequences of its own."""
+    classes: tuple[str, ...] = ()
+    """Names of the classes of YOLO's labels; none: those of ``classes.txt``."""
+    labelled: tuple[str, ...] = ()
+    """Kinds that the dataset labels, such as ``vehicle``: objects of others count neither way. None: all that
+    its classes name."""
 
 
 def split_options(uri: str, place: str, *, accepted: Collection[str]) -> tuple[str, Options]:
@@ -79,6 +84,13 @@ def _view(uri: str, text: str) -> float:
     return _number(uri, "view", text, 0.1, 3)
 
 
+def _words(uri: str, text: str) -> tuple[str, ...]:
+    words = tuple(word.strip() for word in text.split(","))
+    if not all(words):
+        raise UserError(f"dataset {uri!r} names {text!r}: accepted are names between commas")
+    return words
+
+
 def _annotated(uri: str, text: str) -> bool:
     if text not in ("annotations", "none"):
         raise UserError(f"dataset {uri!r} says labels={text}: accepted are annotations and none")
@@ -102,4 +114,6 @@ _OPTIONS: Mapping[str, tuple[str, Callable[[str, str], Any]]] = {
     "labels": ("annotated", _annotated),
     "view": ("view", _view),
     "seeds": ("seeds", parse_numbers),
+    "classes": ("classes", _words),
+    "labelled": ("labelled", _words),
 }

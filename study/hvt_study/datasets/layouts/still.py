@@ -1,8 +1,8 @@
 """Annotated aerial pictures, made into sequences by a virtual camera that flies over them.
 
-VisDrone-DET's layout (ROOT/images/NAME.jpg, ROOT/annotations/NAME.txt), a folder of pictures with NAME.txt beside
-NAME.jpg, or a single picture. Real pixels and real labels, and boxes that follow exactly; the way is drawn from a
-seed. See `hvt_study.datasets.virtual_camera`.
+VisDrone-DET's layout (ROOT/images/NAME.jpg, ROOT/annotations/NAME.txt), YOLO's (ROOT/labels/NAME.txt and
+ROOT/classes.txt), a folder of pictures with NAME.txt beside NAME.jpg, or a single picture. Real pixels and real
+labels, and boxes that follow exactly; the way is drawn from a seed. See `hvt_study.datasets.virtual_camera`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 from hvt_common.errors import UserError
-from hvt_common.inference.class_names import VISDRONE_NAMES
 from hvt_edge.source.folder import sequence_files
 from hvt_study.datasets.clip import NOMINAL_FPS, Clip
 from hvt_study.datasets.label_table import file_stamp
@@ -33,10 +32,14 @@ class StillLabels:
     picture: Path
     view: float
     seed: int
+    classes: tuple[str, ...] = ()
+    """Of YOLO's labels."""
 
     def __call__(self, index: int) -> FrameLabels:
         """Of frame ``index``, in the camera's pixels; each mirror image of an object is one of its own."""
-        labels = _camera(self.picture, self.view, self.seed, True, _stamps(self.picture)).labels(index)
+        labels = _camera(
+            self.picture, self.view, self.seed, True, self.classes, _stamps(self.picture)
+        ).labels(index)
         assert labels is not None, "made for annotated pictures only"
         return labels
 
@@ -63,8 +66,8 @@ def _pictures(place: Path) -> list[Path]:
     found = [file for folder in folders or [place] for file in sequence_files(folder)]
     if not found:
         raise UserError(
-            f"still folder {place} holds no pictures: expected are images/NAME.jpg and annotations/NAME.txt, "
-            "or NAME.jpg and NAME.txt beside it"
+            f"still folder {place} holds no pictures: expected are images/NAME.jpg and annotations/NAME.txt or "
+            "labels/NAME.txt, or NAME.jpg and NAME.txt beside it"
         )
     return found
 
@@ -89,7 +92,7 @@ def _check_annotated(place: Path, pictures: list[Path]) -> None:
 
 def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
     view = float(f"{options.view or USUAL_VIEW:g}")  # as it is written in the clip's name
-    camera = _camera(picture, view, seed, options.annotated, _stamps(picture))
+    camera = _camera(picture, view, seed, options.annotated, options.classes, _stamps(picture))
     known = camera.annotations
     return Sequence(
         name=name,
@@ -98,8 +101,8 @@ def _open(name: str, picture: Path, seed: int, options: Options) -> Sequence:
         frame_count=camera.frame_count,
         fps=NOMINAL_FPS,
         source_size=camera.size,
-        labels=None if known is None else StillLabels(picture, view, seed),
-        class_set=() if known is None else tuple(sorted(VISDRONE_NAMES)),
+        labels=None if known is None else StillLabels(picture, view, seed, options.classes),
+        class_set=() if known is None else known.class_set,
         attributes={"view": f"{view:g}", "seed": str(seed)},
         files=(picture,) if known is None else (picture, annotation_file(picture)),
     )
@@ -111,9 +114,10 @@ def _camera(
     view: float,
     seed: int,
     annotated: bool,  # noqa: FBT001 - part of the key
+    classes: tuple[str, ...],
     stamps: tuple[Hashable, ...],  # noqa: ARG001 - likewise
 ) -> VirtualCamera:
-    return VirtualCamera(picture, view, NOMINAL_FPS, seed, annotated)
+    return VirtualCamera(picture, view, NOMINAL_FPS, seed, annotated, classes)
 
 
 def _stamps(picture: Path) -> tuple[Hashable, ...]:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Words
 from contextlib import contextmanager
+from dataclasses import replace
 from fnmatch import fnmatchcase
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
 from hvt_common.errors import UserError
+from hvt_study.datasets.class_map import of_kinds
 from hvt_study.datasets.layouts.clips import open_clips
 from hvt_study.datasets.layouts.demo import open_demo
 from hvt_study.datasets.layouts.mot import open_mot
@@ -26,11 +29,11 @@ _Found = Mapping[str, Callable[[], Sequence]]
 _Layout = Callable[[Path, Options], _Found]
 
 _LAYOUTS: Mapping[str, tuple[_Layout, frozenset[str]]] = {
-    "visdrone": (open_visdrone, frozenset({"fps", "labels"})),
-    "uavdt": (open_uavdt, frozenset({"fps", "labels"})),
-    "mot": (open_mot, frozenset({"fps", "labels"})),
+    "visdrone": (open_visdrone, frozenset({"fps", "labels", "labelled"})),
+    "uavdt": (open_uavdt, frozenset({"fps", "labels", "labelled"})),
+    "mot": (open_mot, frozenset({"fps", "labels", "labelled"})),
     "clips": (open_clips, frozenset({"fps"})),
-    "still": (open_stills, frozenset({"labels", "view", "seeds"})),
+    "still": (open_stills, frozenset({"labels", "view", "seeds", "classes", "labelled"})),
 }
 """What each scheme is, and the options that it takes. Only sequences that are asked for are opened."""
 
@@ -100,7 +103,21 @@ def _laid_out(uri: str) -> _Found:
     if not text or not (path.is_dir() or (files_too and path.is_file())):
         state = "is not a folder" if text and path.exists() else "does not exist"
         raise UserError(f"dataset {uri!r}: folder {text!r} {state}")
-    return opener(path, options)
+    found = opener(path, options)
+    if not options.labelled:
+        return found
+    return {name: partial(_of_kinds, make, options.labelled, uri) for name, make in found.items()}
+
+
+def _of_kinds(make: Callable[[], Sequence], kinds: tuple[str, ...], uri: str) -> Sequence:
+    """The sequence as one that is judged in these kinds alone."""
+    sequence = make()
+    classes = of_kinds(sequence.class_set, kinds)
+    if sequence.labels is not None and not classes:
+        raise UserError(
+            f"dataset {uri!r} labels none of {','.join(kinds)}: its classes are {', '.join(sequence.class_set)}"
+        )
+    return replace(sequence, class_set=classes)
 
 
 def _check_there(found: Mapping[str, _Found], only: Words[str]) -> None:

@@ -12,7 +12,8 @@ INTERVALS = f"95 % bootstrap interval over sequences (from {ENOUGH} on)"
 """How means are bracketed."""
 _LABELS = {
     "annotations": "annotations (people's, or exact)",
-    "reference": "reference (the detector on source frames before they are coded, none smaller than the base)",
+    "reference": "reference (the detector on source frames before they are coded, in tiles, "
+    "none smaller than the base)",
 }
 _NAMED = 4
 """Of several datasets; the rest is counted."""

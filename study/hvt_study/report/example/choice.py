@@ -23,7 +23,7 @@ __all__ = [
 
 PERCENTILES = (10, 50, 90)
 """Of the gain in PSNR: the stills that are shown."""
-_GAIN = "top1_all"
+_GAIN = "named_f1"
 _PREFERRED = "M6"
 
 
@@ -117,7 +117,7 @@ def choose_run(rows: Sequence[RunRow]) -> Choice | None:
     """The run of the sequence with the median gain, of those that sent stills; None where no such method counts.
 
     Of the methods that sent stills M6 is taken, or the last in the order of tables; in the thinnest regime; with the
-    codec that comes first. Gain is in found & named, against M0 at the same total; without M0, against the same run
+    codec that comes first. Gain is in named F1, against M0 at the same total; without M0, against the same run
     without the stills' word. Where no run sent a still, the rule goes by all of them: there is a timeline still.
 
     Raises:
@@ -164,7 +164,7 @@ def _median(setting: Setting, arm: Arm, runs: BySequence) -> Choice:
     gains, over = _gains(setting, arm, runs)
     ordered = sorted(gains, key=lambda name: (gains[name], name)) or sorted(runs)
     name = ordered[(len(ordered) - 1) // 2]
-    how = f"with the median gain in found & named over {over}" if gains else "in the middle by name"
+    how = f"with the median gain in named F1 over {over}" if gains else "in the middle by name"
     where = f"{arm.name} in the thinnest regime with such runs ({arm.regime})"
     if len(ordered) == 1:
         return Choice(str(runs[name]["key"]), f"{where}, which has one sequence {sent}")
@@ -173,12 +173,12 @@ def _median(setting: Setting, arm: Arm, runs: BySequence) -> Choice:
 
 
 def _gains(setting: Setting, arm: Arm, runs: BySequence) -> tuple[Mapping[str, float], str]:
-    """In found & named by sequence, and over what."""
+    """In named F1 by sequence, and over what."""
     for pair in _plain(setting, arm):
         against = {name: gap for name, gap in pair.gaps(_GAIN).items() if name in runs}
         if against:
             return against, "M0 at the same total"
-    after, before = values(runs, _GAIN), values(runs, "top1_all_before")
+    after, before = values(runs, _GAIN), values(runs, f"{_GAIN}_before")
     own = {name: after[name] - before[name] for name in runs}
     return {name: gap for name, gap in own.items() if not math.isnan(gap)}, "itself without stills"
 

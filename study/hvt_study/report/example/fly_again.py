@@ -34,6 +34,7 @@ from hvt_study.report.example.store import png_of
 from hvt_study.runs.run_context import RunContext, open_run_context
 from hvt_study.runs.run_settings import flight_plan
 from hvt_study.runs.spec import RunSpec
+from hvt_study.runs.video_shape import VideoShape
 from hvt_study.serial_link import Arrival
 
 __all__ = ["example_of", "fly_again"]
@@ -53,7 +54,7 @@ def fly_again(spec: RunSpec, plan: StudyPlan, *, rule: str) -> Example:
         UserError: dataset or models cannot be used, or the edge refuses its settings.
     """
     context = open_run_context(spec, cache=plan.cache)
-    flight = flight_plan(spec, context, budget_bps=spec.budget_bps, fps=None)
+    flight = flight_plan(spec, context, budget_bps=spec.budget_bps, shape=VideoShape())
     title = f"{spec.sequence}, {spec.method} {spec.still_codec}, {spec.regime} regime, {spec.labels} labels"
     return example_of(flight, context, key=spec.key, rule=rule, title=title)
 

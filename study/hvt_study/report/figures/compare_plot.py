@@ -16,30 +16,35 @@ __all__ = ["STYLES", "plot"]
 STYLES = {
     "M0": ("#000000", "o", "--"),
     "M0-fps": ("#000000", "s", "-"),
+    "M0-best": ("#009E73", "P", "-"),
     "R0": ("#56B4E9", "^", "-"),
     "M5-jpeg": ("#E69F00", "v", "--"),
     "M5-residual": ("#E69F00", "D", "-"),
     "tracks": ("#CC79A7", "<", "-"),
     "M6": ("#D55E00", "*", "-"),
+    "auto": ("#009E73", "P", "-"),
 }
-_MEASURES = (("f1", "F1 of the list (IoU 0.5)"), ("class_agreement", "class agreement"))
-_HALVES = {1: "first", 2: "second"}
+_MEASURES = (("named_f1", "named F1 of the list"), ("false_per_frame", "false objects a frame"))
+_ONE_TARGET = (("recall", "share of its time at which the target is found"), ("gaps", "gaps"))
 _DPI = 200
 
 
-def plot(result: CompareResult, path: Path, *, half: int = 2) -> None:
-    """Write a PNG: F1 and class agreement of one half of the clip over kbps in all, a line a method."""
+def plot(result: CompareResult, path: Path) -> None:
+    """Write a PNG: named F1 and false objects a frame of the whole clip over kbps in all, a line a method.
+
+    Of one target: the share of its time at which it is found, and the gaps.
+    """
     figure = Figure(figsize=(9.6, 4.4), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True)
-    rows = [row for row in result.rows if row["half"] == half]
-    for axes, (measure, label) in zip(panels, _MEASURES, strict=True):
+    rows = [row for row in result.rows if row["half"] == 0]
+    for axes, (measure, label) in zip(panels, _ONE_TARGET if result.one_target else _MEASURES, strict=True):
         _draw(axes, rows, measure=measure)
         axes.set_ylabel(label)
         axes.set_xlabel("kbps in all, every byte counted")
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside right center", frameon=False)
     figure.suptitle(
-        f"{result.clip}: the ground's list at every mark, {_HALVES[half]} half, {result.labels} labels",
+        f"{result.clip}: the ground's list over the whole clip, {result.labels} labels",
         fontsize="medium",
     )
     figure.savefig(path, dpi=_DPI, metadata={"Software": None})

@@ -17,8 +17,8 @@ from hvt_study.report.figures.drawing import drawn, fill_of, mark_of, plain_axes
 
 __all__ = ["codec_figure", "utility_figure"]
 
-_UTILITY = ("map_50", "top1", "top1_all")
-_CODEC = ("top1_all", "confidence_gain", "stills_per_min")
+_UTILITY = ("named_f1", "top1_all", "map_50")
+_CODEC = ("named_f1", "confidence_gain", "stills_per_min")
 _LEGEND_COLUMNS = 6
 _TOTAL = {"pilot": "total by the whole clip, kbps"}
 

@@ -84,6 +84,7 @@ _STYLES: Mapping[str, Style] = MappingProxyType(
     {
         "M0": Style(PALETTE["black"], "o", "--"),
         "M0-fps": Style(PALETTE["black"], "s", "-"),
+        "M0-best": Style(PALETTE["green"], "P", "-"),
         "R0": Style(PALETTE["sky"], "^", "-"),
         "M1": Style(PALETTE["blue"], "o", ":"),
         "M2": Style(PALETTE["blue"], "v", "--"),

@@ -18,10 +18,13 @@ _SPENT = (
     *("mean_still_bytes", "tracks_refined", "delay_p50_ms", "delay_p95_ms", "still_delay_p50_ms"),
     *("still_delay_p95_ms", "edge_cpu_ms"),
 )
-_SEEN = ("map_50", "map_50_95", "recall", "precision", "f1", "mota", "idf1", "hota", "id_switches")
+_SEEN = (
+    *("map_50", "map_50_95", "recall", "precision", "f1", "mota", "idf1", "hota", "id_switches"),
+    *("found_share", "gaps", "longest_gap_s"),
+)
 _NAMED = (
-    *("top1_before", "top1", "top1_all_before", "top1_all", "macro_f1_before", "macro_f1"),
-    *("macro_f1_all_before", "macro_f1_all"),
+    *("named_f1_before", "named_f1", "false_per_frame", "top1_before", "top1", "top1_all_before"),
+    *("top1_all", "macro_f1_before", "macro_f1", "macro_f1_all_before", "macro_f1_all"),
     *("first_correct_p50_s", "first_correct_p90_s", "first_correct_never"),
 )
 _SIZES = (

@@ -16,10 +16,10 @@ from hvt_study.report.data.pairs import Pair
 __all__ = ["differences_table", "equal_table", "ratio"]
 
 _COMPARED = (
-    *("map_50", "map_50_95", "f1", "top1", "top1_all", "macro_f1", "macro_f1_all", "mota", "idf1"),
-    "hota",
+    *("named_f1", "false_per_frame", "map_50", "map_50_95", "f1", "top1", "top1_all", "macro_f1"),
+    *("macro_f1_all", "mota", "idf1", "hota"),
 )
-_DECIDES = "top1_all"
+_DECIDES = "named_f1"
 
 
 def differences_table(setting: Setting, found: Sequence[Pair]) -> Table | None:

@@ -12,6 +12,7 @@ import pytest
 from hvt_common.errors import UserError
 from hvt_common.inference.cli import main as models
 from hvt_common.inference.detect import open_detector, warm_up
+from hvt_common.inference.scores import uncalibrated
 from hvt_common.inference.tiles import tiled
 from hvt_common.runtime import plug_ins
 from hvt_study.cli import main as study
@@ -150,3 +151,11 @@ def test_a_study_says_that_it_takes_files_alone(installed, tmp_path, capsys):
     installed({"acme-blobs": "BlobDetector"}, module="acme_blobs", source=BLOBS)
     assert study(["run", "demo:0", "--detector", "acme-blobs", "--out", str(tmp_path / "out")]) == 2
     assert "detector 'acme-blobs' is a plug-in" in capsys.readouterr().err
+
+
+def test_it_is_named_whole_where_its_scores_are_no_probabilities(installed):
+    """The log would name its model file's last part, which is no detector."""
+    installed({"acme-blobs": "BlobDetector"}, module="acme_blobs", source=BLOBS)
+    assert "detector acme-blobs:/opt/one.engine has no" in uncalibrated(
+        "detector", "acme-blobs:/opt/one.engine"
+    )

@@ -147,7 +147,7 @@ def test_typical_sizes_are_small():
     assert len(BASE.pack()) <= 40
     assert len(ROI.pack()) <= 150
     assert len(STEP.pack()) <= 45 + len(STEP.boxes)
-    assert len(replace(STATUS, failed=()).pack()) <= 180
+    assert len(replace(STATUS, failed=(), levers="").pack()) <= 190
     assert len(REQUEST.pack()) <= 20
 
 

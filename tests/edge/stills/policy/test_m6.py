@@ -76,6 +76,22 @@ def test_known_answer():
     assert unseen.score == pytest.approx(1000 * wrong * use * (1 - exp(-0.6 / 0.22)) / 680)
 
 
+def test_details_count_where_they_are_wanted():
+    """A code on a roof would stay unread: the class of its vehicle is certain, so no still of it is worth a bit."""
+    van = car(box_source_px=(200, 200, 296, 248), confidence=0.97, lost=0.9)
+    reads = ExpectedGain(detail_weight=0.5)
+    plain, wanted = M6.gain(van, step()), reads.gain(van, step())
+    area = 96 * 48
+    assert wanted - plain == pytest.approx(0.5 * 0.9 * area / (area + 48**2) * M6.use(van, from_source=False))
+    assert reads.requests([van], step())[0].score > 3 * M6.requests([van], step())[0].score
+    # The base shows it all, or a still has just done so: nothing is to be gained.
+    assert reads.gain(replace(van, loss=lambda: BaseLoss(40.0, 0.0)), step()) < 0.02
+    assert reads.gain(sent(van, seconds=1.0), step()) < 0.25 * wanted
+    # More pixels on target, more to read.
+    small = replace(van, box_source_px=(200, 200, 216, 208))
+    assert reads.hidden_detail(small) < 0.1 * reads.hidden_detail(van)
+
+
 def test_an_object_that_the_base_does_not_show_comes_first():
     """What only the edge sees would stay unseen at the ground."""
     invisible, visible = car(1, lost=0.97, confidence=0.7), car(2, lost=0.1, confidence=0.7)
@@ -170,5 +186,5 @@ def test_any_weight_a_user_may_give_is_survived():
             policy = method("M6", **{name: value})
             assert isinstance(policy, ExpectedGain)
             for one in (car(), sent(car(), seconds=1), car(loss=None, sharpness=None)):
-                assert 0 <= policy.gain(one, step()) <= 1
+                assert 0 <= policy.gain(one, step()) <= 1 + min(1000.0, policy.detail_weight)
                 policy.requests([one], step())

@@ -101,6 +101,8 @@ def _verdict(refinement: Refinement) -> str:
     certain = "✓ " if refinement.sure else ""
     if refinement.class_before == refinement.class_after:
         return f"{refinement.class_after} {certain}{certainty}"
+    if refinement.track_id is None:  # nothing was renamed by it
+        return f"{refinement.class_before}, by itself {refinement.class_after} {certainty}"
     return f"{refinement.class_before} → {refinement.class_after} {certain}{certainty}"
 
 

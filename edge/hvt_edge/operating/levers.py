@@ -1,0 +1,165 @@
+"""``--profile auto``: which levers the edge pulls follows from what they were measured to give.
+
+Two levers cost bits that the video could have: the edge's own tracks, and stills. Each is pulled while it pays.
+
+**Tracks** pay where the base hides objects: their gain in F1 is what the shadow ground measured, less what the video
+would gain by the same bits. **Stills** pay where they change what the ground shows: it says of each what it made of
+it. Where hardly any changed anything they pause, and a few are sent now and then to find out whether that holds.
+
+A ground that lies in its reports can stop stills or bring them back, within their share of the budget. It can change
+neither video nor budget.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+from hvt_edge.operating.point import Levers, Operating
+
+__all__ = ["LeverControl", "LeverSettings"]
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class LeverSettings:
+    """What is worth its bits. Gains are of F1, 0…1."""
+
+    tracks_bps: int
+    """Line bits a second that tracks take of the budget."""
+    on_gain: float = 0.035
+    """From so much net gain on tracks are sent …"""
+    off_gain: float = 0.02
+    """… until it falls below this: what is taken for hidden is in part what the detector alone sees."""
+    gain_per_doubling: float = 0.07
+    """What twice the bits give video: .05 to .11 between 100 and 400 kbps (docs/design-notes/compare.md)."""
+    least_comparisons: float = 1.5
+    """Before so many comparisons no tracks are sent, for a single picture may be an exception, unless …"""
+    plain_gain: float = 0.2
+    """… it is as plain as this."""
+    least_answers: int = 12
+    """So many stills must have been answered before they may pause."""
+    most_answers: int = 40
+    """So many of the newest count."""
+    least_changed: float = 0.1
+    """The share of stills that must change something."""
+    pause_ns: int = 20 * _SECOND_NS
+    """How long stills pause before some are tried again; twice as long after each vain try, up to 8 times."""
+    most_pauses: int = 8
+    load_samples: int = 8
+    """Seconds over which the machine is judged."""
+    least_analyzed: float = 0.03
+    """The share of frames that perception must have time for: two pictures in five seconds."""
+
+
+class LeverControl:
+    """Takes measurements in the thread of perception, and sets ``operating.now.levers``. No clock of its own."""
+
+    def __init__(self, operating: Operating, settings: LeverSettings) -> None:
+        self._operating = operating
+        self._settings = settings
+        self._lock = threading.Lock()
+        self._gain = self._hidden = self._misnamed = self._comparisons = 0.0
+        self._changed: deque[bool] = deque(maxlen=settings.most_answers)
+        self._paused_until_ns: int | None = None
+        self._pauses = 1
+        self._too_slow = False
+        operating.pull(Levers(tracks=False))
+        self._loads: deque[tuple[int, int]] = deque(maxlen=settings.load_samples)
+
+    def take_shadow(self, *, gain: float, hidden: float, misnamed_share: float, comparisons: float) -> None:
+        """What the shadow ground measured, see `hvt_edge.perception.shadow.Shadow`; ``hidden`` objects a picture."""
+        self._gain, self._hidden, self._misnamed, self._comparisons = (
+            gain,
+            hidden,
+            misnamed_share,
+            comparisons,
+        )
+
+    def take_answer(self, *, changed: bool) -> None:
+        """A ground has inspected a still; ``changed``: it now shows another class, or an object that it had not."""
+        self._changed.append(changed)
+
+    def take_load(self, captured: int, unanalyzed: int, *, now_ns: int) -> None:
+        """How many frames came so far, and how many perception had no time for. From any thread.
+
+        It decides too where the machine is too slow, because perception may never come to it.
+        """
+        self._loads.append((captured, unanalyzed))
+        came = captured - self._loads[0][0]
+        skipped = unanalyzed - self._loads[0][1]
+        self._too_slow = (
+            len(self._loads) == self._loads.maxlen
+            and came > 0
+            and came - skipped < self._settings.least_analyzed * came
+        )
+        if self._too_slow:
+            self.decide(now_ns)
+
+    def forget(self) -> None:
+        """Another scene: what was measured says nothing of it."""
+        self._comparisons = 0.0
+        self._changed.clear()
+        self._paused_until_ns, self._pauses = None, 1
+
+    def decide(self, now_ns: int) -> Levers:
+        """Set the levers for what is known now; ``now_ns`` is the time that windows go by."""
+        with self._lock:
+            return self._decide(now_ns)
+
+    def _decide(self, now_ns: int) -> Levers:
+        before = self._operating.now.levers
+        tracks = self._tracks(before.tracks) and not self._too_slow
+        # Tracks tell classes too; without them a still is what corrects one.
+        named = tracks or self._misnamed < self._settings.least_changed
+        stills = (self._stills(now_ns) or not named) and not self._too_slow
+        levers = Levers(tracks, stills, self._says(tracks=tracks, stills=stills))
+        if levers != before:
+            self._operating.pull(levers)
+        return levers
+
+    @property
+    def net_gain(self) -> float:
+        """Of the tracks, less what the video would gain by their bits."""
+        settings, total_bps = self._settings, self._operating.now.total_bps
+        share = min(0.9, settings.tracks_bps / total_bps)
+        return self._gain - settings.gain_per_doubling * math.log2(1 / (1 - share))
+
+    def _tracks(self, sent: bool) -> bool:  # noqa: FBT001 - the state before
+        settings, net_gain = self._settings, self.net_gain
+        if self._comparisons < settings.least_comparisons:
+            return self._comparisons > 0 and net_gain >= settings.plain_gain
+        return net_gain >= (settings.off_gain if sent else settings.on_gain)
+
+    def _stills(self, now_ns: int) -> bool:
+        settings = self._settings
+        if self._paused_until_ns is not None:
+            if now_ns < self._paused_until_ns:
+                return False
+            self._paused_until_ns = None
+            self._pauses = min(settings.most_pauses, 2 * self._pauses)
+            while len(self._changed) > settings.least_answers // 2:  # some are tried, no more
+                self._changed.popleft()
+        if len(self._changed) < settings.least_answers or self._share() >= settings.least_changed:
+            return True
+        self._paused_until_ns = now_ns + self._pauses * settings.pause_ns
+        return False
+
+    def _share(self) -> float:
+        return sum(self._changed) / max(1, len(self._changed))
+
+    def _says(self, *, tracks: bool, stills: bool) -> str:
+        """One line for people."""
+        if self._too_slow:
+            return "video alone: this machine is too slow for the detector"
+        hidden = f"{self._hidden:.0f} objects the base does not show"
+        of_tracks = (
+            f"{'tracks' if tracks else 'no tracks'}: {hidden}"
+            if self._comparisons
+            else "tracks: not measured yet"
+        )
+        changed = f"changed {sum(self._changed)} of {len(self._changed)}"
+        return f"{of_tracks}; {f'stills {changed}' if stills else f'stills paused: {changed}'}"

@@ -1,0 +1,219 @@
+"""The shadow ground: what the ground's detector would miss on the base stream of what the source shows.
+
+The edge decodes its own stream and holds the untouched source, so it can measure instead of guess. Now and then, on a
+frame whose source the detector has just seen, it runs the detector on the decoded base frame too, as the ground does,
+and compares object by object. What it takes for true is what the detector says of the source, each box by its
+confidence: with a calibrated detector a box of .6 is real three times in five. So a box that the base does not
+show counts as much for being sent as against it.
+
+Expected named F1 of a list (F1 = 2 TP / (listed + true); a box counts only under its class; expectations by the
+confidences p):
+
+    true    = sum of p over source boxes + sum of p over base-only boxes
+    base    = 2 (sum of p over source boxes that the base shows, w of it where it bears another class there)
+                / (shown + base-only + true)
+    sent    = 2 (sum of p over all source boxes, 1 - w of it where the base bears another class)
+                / (all + base-only + true)
+
+``w`` is 1/3: of two names for one object that of the finer picture is right twice as often (our choice).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hvt_common.values import Detections, Image, iou
+from hvt_edge.perception.analyzer import AnalyzedFrame
+
+__all__ = ["Shadow", "ShadowGround", "ShadowSettings"]
+
+_SECOND_NS = 1_000_000_000
+_THUMBNAIL = (32, 18)
+_BASE_NAMES = 1 / 3
+"""Where base and source name an object differently, how often the base's name is right."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShadowSettings:
+    """How often is compared, and how long it is remembered."""
+
+    confidence: float
+    """From where a detection starts a track, at the edge and at the ground."""
+    rest_ns: int = _SECOND_NS
+    """Capture time from one comparison to the next, at least. On a slow machine more: see ``most_share``."""
+    quick_rest_ns: int = _SECOND_NS // 3
+    quick_comparisons: float = 2.5
+    """At first so few comparisons are made in quick order, because nothing is known."""
+    most_share: float = 0.15
+    """Of a processor core, for comparisons; in lockstep, where no clock may decide, only ``rest_ns`` counts."""
+    memory_s: float = 8.0
+    """Time constant with which former comparisons fade."""
+    lost_ns: int = 2 * _SECOND_NS
+    """So long the ground's tracker lists what its detector sees no more."""
+    scene_correlation: float = 0.3
+    """Two pictures a third of a second apart that correlate less, as thumbnails, are of two scenes."""
+    match_iou: float = 0.3
+    """As little as the ground takes for one object: boxes of 15 pixels from two pictures seldom reach more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shadow:
+    """What was measured, means a picture, the newest most; see the module for ``p``."""
+
+    comparisons: float = 0.0
+    """How many comparisons the means are worth."""
+    source: float = 0.0
+    """Boxes of the source."""
+    source_p: float = 0.0
+    """Sum of their confidences."""
+    shown: float = 0.0
+    """Of these, the boxes that the base shows too."""
+    shown_p: float = 0.0
+    misnamed: float = 0.0
+    """Of the shown, those that bear another class on the base."""
+    misnamed_p: float = 0.0
+    false: float = 0.0
+    """Boxes of the base where the source has none."""
+    false_p: float = 0.0
+
+    @property
+    def hidden(self) -> float:
+        """Objects a picture that the base does not show."""
+        return self.source - self.shown
+
+    @property
+    def misnamed_share(self) -> float:
+        """Of the objects that the base shows, those that it shows under another class."""
+        return self.misnamed / self.shown if self.shown else 0.0
+
+    @property
+    def gain(self) -> float:
+        """How much expected named F1 the ground's list gains by being sent every source box; 0 at first."""
+        true = self.source_p + self.false_p
+        if not true:
+            return 0.0
+        named_p = self.shown_p - (1 - _BASE_NAMES) * self.misnamed_p
+        sent_p = self.source_p - _BASE_NAMES * self.misnamed_p
+        return 2 * sent_p / (self.source + self.false + true) - 2 * named_p / (self.shown + self.false + true)
+
+
+class ShadowGround:
+    """Looks now and then; deterministic where ``spent_ns`` is not given.
+
+    ``detect`` is the detector on a whole picture, as the ground runs it; None of it while it does not work.
+    ``spent_ns`` is a clock in nanoseconds by which the cost of a comparison is measured; None in lockstep.
+    """
+
+    def __init__(
+        self,
+        detect: Callable[[Image], Detections | None],
+        *,
+        settings: ShadowSettings,
+        spent_ns: Callable[[], int] | None = None,
+    ) -> None:
+        self._detect = detect
+        self._settings = settings
+        self._spent_ns = spent_ns
+        self._next_ns = 0
+        self._last_ns: int | None = None
+        self._shown_ns: dict[int, int] = {}
+        """Track id → when the base showed it last."""
+        self._thumbnail: tuple[int, npt.NDArray[np.float32]] | None = None
+        self.scene_changes = 0
+        """How often another scene began."""
+        self.now = Shadow()
+
+    def compare(self, seen: AnalyzedFrame) -> bool:
+        """Compare, if this is a decision step on a coded frame and one is due; tell whether it was done."""
+        capture_ns = seen.frame.capture_ns
+        if seen.detected and self._is_another_scene(seen.frame.source_bgr, capture_ns):
+            self._forget()
+        if not seen.detected or seen.base_bgr is None or capture_ns < self._next_ns:
+            return False
+        if not self._next_ns:  # the first picture of a stream is coarser than any other
+            self._next_ns = capture_ns + self._settings.quick_rest_ns
+            return False
+        began_ns = self._spent_ns() if self._spent_ns else 0
+        found = self._detect(seen.base_bgr)
+        took_ns = self._spent_ns() - began_ns if self._spent_ns else 0
+        settings = self._settings
+        rest_ns = (
+            settings.rest_ns if self.now.comparisons >= settings.quick_comparisons else settings.quick_rest_ns
+        )
+        self._next_ns = capture_ns + max(rest_ns, round(took_ns / settings.most_share))
+        if found is None:
+            return False
+        self._take(self._compared(seen, found), capture_ns)
+        return True
+
+    def _is_another_scene(self, source_bgr: Image, capture_ns: int) -> bool:
+        """Whether this picture has nothing to do with that of the decision step just before."""
+        small = cv2.resize(source_bgr, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
+        small -= small.mean()
+        before, self._thumbnail = self._thumbnail, (capture_ns, small)
+        if before is None or capture_ns - before[0] > self._settings.rest_ns:
+            return False  # so much later a moving camera may show other ground
+        norm = float(np.linalg.norm(before[1]) * np.linalg.norm(small))
+        return norm > 0 and float(before[1] @ small) / norm < self._settings.scene_correlation
+
+    def _forget(self) -> None:
+        """Another scene: what was measured says nothing of it."""
+        self.scene_changes += 1
+        self.now, self._last_ns, self._next_ns, self._shown_ns = Shadow(), None, 0, {}
+
+    def _compared(self, seen: AnalyzedFrame, found: Detections) -> Shadow:
+        tracks, least = seen.tracks, self._settings.confidence
+        rows = np.flatnonzero(tracks.seen_frames == tracks.frame_index)
+        boxes, p = tracks.boxes_xyxy_px[rows], tracks.confidences[rows].astype(float)
+        # A track that has begun goes on with weak detections too, so that they show an object.
+        overlaps = iou(found.boxes_xyxy_px, boxes)
+        same = overlaps >= self._settings.match_iou
+        shown = same.any(axis=0)
+        ids = tracks.ids[rows]
+        self._note_shown(ids[shown].tolist(), seen.frame.capture_ns)
+        shown |= np.isin(ids, list(self._shown_ns))
+        alone = (found.confidences >= least) & ~same.any(axis=1)
+        misnamed = np.zeros(len(rows), bool)
+        matched = same.any(axis=0)
+        if matched.any():
+            best = overlaps[:, matched].argmax(axis=0)
+            misnamed[matched] = found.class_ids[best] != tracks.class_ids[rows][matched]
+        return Shadow(
+            comparisons=1,
+            source=len(rows),
+            source_p=float(p.sum()),
+            shown=int(shown.sum()),
+            shown_p=float(p[shown].sum()),
+            misnamed=int(misnamed.sum()),
+            misnamed_p=float(p[misnamed].sum()),
+            false=int(alone.sum()),
+            false_p=float(found.confidences[alone].sum()),
+        )
+
+    def _note_shown(self, ids: list[int], capture_ns: int) -> None:
+        """These tracks are shown now. The ground's tracker carries a track on for a while, so they stay shown."""
+        since_ns = capture_ns - self._settings.lost_ns
+        recent = {track_id: at_ns for track_id, at_ns in self._shown_ns.items() if at_ns >= since_ns}
+        self._shown_ns = recent | dict.fromkeys(ids, capture_ns)
+
+    def _take(self, one: Shadow, capture_ns: int) -> None:
+        weight = 0.0
+        if self._last_ns is not None:
+            weight = math.exp(-max(0, capture_ns - self._last_ns) / _SECOND_NS / self._settings.memory_s)
+        self._last_ns = capture_ns
+        worth = weight * self.now.comparisons + 1
+        means = {
+            field.name: (
+                weight * self.now.comparisons * getattr(self.now, field.name) + getattr(one, field.name)
+            )
+            / worth
+            for field in fields(Shadow)
+            if field.name != "comparisons"
+        }
+        self.now = Shadow(comparisons=worth, **means)

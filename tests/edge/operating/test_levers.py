@@ -1,0 +1,128 @@
+"""What is sent beside the video, by what it was measured to give."""
+
+from __future__ import annotations
+
+import pytest
+
+from hvt_edge.operating.levers import LeverControl, LeverSettings
+from hvt_edge.operating.point import Operating
+
+SECOND_NS = 1_000_000_000
+SETTINGS = LeverSettings(tracks_bps=8_000)
+
+
+class Rig:
+    """A control at a budget, fed by hand; time runs in seconds."""
+
+    def __init__(self, *, budget_bps: int = 800_000) -> None:
+        self.operating = Operating(
+            budget_bps=budget_bps, video_share=None, base_bps=budget_bps, method="M6", decimation=1
+        )
+        self.control = LeverControl(self.operating, SETTINGS)
+        self.at_s = 0
+
+    def tracks(self, gain: float, *, comparisons: float = 3.0, misnamed_share: float = 0.0) -> bool:
+        """Whether tracks are sent after a second in which this was measured."""
+        self.control.take_shadow(gain=gain, hidden=4, misnamed_share=misnamed_share, comparisons=comparisons)
+        return self.second().tracks
+
+    def answers(self, count: int, *, changed: int = 0) -> bool:
+        """Whether stills are sent after so many were answered."""
+        for number in range(count):
+            self.control.take_answer(changed=number < changed)
+        return self.second().stills
+
+    def second(self, seconds: int = 1):
+        """The levers so much later."""
+        self.at_s += seconds
+        self.control.decide(self.at_s * SECOND_NS)
+        return self.operating.now.levers
+
+
+def test_tracks_follow_their_gain_and_do_not_flicker():
+    """At the border of being worth their bits they would come and go with the noise of the measurement."""
+    rig = Rig()
+    between = (SETTINGS.on_gain + SETTINGS.off_gain) / 2
+    gains = (0.0, between, 0.1, between, 0.0, between)
+    assert [rig.tracks(gain) for gain in gains] == [False, False, True, True, False, False]
+
+
+def test_one_picture_is_no_measurement_unless_it_is_plain():
+    """The first pictures of a stream hide everything: tracks would begin on every clip."""
+    rig = Rig()
+    assert not rig.tracks(0.0, comparisons=0.0), "nothing was measured yet"
+    assert not rig.tracks(0.1, comparisons=1.0)
+    assert rig.tracks(0.3, comparisons=1.0)
+
+
+def test_on_a_thinner_link_tracks_must_give_more():
+    """8 kbps are a tenth of 80 kbps and nothing of 1400: video would gain by them."""
+    gain = SETTINGS.on_gain + 0.004
+    assert Rig(budget_bps=1_400_000).tracks(gain)
+    assert not Rig(budget_bps=60_000).tracks(gain)
+
+
+def test_stills_that_change_nothing_pause_and_are_tried_again():
+    """A fifth of the budget would go to pictures that tell the ground what it knows."""
+    rig = Rig()
+    assert rig.answers(SETTINGS.least_answers - 1), "too few to tell"
+    assert not rig.answers(1)
+    pause_s = SETTINGS.pause_ns // SECOND_NS
+    assert not rig.second(pause_s - 1).stills
+    assert rig.second(1).stills, "the scene may have changed"
+    assert not rig.answers(SETTINGS.least_answers), "in vain"
+    assert not rig.second(2 * pause_s - 1).stills, "the next try comes later"
+    assert rig.second(1).stills
+
+
+def test_stills_that_change_something_go_on():
+    """The next one may be the one that matters."""
+    rig = Rig()
+    assert rig.answers(SETTINGS.most_answers, changed=5)
+    assert "stills changed 5 of 40" in rig.operating.now.levers.says
+
+
+def test_stills_go_on_where_the_base_misnames_and_no_tracks_tell():
+    """They are then the only way by which a right name reaches the ground, whatever the edge thinks of them."""
+    rig = Rig()
+    assert rig.answers(SETTINGS.most_answers) is False
+    rig.tracks(0.0, misnamed_share=0.3)
+    assert rig.operating.now.levers.stills
+
+
+def test_another_scene_begins_anew():
+    """What was measured on the ground says nothing of the sky."""
+    rig = Rig()
+    rig.tracks(0.1)
+    assert not rig.answers(SETTINGS.least_answers)
+    rig.control.forget()
+    levers = rig.second()
+    assert levers.stills
+    assert levers.says.startswith("tracks: not measured yet")
+
+
+def test_a_machine_that_is_too_slow_sends_video_alone_and_says_so():
+    """Perception that never comes to a frame would leave the last levers for ever."""
+    rig = Rig()
+    rig.tracks(0.1)
+    for second in range(SETTINGS.load_samples + 1):
+        rig.control.take_load(15 * second, 15 * second, now_ns=second * SECOND_NS)
+    levers = rig.operating.now.levers
+    assert not levers.tracks
+    assert not levers.stills
+    assert "too slow" in levers.says
+    for second in range(20, 20 + SETTINGS.load_samples):
+        rig.control.take_load(15 * second, 15 * 20, now_ns=second * SECOND_NS)
+    assert rig.tracks(0.1), "it has time again"
+
+
+@pytest.mark.parametrize("lies", [True, False])
+def test_a_ground_that_lies_moves_stills_alone(lies):
+    """Whoever answers on feedback would else decide on video or tracks."""
+    rig = Rig()
+    rig.tracks(0.1)
+    before = rig.operating.now
+    rig.answers(1000, changed=1000 if lies else 0)
+    now = rig.operating.now
+    assert now.levers.tracks == before.levers.tracks
+    assert (now.total_bps, now.base_bps, now.decimation) == (before.total_bps, before.base_bps, 1)

@@ -1,0 +1,157 @@
+"""How much of what the source shows the ground would miss."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hvt_common.inference.detect import open_detector
+from hvt_common.inference.store import EMBEDDED_DETECTOR
+from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.values import Detections, Frame, Tracks
+from hvt_edge.perception.analyzer import AnalyzedFrame, Analyzer, AnalyzerSettings
+from hvt_edge.perception.shadow import ShadowGround, ShadowSettings
+from hvt_edge.source.demo import DemoSource
+from hvt_edge.video.encoder_settings import encoder_settings
+from hvt_edge.video.x265 import BaseEncoder
+
+FPS = 15
+PERIOD_NS = 1_000_000_000 // FPS
+SETTINGS = ShadowSettings(confidence=0.4)
+PICTURE = np.random.default_rng(3).integers(0, 255, (64, 96, 3), np.uint8)
+
+
+def box(place: int) -> list[float]:
+    """Of the object at this place."""
+    return [10.0 * place, 0.0, 10.0 * place + 8, 8.0]
+
+
+def found(*places: int, confidence: float = 0.8, class_id: int = 0) -> Detections:
+    """What the detector says of the base."""
+    count = len(places)
+    return Detections(
+        np.array([box(place) for place in places], np.float32).reshape(-1, 4),
+        np.full(count, confidence, np.float32),
+        np.full(count, class_id, np.int32),
+    )
+
+
+def seen(index: int, confidences: dict[int, float], picture: np.ndarray = PICTURE) -> AnalyzedFrame:
+    """A decision step whose source shows objects at these places."""
+    places = list(confidences)
+    count = len(places)
+    tracks = Tracks(
+        frame_index=index,
+        ids=np.array(places, np.int64),
+        boxes_xyxy_px=np.array([box(place) for place in places], np.float32).reshape(-1, 4),
+        confidences=np.array(list(confidences.values()), np.float32),
+        class_ids=np.zeros(count, np.int32),
+        born_frames=np.zeros(count, np.int64),
+        seen_frames=np.full(count, index, np.int64),
+        started=np.zeros(count, bool),
+    )
+    frame = Frame(index=index, capture_ns=(index + 1) * PERIOD_NS, source_bgr=picture, base_bgr=picture)
+    return AnalyzedFrame(frame, picture, tracks, detected=True)
+
+
+def compared(*answers: Detections, confidences: dict[int, float], every: int = 30) -> ShadowGround:
+    """A shadow ground whose detector said this of the base, one look after the other."""
+    left = list(answers)
+    shadow = ShadowGround(lambda _image: left.pop(0) if left else found(), settings=SETTINGS)
+    assert not shadow.compare(seen(0, confidences)), "the first picture is coarser than any other"
+    for number in range(len(answers)):
+        assert shadow.compare(seen((number + 1) * every, confidences))
+    return shadow
+
+
+def test_the_gain_is_that_of_the_formula():
+    """Levers would be moved by a number that means something else than the docs say."""
+    shadow = compared(found(0, 5), confidences={0: 0.9, 1: 0.5, 2: 0.7})
+    true = 0.9 + 0.5 + 0.7 + 0.8
+    base, sent = 2 * 0.9 / (1 + 1 + true), 2 * 2.1 / (3 + 1 + true)
+    assert shadow.now.gain == pytest.approx(sent - base, abs=1e-6)
+    assert (shadow.now.hidden, shadow.now.false) == (2, 1)
+
+
+def test_a_box_that_is_hardly_real_gains_nothing():
+    """The ground would be sent of everything that the detector half believes."""
+    gains = [
+        compared(found(0, 1), confidences={0: 0.95, 1: 0.95, 2: doubt}).now.gain for doubt in (0.95, 0.6, 0.2)
+    ]
+    assert gains == sorted(gains, reverse=True)
+    assert gains[0] > 0 > gains[-1]
+
+
+def test_a_name_that_the_base_gets_wrong_counts():
+    """A pickup that the base shows as a car is found and not named."""
+    right = compared(found(0), confidences={0: 0.9}).now
+    wrong = compared(found(0, class_id=1), confidences={0: 0.9}).now
+    assert right.gain == pytest.approx(0)
+    assert (wrong.misnamed_share, wrong.gain) == (1.0, pytest.approx(2 * 0.9 / 3 / 1.9, abs=1e-6))
+
+
+def test_what_the_tracker_carries_on_is_not_hidden():
+    """The ground lists an object for two seconds more; each flicker of the detector would count as a loss."""
+    flickers = compared(found(0), found(), confidences={0: 0.9}, every=15)
+    gone = compared(found(0), found(), confidences={0: 0.9}, every=45)
+    assert flickers.now.hidden == 0
+    assert gone.now.hidden > 0
+
+
+def test_another_scene_forgets_and_a_moving_camera_does_not():
+    """Levers would be held for seconds by what a scene before the cut needed."""
+    shadow = compared(found(), found(), found(), confidences={0: 0.9})
+    assert shadow.now.comparisons > 1
+    shadow.compare(seen(95, {0: 0.9}, np.roll(PICTURE, 2, axis=1)))
+    assert shadow.scene_changes == 0
+    shadow.compare(seen(100, {0: 0.9}, 255 - PICTURE))
+    assert (shadow.scene_changes, shadow.now.comparisons) == (1, 0)
+
+
+def test_no_more_than_its_share_of_the_processor():
+    """On a slow machine the measurement would take the time of what it measures."""
+    clock = [0]
+
+    def detect(_image: np.ndarray) -> Detections:
+        clock[0] += 600_000_000
+        return found(0)
+
+    shadow = ShadowGround(detect, settings=SETTINGS, spent_ns=lambda: clock[0])
+    frames = 20 * FPS
+    comparisons = sum(shadow.compare(seen(index, {0: 0.9})) for index in range(0, frames, 5))
+    assert clock[0] <= 0.15 * frames * PERIOD_NS + 600_000_000
+    assert comparisons >= 4
+
+
+def test_a_thin_base_hides_what_a_rich_one_shows():
+    """On real x265, the real detector and the drawn scene: else the levers would follow noise."""
+    size = (320, 180)
+    gains = {kbps: _measured(size, kbps) for kbps in (40, 1_500)}
+    assert gains[40] > gains[1_500] + 0.05, gains
+
+
+def _measured(size: tuple[int, int], kbps: int) -> float:
+    detector = open_detector(EMBEDDED_DETECTOR, threads=2, confidence=0.1)
+    encoder = BaseEncoder(
+        encoder_settings(
+            size=size,
+            fps=FPS,
+            preset="veryfast",
+            total_bps=1000 * kbps,
+            base_bps=1000 * kbps,
+            edge_id="edge-1",
+        )
+    )
+    shadow = ShadowGround(detector.detect, settings=SETTINGS)
+    with DemoSource(size=size, fps=FPS, fit="letterbox", seed=0, max_frames=36) as source:
+        analyzer = Analyzer(
+            detector,
+            ByteTracker(TrackerSettings.starting_at(0.4, camera_motion="off"), fps=FPS),
+            view=source.view,
+            settings=AnalyzerSettings(candidates="source"),
+        )
+        for frame in source.frames(start_ns=0):
+            shadow.compare(analyzer.analyze(frame, encoder.encode(frame)))
+    assert shadow.now.comparisons > 1
+    assert shadow.now.source > 5, "there is something to see"
+    return shadow.now.gain

@@ -1,0 +1,121 @@
+"""The verdict of a comparison: what a user flies must be what was judged best, and no noise may choose for him."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+
+from hvt_common.config import load
+from hvt_common.errors import UserError
+from hvt_edge.config import EdgeConfig, with_profile
+from hvt_edge.config import check as check_edge
+from hvt_edge.stills.policy.registry import METHODS as REGISTRY
+from hvt_study.matrix.compare import COMPARED, ComparePlan, CompareResult
+from hvt_study.matrix.verdict import SIMPLEST_FIRST, command_of, verdicts
+from hvt_study.runs.methods import METHODS
+from hvt_study.runs.run_settings import edge_flags
+from hvt_study.runs.spec import ModelChoice, RunSpec
+from hvt_study.runs.video_shape import VideoShape
+
+MODELS = ModelChoice("aerial-nano", "aerial-nano")
+
+
+def plan(clip="my clip.mp4", models=MODELS):
+    return ComparePlan(clip=clip, models=models, rates_bps=(200_000,), cache=Path("cache"))
+
+
+def row(method, named_f1, *, rate=200.0, half=0, **more):
+    shape = {"set_fps": 3.0 if "-" in method and method[0:2] == "M0" else None}
+    shape |= {"base_width": 960, "base_height": 540, "picture_age_p95_ms": 90.0, "recall": None, "gaps": None}
+    return {"method": method, "rate_kbps": rate, "half": half, "named_f1": named_f1, **shape, **more}
+
+
+def result(*rows):
+    every = tuple({**one, "half": half} for one in rows for half in (0, 1, 2))
+    return CompareResult(every, (), "exact", "clip")
+
+
+def said(*rows):
+    (one,) = verdicts(plan(), result(*rows))
+    return one
+
+
+def test_the_best_one_is_named_with_its_lead():
+    """Who reads the last line alone must know what to fly, and why."""
+    one = said(row("M0", 0.6), row("M0-fps", 0.7), row("M6", 0.81))
+    assert one.sentence == "At 200 kbps fly M6: named F1 .810, .110 more than the next, M0-fps."
+    assert one.command == ("hvt-edge --source 'my clip.mp4' --budget 200kbps --size 960x540 --profile thin")
+
+
+def test_within_noise_the_simplest_wins():
+    """A second detector at the edge would be flown for a difference that the next flight turns round."""
+    one = said(row("M0", 0.70), row("tracks", 0.705), row("M6", 0.709))
+    assert one.sentence.startswith("At 200 kbps fly M0: named F1 .700. tracks, M6 within .01")
+    one = said(row("M0", 0.699), row("tracks", 0.705), row("M6", 0.709))
+    assert one.sentence.startswith("At 200 kbps fly tracks: ")
+
+
+def test_an_old_picture_is_told():
+    """Three frames a second may show most, and still be too late for who steers by them."""
+    one = said(row("M0-best", 0.8, picture_age_p95_ms=612.0), row("M0", 0.5))
+    assert one.sentence.endswith(" Its newest picture is up to 0.6 s old.")
+    assert "M0-best at 960x540 and 3 frames a second" in one.sentence
+
+
+def test_nothing_right_is_no_advice():
+    """A command would be printed that shows nothing."""
+    one = said(row("M0", 0.0), row("M6", 0.0))
+    assert (one.command, ".000" in one.sentence) == ("", True)
+
+
+def test_of_one_target_recall_decides():
+    """Nobody knows what else is in view: precision would be made up."""
+    one = said(row("M0", None, recall=0.2, gaps=1), row("M6", None, recall=0.5, gaps=2))
+    assert one.sentence.startswith("At 200 kbps fly M6: recall .500")
+
+
+def test_each_rate_has_a_verdict():
+    """The best method depends on the rate."""
+    rows = [row("M0", 0.2), row("M6", 0.6), row("M0", 0.9, rate=800.0), row("M6", 0.9, rate=800.0)]
+    assert [("M0:" in one.sentence) for one in verdicts(plan(), result(*rows))] == [False, True]
+
+
+def test_every_method_has_a_place():
+    """A method that is compared could never be advised."""
+    assert set(SIMPLEST_FIRST) == set(COMPARED)
+
+
+def config_of(flags):
+    config, given = load(EdgeConfig, flags, program="hvt-edge", description="")
+    return check_edge(with_profile(config, given=given.values))
+
+
+@pytest.mark.parametrize("name", COMPARED)
+def test_the_command_flies_what_was_compared(name):
+    """What is flown would be something else than what was judged."""
+    method, codec = COMPARED[name]
+    chosen = bool(METHODS[method].fps_choices)
+    one = row(name, 0.5, set_fps=1.0 if chosen else None)
+    command = shlex.split(command_of(plan(), one))
+    assert command[0] == "hvt-edge"
+    theirs = config_of(command[1:])
+    spec = RunSpec("clips:x", "x", method, "200kbps", 200_000, MODELS, codec, size=(960, 540))
+    shape = VideoShape(1.0, (960, 540)) if chosen else VideoShape()
+    ours = config_of(["--source", "my clip.mp4", *edge_flags(spec, budget_bps=200_000, shape=shape)])
+    own = {"pace", "threads", "profile", "confidence"}
+    blind = {"detect_every", "camera_motion"} if method.startswith("M0") else set()
+    for field in EdgeConfig.__dataclass_fields__.keys() - own - blind:
+        if field == "still_codec" and not codec:
+            continue
+        assert getattr(theirs, field) == getattr(ours, field), field
+
+
+@pytest.mark.parametrize("name", [name for name in COMPARED if name not in ("M0", "R0")])
+def test_names_of_the_table_are_profiles(name):
+    """Who types what the table says would be left with an error that does not help."""
+    assert config_of(["--source", "x.mp4", "--budget", "300kbps", "--profile", name]).budget_bps == 300_000
+    if name not in REGISTRY:
+        with pytest.raises(UserError, match=f"or give --profile {name}"):
+            load(EdgeConfig, ["--method", name], program="hvt-edge", description="")
