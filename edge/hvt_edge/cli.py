@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
-from hvt_common.runtime.process import limit_malloc_arenas, stop_on_signals
+from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, start_log, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.summary import table, title
 
-__all__ = ["main"]
+__all__ = ["main", "program"]
 
 _DESCRIPTION = (
     "Publish a camera or clip over Zenoh: a low-bitrate HEVC base stream, and sharp stills of what matters, "
@@ -24,6 +24,11 @@ _DESCRIPTION = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the edge; return 0, or 2 after a sentence on what is wrong."""
     return exit_with_sentence(_run, program="hvt-edge", argv=argv)
+
+
+def program() -> NoReturn:
+    """`main` as a process of its own."""
+    leave(main())
 
 
 def _run(argv: Sequence[str] | None) -> int:
@@ -44,4 +49,4 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence, needs_extra
-from hvt_common.runtime.process import limit_malloc_arenas, stop_on_signals
+from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, start_log, write_json
 from hvt_ground.config import GroundConfig, check
 
-__all__ = ["main"]
+__all__ = ["main", "program"]
 
 _DESCRIPTION = (
     "Receive what edges publish over Zenoh: decode, detect, track, refine classes by the stills, and record "
@@ -22,6 +23,11 @@ _DESCRIPTION = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the ground; return 0, or after a sentence 2 (a setting is wrong) or 1 (it went wrong in flight)."""
     return exit_with_sentence(_run, program="hvt-ground", argv=argv)
+
+
+def program() -> NoReturn:
+    """`main` as a process of its own."""
+    leave(main())
 
 
 def _run(argv: Sequence[str] | None) -> int:
@@ -57,4 +63,4 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

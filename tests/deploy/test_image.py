@@ -81,4 +81,4 @@ def test_what_is_copied_builds_the_wheel(tmp_path: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {"hvt_edge/cli.py", "hvt_ground/cli.py", "hvt_common/transport/session.py"} <= names
     (scripts,) = (name for name in names if name.endswith("entry_points.txt"))
-    assert "hvt-edge = hvt_edge.cli:main" in zipfile.ZipFile(wheel).read(scripts).decode()
+    assert "hvt-edge = hvt_edge.cli:program" in zipfile.ZipFile(wheel).read(scripts).decode()

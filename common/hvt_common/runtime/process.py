@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import os
@@ -10,9 +11,16 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
-__all__ = ["STOP_SIGNALS", "limit_malloc_arenas", "lower_priority", "stop_on_signals", "with_lower_priority"]
+__all__ = [
+    "STOP_SIGNALS",
+    "leave",
+    "limit_malloc_arenas",
+    "lower_priority",
+    "stop_on_signals",
+    "with_lower_priority",
+]
 
 T = TypeVar("T")
 
@@ -41,6 +49,19 @@ def stop_on_signals() -> threading.Event:
         if one is not signal.SIGHUP or signal.getsignal(one) is not signal.SIG_IGN:
             signal.signal(one, lambda *_: stop.set())
     return stop
+
+
+def leave(code: int) -> NoReturn:
+    """End the process with this exit code, also while a thread is in a native library: a long detection, a dead link.
+
+    As it finalizes, Python ends such a thread where its call returns, through frames of C++ that do not allow it: the
+    process would abort after all was done. Nothing is finalized here.
+    """
+    atexit._run_exitfuncs()  # noqa: SLF001 - `os._exit` leaves them out
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):  # whoever read it is gone
+            stream.flush()
+    os._exit(code)
 
 
 def lower_priority() -> None:

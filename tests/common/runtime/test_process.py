@@ -1,4 +1,4 @@
-"""Frames that many threads take and let go do not make the process larger and larger."""
+"""A process frees the frames of its threads, and ends with its own exit code."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
-pytestmark = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is about glibc's heaps")
+only_with_glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is about glibc's heaps")
 
-PROGRAM = """
+FRAMES = """
 import threading
 import numpy as np, psutil
 from hvt_common.runtime.process import limit_malloc_arenas
@@ -44,7 +44,7 @@ def resident_mb(*, asked: bool, **more: str) -> int:
     """Of a process in which ten threads have held 30 MB each, in turn."""
     around = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")} | more
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM.format(asked=asked)],
+        [sys.executable, "-c", FRAMES.format(asked=asked)],
         env=around,
         capture_output=True,
         text=True,
@@ -54,12 +54,45 @@ def resident_mb(*, asked: bool, **more: str) -> int:
     return int(done.stdout)
 
 
+@only_with_glibc
 def test_threads_share_the_room_of_frames():
     """The edge would grow in steps for hours, and its system would end it in the air."""
     few, many = resident_mb(asked=True), resident_mb(asked=False, MALLOC_ARENA_MAX="16")
     assert few < many - 100
 
 
+@only_with_glibc
 def test_who_has_asked_for_another_allocation_keeps_it():
     """An operator who has tuned the allocator would be overruled in silence."""
     assert resident_mb(asked=True, MALLOC_ARENA_MAX="16") > resident_mb(asked=True) + 100
+
+
+DETECTING = """
+import threading, time
+import numpy as np
+from hvt_common.inference.detect import open_detector
+from hvt_common.runtime.process import leave
+
+began = threading.Semaphore(0)
+
+def detect():
+    detector, picture = open_detector("aerial-nano"), np.zeros((360, 640, 3), np.uint8)
+    while True:
+        detector.detect(picture)
+        began.release()
+
+for _ in range(2):
+    threading.Thread(target=detect, daemon=True).start()
+for _ in range(4):
+    began.acquire()
+print("all was written", end="")
+leave(3)
+"""
+
+
+def test_a_process_ends_with_its_code_while_a_detection_runs():
+    """Python ends such a thread as it finalizes, and onnxruntime aborts: a good flight would count as failed."""
+    done = subprocess.run(
+        [sys.executable, "-c", DETECTING], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (3, "all was written", "")
