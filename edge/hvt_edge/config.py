@@ -149,12 +149,16 @@ class EdgeConfig:
     wait: float = _LINK.option(DURATION, 15.0, "how long a clip waits for its first ground before it plays")
 
     method: str = _SENT.option(
-        choice(*METHODS, elsewhere=dict.fromkeys(PROFILES, "--profile")), "M5", "who gets a still, and when"
+        choice(*METHODS, elsewhere=dict.fromkeys(PROFILES, "--profile")),
+        "M5",
+        "who gets a still, and when",
+        shown_default="as --profile says; M5 with --regime",
     )
     profile: str | None = _SENT.option(
         choice(*PROFILES),
         None,
         "settings in one word: auto, thin, paper (docs/methods.md), or a method of hvt-study compare",
+        shown_default="auto, or none where --method or --regime is given",
     )
     tune: tuple[str, ...] = _SENT_RARE.option(
         TEXT, (), "a parameter of the method, KEY=VALUE (docs/methods.md)", many=True
@@ -331,9 +335,14 @@ class EdgeConfig:
 
 
 def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
-    """The configuration with the profile's settings, except for fields that the user has ``given``."""
+    """The configuration with the profile's settings, except for fields that the user has ``given``.
+
+    Without a profile it is auto, unless the user says which method to fly.
+    """
     if config.profile is None:
-        return config
+        if not {"method", "regime"}.isdisjoint(given):
+            return config
+        config = replace(config, profile="auto")
     settings = dict(PROFILES[config.profile])
     if config.regime is not None:  # which sets the share itself
         settings.pop("video_share", None)

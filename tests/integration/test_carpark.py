@@ -53,7 +53,8 @@ def flight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
     detector = str(data / "models/yolov5su_visdrone_640.onnx")
     with Link(folder) as link:
         edge = link.edge(
-            *("--source", str(data / "clips/drone_carpark.mp4"), "--edge-id", "uav-1", "--pace", "lockstep"),
+            *("--source", str(data / "clips/drone_carpark.mp4"), "--edge-id", "uav-1", "--method", "M5"),
+            *("--pace", "lockstep"),
             *("--detector", detector, "--record-base", "base.mkv", "--wait", "60s"),
             listens=True,
         )

@@ -224,20 +224,24 @@ class RollingBudget:
         """Return how many line bytes of what was kept may go now: what neither base nor stills will want.
 
         It takes no share of anybody's. ``reserve`` is left free of a window, as a share of what stills have of one.
-        Where no base frame has gone out for a window, none is expected.
         """
         settings = self._settings
-        if self._last_base_ns is None or now_ns - self._last_base_ns > settings.window_ns:
-            after_ns = now_ns - settings.window_ns
-            free = self._total - sum(size for at_ns, size in self._events if at_ns > after_ns)
-        else:
-            free = self._window_allowance(now_ns)
         reserved = reserve * settings.still_bps * settings.window_ns / 8 / SECOND_NS
-        return max(0, int(free - reserved))
+        return max(0, int(self._free(now_ns) - reserved))
 
     def keyframe_fits(self, keyframe_bytes: int, *, now_ns: int) -> bool:
         """Tell whether a keyframe of this many line bytes, sent now, leaves every window within the total."""
-        return self._window_allowance(now_ns) + self.base_step_bytes >= keyframe_bytes
+        return self._free(now_ns) + self.base_step_bytes >= keyframe_bytes
+
+    def _free(self, now_ns: int) -> float:
+        """What the window has room for, in line bytes, beside the base frames that are expected.
+
+        Where no base frame has gone out for a window, none is expected.
+        """
+        window_ns = self._settings.window_ns
+        if self._last_base_ns is not None and now_ns - self._last_base_ns <= window_ns:
+            return self._window_allowance(now_ns)
+        return self._total - sum(size for at_ns, size in self._events if at_ns > now_ns - window_ns)
 
     def _record(self, line_bytes: int, now_ns: int) -> None:
         insort(self._events, (now_ns, line_bytes))

@@ -159,7 +159,7 @@ class LeverControl:
         of_tracks = (
             f"{'tracks' if tracks else 'no tracks'}: {hidden}"
             if self._comparisons
-            else "tracks: not measured yet"
+            else "no tracks: not measured"
         )
         changed = f"changed {sum(self._changed)} of {len(self._changed)}"
         return f"{of_tracks}; {f'stills {changed}' if stills else f'stills paused: {changed}'}"

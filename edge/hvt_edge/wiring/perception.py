@@ -60,8 +60,11 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
 
 
 def make_shadow(config: EdgeConfig, detector: FailingDetector) -> ShadowGround | None:
-    """What measures how much of the source the base stream shows; None where nothing depends on it."""
-    if not config.measures:
+    """What measures how much of the source the base stream shows; None where nothing depends on it.
+
+    `MOTION` remembers the pictures of one stream, and those of the base are another.
+    """
+    if not config.measures or config.detector == MOTION:
         return None
     whole = (
         detector.detect_whole

@@ -225,6 +225,16 @@ def test_a_keyframe_fits_once_what_was_before_it_has_left():
     assert run.budget.keyframe_fits(20_000, now_ns=now_ns + SECOND_NS // 15)
 
 
+def test_after_a_hole_the_window_has_room_for_a_keyframe():
+    """A camera that comes back would be shown by difference from a picture that is long gone."""
+    run = Run(BudgetSettings(800_000, 760_000, fps=15))
+    for number in range(30):
+        now_ns = START_NS + round(number * SECOND_NS / 15)
+        run.base(6_300, now_ns)
+    assert not run.budget.keyframe_fits(20_000, now_ns=now_ns)
+    assert run.budget.keyframe_fits(20_000, now_ns=now_ns + 2 * SECOND_NS)
+
+
 @pytest.mark.parametrize("window_s", [0.5, 1.0, 4.0])
 def test_the_most_a_still_is_ever_given_is_known(window_s):
     """A request larger than that would wait for room that never comes."""

@@ -98,7 +98,7 @@ def test_another_scene_begins_anew():
     rig.control.forget()
     levers = rig.second()
     assert levers.stills
-    assert levers.says.startswith("tracks: not measured yet")
+    assert levers.says.startswith("no tracks: not measured")
 
 
 def test_a_machine_that_is_too_slow_sends_video_alone_and_says_so():
