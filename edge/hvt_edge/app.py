@@ -244,6 +244,7 @@ class Edge:
             edge=config.edge_id,
             session=f"{self._world.session_id:016x}",
             method=now.method,
+            levers=now.levers.says,
             frames=counts.encoded - stored,
             frames_stored=stored,
             frames_captured=counts.captured,

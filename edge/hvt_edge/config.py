@@ -339,11 +339,12 @@ def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
 
     Without a profile it is auto, unless the user says which method to fly.
     """
-    if config.profile is None:
+    profile = config.profile
+    if profile is None:
         if not {"method", "regime"}.isdisjoint(given):
             return config
-        config = replace(config, profile="auto")
-    settings = dict(PROFILES[config.profile])
+        profile = "auto"
+    settings = {"profile": profile, **PROFILES[profile]}
     if config.regime is not None:  # which sets the share itself
         settings.pop("video_share", None)
     if "candidates" in given and config.candidates != "source":

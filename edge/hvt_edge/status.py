@@ -117,7 +117,7 @@ class StatusReporter:
         parts = [
             f"{config.edge_id} {counts.duration_s(config.nominal_fps):6.1f} s",
             f"{bitrate_text(rate_bps)} of {bitrate_text(now.total_bps)}",
-            now.method,
+            f"auto, {now.method}" if config.measures else now.method,
             f"stills {sum(ledger.outcomes('sent').values())}, {self.stills.pending} pending",
             f"tracks {self.stills.analyzer.tracks}",
             link,

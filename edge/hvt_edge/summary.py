@@ -70,7 +70,10 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     share = f"{total / content['budget_bps']:.0%} of {bitrate_text(content['budget_bps'])}"
     sent = f"{stills['sent']}, {stills['per_minute']:.0f} a minute, {stills['mean_bytes']} bytes in the mean"
     rows = [
-        ("method", content["method"]),
+        (
+            "method",
+            f"auto, {content['method']}: {content['levers']}" if content["levers"] else content["method"],
+        ),
         ("frames", f"{content['frames']} in {content['duration_s']:.1f} s"),
         *_left_out(content),
         ("total", f"{bitrate_text(total)}, {share}; fullest window {bitrate_text(worst['total'])}"),

@@ -10,7 +10,7 @@ import pytest
 
 from hvt_common.config import load
 from hvt_common.transport.zenoh_config import LinkSettings, configure
-from hvt_edge.config import EdgeConfig
+from hvt_edge.config import EdgeConfig, with_profile
 from hvt_edge.config import check as check_edge
 from hvt_ground.config import GroundConfig
 from hvt_ground.config import check as check_ground
@@ -32,10 +32,10 @@ def _uncommented(sample: Path, folder: Path) -> Path:
 def test_sample_of_the_edge_is_for_a_300_kbps_radio(tmp_path: Path) -> None:
     """The first thing an engineer copies: it must load, and leave the radio room."""
     sample = DEPLOY / "config" / "edge.toml"
-    config, _ = load(EdgeConfig, ["--config", str(sample)], program="hvt-edge", description="")
-    config = check_edge(config)
+    config, given = load(EdgeConfig, ["--config", str(sample)], program="hvt-edge", description="")
+    config = check_edge(with_profile(config, given=given.values))
     assert config.budget_bps == 250_000
-    assert config.base_bps == 200_000
+    assert config.measures
     assert configure(LinkSettings(role="edge", connect=config.connect))[1] == ()
     everything, asked = load(
         EdgeConfig, ["--config", str(_uncommented(sample, tmp_path))], program="hvt-edge", description=""

@@ -150,5 +150,5 @@ def test_the_documented_configuration_is_the_sample() -> None:
     """Numbers of the text that follow from the sample file have to follow it when it changes."""
     sample = _text("deploy/config/edge.toml")
     assert 'budget = "250kbps"' in sample
-    assert "video-share = 0.8\n" in sample
-    assert "`--budget 250kbps --video-share 0.8`" in _text("docs/deployment.md")
+    assert 'profile = "auto"\n' in sample
+    assert "`--budget 250kbps`" in _text("docs/deployment.md")

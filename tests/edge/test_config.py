@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import UserError
-from hvt_edge.config import EdgeConfig, check
+from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.profiles import REGIMES
 from hvt_edge.stills.policy.registry import METHODS
 
@@ -25,6 +25,26 @@ def read(*argv: str) -> EdgeConfig:
 def settled(*argv: str) -> EdgeConfig:
     """What a command line gives."""
     return check(read(*argv))
+
+
+@pytest.mark.parametrize(
+    ("given", "measures", "method", "codec"),
+    [
+        ([], True, "M6", "residual"),
+        (["--still-codec", "jpeg"], True, "M6", "jpeg"),
+        (["--method", "M3"], False, "M3", "jpeg"),
+        (["--regime", "low"], False, "M5", "jpeg"),
+        (["--regime", "low", "--profile", "auto"], True, "M6", "residual"),
+        (["--profile", "thin"], False, "M6", "residual"),
+    ],
+)
+def test_what_pays_is_measured_unless_a_method_is_asked_for(given, measures, method, codec):
+    """A first user would get the paper's stills, which lose against plain video; or a study something else than it
+    asked for.
+    """
+    config, words = load(EdgeConfig, ["--source", "demo", *given], program="hvt-edge", description="")
+    config = check(with_profile(config, given=words.values))
+    assert (config.measures, config.method, config.still_codec) == (measures, method, codec)
 
 
 def test_what_is_said_without_flags_is_the_low_regime():

@@ -17,7 +17,8 @@ def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
         Ledger(),
         edge="uav-1",
         session="0",
-        method="M5",
+        method="M6",
+        levers="no tracks: 0 objects the base does not show; stills changed 2 of 3",
         frames=9,
         frames_captured=80,
         frames_dropped=70,
@@ -38,6 +39,7 @@ def test_the_table_tells_apart_why_frames_are_missing_and_names_what_failed():
         failed=(failure,),
     )
     said = [text for _, text in table(content)]
+    assert said[0] == "auto, M6: no tracks: 0 objects the base does not show; stills changed 2 of 3"
     assert "66 of 80 frames dropped: encoder and detector need 1.6 cores, 1.1 were free" in said
     assert "4 of 80 frames dropped: the link had no room" in said
     assert "the clip took 14 s longer than it is: this machine is too slow for it" in said
