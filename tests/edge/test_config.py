@@ -39,9 +39,7 @@ def settled(*argv: str) -> EdgeConfig:
     ],
 )
 def test_what_pays_is_measured_unless_a_method_is_asked_for(given, measures, method, codec):
-    """A first user would get the paper's stills, which lose against plain video; or a study something else than it
-    asked for.
-    """
+    """A first user would get the paper's stills, which lose against plain video."""
     config, words = load(EdgeConfig, ["--source", "demo", *given], program="hvt-edge", description="")
     config = check(with_profile(config, given=words.values))
     assert (config.measures, config.method, config.still_codec) == (measures, method, codec)
