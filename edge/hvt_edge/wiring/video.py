@@ -20,7 +20,7 @@ from hvt_edge.video.regions import TrackRegions
 from hvt_edge.video.x265 import BaseEncoder
 
 _MOST_ENCODER_THREADS = 4  # a 720p picture has twelve rows of blocks, each some steps behind the one above
-_AUTO_LEAST_FPS = 5.0
+_AUTO_LEAST_FPS = 7.5
 """With ``--profile auto``: frames that are larger arrive later, and nobody asked for delay."""
 _REST_S = 10.0
 """How often ``--fps auto`` may think again."""

@@ -33,7 +33,7 @@ def clip(tmp_path_factory):
 
 def flown(clip, *flags, link_bps=200_000, detector=None):
     width, height = SIZE
-    base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}", "--detector", "motion"]
+    base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}"]
     base += ["--budget", "200kbps", "--preset", "ultrafast"]
     edge, _ = load(EdgeConfig, [*base, *flags], program="hvt-edge", description="")
     ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
