@@ -72,11 +72,11 @@ class Compared:
             code = self.codes[one.object_id].text
             left, right = code_pictures(one, _newest(video, one.still.frame))
             if self.legible is None:
-                words = f"video of {video.name}", f"still of {code}"
+                words = f"video of {video.name}", f"still; painted: {code}"
             else:
                 read = one.object_id in self.legible[-1].stills
-                never = f"read: {code}" if one.object_id in known else "never read"
-                words = f"{video.name}: {never}", f"still: {code if read else 'not read'}"
+                seen = f"read: {code}" if one.object_id in known else "not read"
+                words = f"{video.name}: {seen}", f"still: {code if read else 'not read'}"
             pairs.append(Pair(left, right, *words))
         return pairs
 
