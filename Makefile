@@ -24,7 +24,7 @@ else
 endif
 	@touch $(STAMP)
 
-demo: setup      ## edge and ground as two processes on the drawn scene: demo.rrd and a summary
+demo: setup      ## three edges and one ground on the drawn scene: a table, demo.png, demo.rrd
 	@$(BIN)/python deploy/demo.py
 
 # Many tests wait for other processes, so that more run at once than there are processors. Flights that a busy machine

@@ -94,6 +94,9 @@ class GroundConfig:
     tracks: Path | None = _FILES.option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
+    stills: Path | None = _FILES.option(
+        PATH, None, "also write each still as a picture, with a table of them: a folder that is there"
+    )
     timing: Path | None = _FILES_RARE.option(
         PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
     )
@@ -131,6 +134,8 @@ def check(config: GroundConfig) -> GroundConfig:
 
 def _check_files(config: GroundConfig) -> None:
     """Two files must not be one. What is written into a folder has names of its own, and a device takes anything."""
+    if config.stills is not None and not config.stills.is_dir():
+        raise UserError(f"--stills {config.stills} is no folder: create it, or name one that is there")
     files: dict[str, str] = {}
     for name, path, suffix in (
         ("--record", config.record, ".rrd"),

@@ -115,6 +115,8 @@ class Refinement:
     """The still says that the object is nothing of mine."""
     sure: bool = False
     """``class_after`` has a calibrated probability above .9."""
+    shown_index: int = 0
+    """The frame that the still shows; ``frame_index`` is the one at which it was known."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,7 @@ from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.sinks.still_files import StillFiles
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.sinks.tracks_table import TrackTable
 
@@ -91,6 +92,10 @@ class SessionFactory:
             names = partial(output_path, config.tracks, suffix=".csv", edge=edge, stamp=stamp)
             open_table = partial(self._opened, TrackTable, names)
             sinks.append(self._outputs.open(f"tracks table of {edge}", open_table, wait_s=wait_s))
+        if config.stills is not None:
+            names = partial(output_path, config.stills, suffix=".csv", edge=edge, stamp=stamp)
+            open_stills = partial(self._opened, StillFiles, names)
+            sinks.append(self._outputs.open(f"stills of {edge}", open_stills, wait_s=wait_s))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
         return GroundSession(

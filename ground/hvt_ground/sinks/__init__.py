@@ -1,6 +1,6 @@
 """Where events go: recordings, live views, tables; each behind a queue, so that its failure is its own.
 
-Beside what is listed here there are `timing`, `tracks_table` and the room `rerun`.
+Beside what is listed here there are `still_files`, `timing`, `tracks_table` and the room `rerun`.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ COMMANDS: Final = {
     "plan": "Say how many runs, bytes and hours `hvt-study run` with the same arguments would take.",
     "compare": "Fly every method at every rate over a clip and say what the ground shows.",
     "read": "Read codes on roofs at the ground with each method, for the same bits; needs hvt[reading].",
+    "demo": "Compare flights of the drawn scene that hvt-edge and hvt-ground left in a folder: a table, a picture.",
     "run": "Fly every method at every budget on datasets, at matched totals; write results.parquet and a report.",
     "report": "Make report.html, report.md and figures again from a study's results.parquet, or of several joined.",
     "tune": "Search for a method's parameters on some sequences; report what they are worth on others.",

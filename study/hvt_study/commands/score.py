@@ -22,6 +22,8 @@ _ROWS = (
     ("the same of small objects", "small_top1"),
     ("macro-F1", "macro_f1"),
     ("found with the right class", "seen_right"),
+    ("named F1", "named_f1"),
+    ("false objects a frame", "false_per_frame"),
 )
 
 

@@ -47,6 +47,10 @@ class Score:
     """Top-1 of those that are small."""
     seen_right: float
     """Share of all objects, missed ones included, that are shown with their right class."""
+    named_f1: float
+    """2 right / (objects + boxes): found and rightly named, with what is shown and false counted against it."""
+    false_per_frame: float
+    """Boxes on nothing, or of another class than their object's."""
 
 
 def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
@@ -100,6 +104,8 @@ def score(
         macro_f1=_or_zero(one.macro_f1_all),
         small_top1=_or_zero(one.by_size["small"].top1_found),
         seen_right=_or_zero(one.counts.top1_all),
+        named_f1=one.named_f1,
+        false_per_frame=_or_zero(one.false_per_frame),
     )
 
 

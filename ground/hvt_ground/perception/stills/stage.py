@@ -274,6 +274,7 @@ class StillStage:
             still_bgr=context.decoded.image_bgr,
             crop_base_px=self._to_base(header.crop_source_px),
             stored=stored,
+            shown_index=header.frame_index,
         )
 
     # Results and notices

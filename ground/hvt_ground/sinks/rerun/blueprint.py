@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -24,6 +26,7 @@ __all__ = [
     "TRACKS",
     "TRACK_COUNT",
     "VIDEO",
+    "comparison",
     "screen",
 ]
 
@@ -56,10 +59,31 @@ def screen(
     on. ``fps`` sets the pace of the frame timeline, ``budget_bps`` the height of the bitrate plot. Latencies are
     plotted where ``clocked``; ``live`` follows the newest data rather than play from the beginning.
     """
-    left = rrb.Vertical(_videos(base_size), _plots(budget_bps, clocked=clocked), row_shares=[2.9, 1.0])
-    right = rrb.Vertical(_gallery(), _session(), _events(), row_shares=[2.3, 0.67, 0.93])
+    page = _page("", base_size=base_size, clocked=clocked, top_kbps=1.8 * budget_bps / 1000)
+    return _blueprint(page, fps=fps, live=live)
+
+
+def comparison(edges: Sequence[str], *, base_size: tuple[int, int], fps: float) -> rrb.Blueprint:
+    """The base pictures of several edges beside each other, their links below; then a tab with the page of each.
+
+    What each has recorded lies below its name.
+    """
+    columns = [
+        rrb.Vertical(
+            _video(base_size, edge, root=f"/{edge}", without=(f"{PATCHES}/**",)),
+            _plot(f"/{edge}{BITRATE}", "Link, kbit/s"),
+            row_shares=[1.6, 1.0],
+        )
+        for edge in edges
+    ]
+    beside = rrb.Horizontal(*columns, name="Side by side")
+    pages = [_page(f"/{edge}", base_size=base_size, clocked=False, name=edge) for edge in edges]
+    return _blueprint(rrb.Tabs(beside, *pages), fps=fps, live=False)
+
+
+def _blueprint(content: rrb.Container, *, fps: float, live: bool) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[1.72, 1.0]),
+        content,
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(
@@ -74,13 +98,29 @@ def screen(
     )
 
 
-def _videos(base_size: tuple[int, int]) -> rrb.Tabs:
+def _page(
+    root: str,
+    *,
+    base_size: tuple[int, int],
+    clocked: bool,
+    top_kbps: float | None = None,
+    name: str | None = None,
+) -> rrb.Horizontal:
+    """All of one edge, whose entities lie below ``root``."""
+    plots = _plots(root, clocked=clocked, top_kbps=top_kbps)
+    left = rrb.Vertical(_videos(root, base_size), plots, row_shares=[2.9, 1.0])
+    right = rrb.Vertical(_gallery(root), _session(root), _events(root), row_shares=[2.3, 0.67, 0.93])
+    return rrb.Horizontal(left, right, column_shares=[1.72, 1.0], name=name)
+
+
+def _videos(root: str, base_size: tuple[int, int]) -> rrb.Tabs:
     return rrb.Tabs(
-        _video(base_size, "Base stream and tracks", without=(f"{PATCHES}/**",)),
+        _video(base_size, "Base stream and tracks", root=root, without=(f"{PATCHES}/**",)),
         # Boxes say which objects a still has spoken on; thin and without words, for the picture is the matter.
         _video(
             base_size,
             "Enhanced: stills in their places",
+            root=root,
             without=(TRACKS, REPORTED, DOUBTED, LABELS),
             bare=REFINED,
         ),
@@ -88,12 +128,12 @@ def _videos(base_size: tuple[int, int]) -> rrb.Tabs:
 
 
 def _video(
-    base_size: tuple[int, int], name: str, *, without: tuple[str, ...], bare: str | None = None
+    base_size: tuple[int, int], name: str, *, root: str, without: tuple[str, ...], bare: str | None = None
 ) -> rrb.Spatial2DView:
     style = rr.Boxes2D.from_fields(radii=rr.Radius.ui_points(0.5), show_labels=False)
     return rrb.Spatial2DView(
-        origin="/base",
-        contents=["/base/**", *(f"- {path}" for path in without)],
+        origin=f"{root}/base",
+        contents=[f"{root}/base/**", *(f"- {root}{path}" for path in without)],
         name=name,
         background=_PAPER,
         visual_bounds=rrb.VisualBounds2D(
@@ -101,14 +141,14 @@ def _video(
             y_range=[0, base_size[1] + points(LEGEND_POINTS, base_size[0])],
         ),
         defaults=[rr.EncodedImage.from_fields(media_type="image/jpeg")],
-        overrides={bare: style} if bare is not None else None,
+        overrides={f"{root}{bare}": style} if bare is not None else None,
     )
 
 
-def _gallery() -> rrb.Spatial2DView:
+def _gallery(root: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
-        origin=STILLS,
-        contents=[f"{STILLS}/**", f"- {OVERFLOW}/**"],
+        origin=f"{root}{STILLS}",
+        contents=[f"{root}{STILLS}/**", f"- {root}{OVERFLOW}/**"],
         name="Base crop | still",
         background=_PAPER,
         visual_bounds=rrb.VisualBounds2D(x_range=[0, CANVAS[0]], y_range=[0, CANVAS[1]]),
@@ -116,27 +156,28 @@ def _gallery() -> rrb.Spatial2DView:
     )
 
 
-def _plots(budget_bps: float, *, clocked: bool) -> rrb.Horizontal:
+def _plots(root: str, *, clocked: bool, top_kbps: float | None) -> rrb.Horizontal:
     # Nearly twice the budget: room for the legend, and an overshoot is seen to be one.
-    plots = [_plot(BITRATE, "Link, kbit/s", rrb.ScalarAxis(range=(0.0, 1.8 * budget_bps / 1000)))]
+    axis = rrb.ScalarAxis(range=(0.0, top_kbps)) if top_kbps is not None else None
+    plots = [_plot(f"{root}{BITRATE}", "Link, kbit/s", axis)]
     if clocked:
-        plots.append(_plot(LATENCY, "Latency, ms"))
-    plots.append(_plot(TRACK_COUNT, "Tracks"))
+        plots.append(_plot(f"{root}{LATENCY}", "Latency, ms"))
+    plots.append(_plot(f"{root}{TRACK_COUNT}", "Tracks"))
     return rrb.Horizontal(*plots, column_shares=[1.5, *[1.0] * (len(plots) - 1)])
 
 
 def _plot(origin: str, name: str, axis_y: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
-    corner = rrb.Corner2D.RightBottom if origin == TRACK_COUNT else rrb.Corner2D.LeftTop
+    corner = rrb.Corner2D.RightBottom if origin.endswith(TRACK_COUNT) else rrb.Corner2D.LeftTop
     return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=corner, axis_y=axis_y)
 
 
-def _session() -> rrb.TextDocumentView:
-    return rrb.TextDocumentView(origin=SESSION, name="Session")
+def _session(root: str) -> rrb.TextDocumentView:
+    return rrb.TextDocumentView(origin=f"{root}{SESSION}", name="Session")
 
 
-def _events() -> rrb.TextLogView:
+def _events(root: str) -> rrb.TextLogView:
     return rrb.TextLogView(
-        origin=EVENTS,
+        origin=f"{root}{EVENTS}",
         name="Events",
         columns=rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["body"]),
     )

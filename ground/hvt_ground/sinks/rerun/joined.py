@@ -1,0 +1,83 @@
+"""Several recordings as one that opens on their base pictures beside each other, each with a tab of its own.
+
+``python -m hvt_ground.sinks.rerun.joined A.rrd B.rrd … --out ALL.rrd``: for flights of the same scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+from rerun.chunk import Chunk, RrdReader
+
+from hvt_common.errors import UserError, exit_with_sentence
+from hvt_common.units import parse_size
+from hvt_ground.sinks.rerun.blueprint import comparison
+from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, release_recordings, send_blueprint
+
+__all__ = ["join_recordings", "main"]
+
+_FLUSH_S = 10.0
+
+
+def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, int], fps: float) -> None:
+    """Write the recordings of ``paths`` into ``out``, what each holds below the name of its edge.
+
+    Raises:
+        UserError: a file is no recording, or two are of the same edge.
+    """
+    read = [_read(path) for path in paths]
+    edges = [edge for edge, _ in read]
+    if len(set(edges)) < len(edges):
+        raise UserError(f"two recordings are of the same edge ({', '.join(edges)}): give one of each")
+    name = RecordingId("joined", "-".join(edges))
+    recording = new_recording(name)
+    try:
+        recording.save(out)
+        recording.send_recording_name(", ".join(edges))
+        send_blueprint(recording, name, comparison(edges, base_size=base_size, fps=fps))
+        for edge, chunks in read:
+            recording.send_chunks([one.with_entity_path(f"/{edge}{one.entity_path}") for one in chunks])
+            recording.flush(timeout_sec=_FLUSH_S)
+    finally:
+        recording.disconnect()
+        del recording
+        release_recordings()
+
+
+def _read(path: Path) -> tuple[str, list[Chunk]]:
+    """The edge's id, and everything but what is of the file itself."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that there is no footer
+            reader = RrdReader(path)
+        application = reader.recordings()[0].application_id
+        chunks = [one for one in reader.stream() if not one.entity_path.startswith("/__")]
+    except (OSError, RuntimeError, ValueError, IndexError) as error:
+        raise UserError(f"{path} is no recording ({error}): give .rrd files of hvt-ground") from None
+    return application.removeprefix("hvt-"), chunks
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="hvt_ground.sinks.rerun.joined", description="Several recordings as one, beside each other."
+    )
+    parser.add_argument("recordings", type=Path, nargs="+", help=".rrd files, one an edge")
+    parser.add_argument("--out", type=Path, required=True, help="the .rrd to write")
+    parser.add_argument("--size", default="640x360", help="of the base streams (default 640x360)")
+    parser.add_argument("--fps", type=float, default=15.0, help="of the frame timeline (default 15)")
+    given = parser.parse_args(argv)
+    size = parse_size(given.size, name="--size")
+    join_recordings(given.recordings, given.out, base_size=size, fps=given.fps)
+    return 0
+
+
+def _main(argv: Sequence[str] | None = None) -> int:
+    return exit_with_sentence(main, program="hvt_ground.sinks.rerun.joined", argv=argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(_main())
