@@ -18,7 +18,11 @@ HIDDEN_CROP_RATIO = 1.15
 """A still that is not shown keeps its base crop while the recording is smaller than this times the bytes received."""
 
 PAIR_RATIO = 1.3
-"""A pair that costs more than came over the link (a residual still, shown as JPEG) is shown below this ratio."""
+"""A pair that costs more than came over the link (a residual still, shown as JPEG) is shown below this ratio …"""
+
+PAIR_SHARE = 0.25
+"""… and, however much video and boxes take, while such pairs are less than this times the bytes received: stills are
+what one looks for."""
 
 PATCH_RATIO = 1.25
 """A patch that repeats a picture of the gallery, or follows its track, is written below this ratio."""
@@ -35,6 +39,8 @@ class StillRows:
         self._size_limit = size_limit
         self._gallery = Gallery()
         self._patches = Patches()
+        self._pair_bytes = 0
+        """Of pairs that cost more than came over the link."""
         self._pictured: OrderedDict[int, None] = OrderedDict()
 
     def refinement(self, refinement: Refinement) -> list[TableRow]:
@@ -88,13 +94,15 @@ class StillRows:
         # A slot's old base crop must not stand beside a new still: the frame's absence is shown as a blank.
         pictures = (("base", base or BLANK), ("still", still))
         cost = sum(len(data) for _, (data, _) in pictures)
-        if still[0] is not refinement.still and not self._size_limit.has(cost, ratio=PAIR_RATIO):
+        dear = still[0] is not refinement.still
+        if dear and not self._has_room(cost):
             return []
         at = refinement.frame_index, refinement.capture_ns
         gallery = self._gallery
         slot = gallery.put_stored(*at) if refinement.stored else gallery.put(*at, changed=changed)
         if slot is None:
             return []
+        self._pair_bytes += cost if dear else 0
         path = f"{names.STILLS}/{slot}"
         words = Caption(caption(refinement), class_colour(refinement.class_after), frame_of(slot))
         rows = [TableRow(path, "caption", words)]
@@ -102,6 +110,10 @@ class StillRows:
             picture = PlacedJpeg(data, placed(slot, size, right=name == "still"))
             rows.append(TableRow(f"{path}/{name}", "placed jpeg", picture, len(data)))
         return rows
+
+    def _has_room(self, pair_bytes: int) -> bool:
+        share = PAIR_SHARE * self._size_limit.received_bytes
+        return self._pair_bytes + pair_bytes <= share or self._size_limit.has(pair_bytes, ratio=PAIR_RATIO)
 
     def _patch(self, refinement: Refinement, still: Coded) -> list[TableRow]:
         """The still on the enhanced picture; nothing where its object is not on the screen."""
