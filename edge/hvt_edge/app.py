@@ -228,6 +228,7 @@ class Edge:
         status.send("ended")
         self._reached |= link.has_subscriber(Channel.BASE)
         if link.has_ground():  # what is still in a queue would be lost with the session
+            until_ns = self._world.clock() + round(_GOODBYE_S * SECOND_NS)
             self._world.inbox.wait_for_end(
                 base=self.ledger.messages(Account.BASE),
                 roi=transmitter.still_sequence + 1,
@@ -235,6 +236,9 @@ class Edge:
                 still_sequence=transmitter.still_sequence,
                 timeout_s=_GOODBYE_S,
             )
+            if stages.backlog is not None:
+                left_ns = max(0, until_ns - self._world.clock())
+                stages.backlog.wait_for_end(timeout_s=left_ns / SECOND_NS)
 
     def _summary(self, stages: Stages, link: EdgeLink) -> dict[str, Any]:
         counts, config, backlog, now = self._counts, self._config, stages.backlog, stages.operating.now

@@ -121,7 +121,9 @@ def _store_rows(store: dict[str, Any] | None) -> list[tuple[str, str]]:
         return []
     sent = f"{store['sent_stills']} stills and {store['sent_video_s']:.0f} s of video sent afterwards"
     left = f"{store['stills']} stills and {store['video_s']:.0f} s are still kept"
-    return [("store", f"{sent}; {left}")]
+    lost = store["unacknowledged_bytes"]
+    on_its_way = f"; {lost} bytes that were sent had not arrived" if lost else ""
+    return [("store", f"{sent}; {left}{on_its_way}")]
 
 
 def _reasons(counts: dict[str, int]) -> str:

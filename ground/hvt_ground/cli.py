@@ -43,6 +43,7 @@ def _run(argv: Sequence[str] | None) -> int:
             return control.run(words)
     with needs_extra("'hvt[ground]'"):  # only now: without Rerun this is a sentence, not a traceback
         from hvt_ground.app import Ground  # noqa: PLC0415
+        from hvt_ground.sinks.rerun.sdk import leave_out_pandas  # noqa: PLC0415
         from hvt_ground.status import table  # noqa: PLC0415
     config, requested = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
     if requested.print_config:
@@ -50,6 +51,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = check(config)
     limit_malloc_arenas()
+    leave_out_pandas()
     release_log = start_log("hvt-ground", quiet=config.quiet)
     stop = stop_on_signals()
     sessions = Ground(config, stop=stop, on_started=release_log).run()

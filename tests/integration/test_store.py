@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from lab.link.carriers.relay import Relay
 from lab.link.timeline import LinkState, Phase, Script
 from programs.processes import Link, eventually
 from programs.rrd import Recording
+from rigs.kept import INFO, opened, packed_still
 
 pytestmark = pytest.mark.integration
 
@@ -157,3 +159,41 @@ def test_an_edge_that_is_started_again_sends_what_the_former_run_kept(tmp_path, 
     assert stills_taken(tmp_path / "again.csv")[1] == stills
     assert len(stills) > 2
     assert len(frames) > 5
+
+
+def test_an_edge_that_is_stopped_counts_what_the_ground_has(tmp_path, scene):
+    """Of a stopped flight the two accounts would differ: nobody could tell a lost message from one never sent."""
+    store, timing = tmp_path / "store", tmp_path / "timing.csv"
+    with opened(store, session_id=INFO.session_id) as folder:
+        for number in range(400):
+            data = packed_still(number, session_id=INFO.session_id)
+            folder.add_still(number, data, utility=1.0, capture_ns=time.time_ns())
+    slow = LinkState(rate_bps=600_000, delay_s=0.15)
+    script = Script(phases=(Phase(0.0, slow),), lasts_s=200.0, queue_bytes=64_000)
+    with Link(tmp_path) as link, Relay(script, target_port=link.port) as relay:
+        ground = link.ground(
+            "--detector", "motion", "--classifier", "none",
+            "--record", str(tmp_path / "run.rrd"), "--timing", str(timing),
+        )  # fmt: skip
+        edge = link.start(
+            "hvt_edge.cli",
+            ["--connect", f"tcp/127.0.0.1:{relay.port}", "--source", str(scene), *EDGE, "--edge-id", "uav-1",
+             "--method", "M0", "--max-frames", "30", "--store-folder", str(store)],
+            name="edge",
+        )  # fmt: skip
+        relay.begin()
+        edge.until("sending what was kept", within_s=60)
+        eventually(
+            lambda: timing.exists() and timing.read_text().count("backlog-still") > 20,
+            within_s=30,
+            what="some of it has come",
+        )
+        edge.stop()
+        sent = edge.summary()
+        ground.stop()
+        said = ground.summary()
+    (received,) = said if isinstance(said, list) else [said]
+    assert received["backlog_bytes"] == sent["backlog_bytes"] > 0
+    assert received["base_bytes"] == sent["base_bytes"]
+    assert sent["store"]["unacknowledged_bytes"] == 0
+    assert sent["store"]["stills"], "it was stopped before all was sent"

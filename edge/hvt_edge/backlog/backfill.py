@@ -93,6 +93,11 @@ class Backfill:
         return len(self._line)
 
     @property
+    def unacknowledged_bytes(self) -> int:
+        """Of what is on its way; for any thread."""
+        return sum(one.sent_bytes - one.acknowledged_bytes for one in tuple(self._line.values()))
+
+    @property
     def cached_bytes(self) -> int:
         """Of the object in memory."""
         return 0 if self._data is None else len(self._data[1])

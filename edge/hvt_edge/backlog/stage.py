@@ -7,6 +7,7 @@ because the ground could not show them. So between what was sent and what was st
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -259,6 +260,15 @@ class BacklogStage:
     def send_no_more(self) -> None:
         """Before the last report to the ground, which says how much there was."""
         self._worker.send_no_more()
+
+    def wait_for_end(self, *, timeout_s: float) -> bool:
+        """After that: wait until a ground has all that was sent; False after the time-out."""
+        until_ns = self._clock() + round(timeout_s * SECOND_NS)
+        while self.numbers.unacknowledged_bytes:
+            if self._clock() >= until_ns:
+                return False
+            time.sleep(_POLL_S)
+        return True
 
     def close(self) -> None:
         """Store what no ground has acknowledged, and leave the store in order; after the last report."""

@@ -64,6 +64,8 @@ class StoreNumbers:
     evicted_segments: int = 0
     unreadable: int = 0
     given_up: int = 0
+    unacknowledged_bytes: int = 0
+    """Sent, and not in any report of a ground yet."""
 
     @property
     def empty(self) -> bool:
@@ -151,6 +153,7 @@ class StoreWorker:
             evicted_segments=store.evicted_segments,
             unreadable=store.damaged,
             given_up=self._backfill.given_up,
+            unacknowledged_bytes=self._backfill.unacknowledged_bytes,
         )
 
     def send_no_more(self) -> None:
@@ -231,7 +234,7 @@ class StoreWorker:
         if done is not None:
             pause_ns = 8 * SECOND_NS * done[1] / (_TRICKLE_SHARE * self._total_bps())
             self._trickle_ns = now_ns + round(pause_ns)
-        allowance = None if self._sending.busy else self._allowance(now_ns)
+        allowance = self._allowance(now_ns) if self._sending.ready else None
         if allowance is None or (allowance.trickle and now_ns < self._trickle_ns):
             return
         chunk = self._backfill.next_chunk(
@@ -249,7 +252,7 @@ class StoreWorker:
 class ChunkThread:
     """Sends one chunk at a time in a thread of its own: a link that is full for seconds must not hold up the disk.
 
-    `put`, `take` and `busy` are for one thread; ``on_done()`` is called in its own after each chunk. ``send(chunk)``
+    `put`, `take` and `ready` are for one thread; ``on_done()`` is called in its own after each chunk. ``send(chunk)``
     returns the line bytes, 0 where it was not sent; it may block.
     """
 
@@ -258,15 +261,18 @@ class ChunkThread:
         self._on_done = on_done
         self._chunks: SimpleQueue[Chunk | None] = SimpleQueue()
         self._done: SimpleQueue[tuple[Chunk, int | BaseException]] = SimpleQueue()
-        self._closed = False
-        self.busy = False
-        """Whether a chunk is being sent, or was sent and not taken note of."""
+        self._closed = self._busy = False
         self._thread = threading.Thread(target=self._run, name="hvt-backlog", daemon=True)
         self._thread.start()
 
+    @property
+    def ready(self) -> bool:
+        """Whether it sends another: none is being sent, or was sent and not taken note of."""
+        return not (self._busy or self._closed)
+
     def put(self, chunk: Chunk) -> None:
-        """Send this; only where it is not `busy`."""
-        self.busy = True
+        """Send this; only where it is `ready`."""
+        self._busy = True
         self._chunks.put(chunk)
 
     def take(self) -> tuple[Chunk, int] | None:
@@ -274,22 +280,22 @@ class ChunkThread:
         if self._done.empty():
             return None
         chunk, sent = self._done.get()
-        self.busy = False
+        self._busy = False
         if isinstance(sent, BaseException):
             raise sent
         return chunk, sent
 
     def close(self, timeout_s: float) -> None:
-        """Send no more; what is being sent has so long to go."""
+        """Send no more, and say of what waits that it was not sent; what is being sent has so long to go."""
         self._closed = True
         self._chunks.put(None)
         self._thread.join(timeout=timeout_s)
 
     def _run(self) -> None:
         lower_priority()
-        while (chunk := self._chunks.get()) is not None and not self._closed:
+        while (chunk := self._chunks.get()) is not None:
             try:
-                self._done.put((chunk, self._send(chunk)))
+                self._done.put((chunk, 0 if self._closed else self._send(chunk)))
             except BaseException as error:  # noqa: BLE001 - handed to the disk thread, which hands it on
                 self._done.put((chunk, error))
             self._on_done()

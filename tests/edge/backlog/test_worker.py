@@ -350,3 +350,20 @@ def test_the_link_that_blocks_is_the_edges_own(tmp_path):
     eventually(lambda: rig.backlog.numbers.video_s > 2.5, within_s=10, what="frames are stored")
     gate.set()
     assert {unit.frame_index for unit in rig.kept()} >= set(range(90, 110))
+
+
+def test_what_was_sent_and_not_acknowledged_is_known_after_the_last_chunk(tmp_path):
+    """A goodbye that does not wait for it loses it with the session: the ground's account would be another."""
+    link, still = Link(), {"session_id": 7, "kind": BacklogKind.STILL, "number": 3}
+    with opened(tmp_path) as store:
+        add_stills(store, {3: 1.0})
+    worker = worker_of(tmp_path, link)
+    eventually(lambda: link.sent, within_s=10, what="a chunk is sent")
+    worker.send_no_more()
+    sent_bytes = sum(len(chunk.data) for _, chunk in link.sent)
+    time.sleep(0.3)  # turns in which nothing may be counted that does not leave
+    assert worker.numbers.unacknowledged_bytes == sent_bytes == link.sent[0][1].total_bytes
+    arrived = AcknowledgedRange(**still, acknowledged_bytes=sent_bytes)
+    worker.intake.on_acknowledged([arrived], receiver_id=1)
+    eventually(lambda: not worker.numbers.unacknowledged_bytes, within_s=10, what="it has arrived")
+    worker.close()

@@ -8,9 +8,12 @@ are the SDK's own, so pyproject pins the version.
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 
+import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings as bindings
@@ -19,6 +22,7 @@ from hvt_common.errors import UserError
 
 __all__ = [
     "RecordingId",
+    "leave_out_pandas",
     "new_recording",
     "release_recordings",
     "send_blueprint",
@@ -38,6 +42,26 @@ class RecordingId:
     def application(self) -> str:
         """The viewer has one screen for each application: one for all edges would be the last one's."""
         return f"hvt-{self.edge}"
+
+
+def leave_out_pandas() -> None:
+    """Keep Arrow from importing pandas where that is installed: 50 MB, and nothing of it is used here.
+
+    Arrow, in which the SDK writes, looks for it once in a process, at the first list that it converts: here. For
+    processes that convert nothing to pandas themselves.
+    """
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    try:
+        pa.array([0])
+    finally:
+        sys.meta_path.remove(finder)
+
+
+class _NoPandas(MetaPathFinder):
+    def find_spec(self, fullname: str, *_: object) -> None:
+        if fullname == "pandas":
+            raise ModuleNotFoundError(fullname, name=fullname)
 
 
 def new_recording(one: RecordingId) -> rr.RecordingStream:

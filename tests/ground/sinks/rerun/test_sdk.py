@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -39,3 +41,22 @@ def test_many_recordings_leave_no_threads(tmp_path):
     before = threads()
     recorded(2, 3, 4, 5)
     eventually(lambda: threads() <= before, within_s=20, what="no thread of the four is left")
+
+
+@pytest.mark.skipif(find_spec("pandas") is None, reason="pandas is not installed")
+def test_a_ground_does_not_import_pandas():
+    """Where the study is installed too, a ground would take 50 MB more for what it never uses."""
+    program = """
+import sys
+import pyarrow
+import rerun
+from hvt_ground.sinks.rerun.sdk import leave_out_pandas
+leave_out_pandas()
+recording = rerun.RecordingStream("hvt-uav-1")
+recording.log("a", rerun.Boxes2D(centers=[[1, 2]], half_sizes=[[1, 1]], labels=["car"]))
+pyarrow.array([1, 2])
+print("pandas" in sys.modules)
+import pandas  # who wants it has it
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
