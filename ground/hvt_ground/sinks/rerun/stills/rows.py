@@ -95,7 +95,7 @@ class StillRows:
         pictures = (("base", base or BLANK), ("still", still))
         cost = sum(len(data) for _, (data, _) in pictures)
         dear = still[0] is not refinement.still
-        if dear and not self._has_room(cost):
+        if dear and not self._pair_fits(cost):
             return []
         at = refinement.frame_index, refinement.capture_ns
         gallery = self._gallery
@@ -111,7 +111,7 @@ class StillRows:
             rows.append(TableRow(f"{path}/{name}", "placed jpeg", picture, len(data)))
         return rows
 
-    def _has_room(self, pair_bytes: int) -> bool:
+    def _pair_fits(self, pair_bytes: int) -> bool:
         share = PAIR_SHARE * self._size_limit.received_bytes
         return self._pair_bytes + pair_bytes <= share or self._size_limit.has(pair_bytes, ratio=PAIR_RATIO)
 
