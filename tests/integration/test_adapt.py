@@ -18,7 +18,7 @@ THIN = Script(
 )
 EDGE = (
     "--source-fps", "15", "--size", "640x360", "--budget", "800kbps", "--detector", "motion",
-    "--preset", "ultrafast", "--max-frames", "180", "--detect-every", "15",
+    "--preset", "ultrafast", "--max-frames", "180", "--detect-every", "15", "--method", "M5",
 )  # fmt: skip
 
 

@@ -42,7 +42,7 @@ PLAYS = (
         "--budget",
         "300kbps",
     ),
-    *("--detector", "motion", "--edge-id", "uav-1", "--wait", "60s"),
+    *("--detector", "motion", "--edge-id", "uav-1", "--wait", "60s", "--method", "M5"),
 )
 SEES = ("--detector", "motion", "--classifier", "none")
 
@@ -268,19 +268,8 @@ def test_a_lost_still_comes_the_second_time_and_is_shown_once(link: Link):
             "hvt_edge.cli",
             [
                 *("--connect", f"udp/127.0.0.1:{relay.port}", *PLAYS),
-                *(
-                    "--method",
-                    "M2",
-                    "--cooldown",
-                    "0s",
-                    "--min-gain",
-                    "1",
-                    "--gate",
-                    "60",
-                    "--video-share",
-                    "0.6",
-                ),
-                *("--still-codec", "jpeg"),
+                *("--method", "M1", "--tune", "every_frames=20", "--cooldown", "0s", "--min-gain", "1"),
+                *("--gate", "60", "--video-share", "0.6", "--still-codec", "jpeg"),
             ],
             name="edge",
         )

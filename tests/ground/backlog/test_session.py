@@ -372,7 +372,7 @@ def test_stills_of_an_outage_name_the_tracks_of_its_video(flight, tmp_path, own)
     recording = Recording(tmp_path / ("0.rrd" if own else "backlog-0.rrd"))
     texts = [(frame, text) for frame, _, text in recording.events() if "late still #3" in text]
     assert [frame for frame, _ in texts] == [45, 45]
-    assert "late still #3 of edge track 1: car → bus .90" in texts[0][1]
+    assert "late still #3 of edge track 1: car, by itself bus .90" in texts[0][1]
     assert f"late still #3 → track {FIRST_TRACK_ID}: car → bus .90" in texts[1][1]
     before, after = (recording.boxes(frame)[FIRST_TRACK_ID] for frame in (43, 50))
     assert (before.class_after, before.refined) == ("car", False)

@@ -170,7 +170,7 @@ def stays(before: Use, after: Use) -> None:
     grown = after.rss_bytes - before.rss_bytes
     assert grown < MOST_GROWTH_BYTES, f"{grown / 2**20:.1f} MiB"
     eventually(lambda: Use(after.pid).threads <= before.threads + 2, within_s=20, what="threads have ended")
-    assert after.files <= before.files + 2
+    eventually(lambda: Use(after.pid).files <= before.files + 2, within_s=20, what="files are closed")
 
 
 FLIGHT = ("--source", "demo", "--fps", "5", "--size", "640x360", "--max-frames", "10", "--detector", "motion")
