@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test check lint type format docs bench bench-stills bench-compare bench-peers link soak kills failures fuzz clean help
+.PHONY: setup demo test check arm lint type format docs bench bench-stills bench-compare bench-peers link soak kills failures fuzz clean help
 
 .PHONY: nightly nightly-tests
 
@@ -52,6 +52,9 @@ lint: setup
 type: setup
 	@$(BIN)/mypy
 	@$(BIN)/mypy --config-file tests/mypy.ini tests lab bench
+
+arm: setup       ## whether all that is needed comes as a ready wheel for 64-bit ARM
+	@$(BIN)/python deploy/arm_wheels.py
 
 check: lint type ## lint, format, import arrows, types; of the tests whether they call what is there
 
