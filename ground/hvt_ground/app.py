@@ -8,6 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from hvt_common.errors import FlightError, UserError
@@ -21,11 +22,13 @@ from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event
+from hvt_ground.perception.models import stills_calibrated
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort, GroundLink
 from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
+from hvt_ground.state import StateMaker
 from hvt_ground.status import completed, status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 
@@ -147,7 +150,14 @@ class Ground:
         watch: LinkWatch,
         failures: Failures,
     ) -> None:
-        polls = 0
+        config, polls = self._config, 0
+        maker = StateMaker(
+            self._clock,
+            detector=Path(config.detector).name,
+            classifier=Path(config.classifier or "none").name,
+            calibrated=stills_calibrated(config),
+            failures=failures,
+        )
         while not self._stop.wait(_POLL_S):
             ports = link.ports()
             self._leave_edges(ports)
@@ -158,10 +168,9 @@ class Ground:
             self._raise_error()
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
-                edges = [(edge, one.sessions) for edge, one in sorted(self._edges.items())]
-                text = status_text(edges, failures=failures)
-                line.show(text or ("no link" if watch.trouble else "no edge yet"))
-            if self._config.once and self._all_ended():
+                state = maker.make([(edge, one.sessions) for edge, one in sorted(self._edges.items())])
+                line.show(status_text(state) or ("no link" if watch.trouble else "no edge yet"))
+            if config.once and self._all_ended():
                 return
 
     def _serve_edge(self, port: EdgePort, factory: SessionFactory) -> EdgeThread:
