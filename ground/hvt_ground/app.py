@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections import defaultdict, deque
@@ -11,14 +12,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hvt_common.errors import FlightError, UserError
+from hvt_common.errors import FlightError, UserError, needs_extra
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, reason_of
+from hvt_common.runtime.health_server import METRICS_TYPE, Answer, HealthServer
 from hvt_common.runtime.reporting import StatusLine, check_writable
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
+from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event
@@ -28,7 +31,7 @@ from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort, GroundLink
 from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
-from hvt_ground.state import StateMaker
+from hvt_ground.state import GroundState, StateMaker
 from hvt_ground.status import completed, status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 
@@ -36,6 +39,8 @@ __all__ = ["Ground"]
 
 _POLL_S = 0.1
 _STATUS_EVERY_POLLS = 10
+_STUCK_S = 5.0
+"""A ground that has made no state for so long does not serve its edges either."""
 _MOST_SUMMARIES = 256
 """Of an edge; one that is started again and again for weeks is not to fill the memory."""
 
@@ -56,6 +61,7 @@ class Ground:
         )
         """By edge, the summaries of sessions and what they were written to."""
         self._began_s = time.monotonic()
+        self._state: GroundState | None = None
 
     def run(self) -> list[dict[str, Any]]:
         """Serve edges until ``stop`` is set, or with ``--once`` until they have ended; return a summary a session.
@@ -75,6 +81,8 @@ class Ground:
             view: LiveView | None = None
             if config.view or config.serve:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
+            if config.metrics is not None:
+                stack.enter_context(self._health_server(config.metrics))
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
             settings = LinkSettings(
@@ -140,6 +148,32 @@ class Ground:
         if page:
             line.note(f"hvt-ground: watch at {page}")
 
+    # Who watches
+
+    def _health_server(self, address: str) -> HealthServer:
+        with needs_extra("'hvt[ground]'"):
+            from hvt_ground.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
+
+        def of_state(make: Callable[[GroundState], Answer]) -> Answer:
+            state = self._state
+            if state is None:
+                return Answer(b"it has not begun\n", status=503)
+            age_s = (self._clock() - state.at_ns) / SECOND_NS
+            return make(state) if age_s < _STUCK_S else Answer(b"it stands still\n", status=503)
+
+        def alive() -> Answer:
+            return of_state(lambda _state: Answer(b"ok\n"))
+
+        answers = {
+            "/metrics": lambda: of_state(lambda state: Answer(metrics_text(state), METRICS_TYPE)),
+            "/state.json": lambda: of_state(
+                lambda state: Answer(json.dumps(state.as_dict()).encode(), "application/json")
+            ),
+            "/healthz": alive,
+            "/readyz": alive,
+        }
+        return HealthServer(address, answers, name="--metrics")
+
     # Serving
 
     def _serve(
@@ -168,8 +202,8 @@ class Ground:
             self._raise_error()
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
-                state = maker.make([(edge, one.sessions) for edge, one in sorted(self._edges.items())])
-                line.show(status_text(state) or ("no link" if watch.trouble else "no edge yet"))
+                self._state = maker.make([(edge, one.sessions) for edge, one in sorted(self._edges.items())])
+                line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
             if config.once and self._all_ended():
                 return
 

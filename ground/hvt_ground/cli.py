@@ -36,6 +36,10 @@ def _run(argv: Sequence[str] | None) -> int:
         from hvt_ground.pki import command as keys  # noqa: PLC0415 - who serves edges needs neither of these
 
         return keys.run(words[1:])
+    if words[:1] == ["status"]:
+        from hvt_ground.control import watch  # noqa: PLC0415
+
+        return watch.run(words[1:])
     if words and not words[0].startswith("-"):
         from hvt_ground.control import command as control  # noqa: PLC0415
 

@@ -102,6 +102,11 @@ class GroundConfig:
     )
     view: bool = _FILES.switch("also open the Rerun viewer")
     serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")
+    metrics: str | None = _FILES.option(
+        TEXT,
+        None,
+        "answer Prometheus (/metrics), /healthz, /readyz and hvt-ground status at HOST:PORT, unencrypted",
+    )
     summary: Path | None = _FILES.option(PATH, None, "write the summary as JSON")
     quiet: bool = _FILES.switch("no status line")
 

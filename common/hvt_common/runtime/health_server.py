@@ -1,0 +1,139 @@
+"""A small HTTP server for programs that watch this one: metrics, and whether it is alive.
+
+Few requests at a time, each within some seconds, each answer made when it is asked for: a scraper comes every few
+seconds, and whoever does something else with the port disturbs nobody but other askers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from socketserver import ThreadingMixIn
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+from hvt_common.errors import UserError
+
+__all__ = ["METRICS_TYPE", "Answer", "HealthServer"]
+
+METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+"""Of Prometheus' text format."""
+
+_MOST_AT_ONCE = 16
+_PATIENCE_S = 2.0
+"""So long a client may take to say what it wants, and to take its answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one path answers."""
+
+    body: bytes
+    media_type: str = "text/plain; charset=utf-8"
+    status: int = 200
+
+
+class HealthServer:
+    """Serves ``answers``, by path, at ``address`` (HOST:PORT) while the context lasts; ``name`` is the option's.
+
+    Raises `UserError` where the address is none or cannot be listened on.
+    """
+
+    def __init__(self, address: str, answers: Mapping[str, Callable[[], Answer]], *, name: str) -> None:
+        host, port = _parsed(address, name=name)
+        try:
+            self._server = _Server(host, port, answers)
+        except OSError as error:
+            raise UserError(
+                f"{name} {address} cannot be listened on ({error.strerror or error}): give another port, or end "
+                "what uses it"
+            ) from None
+        self._thread = threading.Thread(target=self._server.serve_forever, name="hvt-health", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _Server(ThreadingMixIn, HTTPServer):
+    request_queue_size = 16
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, host: str, port: int, answers: Mapping[str, Callable[[], Answer]]) -> None:
+        self.answers = answers
+        self._free = threading.BoundedSemaphore(_MOST_AT_ONCE)
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        super().__init__((host, port), _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        pass
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = _PATIENCE_S
+    server_version, sys_version = "hvt", ""
+
+    def setup(self) -> None:
+        super().setup()
+        # The timeout is for each read: who sends a byte a second would be here for ever.
+        self._deadline = threading.Timer(2 * _PATIENCE_S, self._give_up)
+        self._deadline.daemon = True
+        self._deadline.start()
+
+    def finish(self) -> None:
+        self._deadline.cancel()
+        super().finish()
+
+    def do_GET(self) -> None:
+        make = self.server.answers.get(urlsplit(self.path).path)
+        answer = Answer(b"not here\n", status=404) if make is None else make()
+        self.send_response(answer.status)
+        self.send_header("Content-Type", answer.media_type)
+        self.send_header("Content-Length", str(len(answer.body)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(answer.body)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - http.server's name
+        pass
+
+    def _give_up(self) -> None:
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_RDWR)
+
+
+def _parsed(address: str, *, name: str) -> tuple[str, int]:
+    try:
+        parts = urlsplit(f"//{address}")
+        host, port = parts.hostname or "", parts.port or 0
+    except ValueError:
+        host, port = "", 0
+    if not host or not port or parts.path or parts.query:
+        raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT, such as 127.0.0.1:9464")
+    return host, port

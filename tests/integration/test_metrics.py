@@ -1,0 +1,110 @@
+"""A ground that is watched: what Prometheus, a probe and a second shell read while it serves a real edge."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from programs.processes import Link, eventually, free_ports
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
+
+EDGE = ("--source", "demo", "--fps", "5", "--size", "640x360", "--detector", "motion", "--method", "M0")
+
+
+def read(address: str, path: str) -> bytes:
+    """What a path answers."""
+    with urllib.request.urlopen(f"http://{address}{path}", timeout=10) as answer:
+        return answer.read()
+
+
+def series(address: str) -> dict[tuple[str, str], float]:
+    """Values by name and edge."""
+    families = text_string_to_metric_families(read(address, "/metrics").decode())
+    return {
+        (one.name, one.labels.get("edge", "")): one.value
+        for family in families
+        for one in family.samples
+        if "link" not in one.labels or one.value
+    }
+
+
+def status(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """``hvt-ground status``."""
+    command = [sys.executable, "-m", "hvt_ground.cli", "status", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_ground_in_service_can_be_watched(tmp_path):
+    """A team would learn of a lost link from the one who looks at the screen."""
+    address = f"127.0.0.1:{free_ports(1)[0]}"
+    with Link(tmp_path) as link:
+        ground = link.ground("--metrics", address, "--detector", "motion", "--classifier", "none")
+        edge = link.edge(*EDGE, "--edge-id", "uav-1")
+        received = ("hvt_frames_received_total", "uav-1")
+
+        def flies() -> bool:
+            try:
+                return series(address).get(received, 0) > 5
+            except OSError:
+                return False  # it is starting
+
+        eventually(flies, within_s=60, what="the metrics show frames")
+        found = series(address)
+        assert found["hvt_budget_bits_per_second", "uav-1"] == 800_000
+        assert found["hvt_received_bits_per_second", "uav-1"] > 0
+        assert found["hvt_link", "uav-1"] == 1
+        assert read(address, "/healthz") == b"ok\n"
+        said = status("--at", address)
+        assert said.returncode == 0, said.stderr
+        assert "uav-1" in said.stdout
+        state = json.loads(status("--at", address, "--json").stdout)
+        assert state["edges"][0]["session"]["frames_received"] > 5
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            read(address, "/../../etc/passwd")
+        host, _, port = address.partition(":")
+        with contextlib.ExitStack() as stack:
+            for number in range(40):
+                one = stack.enter_context(socket.create_connection((host, int(port))))
+                with contextlib.suppress(OSError):  # it may be closed at once
+                    one.sendall(b"\x00\xff" * 4000 if number % 2 else b"GET /me")
+            count = found[received]
+
+            def serves() -> bool:
+                try:
+                    return series(address)[received] > count
+                except OSError:
+                    return False  # all places are taken, for some seconds
+
+            eventually(serves, within_s=60, what="it serves on")
+        busy = link.start("hvt_ground.cli", ["--metrics", address], name="busy")
+        assert busy.wait(within_s=60) == 2
+        assert f"--metrics {address} cannot be listened on" in busy.said
+        edge.kill()
+        eventually(
+            lambda: (
+                ("hvt_link", "uav-1") in series(address)
+                and json.loads(read(address, "/state.json"))["edges"][0]["link"] == "lost"
+            ),
+            within_s=60,
+            what="the link is lost",
+        )
+        lost = series(address)
+        assert ("hvt_received_bits_per_second", "uav-1") not in lost, "nothing is known of it"
+        ground.stop()
+
+
+def test_where_no_ground_answers_is_a_sentence():
+    """A traceback would say that the command is broken."""
+    said = status("--at", f"127.0.0.1:{free_ports(1)[0]}")
+    assert said.returncode == 1
+    assert "no ground answers at" in said.stderr
+    assert len(said.stderr.strip().splitlines()) == 1
