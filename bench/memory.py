@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 
 from bench.bars import measured
+from bench.fleet.played import SIZE, coded, played
 from bench.material import frames
-from bench.played import SIZE, coded, played
 from bench.processes import Peaks, free_endpoint, running
 
 _FPS = 5.0

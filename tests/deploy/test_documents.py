@@ -27,6 +27,14 @@ OTHER_FLAGS = {
     "--no-name",
     "--build",
     "--now",
+    # Of programs that docs/small-boards.md starts.
+    "--codec",
+    "--framerate",
+    "--height",
+    "--libav-format",
+    "--python",
+    "--user",
+    "--width",
 }
 
 

@@ -1,1 +1,4 @@
-"""What every process needs: `clock`, `failures`, `plug_ins`, `process` (signals), `reporting`, `statistics`."""
+"""What every process needs: `clock`, `failures`, `plug_ins`, `process` (signals), `reporting`, `statistics`.
+
+`health_server` answers who watches one.
+"""

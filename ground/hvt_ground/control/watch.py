@@ -30,7 +30,7 @@ def run(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(argv)
     address: str = arguments.at
     if not arguments.watch:
-        state = _asked(address)
+        state = _requested(address)
         if arguments.json:
             say(json.dumps(state))
         else:
@@ -39,17 +39,17 @@ def run(argv: Sequence[str]) -> int:
     try:
         if arguments.json:
             while True:
-                print(json.dumps(_asked(address)), flush=True)
+                print(json.dumps(_requested(address)), flush=True)
                 time.sleep(1)
-        with Live(_table(_asked(address)), refresh_per_second=4) as live:
+        with Live(_table(_requested(address)), refresh_per_second=4) as live:
             while True:
                 time.sleep(1)
-                live.update(_table(_asked(address)))
+                live.update(_table(_requested(address)))
     except KeyboardInterrupt:
         return 0
 
 
-def _asked(address: str) -> dict[str, Any]:
+def _requested(address: str) -> dict[str, Any]:
     try:
         with urllib.request.urlopen(f"http://{address}/state.json", timeout=_PATIENCE_S) as answer:
             state: dict[str, Any] = json.loads(answer.read(_MOST_BYTES))

@@ -94,7 +94,7 @@ class Pipeline:
         self._detect_every = detect_every
         self._frame_ns = SECOND_NS / fps
         self._turn_s = _TURN_SHARE / fps
-        self._asker = object()
+        self._turn_key = object()
         """Stands for this session among those that take turns, and keeps nothing of it alive."""
         self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
@@ -227,7 +227,7 @@ class Pipeline:
         parts, last = self._parts, self._detected_frame
         frames = None if last is None else index - last
         due = frames is None or frames >= (_PUT_OFF if hurry else 1) * self._detect_every
-        if due and (parts.turns is None or parts.turns.take(self._asker, within_s=self._turn_s)):
+        if due and (parts.turns is None or parts.turns.take(self._turn_key, within_s=self._turn_s)):
             self._detected_frame = index
             self.detections_run += 1
             try:

@@ -1,6 +1,6 @@
 """A ground with 1, 2, 4, 8 and 16 edges: ``make bench-fleet``, or ``python -m bench.fleet [COUNT …]``.
 
-Each edge sends 640x360 at 15 fps of the drawn scene, played from this process (`bench.played`). The ground detects on
+Each edge sends 640x360 at 15 fps of the drawn scene, played from this process (`bench.fleet.played`). The ground detects on
 every third frame and tracks all it has time for. Shown are the frames that it tracked a second, the cores that it
 took, their ratio, the share of frames passed over for lack of time at the best and the worst served edge (fair where
 they are alike), capture to overlay at the worst one, and peak memory.
@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from bench.played import SIZE, coded, played
+from bench.fleet.played import SIZE, coded, played
 from bench.processes import Peaks, free_endpoint, running
 from hvt_edge.source.opening import open_source
 

@@ -1,0 +1,1 @@
+"""One ground with many edges: ``python -m bench.fleet``; `played` plays the edges."""
