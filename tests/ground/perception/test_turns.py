@@ -51,7 +51,7 @@ def test_a_noisy_edge_starves_no_other(count):
     had = flown(fps, detect_s=0.025, lasts_s=3.0)
     calm = [had[name] for name in fps if name != "noisy"]
     most = max(had.values())
-    assert min(calm) >= 0.4 * min(most, 3 * 10), "on a busy machine a picture may come late"
+    assert min(calm) >= 0.25 * min(most, 3 * 10), "on a busy machine a picture may come late"
 
 
 def test_nobody_waits_for_longer_than_it_said():
