@@ -24,7 +24,7 @@ __all__ = ["IndexWriter", "RecordingsFolder"]
 
 _log = logging.getLogger(__name__)
 
-_LOOK_EVERY_S = 60.0
+_POLL_S = 60.0
 _END_S = 3.0
 
 
@@ -92,7 +92,7 @@ class IndexWriter:
                 self._index.put(replace(row, size_bytes=path.stat().st_size, whole=True))
 
     def _remove_due(self) -> None:
-        if not (self._retention.keep or self._retention.keep_video):
+        if not (self._retention.limits or self._retention.video_age):
             return
         rows = {row.file: row for row in self._index.rows() if _is_plain(row.file)}
         gone = [name for name in rows if not (self._folder / name).exists()]
@@ -135,7 +135,7 @@ class RecordingsFolder:
         self._failures = failures
         self._sink: QueuedSink[RecordingRow | None] | None = None
         self._stop = threading.Event()
-        self._clock = threading.Thread(target=self._look, name="hvt-recordings", daemon=True)
+        self._clock = threading.Thread(target=self._poll, name="hvt-recordings", daemon=True)
 
     def open(self) -> None:
         """Begin; the folder is there now."""
@@ -164,9 +164,9 @@ class RecordingsFolder:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Files grow old while nobody flies, too."""
-        while self._sink is not None and not self._stop.wait(_LOOK_EVERY_S):
+        while self._sink is not None and not self._stop.wait(_POLL_S):
             self._sink.log(None)
 
 

@@ -16,10 +16,10 @@ _CLOCK_SET_NS = 1_577_836_800 * SECOND_NS
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """How much is kept: a file for ``keep``, its video for ``keep_video``. None keeps all."""
+    """What stays: files within all ``limits``, their video up to ``video_age``. Without them all stays."""
 
-    keep: tuple[Limit, ...] = ()
-    keep_video: Limit | None = None
+    limits: tuple[Limit, ...] = ()
+    video_age: Limit | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,24 +37,24 @@ def due(rows: Sequence[RecordingRow], retention: Retention, *, in_use: Collectio
     | a file | is |
     |---|---|
     | that is written to (``in_use``) | left alone, but counts among the bytes |
-    | whose last byte is older than a time of ``keep`` | removed |
-    | that is the oldest left while all have more bytes than ``keep`` allows | removed |
-    | with video, older than ``keep_video`` | stripped of it |
+    | whose last byte is older than a time of ``limits`` | removed |
+    | that is the oldest left while all have more bytes than ``limits`` allow | removed |
+    | with video, older than ``video_age`` | stripped of it |
     """
     ordered = sorted(rows, key=lambda row: (row.written_ns, row.file))
     free = [row for row in ordered if row.file not in in_use]
     removed: list[str] = []
-    for limit in retention.keep:
+    for limit in retention.limits:
         if limit.seconds is not None:
             removed += [row.file for row in free if _older(row, limit, now_ns)]
-    for limit in retention.keep:
+    for limit in retention.limits:
         if limit.size_bytes is not None:
             excess = sum(row.size_bytes for row in rows if row.file not in removed) - limit.size_bytes
             for row in free:
                 if excess > 0 and row.file not in removed:
                     removed.append(row.file)
                     excess -= row.size_bytes
-    video = retention.keep_video
+    video = retention.video_age
     stripped = [
         row.file
         for row in free

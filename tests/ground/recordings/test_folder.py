@@ -210,7 +210,7 @@ def test_video_is_removed_and_the_rest_stays(tmp_path, events):
     """Who wants to know in a year what flew there would have to keep all pictures for it."""
     fly(tmp_path, events)
     before = Recording(tmp_path / NAMES[0])
-    rows = look(tmp_path, Retention(keep_video=Limit(seconds=86_400)), later_s=90_000)
+    rows = look(tmp_path, Retention(video_age=Limit(seconds=86_400)), later_s=90_000)
     assert [one.video for one in rows] == [False, False]
     after = Recording(tmp_path / NAMES[0])
     assert after.video() == []
@@ -229,7 +229,7 @@ def test_a_file_that_cannot_be_stripped_holds_up_no_other(tmp_path, events, capl
     """One bad file, and nothing is removed any more."""
     fly(tmp_path, events)
     (tmp_path / NAMES[0]).write_bytes(b"RRF2 no more")
-    rows = look(tmp_path, Retention(keep_video=Limit(seconds=60.0)), later_s=1000)
+    rows = look(tmp_path, Retention(video_age=Limit(seconds=60.0)), later_s=1000)
     assert [one.video for one in rows] == [True, False]
     assert len([one for one in caplog.messages if "cannot be stripped" in one]) == 1
     assert (tmp_path / NAMES[0]).read_bytes() == b"RRF2 no more"
