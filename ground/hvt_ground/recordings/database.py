@@ -47,7 +47,7 @@ class Index:
     """
 
     def __init__(self, folder: Path) -> None:
-        path = folder / INDEX
+        self._path = path = folder / INDEX
         try:
             self._database = _opened(path)
         except sqlite3.OperationalError:  # locked, not writable, disk full: what is there may be good
@@ -62,6 +62,8 @@ class Index:
 
     def put(self, row: RecordingRow) -> None:
         """Note a file, in place of what was known of it."""
+        if not self._path.exists():  # what is written would be in no file
+            raise sqlite3.OperationalError(f"{self._path} was removed")
         values = [getattr(row, name) for name in _COLUMNS]
         with self._database as transaction:
             transaction.execute(

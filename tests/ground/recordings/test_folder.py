@@ -142,6 +142,23 @@ def test_an_index_that_cannot_be_written_disturbs_no_flight(tmp_path, events, ho
     assert [one.file for one in read_index(tmp_path)] == NAMES, "what it missed it reads from the files"
 
 
+def test_an_index_that_is_removed_in_flight_is_made_anew(tmp_path, events):
+    """All that came after it would be written to a file that is in no folder."""
+    failures = Failures(time.time_ns)
+    with RecordingsFolder(tmp_path, ALL, failures=failures) as index:
+        index.open()
+        sink = SessionFiles(settings(tmp_path), split=SPLIT, index=index)
+        eventually(lambda: (tmp_path / INDEX).exists() and read_index(tmp_path), within_s=20, what="a row")
+        for one in tmp_path.glob(f"{INDEX}*"):
+            one.unlink()
+        for event in events:
+            sink.log(event)
+        eventually((tmp_path / INDEX).exists, within_s=20, what="it is there again")
+        sink.close()
+        eventually(lambda: failures.parts[0].working, within_s=20, what="it works again")
+    assert [one.file for one in look(tmp_path)] == NAMES
+
+
 def test_by_age_and_by_bytes(tmp_path, events):
     """The disk is full after a month."""
     fly(tmp_path, events)
