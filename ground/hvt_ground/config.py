@@ -25,8 +25,8 @@ def _age(text: str, *, name: str) -> Limit:
     return limit
 
 
-_LIMIT = SettingType("TIME|SIZE", parse_limit)
-_AGE = SettingType("TIME", _age)
+_LIMIT = SettingType("LIMIT", parse_limit)
+_AGE = SettingType("AGE", _age)
 
 _LINK, _MODELS, _FILES = Group("link and edges"), Group("models"), Group("files and views")
 _LINK_RARE, _MODELS_RARE, _FILES_RARE = (replace(group, rare=True) for group in (_LINK, _MODELS, _FILES))
