@@ -26,6 +26,7 @@ You can set every option below as a flag or as a TOML key of `--config FILE`; a 
 | RATE | `800kbps`, `0.8Mbps` or `800000` (bits a second) |
 | SIZE | `200MB`, `64kB`, `1GB` or bytes |
 | TIME | `2s`, `500ms`, `1min`, `1h` or seconds |
+| AGE, LIMIT | `1h`, `14days`, `2weeks`; a LIMIT may be `500MB` or `200GB` as well; never without a unit |
 | SHARE | `0.8` or `80%` |
 | WxH | `1280x720`, pixels |
 | list | the flag may be repeated; in TOML `["…", "…"]` |

@@ -34,6 +34,8 @@ ask haveImageWriter keep_blank_values keep_trailing_newline
 set_log_tick_enabled set_xticks set_yticks tick_params xticks yticks
 """
 _LIBRARIES_SAY = frozenset(_OF_LIBRARIES.split())
+_OPTIONS = frozenset({"keep", "keep_video"})
+"""As restic and others call what retention leaves: a setting's name is its flag's."""
 _FORMER_OPTION = re.compile(r'^\s+"[a-z-]+": (_REFRESH_GONE|"give --)')
 """A line of the table that answers an option of an earlier version with what takes its place."""
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z0-9]+")
@@ -50,7 +52,7 @@ def _tracked(*patterns: str) -> list[str]:
 
 
 def _forbidden(name: str) -> bool:
-    if name in _LIBRARIES_SAY:
+    if name in _LIBRARIES_SAY | _OPTIONS:
         return False
     parts = {part.lower() for part in _PARTS.findall(name)}
     return bool(parts & _NO_NAME) or name.strip("_") in _NO_CLASS

@@ -1,9 +1,9 @@
 """A ground with 1, 2, 4, 8 and 16 edges: ``make bench-fleet``, or ``python -m bench.fleet [COUNT …]``.
 
 Each edge sends 640x360 at 15 fps of the drawn scene, played from this process (`bench.fleet.played`). The ground
-detects on every third frame and tracks all it has time for. Shown are the frames that it tracked a second, the cores that it
-took, their ratio, the share of frames passed over for lack of time at the best and the worst served edge (fair where
-they are alike), capture to overlay at the worst one, and peak memory.
+detects on every third frame and tracks all it has time for. Shown are the frames that it tracked a second, the cores
+that it took, their ratio, the share of frames passed over for lack of time at the best and the worst served edge
+(fair where they are alike), capture to overlay at the worst one, and peak memory.
 """
 
 from __future__ import annotations

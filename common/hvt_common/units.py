@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 
 from hvt_common.errors import UserError
 
 __all__ = [
     "SECOND_NS",
+    "Limit",
     "bitrate_text",
     "counts_text",
     "exact_rate",
     "parse_bitrate",
     "parse_bytes",
     "parse_duration_s",
+    "parse_limit",
     "parse_share",
     "parse_size",
 ]
@@ -27,12 +30,18 @@ _BITRATE = re.compile(_NUMBER + r"\s*(bps|bit/s|kbps|kbit/s|k|Mbps|Mbit/s|M)?", 
 _DURATION = re.compile(_NUMBER + r"\s*(ms|s|min|m|h)?")
 _BYTES = re.compile(_NUMBER + r"\s*(B|kB|MB|GB)?", re.IGNORECASE)
 _SIZE = re.compile(r"([0-9]{1,9})\s*[xX]\s*([0-9]{1,9})")
+_SPAN = re.compile(_NUMBER + r"\s*(s|min|h|days?|d|weeks?)")
+_AMOUNT = re.compile(_NUMBER + r"\s*(kB|MB|GB|TB)", re.IGNORECASE)
+_SPAN_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
+_AMOUNT_UNITS = {"k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12}
 _BITRATE_UNITS = {"": 1, "b": 1, "k": 1_000, "m": 1_000_000}
 _BYTES_UNITS = {"": 1, "b": 1, "kb": 1_000, "mb": 1_000_000, "gb": 1_000_000_000}
 _DURATION_UNITS = {"": 1.0, "ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 _LIMIT_BPS = 1_000_000_000
 _LIMIT_BYTES = 10**12
 _LIMIT_S = 10_000_000.0
+_LONGEST_S = 3_660 * 86_400.0
+_LARGEST_BYTES = 10**15
 
 
 def parse_bitrate(text: str, *, name: str) -> int:
@@ -66,6 +75,36 @@ def parse_duration_s(text: str, *, name: str) -> float:
             f"{name} {text!r} is not a duration: write 2s, 500ms or 1min, at most {_LIMIT_S:.0f} s"
         )
     return seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """An age or an amount: one of both."""
+
+    seconds: float | None = None
+    size_bytes: int | None = None
+
+    def __str__(self) -> str:
+        """As `parse_limit` reads it."""
+        if self.seconds is not None:
+            return f"{self.seconds:.15g}s"
+        return f"{(self.size_bytes or 0) / 1e6:.15g}MB"
+
+
+def parse_limit(text: str, *, name: str) -> Limit:
+    """``14days`` or ``200GB``; a bare number could be either and is neither."""
+    span, amount = _SPAN.fullmatch(text.strip()), _AMOUNT.fullmatch(text.strip())
+    if span:
+        seconds = float(span[1]) * _SPAN_UNITS[span[2][0]]
+        if 1 <= seconds <= _LONGEST_S:
+            return Limit(seconds=seconds)
+    elif amount:
+        size_bytes = float(amount[1]) * _AMOUNT_UNITS[amount[2][0].lower()]
+        if 1_000_000 <= size_bytes <= _LARGEST_BYTES:
+            return Limit(size_bytes=round(size_bytes))
+    raise UserError(
+        f"{name} {text!r} is neither a time nor a size: write 1h, 14days or 200GB, at least 1s or 1MB"
+    )
 
 
 def parse_size(text: str, *, name: str) -> tuple[int, int]:

@@ -26,6 +26,8 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.events import Event
 from hvt_ground.perception.models import stills_calibrated
+from hvt_ground.recordings.folder import RecordingsFolder
+from hvt_ground.recordings.retention import Retention
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort, GroundLink
@@ -83,6 +85,9 @@ class Ground:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
             if config.metrics is not None:
                 stack.enter_context(self._health_server(config.metrics))
+            retention = Retention(config.keep, config.keep_video)
+            index = RecordingsFolder(config.record_folder, retention, failures=models.failures)
+            stack.enter_context(index)
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
             settings = LinkSettings(
@@ -95,7 +100,10 @@ class Ground:
             )
             session = stack.enter_context(open_session(settings))
             self._make_record_folder()
-            factory = SessionFactory(config, models, clock=self._clock, outputs=outputs, view=view)
+            index.open()
+            factory = SessionFactory(
+                config, models, clock=self._clock, outputs=outputs, view=view, index=index
+            )
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))

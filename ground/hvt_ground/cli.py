@@ -40,6 +40,10 @@ def _run(argv: Sequence[str] | None) -> int:
         from hvt_ground.control import watch  # noqa: PLC0415
 
         return watch.run(words[1:])
+    if words[:1] == ["recordings"]:
+        from hvt_ground.recordings import command as recordings  # noqa: PLC0415
+
+        return recordings.run(words[1:])
     if words and not words[0].startswith("-"):
         from hvt_ground.control import command as control  # noqa: PLC0415
 

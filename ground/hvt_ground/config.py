@@ -6,16 +6,27 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hvt_common.config import DURATION, PATH, TEXT, Group, choice, integer, number
+from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, integer, number
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
+from hvt_common.units import Limit, parse_limit
 
 __all__ = ["DETECTOR", "MOTION", "NONE", "GroundConfig", "check"]
 
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
 
+
+def _age(text: str, *, name: str) -> Limit:
+    limit = parse_limit(text, name=name)
+    if limit.seconds is None:
+        raise UserError(f"{name} {text!r} is no time: write 3days or 12h")
+    return limit
+
+
+_LIMIT = SettingType("LIMIT", parse_limit)
+_AGE = SettingType("AGE", _age)
 
 _LINK, _MODELS, _FILES = Group("link and edges"), Group("models"), Group("files and views")
 _LINK_RARE, _MODELS_RARE, _FILES_RARE = (replace(group, rare=True) for group in (_LINK, _MODELS, _FILES))
@@ -91,6 +102,19 @@ class GroundConfig:
     record: Path | None = _FILES.option(
         PATH, None, "FILE.rrd, or a folder for one file an edge", shown_default="hvt-<edge>-<time>.rrd here"
     )
+    split: Limit | None = _FILES.option(
+        _LIMIT, None, "begin a new file of the recording after so much, at the next keyframe"
+    )
+    keep: tuple[Limit, ...] = _FILES.option(
+        _LIMIT,
+        (),
+        "remove recordings of the folder of --record that are older, or the oldest beyond so many bytes",
+        many=True,
+        shown_default="all are kept",
+    )
+    keep_video: Limit | None = _FILES.option(
+        _AGE, None, "remove the video of older recordings; stills, boxes and events stay until --keep"
+    )
     tracks: Path | None = _FILES.option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
@@ -111,6 +135,13 @@ class GroundConfig:
     quiet: bool = _FILES.switch("no status line")
 
     @property
+    def record_folder(self) -> Path | None:
+        """The folder of recordings; None where one file was named, or nothing."""
+        if self.record is None or (self.record.suffix == ".rrd" and not self.record.is_dir()):
+            return None
+        return self.record
+
+    @property
     def patience_s(self) -> float:
         """After so long an edge that is away has ended."""
         if self.patience is not None:
@@ -121,6 +152,7 @@ class GroundConfig:
 def check(config: GroundConfig) -> GroundConfig:
     """Return the configuration; `UserError` where settings contradict."""
     _check_files(config)
+    _check_retention(config)
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):
@@ -135,6 +167,21 @@ def check(config: GroundConfig) -> GroundConfig:
         classifier = EMBEDDED_CLASSIFIER if config.detector in (MOTION, EMBEDDED_DETECTOR) else DETECTOR
         return replace(config, classifier=classifier)
     return config
+
+
+def _check_retention(config: GroundConfig) -> None:
+    ages = [one for one in config.keep if one.seconds is not None]
+    for same in (ages, [one for one in config.keep if one not in ages]):
+        if len(same) > 1:
+            raise UserError(
+                f"--keep {same[0]} and --keep {same[1]} are both given: give one time and one size"
+            )
+    for name, given in (("--keep", config.keep[:1]), ("--keep-video", (config.keep_video,))):
+        if any(given) and config.record_folder is None:
+            raise UserError(
+                f"{name} {given[0]} needs a folder of recordings, and --record {config.record or 'is not given'}"
+                f"{' is a file' if config.record else ''}: give --record FOLDER/"
+            )
 
 
 def _check_files(config: GroundConfig) -> None:

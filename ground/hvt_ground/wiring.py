@@ -17,7 +17,7 @@ from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
-from hvt_common.units import bitrate_text
+from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording
 from hvt_ground.config import DETECTOR, GroundConfig
@@ -29,6 +29,8 @@ from hvt_ground.perception.pipeline import Pipeline, PipelineParts
 from hvt_ground.perception.stills.classify import CropReader, NoReader, Redetection, StillReader
 from hvt_ground.perception.stills.refine import Refiner
 from hvt_ground.perception.stills.vocabulary import Vocabulary
+from hvt_ground.recordings.row import RecordingRow
+from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
@@ -48,7 +50,8 @@ _LOCKSTEP_WAIT_S = 10.0
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
-    All that they write to is of ``outputs``; ``view`` is a viewer, None shows nothing live.
+    All that they write to is of ``outputs``; ``view`` is a viewer, None shows nothing live; ``index`` learns of the
+    recordings.
     """
 
     def __init__(
@@ -59,12 +62,14 @@ class SessionFactory:
         clock: Callable[[], int],
         outputs: Outputs,
         view: LiveView | None,
+        index: Sink[RecordingRow] | None = None,
     ) -> None:
         self._config = config
         self._models = models
         self._clock = clock
         self._outputs = outputs
         self._view = view
+        self._index = index
         self._paths: set[Path] = set()
         """Taken by this process."""
         self._naming = threading.Lock()
@@ -81,7 +86,7 @@ class SessionFactory:
         # In lockstep the edge waits, so that nothing need be lost to a slow disk.
         wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
         names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
-        open_recording = partial(self._opened, _recorder(settings), names)
+        open_recording = partial(self._opened, self._files(settings, split=config.split), names)
         sinks: list[Sink[Event]] = [
             self._outputs.open(f"recording of {edge}", open_recording, wait_s=wait_s, for_backlog=True)
         ]
@@ -113,9 +118,16 @@ class SessionFactory:
         stamp = time.strftime("%Y%m%d-%H%M%S")
         names = partial(_backlog_path, self._config.record, edge=info.edge, stamp=stamp)
         part = f"backlog recording of {info.edge}"
-        sink = self._outputs.open(part, partial(self._opened, _recorder(settings), names))
+        sink = self._outputs.open(part, partial(self._opened, self._files(settings, backlog=True), names))
         perception = make_backlog_perception(self._config, self._models, info=info)
         return BacklogRecording(info, sink=sink, perception=perception)
+
+    def _files(
+        self, settings: RecorderSettings, *, split: Limit | None = None, backlog: bool = False
+    ) -> Callable[[Path], SessionFiles]:
+        return lambda path: SessionFiles(
+            replace(settings, path=path), split=split, index=self._index, backlog=backlog
+        )
 
     def _opened(self, make: Callable[[Path], S], name: Callable[..., Path]) -> S:
         """A sink with a file; a name that could not be used is free again."""
@@ -145,10 +157,6 @@ class SessionFactory:
             },
             clocked=info.pace == "realtime",
         )
-
-
-def _recorder(settings: RecorderSettings) -> Callable[[Path], Recorder]:
-    return lambda path: Recorder(replace(settings, path=path))
 
 
 def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:

@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
-from hvt_common.units import bitrate_text, parse_bitrate, parse_duration_s, parse_share, parse_size
+from hvt_common.units import (
+    Limit,
+    bitrate_text,
+    parse_bitrate,
+    parse_duration_s,
+    parse_limit,
+    parse_share,
+    parse_size,
+)
 
 
 @pytest.mark.parametrize(
@@ -103,3 +111,26 @@ def test_any_text_gives_a_finite_value_or_a_sentence(parse, text):
 def test_bitrates_are_shown_with_three_digits(bps, text):
     """The status line would say a rate that nobody can read."""
     assert bitrate_text(bps) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "limit"),
+    [
+        ("1h", Limit(seconds=3600.0)),
+        ("14 days", Limit(seconds=1_209_600.0)),
+        ("2weeks", Limit(seconds=1_209_600.0)),
+        ("500MB", Limit(size_bytes=500_000_000)),
+        ("1.5tb", Limit(size_bytes=1_500_000_000_000)),
+    ],
+)
+def test_a_limit_is_an_age_or_an_amount(text, limit):
+    """Two weeks would be two seconds, or the settings that are printed could not be read again."""
+    assert parse_limit(text, name="--keep") == limit
+    assert parse_limit(str(limit), name="--keep") == limit
+
+
+@pytest.mark.parametrize("wrong", ["", "0", "14", "0.5s", "999kB", "3parsecs", "-1h", "1e9GB", "99999days"])
+def test_what_is_no_limit_is_refused(wrong):
+    """Recordings would be removed at once, or never."""
+    with pytest.raises(UserError, match="neither a time nor a size"):
+        parse_limit(wrong, name="--keep")

@@ -112,7 +112,7 @@ def restarts(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Restarts:
         began = len(shown(folder))
         edge = link.edge(*PLAYS)
         more_is_shown(folder, than=began + 10)
-        files = sorted((folder / "flights").iterdir())
+        files = sorted((folder / "flights").glob("*.rrd"))
         whole = ended(files[0])
         ground.kill()
         seen = len(shown(folder)) - began

@@ -90,6 +90,13 @@ def test_two_viewers(ground):
         ("confidence", "2", "0.01 to 1"),
         ("camera-motion", "yes", "off, flow"),
         ("wait", "-1s", "2s"),
+        ("split", "0", "1h, 14days or 200GB"),
+        ("split", "0h", "at least 1s"),
+        ("split", "10kB", "at least 1s or 1MB"),
+        ("keep", "3parsecs", "14days or 200GB"),
+        ("keep", "14", "14days or 200GB"),
+        ("keep", "-1h", "14days or 200GB"),
+        ("keep-video", "3GB", "3days"),
     ],
 )
 def test_a_value_that_is_not_accepted(ground, flag, value, accepted):
@@ -97,6 +104,27 @@ def test_a_value_that_is_not_accepted(ground, flag, value, accepted):
     sentence = ground(f"--{flag}", value)
     assert f"--{flag} '{value}'" in sentence
     assert accepted in sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--keep", "14days"), "--keep 1209600s needs a folder of recordings, and --record is not given"),
+        (
+            ("--keep", "14days", "--record", "flight.rrd"),
+            "--record flight.rrd is a file: give --record FOLDER/",
+        ),
+        (("--keep-video", "1h", "--record", "flight.rrd"), "--keep-video 3600s needs a folder"),
+        (
+            ("--keep", "1h", "--keep", "2h", "--record", "here"),
+            "--keep 3600s and --keep 7200s are both given",
+        ),
+        (("--keep", "1GB", "--keep", "2GB", "--record", "here"), "both given: give one time and one size"),
+    ],
+)
+def test_what_is_kept_where(ground, words, said):
+    """Nobody would know which recordings are removed, or that none are."""
+    assert said in ground(*words)
 
 
 @pytest.mark.parametrize("words", [("--bogus",), ("stray",)])

@@ -30,7 +30,7 @@ class SinkWriter(Sink[T_contra], Protocol[T_contra]):
 
     @property
     def path(self) -> Path | None:
-        """The file; None without one."""
+        """The file that was opened last; None without one."""
 
     def skipped(self, count: int) -> None:
         """So many items were left out before the next one."""

@@ -156,6 +156,7 @@ class QueuedSink(Generic[T]):
                     sink.skipped(skipped)
                     self._resumed = True
                 sink.log(item)
+                self._note_file(sink)
             sink.close(self._hurry)
         except Exception as error:  # noqa: BLE001 - whatever it is, everything else goes on
             if sink is not None:
@@ -173,6 +174,10 @@ class QueuedSink(Generic[T]):
             self._open, self._failing = True, False
             self._changed.notify_all()
         self._failures.works(self.part)
+
+    def _note_file(self, sink: SinkWriter[T]) -> None:
+        if sink.path is not None and sink.path != self.files[-1]:
+            self.files.append(sink.path)
 
     def _take(self) -> tuple[T, int] | None:
         """The next item, and how many were dropped before it; None at the end."""

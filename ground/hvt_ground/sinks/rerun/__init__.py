@@ -1,4 +1,4 @@
 """The Rerun recording and live view: `recorder` writes one session, `live_view` is the viewer that may watch.
 
-`sdk` has what a process sets up before.
+`recording_file` is one of the files of a session, `sdk` has what a process sets up before.
 """

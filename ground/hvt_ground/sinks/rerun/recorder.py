@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -17,7 +17,6 @@ from typing import Self
 import numpy as np
 from rerun.chunk import Chunk
 
-from hvt_common.errors import UserError
 from hvt_common.units import bitrate_text
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, Traffic, VideoSample
 from hvt_ground.sinks.rerun import blueprint as names
@@ -32,11 +31,12 @@ from hvt_ground.sinks.rerun.overlays import (
     OverlayEncoder,
 )
 from hvt_ground.sinks.rerun.palette import AMBER, GREY, VERMILLION, Rgb
+from hvt_ground.sinks.rerun.recording_file import RecordingFile
 from hvt_ground.sinks.rerun.rrd_file import RrdFile
 from hvt_ground.sinks.rerun.sdk import RecordingId
-from hvt_ground.sinks.rerun.static_data import class_chunk, legend_chunk, session_chunk, static_chunks
+from hvt_ground.sinks.rerun.static_data import session_chunk, static_chunks
 from hvt_ground.sinks.rerun.stills.rows import StillRows
-from hvt_ground.sinks.rerun.tables import TABLE_BYTES, CodedIdentity, LogText, SizeLimit, Table, TableRow
+from hvt_ground.sinks.rerun.tables import CodedIdentity, LogText, SizeLimit, TableRow
 
 __all__ = ["Recorder", "RecorderSettings"]
 
@@ -48,6 +48,8 @@ _PLOT_GAP_NS = 2_500_000_000
 """Plots have a hole where nothing was measured for longer."""
 _BYTES_EACH = {"boxes": 6, "identity": 2, "places": 4, "words": 5}
 """About what the component costs a track; others cost little more than their row."""
+_MOMENTARY = ("video", "text", "lines", "jpeg")
+"""Tables whose values hold for one frame: a file that begins later does not begin with them."""
 _LAYER_PATHS: dict[Layer, str] = {
     "tracks": names.TRACKS,
     "reported": names.REPORTED,
@@ -95,50 +97,108 @@ class Recorder:
         self._size_limit = SizeLimit()
         self._stills = StillRows(self._size_limit)
         self._class_ids: dict[tuple[str, int], int] = {}
-        """By name and level of brightness."""
-        self._legend: tuple[str, ...] = ()
-        self._classes_written: dict[Layer, int] = dict.fromkeys(LAYERS, 0)
-        self._contexts: dict[str, Chunk] = {}
-        """Static values since the last compaction, by what they are."""
-        self._tables: dict[tuple[str, str], Table] = {}
-        self._compact_bytes = settings.compact_bytes
-        self._pending_bytes = 0
+        """By name and level of brightness; of all files, which may be opened together."""
+        self._shown: dict[tuple[str, str], TableRow] = {}
+        """What is on the screen: the newest row of each table whose values hold until the next."""
         self._last_sample: int | None = None
         self._awaits_keyframe = {False: False, True: False}
         """Whether live or stored video begins anew at its next keyframe."""
         self._skipped = 0
-        self._samples = 0
-        self._first_sample = 0
         self._settings = settings
         self._traffic_end: tuple[int, int] | None = None
         """Where the plots would end, had no more come."""
-        self._closed = False
-        self._output = _output(settings)
-        self.path = settings.path
+        self.file = self._into = self.open_file(settings.path)
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is written to; None in a viewer."""
+        return self.file.path
 
     @property
     def size_bytes(self) -> int:
         """The size of the file so far; 0 without one."""
-        return self._output.size_bytes
+        return self.file.size_bytes
 
-    def log(self, item: Event) -> None:
+    def log(self, item: Event, *, into: RecordingFile | None = None) -> None:
         """Record an event. An access unit that no decoder could use at its place is left out.
 
-        What was ``stored`` may lie before what was logged already: whoever logs it vouches for its place.
+        What was ``stored`` may lie before what was logged already: whoever logs it vouches for its place. It may go
+        ``into`` another file (`open_file`).
         """
-        if self._closed or not isinstance(item, FrameEvent):
+        self._into = file = into or self.file
+        if file.closed or not isinstance(item, FrameEvent):
             return
-        rows = [*self._gap_rows(item), *self._rows(item)]
-        chunks = [one if isinstance(one, Chunk) else self._add(one, item) for one in rows]
-        try:
-            if chunks:
-                self._output.write(chunks)
-        except UserError:
-            if self.path is None:
-                raise
-            self._compact()  # the same in fewer bytes, this event included, may be what the disk has room for
-        if self._pending_bytes >= self._compact_bytes:
-            self._compact()
+        at = item.frame_index, item.capture_ns
+        rows = [
+            one if isinstance(one, Chunk) else replace(one, at=one.at or at)
+            for one in (*self._gap_rows(item), *self._rows(item))
+        ]
+        file.write(rows)
+        if self.path is not None and not (isinstance(item, Overlay) and item.stored):
+            for row in rows:
+                if not isinstance(row, Chunk):
+                    self._note_shown(row)
+
+    def open_file(self, path: Path | None) -> RecordingFile:
+        """Another file of the session, or its viewer: opened together they are shown as one.
+
+        Whoever opens one closes it, but for `file`.
+        """
+        settings = self._settings
+        screen = names.screen(
+            base_size=settings.base_size,
+            fps=settings.fps,
+            budget_bps=settings.budget_bps,
+            clocked=settings.clocked,
+            live=path is None,
+        )
+        chunks = static_chunks(settings.edge_id, _facts(settings, f"up to {settings.fps:g} fps"))
+        recording_id = RecordingId(settings.edge_id, settings.session)
+        output: RrdFile | LiveRecording
+        if path is not None:
+            output = RrdFile(path, recording_id, screen, chunks)
+        else:
+            assert settings.live_url is not None, "a recording goes into a file or a viewer"
+            output = LiveRecording(settings.live_url, recording_id, screen, chunks)
+        return RecordingFile(output, size_limit=self._size_limit, compact_bytes=settings.compact_bytes)
+
+    def begins_with(self, item: Event) -> bool:
+        """Whether a file may begin with this: a live keyframe that a decoder can start at."""
+        return (
+            isinstance(item, VideoSample)
+            and item.keyframe
+            and not item.stored
+            and self._decodable(item)
+            and _has_parameter_sets(item.data)
+        )
+
+    def go_on_in(self, file: RecordingFile, *, at: tuple[int, int]) -> None:
+        """Write into ``file`` from now on, which begins ``at`` (frame and capture time) with what is shown then.
+
+        The former one is left open, for `close_file`.
+        """
+        self.file = self._into = file
+        cost = self._size_limit.logged_bytes
+        contexts = [one for layer in LAYERS for one in self._new_classes(layer)]
+        # What is of a later time is in there already.
+        shown = [replace(row, at=at) for row in self._shown.values() if row.at is not None and row.at < at]
+        file.write([*contexts, *shown])
+        self._size_limit.logged_bytes = cost  # the price of another file is not the stills'
+
+    def close_file(self, file: RecordingFile, hurry: threading.Event | None = None) -> None:
+        """Compact what is left of a file and close it; a second call does nothing.
+
+        Once ``hurry`` is set no footer is added, which may take seconds.
+        """
+        if file.closed:
+            return
+        came = None
+        if file.samples:  # what came may be less than the edge had in mind
+            settings = self._settings
+            rate = file.samples / (file.last_sample - file.first_sample + 1) * settings.fps
+            frames = f"{rate:.3g} of {settings.fps:g} fps came"
+            came = session_chunk(settings.edge_id, _facts(settings, frames))
+        file.close(hurry, session=came)
 
     def skipped(self, count: int) -> None:
         """Video goes on at its next keyframe, and the log says what is missing."""
@@ -146,21 +206,8 @@ class Recorder:
         self._awaits_keyframe = {False: True, True: True}
 
     def close(self, hurry: threading.Event | None = None) -> None:
-        """Compact what is left and close the file or the viewer's connection; a second call does nothing.
-
-        Once ``hurry`` is set no footer is added, which may take seconds.
-        """
-        if self._closed:
-            return
-        self._closed = True
-        try:
-            if self._samples:  # what came may be less than the edge had in mind
-                came = session_chunk(self._settings.edge_id, _facts(self._settings, self._came()))
-                self._output.write([came])
-                self._contexts["session"] = came
-            self._compact()
-        finally:
-            self._output.close(hurry)
+        """Close the file, or the viewer's connection (`close_file`)."""
+        self.close_file(self.file, hurry)
 
     def __enter__(self) -> Self:
         return self
@@ -170,21 +217,19 @@ class Recorder:
     ) -> None:
         self.close()
 
-    def _compact(self) -> None:
-        chunks = [*self._contexts.values(), *(table.take() for table in self._tables.values() if table)]
-        self._contexts.clear()
-        self._pending_bytes = 0
-        if chunks:
-            self._output.compact(chunks)
-
-    def _add(self, row: TableRow, event: FrameEvent) -> Chunk:
-        """Add a row to its table."""
-        table = self._tables.setdefault((row.path, row.columns), Table(row.path, row.columns))
-        if not table:
-            self._size_limit.logged_bytes += TABLE_BYTES
-        self._pending_bytes += row.size_bytes
-        self._size_limit.logged_bytes += row.size_bytes
-        return table.add(*(row.at or (event.frame_index, event.capture_ns)), row.value)
+    def _note_shown(self, row: TableRow) -> None:
+        """Stored stills lie before others, and may be shown all the same."""
+        if row.columns in _MOMENTARY or row.at is None:
+            return
+        if row.columns == "place":  # moves what is there
+            patch = self._shown.get((row.path, "patch"))
+            if patch is not None and patch.value is not None:
+                moved = replace(patch.value, place=row.value)
+                self._shown[row.path, "patch"] = replace(patch, value=moved)
+            return
+        before = self._shown.get((row.path, row.columns))
+        if before is None or before.at is None or before.at <= row.at:
+            self._shown[row.path, row.columns] = row
 
     # What each event writes
 
@@ -217,13 +262,11 @@ class Recorder:
             return []
         size = len(sample.data)
         self._size_limit.received_bytes += size
+        self._into.count(sample.frame_index, stored=sample.stored)
         if sample.stored:
             self._backlog_overlays.earn(size)
         else:
-            if self._last_sample is None:
-                self._first_sample = sample.frame_index
             self._last_sample = sample.frame_index
-            self._samples += 1
             self._overlays.earn(size)
         return [TableRow(names.VIDEO, "video", sample.data, size)]
 
@@ -280,16 +323,9 @@ class Recorder:
 
     def _new_classes(self, layer: Layer) -> list[Chunk]:
         """Names and colours, where some are new to the layer."""
-        if self._classes_written[layer] == len(self._class_ids):
-            return []
-        self._classes_written[layer] = len(self._class_ids)
-        self._contexts[layer] = class_chunk(_LAYER_PATHS[layer], self._class_ids)
-        shown = tuple(dict.fromkeys(name for name, _ in self._class_ids))
-        if shown == self._legend:
-            return [self._contexts[layer]]
-        self._legend = shown
-        self._contexts["legend"] = legend_chunk(shown, size=self._settings.base_size)
-        return [self._contexts[layer], self._contexts["legend"]]
+        return self._into.new_classes(
+            layer, _LAYER_PATHS[layer], self._class_ids, size=self._settings.base_size
+        )
 
     def _refinement(self, refinement: Refinement) -> list[TableRow]:
         if refinement.reason == ON_DEMAND and refinement.track_id is not None:
@@ -318,27 +354,6 @@ class Recorder:
             *(TableRow(path, "lines", (np.nan,) * len(values), at=end) for path, values in plots.items()),
             *rows,
         ]
-
-    def _came(self) -> str:
-        frames = (self._last_sample or 0) - self._first_sample + 1
-        return f"{self._samples / frames * self._settings.fps:.3g} of {self._settings.fps:g} fps came"
-
-
-def _output(settings: RecorderSettings) -> RrdFile | LiveRecording:
-    """The file, or the viewer, that opens as a screen."""
-    screen = names.screen(
-        base_size=settings.base_size,
-        fps=settings.fps,
-        budget_bps=settings.budget_bps,
-        clocked=settings.clocked,
-        live=settings.path is None,
-    )
-    chunks = static_chunks(settings.edge_id, _facts(settings, f"up to {settings.fps:g} fps"))
-    recording_id = RecordingId(settings.edge_id, settings.session)
-    if settings.path is not None:
-        return RrdFile(settings.path, recording_id, screen, chunks)
-    assert settings.live_url is not None, "a recording goes into a file or a viewer"
-    return LiveRecording(settings.live_url, recording_id, screen, chunks)
 
 
 def _facts(settings: RecorderSettings, frames: str) -> dict[str, str]:

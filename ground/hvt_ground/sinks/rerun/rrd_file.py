@@ -12,6 +12,7 @@ in memory for as long as it records. At the end the SDK writes the compacted chu
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import os
 import shutil
@@ -46,8 +47,9 @@ _filters = threading.Lock()
 class RrdFile:
     """A recording on disk; each call has written its bytes when it returns.
 
-    It opens with ``screen`` and what holds for all of it. Raises `UserError` where the file cannot be created, or
-    (later) written any further: what was written before is whole then.
+    It opens with ``screen`` and what holds for all of it. Until it is closed its file is locked (flock), which tells
+    others that it is written to, in whichever process, and ends with the process. Raises `UserError` where the file
+    cannot be created, or (later) written any further: what was written before is whole then.
     """
 
     def __init__(
@@ -69,6 +71,7 @@ class RrdFile:
             self._write(stream[:_STREAM_HEADER_BYTES] + _messages(stream), at=0)
         except UserError:
             self._release()
+            os.close(self._file)
             if fresh:
                 path.unlink(missing_ok=True)
             raise
@@ -87,11 +90,13 @@ class RrdFile:
         """Add a footer, unless ``hurry`` is set, close the file and release the SDK's stream."""
         removed = os.fstat(self._file).st_nlink == 0
         self._release()
-        if not removed and self.path.is_file() and not (hurry and hurry.is_set()):
-            self._add_footer(hurry)
+        try:
+            if not removed and self.path.is_file() and not (hurry and hurry.is_set()):
+                self._add_footer(hurry)
+        finally:
+            os.close(self._file)  # and with it the lock
 
     def _release(self) -> None:
-        os.close(self._file)
         with releasing_recordings():
             self._recording.disconnect()
             self._stream.read()  # its own farewell, or the SDK warns that it was dropped
@@ -177,6 +182,9 @@ def _created(path: Path) -> int:
     if not path.parent.is_dir():
         raise UserError(f"recording {path} cannot be created: its folder {path.parent} does not exist")
     try:
-        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
     except OSError as error:
         raise UserError(f"recording {path} cannot be created: {error.strerror}") from error
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    return file

@@ -1,0 +1,123 @@
+"""``hvt-ground recordings list | find``: which recordings are there, and in which is what."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+from hvt_common.errors import Parser, UserError
+from hvt_common.runtime.reporting import say
+from hvt_common.units import SECOND_NS, parse_limit
+from hvt_ground.recordings.database import read_index
+from hvt_ground.recordings.row import RecordingRow
+
+__all__ = ["run"]
+
+_HEAD = ("file", "edge", "begin (UTC)", "length", "MB", "frames", "stills", "tracks by class")
+
+
+def run(argv: Sequence[str]) -> int:
+    """Print what the index says; `UserError` where there is none."""
+    arguments = _parser().parse_args(argv)
+    wanted = _wanted(arguments) if arguments.command == "find" else lambda _: True
+    rows = [row for row in read_index(arguments.folder) if wanted(row)]
+    if arguments.json:
+        say(json.dumps([_as_json(row, arguments.folder) for row in rows], indent=2))
+        return 0
+    table = [_HEAD, *map(_cells, rows)]
+    widths = [max(len(line[column]) for line in table) for column in range(len(_HEAD))]
+    for line in table:
+        say("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
+    return 0
+
+
+def _wanted(arguments: argparse.Namespace) -> Callable[[RecordingRow], bool]:
+    since_ns = None if arguments.since is None else _since_ns(arguments.since)
+    until_ns = None if arguments.until is None else _since_ns(arguments.until)
+
+    def wanted(row: RecordingRow) -> bool:
+        begin_ns, end_ns = row.begin_ns, row.end_ns
+        return (
+            (arguments.name is None or arguments.name in row.classes)
+            and (arguments.edge is None or row.edge == arguments.edge)
+            and (since_ns is None or (end_ns is not None and end_ns >= since_ns))
+            and (until_ns is None or (begin_ns is not None and begin_ns <= until_ns))
+        )
+
+    return wanted
+
+
+def _since_ns(text: str) -> int:
+    """Unix time of ``2h`` ago, or of a date, UTC unless it says otherwise."""
+    try:
+        date = datetime.fromisoformat(text)
+    except ValueError:
+        try:
+            seconds = parse_limit(text, name="the time").seconds
+        except UserError:
+            seconds = None
+        if seconds is None:
+            raise UserError(f"{text!r} is no time: write 2h, 3days, 2026-11-22 or 2026-11-22T13:00") from None
+        return time.time_ns() - round(seconds * SECOND_NS)
+    return round((date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()) * SECOND_NS
+
+
+def _cells(row: RecordingRow) -> tuple[str, ...]:
+    lasted = ""
+    if row.begin_ns is not None and row.end_ns is not None:
+        minutes, seconds = divmod(round((row.end_ns - row.begin_ns) / SECOND_NS), 60)
+        lasted = f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
+    notes = [] if row.video else ["(video removed)"]
+    notes += [] if row.whole else ["(being written, or its ground was killed)"]
+    classes = ", ".join(f"{count} {name}" for name, count in row.classes.items())
+    cells = (
+        row.file,
+        row.edge,
+        _utc(row.begin_ns),
+        lasted,
+        f"{row.size_bytes / 1e6:.1f}",
+        str(row.frames),
+        str(row.stills),
+        " ".join([classes, *notes]).strip(),
+    )
+    # Names come from the wire: none may move the cursor.
+    return tuple("".join(one if one.isprintable() else "?" for one in cell) for cell in cells)
+
+
+def _as_json(row: RecordingRow, folder: Path) -> dict[str, object]:
+    return asdict(row) | {
+        "path": str(folder / row.file),
+        "begin": _utc(row.begin_ns) or None,
+        "end": _utc(row.end_ns) or None,
+    }
+
+
+def _utc(unix_ns: int | None) -> str:
+    if unix_ns is None:
+        return ""
+    try:
+        return datetime.fromtimestamp(unix_ns // SECOND_NS, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    except (ValueError, OverflowError, OSError):
+        return ""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog="hvt-ground recordings", description=__doc__)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    listing = commands.add_parser("list", help="all recordings of a folder")
+    find = commands.add_parser("find", help="those of an edge, of a time, with a class")
+    for one in (listing, find):
+        one.add_argument("folder", metavar="FOLDER", type=Path, help="the folder that --record names")
+        one.add_argument("--json", action="store_true", help="as JSON, with paths and times in nanoseconds")
+    find.add_argument(
+        "--class", dest="name", metavar="CLASS", help="a track was of this class, such as truck"
+    )
+    find.add_argument("--edge", metavar="ID", help="of this edge")
+    find.add_argument("--since", metavar="TIME", help="not over before: 2h ago, or a date (UTC)")
+    find.add_argument("--until", metavar="TIME", help="begun before")
+    return parser

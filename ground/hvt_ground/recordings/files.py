@@ -1,0 +1,171 @@
+"""Files of recordings on disk: whether one is written to, what is in one, how one loses its video."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+import subprocess
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import Chunk, RrdReader
+
+from hvt_ground.recordings.row import FileAccount, RecordingRow
+from hvt_ground.sinks.rerun.sdk import viewer_environment, viewer_program
+
+__all__ = ["SCRATCH", "claimed", "described", "is_claimed", "is_own_name", "remove_video"]
+
+SCRATCH = ".part"
+"""Ends the name of a copy that is being made of a recording."""
+_SPARE_BYTES = 2 * 2**20
+_PATIENCE_S = 600.0
+_VIDEO = "/base/video"
+_LAYERS = ("/base/tracks", "/base/reported", "/base/refined")
+_OWN = re.compile(r"hvt-.+-\d{8}-\d{6}(-\d+|-backlog)*\.rrd")
+_STILL = re.compile(r"(late )?still #(\d+) ")
+
+
+def is_own_name(name: str) -> bool:
+    """Whether a ground gives such names of its own accord: a copy that somebody named is his."""
+    return _OWN.fullmatch(name) is not None
+
+
+@contextmanager
+def claimed(path: Path) -> Iterator[bool]:
+    """Whether a file is nobody's for as long: none writes it (`RrdFile` locks it), none else has claimed it.
+
+    Not where nobody can tell, as on a file system without locks.
+    """
+    file = -1
+    try:
+        try:
+            file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+        else:
+            yield True
+    finally:
+        if file >= 0:
+            os.close(file)
+
+
+def is_claimed(path: Path) -> bool:
+    """Whether some process writes the file, or has claimed it."""
+    with claimed(path) as ours:
+        return not ours
+
+
+def described(path: Path) -> RecordingRow | None:
+    """What a file says of itself; None where it is no recording of ours."""
+    content = _Content()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that there is no footer
+            reader = RrdReader(path)
+        (entry,) = reader.recordings()
+        for chunk in reader.stream():
+            content.add(chunk)
+        state = path.stat()
+    except (OSError, RuntimeError, ValueError, LookupError):
+        return None
+    edge = entry.application_id.removeprefix("hvt-")
+    session = entry.recording_id.removeprefix(f"{edge}-")
+    if not re.fullmatch(r"[0-9a-f]+", session):
+        return None
+    account = content.account()
+    return RecordingRow(
+        file=path.name,
+        edge=edge,
+        session=session,
+        begin_ns=account.begin_ns,
+        end_ns=account.end_ns,
+        written_ns=state.st_mtime_ns,
+        size_bytes=state.st_size,
+        frames=content.frames,
+        stills=account.stills,
+        classes=account.classes,
+        backlog="-backlog" in path.name,
+        video=content.video,
+        whole=True,
+    )
+
+
+class _Content:
+    """What the chunks of a recording have, for the index."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.video = False
+        self._account = FileAccount()
+        self._names: dict[int, str] = {}
+        self._tracks: dict[tuple[int, int], None] = {}
+        """Track and class number of all boxes; the names may come later."""
+
+    def add(self, chunk: Chunk) -> None:
+        """Take a chunk."""
+        path = chunk.entity_path
+        if path == _VIDEO:
+            self.video = True
+            self.frames += len(self._span(chunk))
+        elif path in _LAYERS:
+            self._span(chunk)
+            for context in _values(chunk, "AnnotationContext:context"):
+                for one in context[0]:
+                    self._names[one["class_id"]] = one["class_description"]["info"]["label"]
+            for ids, classes in zip(_values(chunk, "track_id"), _values(chunk, ":class_ids"), strict=False):
+                self._tracks |= dict.fromkeys(zip(ids, classes, strict=False))
+        elif path == "/events":
+            for text in _values(chunk, "TextLog:text"):
+                if found := _STILL.match(text[0]):
+                    self._account.still(int(found[2]) + (2**31 if found[1] else 0))
+
+    def account(self) -> FileAccount:
+        """All of it."""
+        for track, number in self._tracks:
+            self._account.track(track, self._names.get(number, "?"))
+        return self._account
+
+    def _span(self, chunk: Chunk) -> list[int]:
+        batch = chunk.to_record_batch()
+        if "capture_time" not in batch.schema.names:
+            return []
+        times: list[int] = sorted(batch.column("capture_time").cast("int64").to_pylist())
+        for at_ns in times[:1] + times[-1:]:
+            self._account.span(at_ns)
+        return times
+
+
+def remove_video(path: Path) -> None:
+    """Write a recording without its video in its place, whole or not at all; its age stays.
+
+    Raises `OSError` or `subprocess.SubprocessError` where that cannot be done.
+    """
+    scratch, state = path.with_name(path.name + SCRATCH), path.stat()
+    if shutil.disk_usage(path.parent).free < state.st_size + _SPARE_BYTES:
+        raise OSError(None, "the disk has no room for a copy without video", str(path))
+    try:
+        # By Rerun's own program: it keeps screen and footer, and what it takes in memory is not the ground's.
+        command = [
+            *map(str, (viewer_program(), "rrd", "filter", "--drop-entity", _VIDEO, path, "-o", scratch))
+        ]
+        subprocess.run(  # noqa: S603
+            command, check=True, capture_output=True, timeout=_PATIENCE_S, env=viewer_environment()
+        )
+        os.utime(scratch, ns=(state.st_atime_ns, state.st_mtime_ns))
+        scratch.replace(path)
+    finally:
+        with suppress(OSError):
+            scratch.unlink(missing_ok=True)
+
+
+def _values(chunk: Chunk, component: str) -> Iterator[Any]:
+    batch = chunk.to_record_batch()
+    for field, column in zip(batch.schema, batch.columns, strict=True):
+        if (field.metadata or {}).get(b"rerun:component", b"").decode().endswith(component):
+            yield from (value for value in column.to_pylist() if value is not None)

@@ -1,0 +1,145 @@
+"""``hvt-ground recordings``: the flight with the truck is found, and what cannot be is said in one sentence."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+import hvt_ground.cli
+from hvt_common.units import SECOND_NS
+from hvt_ground.recordings.database import INDEX, Index, read_index
+from hvt_ground.recordings.row import RecordingRow
+
+NOON_NS = 1_591_012_800 * SECOND_NS
+"""2020-06-01T12:00:00Z."""
+
+
+def row(file: str, edge: str, begin_ns: int, classes: dict[str, int], **changes: object) -> RecordingRow:
+    """An hour."""
+    end_ns = begin_ns + 3600 * SECOND_NS
+    values = {"size_bytes": 135_000_000, "frames": 54_000, "stills": 31, "whole": True}
+    values |= {"written_ns": end_ns, "session": "00ff", "classes": classes}
+    return RecordingRow(file=file, edge=edge, begin_ns=begin_ns, end_ns=end_ns, **(values | changes))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With three recordings of two edges."""
+    index = Index(tmp_path)
+    index.put(row("b.rrd", "uav-1", NOON_NS, {"car": 12, "truck": 1}))
+    index.put(row("a.rrd", "uav-1", NOON_NS + 86_400 * SECOND_NS, {"car": 3}, video=False))
+    now_ns = time.time_ns()
+    index.put(row("c.rrd", "uav-2", now_ns - 3000 * SECOND_NS, {"truck\x1b[2J": 1}, whole=False))
+    index.close()
+    return tmp_path
+
+
+def found(capsys: pytest.CaptureFixture[str], *words: object) -> list[str]:
+    """The files that the command prints."""
+    assert hvt_ground.cli.main(["recordings", *map(str, words)]) == 0
+    return [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]]
+
+
+def test_the_table_has_them_in_the_order_of_their_time(folder, capsys):
+    """One would have to know the names of the files by heart."""
+    assert hvt_ground.cli.main(["recordings", "list", str(folder)]) == 0
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split()[:3] == ["file", "edge", "begin"]
+    assert [" ".join(line.split()) for line in lines[:2]] == [
+        "b.rrd uav-1 2020-06-01T12:00:00Z 1:00:00 135.0 54000 31 12 car, 1 truck",
+        "a.rrd uav-1 2020-06-02T12:00:00Z 1:00:00 135.0 54000 31 3 car (video removed)",
+    ]
+    assert "truck?[2J (being written" in lines[2], "a name from the wire would move the cursor"
+
+
+@pytest.mark.parametrize(
+    ("words", "files"),
+    [
+        ((), ["b.rrd", "a.rrd", "c.rrd"]),
+        (("--class", "truck"), ["b.rrd"]),
+        (("--class", "zebra"), []),
+        (("--edge", "uav-2"), ["c.rrd"]),
+        (("--since", "10min"), ["c.rrd"]),
+        (("--since", "2020-06-02"), ["a.rrd", "c.rrd"]),
+        (("--since", "2020-06-01T12:30", "--until", "2020-06-01T12:40+00:00"), ["b.rrd"]),
+        (("--until", "2020-06-02T13:30+02:00"), ["b.rrd"]),
+        (("--class", "car", "--since", "2020-06-02", "--edge", "uav-1"), ["a.rrd"]),
+    ],
+)
+def test_find(folder, capsys, words, files):
+    """The hour that matters would be searched among hundreds."""
+    assert found(capsys, "find", folder, *words) == files
+
+
+def test_as_json(folder, capsys):
+    """A program would have to read a table."""
+    assert hvt_ground.cli.main(["recordings", "find", str(folder), "--class", "truck", "--json"]) == 0
+    (one,) = json.loads(capsys.readouterr().out)
+    assert one["path"] == str(folder / "b.rrd")
+    assert (one["begin_ns"], one["classes"], one["end"]) == (
+        NOON_NS,
+        {"car": 12, "truck": 1},
+        "2020-06-01T13:00:00Z",
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("list", "{here}/empty"), "has no index of recordings"),
+        (("find", "{here}/missing"), "has no index of recordings"),
+        (("list", "{here}/damaged"), "cannot be read"),
+        (("find", "{here}", "--since", "lately"), "'lately' is no time: write 2h"),
+        (("find", "{here}", "--since", "5GB"), "'5GB' is no time"),
+        (("find", "{here}", "--class"), "expected one argument"),
+        (("list", "{here}", "--class", "car"), "unrecognized arguments"),
+        (("list",), "FOLDER"),
+        (("burn", "{here}"), "burn"),
+        ((), "COMMAND"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(folder, capsys, words, said):
+    """A traceback, or an empty table, which says that there was no truck."""
+    (folder / "empty").mkdir()
+    (folder / "damaged").mkdir()
+    (folder / "damaged" / INDEX).write_text("no database " * 100)
+    assert hvt_ground.cli.main(["recordings", *(one.format(here=folder) for one in words)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert said in err
+
+
+def test_a_folder_that_nobody_may_write_is_read(folder):
+    """An archive on a card that is locked could not be searched."""
+    with tempfile.TemporaryDirectory() as archive:
+        shutil.copy(folder / INDEX, archive)
+        Path(archive, INDEX).chmod(0o444)
+        Path(archive).chmod(0o555)
+        user = os.geteuid()
+        if user == 0:  # who may write everywhere
+            os.seteuid(65534)
+        try:
+            rows = read_index(Path(archive))
+        finally:
+            os.seteuid(user)
+            Path(archive).chmod(0o755)
+    assert [one.file for one in rows] == ["b.rrd", "a.rrd", "c.rrd"]
+
+
+def test_it_needs_no_rerun(folder):
+    """To look something up would take a second, and the viewer's package."""
+    program = (
+        "import sys; from hvt_ground.cli import main;"
+        f"main(['recordings', 'list', {str(folder)!r}]); print('rerun' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"

@@ -1,0 +1,342 @@
+"""The index of a folder of recordings: it survives kills and damage, disturbs no flight, removes what it should."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import Limit
+from hvt_ground.events import Event, Refinement, VideoSample
+from hvt_ground.recordings.database import INDEX, read_index
+from hvt_ground.recordings.folder import IndexWriter, RecordingsFolder
+from hvt_ground.recordings.retention import Retention
+from hvt_ground.recordings.row import RecordingRow
+from hvt_ground.recordings.session_files import SessionFiles
+from hvt_ground.sinks import QueuedSink
+from hvt_ground.sinks.rerun.live_view import viewer_program
+from hvt_ground.sinks.rerun.recorder import RecorderSettings
+from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
+from programs.processes import eventually
+from programs.rrd import Recording
+
+FRAMES = 60
+SPLIT = Limit(seconds=2.0)
+NAMES = [f"hvt-uav-1-20261122-130000-000{number}.rrd" for number in (1, 2)]
+ALL = Retention()
+
+
+@pytest.fixture(scope="module")
+def events() -> list[Event]:
+    """Four seconds: two files."""
+    drawn = drawn_frames(FRAMES)
+    return [one for one, _ in session(drawn, coded(drawn, kbps=200, keyint=10), tracks=6, total_kbps=400)]
+
+
+def settings(folder: Path) -> RecorderSettings:
+    """Of a session whose files have names of ours."""
+    path = folder / "hvt-uav-1-20261122-130000.rrd"
+    return RecorderSettings(path, "uav-1", "00ff", (320, 192), 15.0, 400_000.0)
+
+
+def fly(folder: Path, events: list[Event], retention: Retention = ALL) -> Failures:
+    """Record them with an index, to the end."""
+    failures = Failures(time.time_ns)
+    with RecordingsFolder(folder, retention, failures=failures) as index:
+        index.open()
+        sink = SessionFiles(settings(folder), split=SPLIT, index=index)
+        for event in events:
+            sink.log(event)
+        sink.close()
+    return failures
+
+
+def look(folder: Path, retention: Retention = ALL, *, later_s: float = 0.0) -> list[RecordingRow]:
+    """Start a ground there, so much later; what the index says then."""
+    IndexWriter(folder, retention, now_ns=lambda: time.time_ns() + round(later_s * 1e9)).close()
+    return read_index(folder)
+
+
+def test_it_says_what_is_in_each_file(tmp_path, events):
+    """The hour with the truck would be found by opening them all."""
+    failures = fly(tmp_path, events)
+    first, second = read_index(tmp_path)
+    assert [first.file, second.file] == NAMES
+    assert (first.edge, first.session, first.whole, first.video) == ("uav-1", "00ff", True, True)
+    assert (first.begin_ns, second.begin_ns) == (START_NS, START_NS + 30 * STEP_NS)
+    assert [one.size_bytes for one in (first, second)] == [(tmp_path / one).stat().st_size for one in NAMES]
+    assert first.classes["truck"] == 2
+    stills = {one.still_sequence for one in events if isinstance(one, Refinement)}
+    assert first.stills + second.stills == len(stills)
+    assert failures.parts == ()
+
+
+def test_files_tell_the_same_when_the_index_is_lost(tmp_path, events):
+    """After a damaged card everything would have to be searched by hand."""
+    fly(tmp_path, events)
+    before = read_index(tmp_path)
+    (tmp_path / INDEX).unlink()
+    (tmp_path / "mine.rrd").write_bytes((tmp_path / NAMES[0]).read_bytes())
+    (tmp_path / "hvt-uav-1-20261122-140000.rrd").write_text("no recording")
+    after = look(tmp_path)
+    assert [replace(one, written_ns=0) for one in after] == [replace(one, written_ns=0) for one in before]
+
+
+@pytest.mark.parametrize("damage", ["text", "zeros", "half", "empty"])
+def test_a_damaged_index_is_set_aside_and_made_anew(tmp_path, events, caplog, damage):
+    """No flight could be recorded with an index, until somebody removes a file that he does not know."""
+    fly(tmp_path, events)
+    index = tmp_path / INDEX
+    data = index.read_bytes()
+    index.write_bytes(
+        {
+            "text": b"this is no database at all " * 50,
+            "zeros": data[:4096] + bytes(len(data) - 4096),
+            "half": data[: len(data) // 2 // 4096 * 4096],
+            "empty": b"",
+        }[damage]
+    )
+    with caplog.at_level(logging.WARNING):
+        assert [one.file for one in look(tmp_path)] == NAMES
+    aside = list(tmp_path.glob(f"{INDEX}.damaged-*"))
+    assert len(aside) == (damage != "empty")
+    assert len(caplog.messages) == (damage != "empty")
+
+
+@pytest.mark.parametrize("how", ["locked", "no file"])
+def test_an_index_that_cannot_be_written_disturbs_no_flight(tmp_path, events, how):
+    """A backup program that holds the index would end the recording."""
+    look(tmp_path)
+    if how == "no file":
+        for one in tmp_path.iterdir():
+            one.unlink()
+        (tmp_path / INDEX).mkdir()
+    blocker = sqlite3.connect(":memory:" if how == "no file" else tmp_path / INDEX, isolation_level=None)
+    failures = Failures(time.time_ns)
+    with closing(blocker), RecordingsFolder(tmp_path, ALL, failures=failures) as index:
+        blocker.execute("BEGIN EXCLUSIVE")
+        index.open()
+        sink = SessionFiles(settings(tmp_path), split=SPLIT, index=index)
+        began_s = time.monotonic()
+        for event in events:
+            sink.log(event)
+        sink.close()
+        assert time.monotonic() - began_s < 5, "nobody waits for it"
+        eventually(lambda: failures.parts, within_s=20, what="it is said")
+        assert [(one.part, one.working) for one in failures.parts] == [("recordings index", False)]
+        blocker.execute("ROLLBACK")
+        if how == "no file":
+            (tmp_path / INDEX).rmdir()
+        eventually(lambda: failures.parts[0].working, within_s=60, what="it works again")
+    assert [one.file for one in read_index(tmp_path)] == NAMES, "what it missed it reads from the files"
+
+
+def test_an_index_that_is_removed_in_flight_is_made_anew(tmp_path, events):
+    """All that came after it would be written to a file that is in no folder."""
+    failures = Failures(time.time_ns)
+    with RecordingsFolder(tmp_path, ALL, failures=failures) as index:
+        index.open()
+        sink = SessionFiles(settings(tmp_path), split=SPLIT, index=index)
+        eventually(lambda: (tmp_path / INDEX).exists() and read_index(tmp_path), within_s=20, what="a row")
+        for one in tmp_path.glob(f"{INDEX}*"):
+            one.unlink()
+        for event in events:
+            sink.log(event)
+        eventually((tmp_path / INDEX).exists, within_s=20, what="it is there again")
+        sink.close()
+        eventually(lambda: failures.parts[0].working, within_s=20, what="it works again")
+    assert [one.file for one in look(tmp_path)] == NAMES
+
+
+def test_by_age_and_by_bytes(tmp_path, events):
+    """The disk is full after a month."""
+    fly(tmp_path, events)
+    day = Retention((Limit(seconds=86_400),))
+    assert len(look(tmp_path, day, later_s=80_000)) == 2
+    first, second = read_index(tmp_path)
+    least = Retention((Limit(size_bytes=second.size_bytes),))
+    assert [one.file for one in look(tmp_path, least)] == [second.file]
+    assert not (tmp_path / first.file).exists()
+    assert look(tmp_path, day, later_s=90_000) == []
+    assert list(tmp_path.glob("*.rrd")) == []
+
+
+def test_what_somebody_removed_does_not_count(tmp_path, events):
+    """Another would be removed to make room that is there."""
+    fly(tmp_path, events)
+    rows = read_index(tmp_path)
+    both = Retention((Limit(size_bytes=sum(one.size_bytes for one in rows)),))
+    third = "hvt-uav-1-20261122-130000-0003.rrd"
+    with closing(IndexWriter(tmp_path, both)) as writer:
+        (tmp_path / NAMES[1]).rename(tmp_path / third)
+        writer.log(replace(rows[1], file=third))
+    assert [one.file for one in read_index(tmp_path)] == [NAMES[0], third]
+    assert sorted(one.name for one in tmp_path.glob("*.rrd")) == [NAMES[0], third]
+
+
+def test_only_files_of_ours_in_the_folder_are_removed(tmp_path, events):
+    """What somebody put there, or a link to elsewhere, would be gone."""
+    folder = tmp_path / "flights"
+    folder.mkdir()
+    fly(folder, events)
+    kept = [folder / "mine.rrd", folder / "notes.txt", tmp_path / "other.rrd", folder / "hvt-a.rrd"]
+    for one in kept:
+        one.write_bytes((folder / NAMES[0]).read_bytes())
+    link = folder / "hvt-uav-1-20200101-000000.rrd"
+    link.symlink_to(tmp_path / "other.rrd")
+    with closing(sqlite3.connect(folder / INDEX)) as forged, forged:
+        forged.execute(
+            "INSERT INTO recordings SELECT '../other.rrd', edge, session, 0, 0, written_ns, 1, 1, 1, 0, 1, 1 "
+            "FROM recordings LIMIT 1"
+        )
+        forged.execute("UPDATE recordings SET written_ns = 1600000000000000000")
+    look(folder, Retention((Limit(seconds=1.0),)))
+    assert [one.name for one in kept if not one.exists()] == []
+    assert link.is_symlink()
+    assert sorted(one.name for one in folder.glob("*-0*.rrd")) == [link.name]
+
+
+def test_a_file_in_flight_is_never_removed(tmp_path, events):
+    """The flight in the air would be lost: not even where another ground writes it."""
+    failures = Failures(time.time_ns)
+    with RecordingsFolder(tmp_path, ALL, failures=failures) as index:
+        index.open()
+        sink = SessionFiles(settings(tmp_path), split=SPLIT, index=index)
+        for event in events:
+            sink.log(event)
+        eventually(lambda: len(read_index(tmp_path)) == 2, within_s=20, what="the index knows both")
+        least = Retention((Limit(seconds=1.0), Limit(size_bytes=1)), Limit(seconds=1.0))
+        assert [one.file for one in look(tmp_path, least, later_s=1e6)] == NAMES[1:]
+        sink.close()
+    assert [frame for frame, *_ in Recording(tmp_path / NAMES[1]).video()] == list(range(30, 60))
+    assert look(tmp_path, least, later_s=1e6) == []
+
+
+def test_video_is_removed_and_the_rest_stays(tmp_path, events):
+    """Who wants to know in a year what flew there would have to keep all pictures for it."""
+    fly(tmp_path, events)
+    before = Recording(tmp_path / NAMES[0])
+    rows = look(tmp_path, Retention(video_age=Limit(seconds=86_400)), later_s=90_000)
+    assert [one.video for one in rows] == [False, False]
+    after = Recording(tmp_path / NAMES[0])
+    assert after.video() == []
+    assert after.events() == before.events()
+    assert after.stills() == before.stills()
+    assert after.boxes(20) == before.boxes(20)
+    assert after.blueprints == 1
+    subprocess.run([viewer_program(), "rrd", "verify", tmp_path / NAMES[0]], check=True, capture_output=True)
+    assert list(tmp_path.glob("*.part")) == []
+    assert [one.size_bytes for one in rows] == [(tmp_path / one).stat().st_size for one in NAMES]
+    (tmp_path / INDEX).unlink()
+    assert [one.video for one in look(tmp_path)] == [False, False]
+
+
+def test_a_file_that_cannot_be_stripped_holds_up_no_other(tmp_path, events, caplog):
+    """One bad file, and nothing is removed any more."""
+    fly(tmp_path, events)
+    (tmp_path / NAMES[0]).write_bytes(b"RRF2 no more")
+    rows = look(tmp_path, Retention(video_age=Limit(seconds=60.0)), later_s=1000)
+    assert [one.video for one in rows] == [True, False]
+    assert len([one for one in caplog.messages if "cannot be stripped" in one]) == 1
+    assert (tmp_path / NAMES[0]).read_bytes() == b"RRF2 no more"
+
+
+GROUND = """
+import pickle, sys, time
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import Limit
+from hvt_ground.recordings.folder import RecordingsFolder
+from hvt_ground.recordings.retention import Retention
+from hvt_ground.recordings.session_files import SessionFiles
+settings, events = pickle.loads(Path({feed!r}).read_bytes())
+index = RecordingsFolder(Path({folder!r}), Retention(*{retention}), failures=Failures(time.time_ns))
+index.open()
+sink = SessionFiles(settings, split=Limit(seconds=2.0), index=index)
+for event in events:
+    sink.log(event)
+    print(event.frame_index, flush=True)
+    time.sleep(0.002)
+time.sleep(60)
+"""
+
+
+def killed(folder: Path, events: list[Event], *, at: int, retention: str = "()") -> None:
+    """A process that records them until it is killed at a frame."""
+    feed = folder.parent / "feed"
+    feed.write_bytes(pickle.dumps((settings(folder), events)))
+    script = GROUND.format(
+        tests=str(Path(__file__).parents[3] / "tests" / "support"),
+        feed=str(feed),
+        folder=str(folder),
+        retention=retention,
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if int(line) >= at:
+            break
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+
+
+@pytest.mark.parametrize("at", [2, 29, 30, 31, 45])
+def test_a_killed_ground_leaves_an_index_that_goes_on(tmp_path, events, at):
+    """A power cut, and the index has to be mended by hand or tells less than there is."""
+    folder = tmp_path / "flights"
+    folder.mkdir()
+    killed(folder, events, at=at)
+    rows = look(folder)
+    assert [one.file for one in rows] == sorted(one.name for one in folder.glob("*.rrd"))
+    assert all(one.whole for one in rows)
+    frames = [frame for one in rows for frame, *_ in Recording(folder / one.file).video()]
+    assert frames[: at + 1] == list(range(at + 1))
+    assert sum(one.frames for one in rows) == len(frames)
+    assert [one.size_bytes for one in rows] == [(folder / one.file).stat().st_size for one in rows]
+    with closing(sqlite3.connect(folder / INDEX)) as database:
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+
+
+def test_a_ground_killed_while_it_removes_video_leaves_no_half_file(tmp_path, events):
+    """Half a copy would stand in the place of the flight, or lie there for ever."""
+    folder = tmp_path / "flights"
+    folder.mkdir()
+    fly(folder, events)
+    half = folder / f"{NAMES[0]}.part"
+    half.write_bytes((folder / NAMES[0]).read_bytes()[:5000])  # as a kill in the middle leaves it
+    empty = folder / "hvt-uav-1-20261122-130000-0003.rrd"
+    empty.touch()
+    other = folder / "mine.rrd.part"
+    other.write_text("mine")
+    assert [one.file for one in look(folder)] == NAMES
+    assert not half.exists()
+    assert not empty.exists()
+    assert other.exists()
+
+
+def test_it_is_a_sink_of_the_house(tmp_path):
+    """It would be looked after by nobody."""
+    failures = Failures(time.time_ns)
+    sink = QueuedSink("recordings index", lambda: IndexWriter(tmp_path, ALL), failures=failures)
+    sink.log(RecordingRow("hvt-a.rrd", "a", "1", 1, 2, 3, 4, 5, 6, {"car\x1b": 7}))
+    assert sink.join(time.monotonic() + 20)
+    assert (sink.files, failures.parts) == ([], ())
+    assert [one.classes for one in read_index(tmp_path)] == [{"car\x1b": 7}]
+
+
+def test_samples_alone_make_a_row(tmp_path, events):
+    """A flight without anything in it would not be found at all."""
+    fly(tmp_path, [one for one in events if isinstance(one, VideoSample)])
+    assert [(one.frames, one.classes) for one in read_index(tmp_path)] == [(30, {}), (30, {})]
