@@ -8,9 +8,9 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hvt_common.errors import FlightError, UserError
+from hvt_common.errors import FlightError, UserError, needs_extra
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, reason_of
@@ -20,6 +20,7 @@ from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
+from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
@@ -28,6 +29,9 @@ from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.status import completed, status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
+
+if TYPE_CHECKING:
+    from hvt_ground.web import WebPage
 
 __all__ = ["Ground"]
 
@@ -72,6 +76,7 @@ class Ground:
             view: LiveView | None = None
             if config.view or config.serve:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
+            page = None if config.web is None else stack.enter_context(self._open_page(config.web))
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)
             settings = LinkSettings(
@@ -83,13 +88,17 @@ class Ground:
                 links=2 if config.links == 2 else 1,
             )
             session = stack.enter_context(open_session(settings))
+            if page is not None:
+                page.use(EdgeClient.of_session(session, settings))
             self._make_record_folder()
-            factory = SessionFactory(config, models, clock=self._clock, outputs=outputs, view=view)
+            factory = SessionFactory(config, models, clock=self._clock, outputs=outputs, view=view, page=page)
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
-            self._say_where(line, page="" if view is None else view.page)
+            self._say_where(
+                line, pages=(*(() if view is None else (view.page,)), *(page.links if page else ()))
+            )
             try:
                 self._serve(link, factory, line, watch, models.failures)
                 self._close_edges()
@@ -128,13 +137,18 @@ class Ground:
                 f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
             ) from None
 
-    def _say_where(self, line: StatusLine, *, page: str) -> None:
+    def _open_page(self, address: str) -> WebPage:
+        with needs_extra("'hvt[web]'"):  # only now: who serves none starts faster
+            from hvt_ground.web import WebPage  # noqa: PLC0415
+        return WebPage(address, clock=self._clock)
+
+    def _say_where(self, line: StatusLine, *, pages: Sequence[str]) -> None:
         config = self._config
         if config.connect:
             line.note(f"hvt-ground: connecting to {', '.join(config.connect)}")
         if config.listen or not (config.connect or config.zenoh_config):
             line.note(f"hvt-ground: listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
-        if page:
+        for page in filter(None, pages):
             line.note(f"hvt-ground: watch at {page}")
 
     # Serving
