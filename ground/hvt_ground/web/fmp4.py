@@ -1,9 +1,9 @@
 """Fragmented MP4 for Media Source: coded pictures in, an initialisation segment and one fragment a picture out.
 
 libavformat's muxer learns a picture's duration from the next one, and so gives out every picture one later; at 15
-pictures a second that is 67 ms. Here the duration is expected instead, and the next picture begins where this one ends:
-the timeline has no holes, at which browsers would stop. Media time is therefore not capture time; who shows a picture
-finds the latter beside the fragment.
+pictures a second that is 67 ms. Here the duration is expected instead, and the next picture begins where this one
+ends: the timeline has no holes, at which browsers would stop. Media time is therefore not capture time; who shows a
+picture finds the latter beside the fragment.
 
 Boxes: ISO/IEC 14496-12; ``avcC`` and ``hvcC``: ISO/IEC 14496-15, 5.3.3.1 and 8.3.3.1.
 """

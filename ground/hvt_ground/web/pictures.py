@@ -6,7 +6,7 @@ wall of edges is a small JPEG.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal, cast
@@ -70,20 +70,27 @@ class Pictures:
         """None while nobody needs decoded pictures."""
         self._h264: _H264 | None = None
         self._copied: Muxer | None = None
+        self._wanted: Mapping[Rung, int] = {}
         self._due_ns: dict[Rung, int] = {}
 
     def add(
-        self, sample: VideoSample, *, wanted: Collection[Rung], now_ns: int, hurry: bool
+        self, sample: VideoSample, *, wanted: Mapping[Rung, int], now_ns: int, hurry: bool
     ) -> Iterator[Made]:
-        """What this sample gives on the ``wanted`` rungs; in a ``hurry`` nothing is coded again."""
+        """What this sample gives on the ``wanted`` rungs; in a ``hurry`` nothing is coded again.
+
+        Where the number of a rung is another than before its stream begins anew.
+        """
+        if wanted.get("hevc") != self._wanted.get("hevc"):
+            self._copied = None
+        if wanted.get("h264") != self._wanted.get("h264"):
+            self._h264 = None
+        self._wanted = wanted
         if not self._remember(sample):
             return
         if "hevc" in wanted:
             yield from self._copy()
-        else:
-            self._copied = None
         if not set(wanted) - {"hevc"}:
-            self._decoder = self._h264 = None
+            self._decoder = None
             return
         picture = self._decode()
         if picture is None or hurry:
@@ -134,14 +141,12 @@ class Pictures:
         return picture.frame
 
     def _coded(
-        self, picture: av.VideoFrame, sample: VideoSample, *, wanted: Collection[Rung], now_ns: int
+        self, picture: av.VideoFrame, sample: VideoSample, *, wanted: Mapping[Rung, int], now_ns: int
     ) -> Iterator[Made]:
         if "h264" in wanted:
             if self._h264 is None:
                 self._h264 = _H264(self._info)
             yield from self._h264.add(picture, sample.capture_ns)
-        else:
-            self._h264 = None
         if "jpeg" in wanted and self._due("jpeg", now_ns, _JPEG_EVERY_NS):
             yield Made("jpeg", jpeg(_bgr(picture)))
         if THUMBNAIL in wanted and self._due(THUMBNAIL, now_ns, _THUMBNAIL_EVERY_NS):

@@ -41,7 +41,7 @@ class WebPage:
         tokens = {} if is_loopback(host) else own_tokens()
         self._clock = clock
         self._socket = _bound(host, port)
-        shown = f"[{host}]" if ":" in host else host
+        shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
         self.links = tuple(
             f"http://{shown}:{port}/" + (f"?token={tokens[role]} ({role})" if tokens else "")
             for role in (("operator", "viewer") if tokens else ("operator",))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -85,6 +85,11 @@ class Viewer:
         self._drop_video()
         self._waits_for_keyframe = False
 
+    @property
+    def empty(self) -> bool:
+        """Whether `take` would wait."""
+        return not self._queue
+
     async def take(self) -> str | bytes:
         """The next message."""
         while not self._queue:
@@ -103,10 +108,10 @@ class Viewer:
         self._there.set()
 
     def _drop_video(self) -> None:
-        kept = [one for one in self._queue if not one[1]]
-        self.lost += len(self._queue) - len(kept)
-        self._queue = deque(kept)
-        self._bytes = sum(len(message) for message, _ in kept)
+        others = [one for one in self._queue if not one[1]]
+        self.lost += len(self._queue) - len(others)
+        self._queue = deque(others)
+        self._bytes = sum(len(message) for message, _ in others)
 
 
 @dataclass(slots=True)
@@ -148,8 +153,8 @@ class EdgePage:
         self.notices: deque[str] = deque(maxlen=_MOST_NOTICES)
         self.pictures = StillPictures()
         self.thumbnail: bytes | None = None
-        self.wanted: frozenset[Rung] = frozenset()
-        """Read by the thread that makes them."""
+        self.wanted: Mapping[Rung, int] = {}
+        """Read by the thread that makes them; another number is another stream, which begins with a start."""
         self.streams: dict[Rung, _Stream] = {}
 
 
@@ -160,7 +165,7 @@ class Hub:
         self._loop = loop
         self.edges: dict[str, EdgePage] = {}
         self.viewers: set[Viewer] = set()
-        self._streams = 0
+        self._streams = self._demands = 0
         self._state = ""
 
     def post(self, call: Callable[[], None]) -> None:
@@ -332,6 +337,7 @@ class Hub:
         wanted: set[Rung] = {rung for rung in RUNGS if self._watching(edge, rung)}
         if any(viewer.wall for viewer in self.viewers):
             wanted.add(THUMBNAIL)
-        edge.wanted = frozenset(wanted)
+        self._demands += 1
+        edge.wanted = {rung: edge.wanted.get(rung, self._demands) for rung in wanted}
         for rung in [rung for rung in edge.streams if rung not in wanted]:
             del edge.streams[rung]  # it begins anew with the next one who looks

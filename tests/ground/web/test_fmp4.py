@@ -3,42 +3,19 @@
 from __future__ import annotations
 
 import io
-from fractions import Fraction
 
 import av
-import numpy as np
 import pytest
 
 from hvt_ground.web.fmp4 import Muxer
-
-SIZE = (320, 192)
-FPS = 15
-
-
-def coded(codec: str, count: int = 20) -> list[tuple[bytes, bool]]:
-    """Annex B access units of a moving square."""
-    encoder = av.CodecContext.create(codec, "w")
-    encoder.width, encoder.height = SIZE
-    encoder.pix_fmt = "yuv420p"
-    encoder.time_base = Fraction(1, FPS)
-    encoder.options = {"preset": "ultrafast", "tune": "zerolatency"}
-    if codec == "libx265":
-        encoder.options |= {"x265-params": "log-level=none:repeat-headers=1"}
-    found = []
-    for index in range(count):
-        picture = np.full((SIZE[1], SIZE[0], 3), 60, np.uint8)
-        picture[50:90, index * 8 : index * 8 + 40] = (40, 200, 220)
-        frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
-        frame.pts = index
-        found += [(bytes(packet), packet.is_keyframe) for packet in encoder.encode(frame)]
-    return found + [(bytes(packet), packet.is_keyframe) for packet in encoder.encode(None)]
+from media.moving_square import FPS, SIZE, moving_square
 
 
 @pytest.mark.parametrize(("codec", "kind"), [("libx264", "h264"), ("libx265", "hevc")])
 def test_every_picture_comes_back_from_the_fragments(codec, kind):
     """A browser would show nothing, or half."""
     muxer = Muxer(kind, size=SIZE, fps=FPS)
-    given = coded(codec)
+    given = moving_square(codec, 20)
     out = io.BytesIO()
     starts = []
     for index, (data, keyframe) in enumerate(given):
@@ -66,7 +43,7 @@ def test_the_timeline_has_no_holes_where_pictures_are_missing():
     """A browser stops at a hole, and would show nothing more."""
     muxer = Muxer("h264", size=SIZE, fps=FPS)
     ends = 0.0
-    for index, (data, keyframe) in enumerate(coded("libx264")):
+    for index, (data, keyframe) in enumerate(moving_square("libx264", 20)):
         late_ns = 3 * 10**9 if index > 10 else 0
         _, fragment = muxer.add(data, keyframe=keyframe, capture_ns=late_ns + index * 10**9 // FPS)
         assert fragment.media_s == pytest.approx(ends, abs=1e-4)
@@ -77,6 +54,6 @@ def test_the_timeline_has_no_holes_where_pictures_are_missing():
 def test_nothing_comes_before_parameter_sets():
     """A player cannot begin without them."""
     muxer = Muxer("h264", size=SIZE, fps=FPS)
-    later = coded("libx264")[1]
+    later = moving_square("libx264", 20)[1]
     assert muxer.add(later[0], keyframe=False, capture_ns=0) == (None, None)
     assert muxer.add(b"nonsense", keyframe=True, capture_ns=0) == (None, None)

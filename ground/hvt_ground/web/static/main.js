@@ -156,6 +156,7 @@ function onShown(picture) {
   const ms = Math.round(connection.now() - picture.captured);
   age.dataset.ms = String(ms);
   age.dataset.frame = String(picture.frame);
+  if (!by("gap").hidden) showAge();
   if (performance.now() - tracksAt > 1000) listTracks();
 }
 
