@@ -124,6 +124,7 @@ def test_boxes_are_drawn_on_the_frame_that_is_shown(page):
       return canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value);
     }"""
     eventually(lambda: page.evaluate(drawn), within_s=20, what="a box is drawn")
+    page.locator("#objects-title").click()
     eventually(lambda: page.locator("#tracks button").count(), within_s=10, what="the tracks are listed")
 
 

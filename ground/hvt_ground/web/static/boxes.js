@@ -1,10 +1,11 @@
 // Boxes and names on the picture, in step with it; a click or a drag is a box too.
 
 /** @typedef {{id: number, box: number[], name: string, sureness: number, read?: 1, doubted?: 1, sure?: 1}} Track */
-/** @typedef {{frame: number, tracks: Track[]}} Overlay */
+/** @typedef {{frame: number, captured: number, tracks: Track[]}} Overlay */
 
 const MOST = 4000;
-const OLD_FRAMES = 45; // a list so old says nothing of this picture
+const OLD_MS = 500; // a list so old says nothing of this picture
+const FADED_MS = 200;
 const CLICK_SHARE = 0.12; // of the picture's width: what a click beside all boxes asks for
 const COLOURS = ["#4cc9f0", "#ffd166", "#f78c6b", "#83e377", "#c77dff", "#ff8fab", "#72efdd", "#e9c46a"];
 
@@ -20,6 +21,7 @@ export class Boxes {
     this.overlays = new Map();
     this.size = [16, 9];
     this.frame = -1;
+    this.captured = 0;
     /** @type {number[] | null} */
     this.drag = null;
     /** @type {number[] | null} */
@@ -56,17 +58,18 @@ export class Boxes {
     if (overlay.frame <= this.frame) this.draw();
   }
 
-  /** @param {number} frame */
-  show(frame) {
-    this.frame = frame;
+  /** @param {{frame: number, captured: number}} picture */
+  show(picture) {
+    this.frame = picture.frame;
+    this.captured = picture.captured;
     this.draw();
   }
 
-  /** The list of this picture, or the newest before it. */
+  /** The list of this picture, or the newest of those shortly before it. */
   current() {
-    for (let frame = this.frame; frame > this.frame - OLD_FRAMES && frame >= 0; frame--) {
+    for (let frame = this.frame; frame > this.frame - 30 && frame >= 0; frame--) {
       const found = this.overlays.get(frame);
-      if (found) return found;
+      if (found) return this.captured - found.captured < OLD_MS ? found : null;
     }
     return null;
   }
@@ -90,8 +93,17 @@ export class Boxes {
     if (!context || !width) return;
     context.clearRect(0, 0, width, height);
     const scale = width / this.size[0];
-    context.font = `${12 * ratio}px system-ui, sans-serif`;
-    for (const track of this.current()?.tracks ?? []) this.drawTrack(context, track, scale, ratio);
+    const letter = (width / ratio < 500 ? 9 : 12) * ratio;
+    context.font = `${letter}px system-ui, sans-serif`;
+    const list = this.current();
+    context.globalAlpha = list && this.captured - list.captured > FADED_MS ? 0.5 : 1;
+    /** @type {number[][]} */
+    const taken = [];
+    for (const track of list?.tracks ?? []) {
+      this.drawBox(context, track, scale, ratio);
+      if (!track.doubted) this.drawName(context, track, scale, letter, taken);
+    }
+    context.globalAlpha = 1;
     for (const box of [this.marked, this.drag && sorted(this.drag)]) {
       if (!box) continue;
       context.setLineDash([6 * ratio, 4 * ratio]);
@@ -103,23 +115,35 @@ export class Boxes {
   }
 
   /** @param {CanvasRenderingContext2D} context @param {Track} track @param {number} scale @param {number} ratio */
-  drawTrack(context, track, scale, ratio) {
+  drawBox(context, track, scale, ratio) {
     const [x, y, right, bottom] = track.box.map((value) => value * scale);
-    const colour = COLOURS[hashed(track.name) % COLOURS.length];
-    context.strokeStyle = colour;
+    context.strokeStyle = colourOf(track);
     context.lineWidth = (track.read ? 3 : 1.5) * ratio;
     context.setLineDash(track.doubted ? [4 * ratio, 4 * ratio] : []);
     if (track.doubted) context.lineWidth = ratio;
     context.strokeRect(x, y, right - x, bottom - y);
     context.setLineDash([]);
-    if (track.doubted) return;
+  }
+
+  /**
+   * Names that would cover one another are left out.
+   * @param {CanvasRenderingContext2D} context @param {Track} track @param {number} scale @param {number} letter
+   * @param {number[][]} taken
+   */
+  drawName(context, track, scale, letter, taken) {
     const words = track.name + (track.sure ? " ✓" : "");
-    const width = context.measureText(words).width + 6 * ratio;
-    const top = y > 16 * ratio ? y - 16 * ratio : bottom;
+    const height = letter * 1.35;
+    const width = context.measureText(words).width + letter * 0.5;
+    const x = track.box[0] * scale;
+    const top = track.box[1] * scale > height ? track.box[1] * scale - height : track.box[3] * scale;
+    const right = x + width;
+    const bottom = top + height;
+    if (taken.some(([l, t, r, b]) => x < r && right > l && top < b && bottom > t)) return;
+    taken.push([x, top, right, bottom]);
     context.fillStyle = "#000a";
-    context.fillRect(x, top, width, 16 * ratio);
-    context.fillStyle = colour;
-    context.fillText(words, x + 3 * ratio, top + 12 * ratio);
+    context.fillRect(x, top, width, height);
+    context.fillStyle = colourOf(track);
+    context.fillText(words, x + letter * 0.25, top + letter);
   }
 
   /** @param {PointerEvent} event */
@@ -157,6 +181,9 @@ const area = (box) => (box[2] - box[0]) * (box[3] - box[1]);
 
 /** @param {number[]} drag */
 const sorted = ([x1, y1, x2, y2]) => [Math.min(x1, x2), Math.min(y1, y2), Math.max(x1, x2), Math.max(y1, y2)];
+
+/** @param {Track} track */
+const colourOf = (track) => COLOURS[hashed(track.name) % COLOURS.length];
 
 /** @param {string} name */
 function hashed(name) {

@@ -151,7 +151,7 @@ function stepDown() {
 /** @param {{frame: number, captured: number}} picture */
 function onShown(picture) {
   shown = { ...picture, at: performance.now() };
-  boxes.show(picture.frame);
+  boxes.show(picture);
   const age = by("age");
   const ms = Math.round(connection.now() - picture.captured);
   age.dataset.ms = String(ms);
@@ -183,6 +183,8 @@ function listTracks() {
   const list = by("tracks");
   if (list.contains(document.activeElement)) return; // not under somebody's fingers
   const tracks = boxes.current()?.tracks ?? [];
+  by("objects-title").textContent = `Tracks: ${tracks.length}`;
+  if (!by("objects").open) return;
   list.replaceChildren();
   for (const track of tracks.slice(0, 40)) {
     const button = make("button", `${track.doubted ? "doubted" : ""} ${track.read ? "read" : ""}`, make("li", "", list));
