@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.hvt-setup
 UV     := $(shell command -v uv 2>/dev/null)
 
-.PHONY: setup demo test check lint type format docs bench bench-stills bench-compare bench-peers link soak kills failures fuzz clean help
+.PHONY: setup demo test check arm lint type format docs bench bench-fleet bench-stills bench-compare bench-peers link soak kills failures fuzz clean help
 
 .PHONY: nightly nightly-tests
 
@@ -53,6 +53,9 @@ type: setup
 	@$(BIN)/mypy
 	@$(BIN)/mypy --config-file tests/mypy.ini tests lab bench
 
+arm: setup       ## whether all that is needed comes as a ready wheel for 64-bit ARM
+	@$(BIN)/python deploy/arm_wheels.py
+
 check: lint type ## lint, format, import arrows, types; of the tests whether they call what is there
 
 format: setup    ## write what `make check` wants to see
@@ -61,6 +64,9 @@ format: setup    ## write what `make check` wants to see
 
 bench: setup     ## memory, and speed as ratios against a peer or a floor; fails where a bar of bench/bars.py is missed
 	@$(BIN)/python -m bench
+
+bench-fleet: setup ## one ground with 1, 2, 4, 8 and 16 played edges: frames a second and core, delay, memory
+	@$(BIN)/python -m bench.fleet
 
 bench-stills: setup ## still codecs on real crops: bytes at equal quality, time to encode and decode
 	@$(BIN)/python -m bench.stills

@@ -1,7 +1,7 @@
 """How old the picture on the page is, and what viewers cost the ground: ``python -m lab.page``.
 
-A flight over loopback and headless Chromium on this machine. Glass to glass: from capture to the picture's being handed
-to the screen, both by this machine's clock. The further viewers take what a browser takes, and show nothing.
+A flight over loopback and headless Chromium on this machine. Glass to glass: from capture to the picture's being
+handed to the screen, both by this machine's clock. The further viewers take what a browser takes, and show nothing.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Self
 
 import psutil
 from playwright.sync_api import sync_playwright
@@ -92,7 +93,7 @@ class _Viewer(ExitStack):
         super().__init__()
         self._port = port
 
-    def __enter__(self) -> _Viewer:
+    def __enter__(self) -> Self:
         where = f"127.0.0.1:{self._port}"
         socket = self.enter_context(
             connect(f"ws://{where}/ws", origin=f"http://{where}", max_queue=None)  # type: ignore[arg-type]

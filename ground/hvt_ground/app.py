@@ -8,6 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvt_common.errors import FlightError, UserError, needs_extra
@@ -22,11 +23,13 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
+from hvt_ground.perception.models import stills_calibrated
 from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort, GroundLink
 from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
+from hvt_ground.state import StateMaker
 from hvt_ground.status import completed, status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 
@@ -100,7 +103,7 @@ class Ground:
                 line, pages=(*(() if view is None else (view.page,)), *(page.links if page else ()))
             )
             try:
-                self._serve(link, factory, line, watch, models.failures)
+                self._serve(link, factory, line, watch, models.failures, page)
                 self._close_edges()
             except Exception as error:
                 raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
@@ -160,8 +163,16 @@ class Ground:
         line: StatusLine,
         watch: LinkWatch,
         failures: Failures,
+        page: WebPage | None,
     ) -> None:
-        polls = 0
+        config, polls = self._config, 0
+        maker = StateMaker(
+            self._clock,
+            detector=Path(config.detector).name,
+            classifier=Path(config.classifier or "none").name,
+            calibrated=stills_calibrated(config),
+            failures=failures,
+        )
         while not self._stop.wait(_POLL_S):
             ports = link.ports()
             self._leave_edges(ports)
@@ -172,10 +183,11 @@ class Ground:
             self._raise_error()
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
-                edges = [(edge, one.sessions) for edge, one in sorted(self._edges.items())]
-                text = status_text(edges, failures=failures)
-                line.show(text or ("no link" if watch.trouble else "no edge yet"))
-            if self._config.once and self._all_ended():
+                state = maker.make([(edge, one.sessions) for edge, one in sorted(self._edges.items())])
+                if page is not None:
+                    page.show(state)
+                line.show(status_text(state) or ("no link" if watch.trouble else "no edge yet"))
+            if config.once and self._all_ended():
                 return
 
     def _serve_edge(self, port: EdgePort, factory: SessionFactory) -> EdgeThread:

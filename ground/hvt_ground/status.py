@@ -12,37 +12,33 @@ from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink, Sink
+from hvt_ground.state import EdgeState, FailedPart, GroundState
 
 __all__ = ["completed", "status_text", "summary", "table"]
 
-_LOST_S = 3.0
-"""Status comes once a second: nothing for so long is no accident."""
+
+def status_text(state: GroundState) -> str:
+    """The status line: what comes of each edge now, and what does not work; empty without any."""
+    return " | ".join([*map(_edge_text, state.edges), *map(failed_text, state.failed)])
 
 
-def status_text(edges: Iterable[tuple[str, EdgeSessions]], *, failures: Failures | None = None) -> str:
-    """The status line: what comes of each edge now, and which models fail; empty without any."""
-    parts = []
-    for edge, sessions in edges:
-        session = sessions.session
-        if session is None:
-            state = "ended" if sessions.ended else "waiting for a keyframe"
-            parts.append("  ".join([f"{edge}: {state}", *failed_texts(sessions.failures)]))
-            continue
-        if sessions.silent_s > _LOST_S and not session.lockstep:
-            lost = f"{edge}: {session.duration_s:.1f} s  LINK LOST for {sessions.silent_s:.0f} s"
-            parts.append("  ".join([lost, *failed_texts(sessions.failures)]))
-            continue
-        latency_ms = session.overlay_latency.percentile(50)
-        age = "" if latency_ms is None or session.lockstep else f"  {latency_ms:.0f} ms"
-        total = session.ledger.summary(session.duration_s).total_bps
-        not_sent = f" (not sent: {counts_text(session.not_sent, most=2)})" if session.not_sent else ""
-        parts.append(
-            f"{edge}: {session.duration_s:.1f} s  {bitrate_text(total)} of "
-            f"{bitrate_text(session.info.budget_bps)}  stills {session.stills_received}{not_sent}  "
-            f"tracks {session.pipeline.tracks}, {session.pipeline.refined} refined{age}"
-            + "".join(f"  {text}" for text in failed_texts(sessions.failures))
+def _edge_text(one: EdgeState) -> str:
+    session = one.session
+    if session is None:
+        said = f"{one.edge}: {'ended' if one.link == 'ended' else 'waiting for a keyframe'}"
+    elif one.link == "lost":
+        said = f"{one.edge}: {session.duration_s:.1f} s  LINK LOST for {one.silent_s:.0f} s"
+    else:
+        not_sent = session.stills_not_sent
+        why = f" (not sent: {counts_text(not_sent, most=2)})" if not_sent else ""
+        age = "" if session.delay_p50_ms is None else f"  {session.delay_p50_ms:.0f} ms"
+        said = (
+            f"{one.edge}: {session.duration_s:.1f} s  {bitrate_text(session.mean_bps)} of "
+            f"{bitrate_text(session.budget_bps)}{' (thin link)' if one.link == 'thin' else ''}  "
+            f"stills {session.stills_received}{why}  "
+            f"tracks {session.tracks}, {session.tracks_refined} refined{age}"
         )
-    return " | ".join(parts + failed_texts(failures))
+    return "  ".join([said, *map(failed_text, one.failed)])
 
 
 def summary(session: GroundSession) -> dict[str, Any]:
@@ -207,10 +203,9 @@ def table(content: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def failed_texts(failures: Failures | None) -> list[str]:
-    """What does not work now, since when."""
-    parts = () if failures is None else failures.parts
-    return [f"{one.part} FAILED at {_utc(one.since_ns)[11:19]} UTC" for one in parts if not one.working]
+def failed_text(one: FailedPart) -> str:
+    """What does not work, since when."""
+    return f"{one.part} FAILED at {_utc(one.since_ns)[11:19]} UTC"
 
 
 def _concerns(part: str, edge: str) -> bool:

@@ -186,6 +186,8 @@ def make_pipeline(
         vocabulary=vocabulary,
         fusion=Fusion(fps=info.fps, edge_classes=edge_classes, path=path),
         path=path,
+        # In lockstep the same input gives the same detections, however long they take.
+        turns=None if info.pace == "lockstep" else models.turns,
     )
     return Pipeline(
         parts,

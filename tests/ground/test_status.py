@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.state import StateMaker
 from hvt_ground.status import completed, status_text, summary, table
 from programs.processes import eventually
 from programs.rrd import Recording
@@ -28,11 +30,13 @@ class Ground:
         self.port, self.path = Port(), folder / "a.rrd"
         self.port.flight = flight
         self.failures = Failures(time.time_ns)
+        self.maker = StateMaker(time.time_ns, failures=self.failures)
         self.outputs = Outputs(self.failures)
         self.ended: list[GroundSession] = []
-        self.sessions = EdgeSessions(self.port, open_session=self._open, on_ended=self.ended.append)
+        self.sessions = EdgeSessions(self.port, open_session=self.open_one, on_ended=self.ended.append)
 
-    def _open(self, info: Info, reports: ReceiverReports) -> GroundSession:
+    def open_one(self, info: Info, reports: ReceiverReports) -> GroundSession:
+        """A session with recordings."""
         settings = RecorderSettings(self.path, info.edge, "1", info.base_size, info.fps, info.budget_bps)
         gone = replace(settings, path=self.path / "no" / "folder.rrd")
         sinks = [
@@ -44,7 +48,7 @@ class Ground:
 
     def line(self) -> str:
         """The status line."""
-        return status_text([("uav-1", self.sessions)], failures=self.failures)
+        return status_text(self.maker.make([("uav-1", self.sessions)]))
 
 
 @pytest.fixture
@@ -108,3 +112,49 @@ def test_what_could_not_be_written_is_named_of_the_edge_it_concerns(ground):
     rows = [text for name, text in table(content) if name in ("failed", "missing")]
     assert any("second recording of uav-1" in row and "did not work again" in row for row in rows)
     assert any("events in second recording of uav-1" in row for row in rows)
+
+
+def test_the_state_says_what_is_known_and_nothing_else(ground):
+    """A page would show 0 bps for an edge that it has not heard, and a delay from before the outage."""
+    now_ns = [time.time_ns()]
+    maker = StateMaker(lambda: now_ns[0], detector="d", failures=ground.failures)
+    (edge,) = maker.make([("uav-1", ground.sessions)]).edges
+    assert (edge.link, edge.session.frames_received, edge.session.tracks_refined) == ("up", 5, 0)
+    assert edge.session.stills_not_sent == {"base_good": 49, "cooldown": 3, "too_large": 1}
+    assert edge.session.edge_frames_dropped == 0
+    since_ns = edge.link_since_ns
+    now_ns[0] += 10**9
+    assert maker.make([("uav-1", ground.sessions)]).edges[0].link_since_ns == since_ns
+    nobody = EdgeSessions(Port(), open_session=ground.open_one)
+    (waiting,) = maker.make([("uav-2", nobody)]).edges
+    assert (waiting.link, waiting.session) == ("waiting", None)
+
+
+def test_an_edge_that_leaves_frames_out_is_on_a_thin_link(ground):
+    """Frames lost to the link and frames lost to a slow machine want different remedies."""
+    flight, now_ns = ground.port.flight, [time.time_ns()]
+    maker = StateMaker(lambda: now_ns[0])
+
+    def link_after(sequence: int, *, dropped: int, dropped_cpu: int) -> str:
+        item = flight.status(base=5)
+        report = Status.parse(item.payload)
+        health = replace(report.health, frames_dropped=dropped, frames_dropped_cpu=dropped_cpu)
+        report = replace(report, sequence=sequence, health=health)
+        ground.sessions.handle(replace(item, payload=report.pack()))
+        now_ns[0] += 10**9
+        return maker.make([("uav-1", ground.sessions)]).edges[0].link
+
+    assert link_after(100, dropped=0, dropped_cpu=0) == "up"
+    assert link_after(101, dropped=4, dropped_cpu=4) == "up"
+    assert link_after(102, dropped=7, dropped_cpu=4) == "thin"
+    assert [link_after(number, dropped=7, dropped_cpu=4) for number in range(103, 108)] == ["thin"] * 4 + [
+        "up"
+    ]
+
+
+def test_a_state_can_be_written_as_json(ground):
+    """Programs read it."""
+    state = StateMaker(time.time_ns).make([("uav-1", ground.sessions)])
+    read = json.loads(json.dumps(state.as_dict()))
+    assert read["edges"][0]["session"]["method"] == ground.sessions.session.info.method
+    assert read["edges"][0]["session"]["stills_not_sent"]["base_good"] == 49

@@ -221,6 +221,7 @@ class SessionAccount:
         self._clock_offset = clock_offset
         self._emit = emit
         self._next_traffic_ns = 0
+        self.last_traffic: Traffic | None = None
 
     def count(self, row: Channel, account: Account, item: Received, *, at_ns: int) -> None:
         """Take the bytes of a message on the line."""
@@ -270,17 +271,16 @@ class SessionAccount:
         self._next_traffic_ns = at_ns + SECOND_NS // 2
         to_bps = 8 * SECOND_NS / self._info.window_ns
         lockstep = self._info.pace == "lockstep"
-        self._emit(
-            Traffic(
-                frame_index=header.frame_index,
-                capture_ns=header.capture_ns,
-                base_bps=ledger.window_bytes(Account.BASE, at_ns) * to_bps,
-                roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
-                total_bps=ledger.window_bytes(None, at_ns) * to_bps,
-                budget_bps=self._info.budget_bps,
-                receive_latency_ms=None if lockstep else self.receive_latency.percentile(50),
-                overlay_latency_ms=None if lockstep else self.overlay_latency.percentile(50),
-                tracks=tracks,
-                tracks_refined=tracks_refined,
-            )
+        self.last_traffic = Traffic(
+            frame_index=header.frame_index,
+            capture_ns=header.capture_ns,
+            base_bps=ledger.window_bytes(Account.BASE, at_ns) * to_bps,
+            roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
+            total_bps=ledger.window_bytes(None, at_ns) * to_bps,
+            budget_bps=self._info.budget_bps,
+            receive_latency_ms=None if lockstep else self.receive_latency.percentile(50),
+            overlay_latency_ms=None if lockstep else self.overlay_latency.percentile(50),
+            tracks=tracks,
+            tracks_refined=tracks_refined,
         )
+        self._emit(self.last_traffic)

@@ -15,6 +15,7 @@ from hvt_common.tracking.bytetrack import weak_confidence
 from hvt_ground.config import DETECTOR, MOTION, NONE, GroundConfig
 from hvt_ground.perception.retried import RetriedClassifier, RetriedDetector
 from hvt_ground.perception.stills.vocabulary import check_common
+from hvt_ground.perception.turns import Turns
 
 __all__ = ["ModelSet", "Models", "stills_calibrated", "track_confidence"]
 
@@ -36,6 +37,8 @@ class Models:
         self._config = config
         self.failures = Failures(SteadyClock())
         """Models whose run raised."""
+        self.turns = Turns()
+        """With the detector."""
         self._set = self._open()
         self._check()
 

@@ -24,6 +24,7 @@ from hvt_ground.perception.stills.decode import ReceivedStill
 from hvt_ground.perception.stills.refine import Refiner, ShownClasses
 from hvt_ground.perception.stills.stage import Progress, StillStage
 from hvt_ground.perception.stills.vocabulary import Vocabulary
+from hvt_ground.perception.turns import Turns
 
 __all__ = ["DecodedFrame", "Pipeline", "PipelineParts", "ReceivedStill"]
 
@@ -33,6 +34,9 @@ _GAP_S = 1.0
 """For how long the base stream may leave out frames and still tell where tracks were between."""
 _PUT_OFF = 4
 """So many times the usual pause is the longest between two detections, where one is put off again and again."""
+
+_TURN_SHARE = 0.5
+"""Of the time to the next picture is waited for the detector, which other sessions use too."""
 
 _HISTORY_S = 3.0
 """Of pictures that residual stills may build on."""
@@ -65,6 +69,8 @@ class PipelineParts:
     fusion: Fusion
     path: CameraPath
     """The one that ``fusion`` moves boxes by."""
+    turns: Turns | None = None
+    """Of the sessions that share the detector; None always detects where that is due."""
 
 
 class Pipeline:
@@ -87,6 +93,9 @@ class Pipeline:
         self._parts = parts
         self._detect_every = detect_every
         self._frame_ns = SECOND_NS / fps
+        self._turn_s = _TURN_SHARE / fps
+        self._asker = object()
+        """Stands for this session among those that take turns, and keeps nothing of it alive."""
         self._farthest = round(_FARTHEST_S * fps)
         self._emit = emit
         gap_frames = max(1, round(_GAP_S * fps))
@@ -218,10 +227,14 @@ class Pipeline:
         parts, last = self._parts, self._detected_frame
         frames = None if last is None else index - last
         due = frames is None or frames >= (_PUT_OFF if hurry else 1) * self._detect_every
-        if due:
+        if due and (parts.turns is None or parts.turns.take(self._asker, within_s=self._turn_s)):
             self._detected_frame = index
             self.detections_run += 1
-            found = parts.detector.detect(image)
+            try:
+                found = parts.detector.detect(image)
+            finally:
+                if parts.turns is not None:
+                    parts.turns.release()
             own = parts.tracker.update(found, frame_index=index, image_bgr=image)
         else:
             own = parts.tracker.predict(frame_index=index, image_bgr=image)

@@ -25,6 +25,9 @@ _log = logging.getLogger(__name__)
 
 _MOST_PICTURES = 12
 """How many decoded frames may wait for detection and tracking; beyond, the oldest goes untracked."""
+_OLDEST_S = 0.6
+"""A frame that has waited for longer goes untracked, if there is a newer one: a ground of too many edges would show
+all of them ever later."""
 _STILLS_AT_ONCE = 16
 """Of one frame. Between those of two frames come the pictures that have arrived: to read stills may take longer than
 the time between two pictures."""
@@ -152,7 +155,8 @@ class RealtimeWorker(PerceptionWorker):
         self._finish_s = finish_s
         self._leave_s = leave_s
         self._lock = threading.Lock()
-        self._pictures: deque[DecodedFrame] = deque(maxlen=_MOST_PICTURES)
+        self._pictures: deque[tuple[DecodedFrame, float]] = deque(maxlen=_MOST_PICTURES)
+        """Each with the moment at which it came."""
         self._stills: deque[ReceivedStill] = deque()
         self._steps: deque[tuple[Tracks, int]] = deque(maxlen=_MOST_STEPS)
         self._jobs: deque[Job] = deque()
@@ -185,7 +189,7 @@ class RealtimeWorker(PerceptionWorker):
         """Queue a frame; where the queue is full the oldest goes untracked."""
         with self._lock:
             self.untracked += len(self._pictures) == _MOST_PICTURES
-            self._pictures.append(picture)
+            self._pictures.append((picture, time.monotonic()))
         self._wake.set()
 
     def step(self, tracks: Tracks, capture_ns: int) -> None:
@@ -272,8 +276,12 @@ class RealtimeWorker(PerceptionWorker):
             if self._given_up.is_set():
                 break
             with self._lock:
-                picture = self._pictures.popleft()
-            self._analyze(picture, hurry or len(self._pictures) > 0)
+                picture, came_s = self._pictures.popleft()
+                newer = len(self._pictures) > 0
+                if newer and time.monotonic() - came_s > _OLDEST_S:
+                    self.untracked += 1
+                    continue
+            self._analyze(picture, hurry or newer)
 
     def _do_jobs(self) -> None:
         """Do what can wait, until something comes that cannot."""

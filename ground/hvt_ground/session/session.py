@@ -30,7 +30,7 @@ from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.session_backlog import SessionBacklog
-from hvt_ground.events import Event, Notice, Refinement, StillsRead, VideoSample
+from hvt_ground.events import Event, Notice, Refinement, StillsRead, Traffic, VideoSample
 from hvt_ground.link.packets import BasePacket
 from hvt_ground.link.reassemble import StreamCounters
 from hvt_ground.link.sequence_window import StillSequenceWindow
@@ -98,7 +98,8 @@ class GroundSession:
         self._decoder = BaseDecoder(size=info.base_size)
         self._step_decoder = TrackStepDecoder()
         self.last_status: Status | None = None
-        self._levers = ""
+        self.levers = ""
+        """What the edge last said that it sends beside the video, and why."""
         self._last_step = -1
         self._stepped_ns = self._status_ns = 0
         """When the newest report of tracks came, and the newest status."""
@@ -205,8 +206,8 @@ class GroundSession:
         self._account.count(Channel.STATUS, Account.META, item, at_ns=status.send_ns)
         self._account.time(Channel.STATUS, item, status, handled=True)
         self.last_status = status
-        if status.levers and status.levers != self._levers:
-            self._levers = status.levers
+        if status.levers and status.levers != self.levers:
+            self.levers = status.levers
             self.note("info", status.levers)
 
     def backlog_chunk(self, header: BacklogHeader, item: Received, *, delivered: bool) -> None:
@@ -266,6 +267,20 @@ class GroundSession:
     def newest_index(self) -> int:
         """Frame index of the newest access unit; -1 before the first."""
         return self._last_index
+
+    @property
+    def newest_captured_ns(self) -> int | None:
+        """When the newest picture was captured, this ground's clock; None before the first."""
+        return None if self._first_capture_ns is None else self.to_local_ns(self._last_capture_ns)
+
+    @property
+    def traffic(self) -> Traffic | None:
+        """How full the link was, twice a second of the stream; None before the first."""
+        return self._account.last_traffic
+
+    def to_local_ns(self, edge_ns: int) -> int:
+        """A time of the edge's clock as this ground's."""
+        return self._clock_offset.to_local_ns(edge_ns)
 
     @property
     def not_sent(self) -> Mapping[str, int]:

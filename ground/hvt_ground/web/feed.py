@@ -11,11 +11,13 @@ from typing import Any
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.messages import Info
 from hvt_common.runtime.process import lower_priority
+from hvt_common.units import bitrate_text, counts_text
 from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
+from hvt_ground.state import EdgeState, FailedPart, GroundState, SessionState
 from hvt_ground.web.pictures import Pictures, jpeg
 from hvt_ground.web.viewers import EdgePage, Hub, text
 
-__all__ = ["SessionFeed"]
+__all__ = ["SessionFeed", "state_message"]
 
 _LATE_NS = 300_000_000
 """Behind the link by so much, pictures are decoded and not coded again until it has caught up."""
@@ -151,3 +153,57 @@ class SessionFeed:
             note=item.note,
         )
         self._hub.post(partial(self._hub.still, self._page, message, pictures))
+
+
+def state_message(state: GroundState) -> str:
+    """How all edges are, for the wall and the plot; the words that an operator reads are made here."""
+    edges = {
+        one.edge: {
+            "link": one.link,
+            "since": one.link_since_ns // _MILLION,
+            "total": None if one.session is None else one.session.total_bps,
+            "base": None if one.session is None else one.session.base_bps,
+            "budget": None if one.session is None else one.session.budget_bps,
+            "words": [] if one.session is None else _words(one.session, calibrated=state.calibrated),
+            "failed": [*map(_failure, one.failed), *_edge_failures(one)],
+        }
+        for one in state.edges
+    }
+    return text("state", at=state.at_ns // _MILLION, edges=edges, failed=[*map(_failure, state.failed)])
+
+
+def _words(session: SessionState, *, calibrated: bool) -> list[str]:
+    """The session in a few sentences; what is not known is left out."""
+    words = []
+    if session.total_bps is not None:
+        words.append(f"{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
+    if session.delay_p50_ms is not None and session.delay_p95_ms is not None:
+        words.append(
+            f"capture to boxes {session.delay_p50_ms:.0f} ms, at most {session.delay_p95_ms:.0f} ms for 95 %"
+        )
+    not_sent = session.stills_not_sent
+    why = f" (not sent: {counts_text(not_sent, most=3)})" if not_sent else ""
+    words.append(f"{session.stills_received} stills{why}")
+    trust = "" if calibrated else "; the probability of a class is not calibrated"
+    words.append(f"{session.tracks} tracks, {session.tracks_refined} refined by stills{trust}")
+    if session.gaps:
+        words.append(f"{session.gaps} gaps, {session.lost} messages lost")
+    if session.backlog_stills or session.backlog_video_s:
+        words.append(
+            f"from outages {session.backlog_stills} stills, {session.backlog_video_s:.0f} s of video"
+        )
+    if session.levers:
+        words.append(session.levers)
+    return words
+
+
+def _edge_failures(one: EdgeState) -> list[str]:
+    return (
+        [] if one.session is None else [f"at the edge: {_failure(part)}" for part in one.session.edge_failed]
+    )
+
+
+def _failure(part: FailedPart) -> str:
+    """Without the reason: it may name files of this machine."""
+    at = time.strftime("%H:%M:%S", time.gmtime(part.since_ns // 1_000_000_000))
+    return f"{part.part} does not work since {at} UTC"

@@ -17,8 +17,9 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import Info
 from hvt_ground.control import EdgeClient
+from hvt_ground.state import GroundState
 from hvt_ground.web.access import Access, is_loopback, own_tokens
-from hvt_ground.web.feed import SessionFeed
+from hvt_ground.web.feed import SessionFeed, state_message
 from hvt_ground.web.requests import EdgeRequests
 from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
 from hvt_ground.web.viewers import EdgePage, Hub
@@ -78,8 +79,9 @@ class WebPage:
         page = EdgePage(info.edge)
         return lambda: SessionFeed(info, page, self._hub, clock=self._clock)
 
-    def state(self, message: str) -> None:
+    def show(self, state: GroundState) -> None:
         """Give out how all edges are; for any thread."""
+        message = state_message(state)
         self._hub.post(lambda: self._hub.state(message))
 
     def __enter__(self) -> Self:

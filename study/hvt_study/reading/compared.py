@@ -31,6 +31,7 @@ READ_METHODS: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "M5-jpeg": ("M5", "jpeg", ()),
     "M5-residual": ("M5", "residual", ()),
     "M6": ("M6", "residual", ()),
+    "auto": ("auto", "residual", ()),
     "M6-detail": ("M6", "residual", ("detail_weight=5",)),
 }
 """(method, still codec, tuning) by the name in tables. ``source`` is the untouched source, read without any link."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -421,8 +422,12 @@ def test_interrupting_a_subscriber_ends_it(endpoint):
     """A callback subscriber that is not closed hangs at exit."""
     listener = start(LISTENER, endpoint)
     assert listener.stdout.readline() == "up\n"
-    time.sleep(0.5)  # until it sleeps: in a finaliser Python would drop the interrupt
-    listener.send_signal(signal.SIGINT)
+    for _ in range(10):  # until it sleeps: in a finaliser Python drops the interrupt
+        time.sleep(0.5)
+        listener.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            listener.wait(timeout=2)
+            break
     _, err = listener.communicate(timeout=20)
     assert err.rstrip().endswith("KeyboardInterrupt")
 

@@ -541,7 +541,7 @@ def test_a_recording_in_use_stays_open(flight, tmp_path):
         made.append(BacklogRecording(info, sink=sink, perception=look_of(info)))
         return made[-1]
 
-    recordings = BacklogRecordings(open_one, most=2)
+    recordings = BacklogRecordings(open_one, most=2, open_s=20)
     first = recordings.acquire(formers[0].info())
     for former in formers[1:]:
         other = recordings.acquire(former.info())
@@ -554,7 +554,7 @@ def test_a_recording_in_use_stays_open(flight, tmp_path):
     assert recordings.open_sessions == [formers[3].session_id, flight.session_id], "done with, it may go"
     recordings.close()
     assert recordings.acquire(flight.info()) is None
-    few = BacklogRecordings(open_one, most_files=1)
+    few = BacklogRecordings(open_one, most_files=1, open_s=20)
     assert few.acquire(formers[0].info()) is made[5].backlog
     assert few.acquire(formers[1].info()) is None, (
         "so many came at once that the last could not be refused before"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,19 @@ def test_pictures_come_between_the_stills_of_two_frames(flight):
     read = [one for _, which in rest if isinstance(which, list) for one in which]
     assert read == [0, 1, 2, 3]
     assert first == 1, "the first frame's are in hand when it comes, the others wait for it"
+
+
+def test_pictures_that_waited_for_long_are_passed_over():
+    """A ground of too many edges would show every one of them ever later."""
+    rig = Rig()
+    rig.worker.picture(picture(0))
+    assert rig.begun.wait(timeout=20)
+    for index in (1, 2, 3):
+        rig.worker.picture(picture(index))
+    time.sleep(0.7)
+    rig.worker.picture(picture(4))
+    assert rig.finish() == [("picture", 0), ("picture", 4)]
+    assert rig.worker.untracked == 3
 
 
 def test_detection_is_for_the_newest_picture():

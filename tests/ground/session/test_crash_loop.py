@@ -23,6 +23,7 @@ from hvt_ground.session.edge_sessions import EdgeSessions, EdgeThread
 from hvt_ground.session.session import GroundSession
 from hvt_ground.session.subscribe import EdgePort, GroundLink
 from hvt_ground.sinks import Outputs
+from hvt_ground.state import StateMaker
 from hvt_ground.status import status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
 from programs.outsider import joined
@@ -119,10 +120,11 @@ def test_two_hundred_sessions_leave_nothing_behind(free_port: int, tmp_path: Pat
     limit_malloc_arenas()  # as hvt-ground does
     endpoint, ended = f"tcp/127.0.0.1:{free_port}", list[str]()
     watching = threading.Event()
+    maker = StateMaker(time.time_ns)
 
     def watch() -> None:
         while not watching.wait(0.001):
-            status_text([("uav-1", sessions)])
+            status_text(maker.make([("uav-1", sessions)]))
 
     with (
         open_session(LinkSettings("ground", listen=(endpoint,))) as session,

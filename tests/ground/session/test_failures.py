@@ -18,6 +18,7 @@ from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from hvt_ground.state import StateMaker
 from hvt_ground.status import completed, status_text, summary, table
 from programs.processes import eventually
 from programs.rrd import Recording
@@ -107,6 +108,11 @@ class Rig:
         return [one.frames_decoded for one in self.consumer.sessions]
 
 
+def status_line(sessions: EdgeSessions) -> str:
+    """What an operator reads."""
+    return status_text(StateMaker(time.time_ns).make([("uav-1", sessions)]))
+
+
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     """Keyframes at 10, 20, 30 and 36."""
@@ -136,7 +142,9 @@ def test_a_session_that_fails_ends_alone_and_begins_anew(flight, tmp_path, caplo
     consumer.broken = ""
     (failed,) = rig.sessions.failures.parts
     assert (failed.part, failed.reason, failed.working) == ("session of uav-1", CAUSES[cause], False)
-    assert "uav-1: ended  session of uav-1 FAILED at " in status_text([("uav-1", rig.sessions)])
+    assert "uav-1: ended  session of uav-1 FAILED at " in status_text(
+        StateMaker(time.time_ns).make([("uav-1", rig.sessions)])
+    )
     neighbour.put(*range(5, 40))
     time.sleep(0.1)  # the pause is over
     rig.put(*range(6, 40))
@@ -181,7 +189,9 @@ def test_a_session_that_cannot_begin_is_tried_ever_more_seldom(flight, tmp_path,
     assert rig.sessions.idle
     (failed,) = rig.sessions.failures.parts
     assert failed.reason == "OSError: [Errno 28] No space left on device"
-    assert "waiting for a keyframe  session of uav-1 FAILED at" in status_text([("uav-1", rig.sessions)])
+    assert "waiting for a keyframe  session of uav-1 FAILED at" in status_text(
+        StateMaker(time.time_ns).make([("uav-1", rig.sessions)])
+    )
     requests = rig.port.keyframe_requests
     assert requests <= 1, "an edge is not asked for keyframes that nobody takes"
     consumer.broken = ""

@@ -15,7 +15,7 @@ from rerun.chunk import Chunk, RrdReader
 from hvt_common.errors import UserError, exit_with_sentence
 from hvt_common.units import parse_size
 from hvt_ground.sinks.rerun.blueprint import comparison
-from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, release_recordings, send_blueprint
+from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
 __all__ = ["join_recordings", "main"]
 
@@ -42,9 +42,9 @@ def join_recordings(paths: Sequence[Path], out: Path, *, base_size: tuple[int, i
             recording.send_chunks([one.with_entity_path(f"/{edge}{one.entity_path}") for one in chunks])
             recording.flush(timeout_sec=_FLUSH_S)
     finally:
-        recording.disconnect()
-        del recording
-        release_recordings()
+        with releasing_recordings():
+            recording.disconnect()
+            del recording
 
 
 def _read(path: Path) -> tuple[str, list[Chunk]]:

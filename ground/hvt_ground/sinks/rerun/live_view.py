@@ -22,6 +22,7 @@ from hvt_common.errors import UserError
 from hvt_ground.sinks.rerun.sdk import (
     RecordingId,
     new_recording,
+    releasing_recordings,
     send_blueprint,
     viewer_environment,
     viewer_program,
@@ -130,7 +131,9 @@ class LiveRecording:
         except (RuntimeError, ValueError, OSError) as error:
             raise UserError(f"live view at {self._url}: the last events were not sent: {error}") from error
         finally:
-            self._recording.disconnect()
+            with releasing_recordings():
+                self._recording.disconnect()
+                del self._recording
 
     def _check(self) -> None:
         """Look for the viewer once a second: the SDK would keep what it cannot send, and slow every call."""

@@ -28,7 +28,7 @@ from rerun.chunk import Chunk, RrdReader
 
 from hvt_common.errors import UserError
 from hvt_ground.sinks.line_file import check_there
-from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, release_recordings, send_blueprint
+from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
 __all__ = ["RrdFile"]
 
@@ -92,10 +92,10 @@ class RrdFile:
 
     def _release(self) -> None:
         os.close(self._file)
-        self._recording.disconnect()
-        self._stream.read()  # its own farewell, or the SDK warns that it was dropped
-        del self._stream, self._recording
-        release_recordings()
+        with releasing_recordings():
+            self._recording.disconnect()
+            self._stream.read()  # its own farewell, or the SDK warns that it was dropped
+            del self._stream, self._recording
 
     def _add_footer(self, hurry: threading.Event | None) -> None:
         """Write all once more through the SDK, which adds a footer; whole or not at all."""
@@ -118,10 +118,10 @@ class RrdFile:
         except (OSError, RuntimeError, ValueError) as error:
             _log.warning("recording %s has no footer: %s", self.path, error)
         finally:
-            recording.disconnect()
+            with releasing_recordings():
+                recording.disconnect()
+                del recording
             scratch.unlink(missing_ok=True)
-            del recording
-            release_recordings()
 
     def _encoded(self, chunks: Sequence[Chunk]) -> bytes:
         """The chunks as messages, LZ4-compressed by the SDK."""

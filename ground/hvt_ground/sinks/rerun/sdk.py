@@ -1,6 +1,11 @@
-"""What the Rerun SDK does not let go of by itself: each recording would leave four threads and two megabytes behind.
+"""What the Rerun SDK does not let go of by itself, and what it may not do twice at once.
 
-A ground opens a recording for each session and each return after a long outage, so this has to be flat over weeks.
+Each recording would leave four threads and two megabytes behind. A ground opens a recording for each session and each
+return after a long outage, so this has to be flat over weeks. And two recordings that begin and end at the same
+moment would stop the process for ever: to free one the SDK holds the lock of its list of recordings, and waits for
+threads of its own that want Python's; to make one it holds Python's, and waits for the list's. So one thread at a
+time makes recordings or lets go of them.
+
 Measured with rerun-sdk 0.41; `tests/ground/sinks/rerun/test_sdk.py` holds it to that. The names it takes for that
 are the SDK's own, so pyproject pins the version.
 """
@@ -9,6 +14,9 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.abc import MetaPathFinder
 from pathlib import Path
@@ -24,11 +32,14 @@ __all__ = [
     "RecordingId",
     "leave_out_pandas",
     "new_recording",
-    "release_recordings",
+    "releasing_recordings",
     "send_blueprint",
     "viewer_environment",
     "viewer_program",
 ]
+
+
+_list_of_recordings = threading.RLock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +77,10 @@ class _NoPandas(MetaPathFinder):
 
 def new_recording(one: RecordingId) -> rr.RecordingStream:
     """A recording without the SDK's own two timelines, which would cost bytes and mean nothing here."""
-    recording = rr.RecordingStream(
-        one.application, recording_id=f"{one.edge}-{one.session}", send_properties=False
-    )
+    with _list_of_recordings:
+        recording = rr.RecordingStream(
+            one.application, recording_id=f"{one.edge}-{one.session}", send_properties=False
+        )
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     return recording
@@ -76,26 +88,29 @@ def new_recording(one: RecordingId) -> rr.RecordingStream:
 
 def send_blueprint(recording: rr.RecordingStream, one: RecordingId, blueprint: rrb.Blueprint) -> None:
     """Send the blueprint and make it active: the SDK's own function never frees the stream that it writes it to."""
-    # As rerun.sinks.send_blueprint has it, but for the last line: stream and storage hold each other until then.
-    stream = rr.RecordingStream._from_native(  # noqa: SLF001
-        bindings.new_blueprint(
-            application_id=one.application,
-            make_default=False,
-            make_thread_default=False,
-            default_enabled=True,
+    # As rerun.sinks.send_blueprint has it, but for the end: stream and storage hold each other until then.
+    with releasing_recordings():
+        stream = rr.RecordingStream._from_native(  # noqa: SLF001
+            bindings.new_blueprint(
+                application_id=one.application,
+                make_default=False,
+                make_thread_default=False,
+                default_enabled=True,
+            )
         )
-    )
-    stream.set_time("blueprint", sequence=0)
-    blueprint._log_to_stream(stream)  # noqa: SLF001
-    bindings.send_blueprint(stream.memory_recording().storage, True, True, recording.to_native())
-    stream.disconnect()
-    del stream
-    release_recordings()
+        stream.set_time("blueprint", sequence=0)
+        blueprint._log_to_stream(stream)  # noqa: SLF001
+        bindings.send_blueprint(stream.memory_recording().storage, True, True, recording.to_native())
+        stream.disconnect()
+        del stream
 
 
-def release_recordings() -> None:
-    """Free every recording that is disconnected and that nobody refers to any more."""
-    bindings.flush_and_cleanup_orphaned_recordings()
+@contextmanager
+def releasing_recordings() -> Iterator[None]:
+    """In it, disconnect recordings and ``del`` the last that refers to them: they are freed at its end."""
+    with _list_of_recordings:
+        yield
+        bindings.flush_and_cleanup_orphaned_recordings()
 
 
 def viewer_program() -> Path:

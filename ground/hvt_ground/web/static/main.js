@@ -10,6 +10,14 @@ import { Wall, kbps, make } from "./wall.js";
 /** @typedef {import("./connection.js").Message} Message */
 
 const GAP_MS = 1000; // without a new picture
+const LINK_WORDS = {
+  waiting: "waiting for a keyframe",
+  up: "link up",
+  thin: "link too thin for all frames",
+  lost: "link lost",
+  ended: "ended",
+};
+const WAIT_FOR_NAMED_MS = 1500;
 const MOST_EVENTS = 200;
 const RUNG_WORDS = {
   hevc: "HEVC, as received",
@@ -63,7 +71,7 @@ function onMessage(message, payload) {
       sessions.set(message.edge, message);
       wall.card(message.edge);
       if (mine) describe();
-      else if (!chosen) choose(fromAddress() ?? message.edge);
+      else if (!chosen) chooseFirst();
       break;
     case "state":
       onGroundState(message);
@@ -101,9 +109,13 @@ function onMessage(message, payload) {
 
 // Which edge
 
-function fromAddress() {
-  const edge = new URLSearchParams(location.hash.slice(1)).get("edge");
-  return edge && sessions.has(edge) ? edge : null;
+/** The one that the address names, or after a moment another. */
+function chooseFirst() {
+  const named = new URLSearchParams(location.hash.slice(1)).get("edge");
+  const [first] = [...sessions.keys()].sort();
+  if (named && sessions.has(named)) choose(named);
+  else if (!named && sessions.size) choose(first);
+  else setTimeout(() => chosen ?? choose(first), WAIT_FOR_NAMED_MS);
 }
 
 /** @param {string} edge */
@@ -251,9 +263,13 @@ async function keyframe() {
 /** @param {Message} message */
 function onGroundState(message) {
   for (const [edge, state] of Object.entries(message.edges)) {
-    wall.state(edge, state);
-    plot.add(edge, { at: message.at, ...state });
-    if (edge === chosen) by("link-text").textContent = state.text;
+    wall.state(edge, state, message.at);
+    if (state.total !== null) plot.add(edge, { at: message.at, total: state.total, base: state.base, budget: state.budget });
+    if (edge !== chosen) continue;
+    const words = [`${LINK_WORDS[state.link]} since ${clock(state.since)}`, ...state.words];
+    by("link-text").textContent = words.join(" · ");
+    const failed = [...state.failed, ...message.failed];
+    by("failed").textContent = failed.join(" · ");
   }
 }
 

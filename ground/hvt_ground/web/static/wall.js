@@ -1,6 +1,6 @@
 // The wall: each edge with a small picture, its link, its budget and what happened last.
 
-/** @typedef {{link: string, since: string, total: number, budget: number}} EdgeState */
+/** @typedef {{link: string, since: number, total: number | null, budget: number | null}} EdgeState */
 
 export class Wall {
   /** @param {HTMLElement} root @param {HTMLElement} nobody @param {(edge: string) => void} onChoose */
@@ -56,16 +56,14 @@ export class Wall {
     this.card(edge).last.textContent = text;
   }
 
-  /** @param {string} edge @param {EdgeState} state */
-  state(edge, state) {
+  /** @param {string} edge @param {EdgeState} state @param {number} now */
+  state(edge, state, now) {
     const card = this.card(edge);
     card.light.dataset.state = state.link;
-    card.state.textContent = state.since;
-    card.bar.max = 1;
-    card.bar.low = 0;
-    card.bar.high = 1;
-    card.bar.value = state.budget ? Math.min(1, state.total / state.budget) : 0;
-    card.bar.title = `${kbps(state.total)} of ${kbps(state.budget)}`;
+    card.state.textContent = `${state.link} ${lasting(now - state.since)}`;
+    const known = state.total !== null && state.budget !== null;
+    card.bar.value = known ? Math.min(1, state.total / state.budget) : 0;
+    card.bar.title = known ? `${kbps(state.total)} of ${kbps(state.budget)}` : "";
   }
 
   /** @param {string | null} chosen */
@@ -81,6 +79,13 @@ export function make(kind, name, into) {
   if (name) made.className = name;
   into.append(made);
   return made;
+}
+
+/** @param {number} ms */
+function lasting(ms) {
+  const seconds = Math.max(0, Math.round(ms / 1000));
+  if (seconds < 100) return `${seconds} s`;
+  return seconds < 6000 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
 }
 
 /** @param {number} bps */

@@ -43,6 +43,47 @@ def test_many_recordings_leave_no_threads(tmp_path):
     eventually(lambda: threads() <= before, within_s=20, what="no thread of the four is left")
 
 
+def test_recordings_that_begin_and_end_at_once_do_not_stop_the_process(tmp_path):
+    """A ground of eight edges hung for ever when they landed together, and no timeout of its own could fire."""
+    program = """
+import sys, threading
+from pathlib import Path
+import numpy as np
+from hvt_ground.events import Overlay
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+
+def fly(number):
+    path = Path(sys.argv[1]) / f"{number}.rrd"
+    for session in range(3):
+        settings = RecorderSettings(
+            path=path, edge_id=f"uav-{number}", session=str(session), base_size=(640, 360), fps=15, budget_bps=800_000
+        )
+        with Recorder(settings) as recorder:
+            for index in range(100):
+                boxes = np.full((20, 4), index, np.float32) + (0, 0, 9, 9)
+                names, ones = ("car",) * 20, np.ones(20, np.float32)
+                recorder.log(
+                    Overlay(index, index * 10**8, np.arange(20), boxes, names, names, ones, np.zeros(20, bool))
+                )
+
+threads = [threading.Thread(target=fly, args=(number,)) for number in range(8)]
+for one in threads:
+    one.start()
+for one in threads:
+    one.join()
+print("ended")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    assert done.stdout == "ended\n"
+    assert len(list(tmp_path.glob("*.rrd"))) == 8
+
+
 @pytest.mark.skipif(find_spec("pandas") is None, reason="pandas is not installed")
 def test_a_ground_does_not_import_pandas():
     """Where the study is installed too, a ground would take 50 MB more for what it never uses."""

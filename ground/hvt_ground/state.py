@@ -1,0 +1,277 @@
+"""What a ground knows at one moment, as one value.
+
+Made once a second (`StateMaker`). Status line, page, metrics and ``hvt-ground status`` read it and nothing else, so
+that none of them says what another does not. What is not known is None, never 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from hvt_common import __version__
+from hvt_common.protocol.messages import Status
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
+from hvt_ground.events import Traffic
+from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.session import GroundSession
+
+__all__ = ["EdgeState", "FailedPart", "GroundState", "LinkState", "StateMaker"]
+
+LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
+"""``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out for want of link; ``lost``:
+nothing has come for `LOST_S`; ``ended``: the edge said so, or stayed away."""
+
+LOST_S = 3.0
+"""A report comes once a second: nothing for so long is no accident."""
+_THIN_S = 5.0
+"""So long after the last frame that was left out for want of link it counts as thin."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailedPart:
+    """A part that does not work now."""
+
+    part: str
+    reason: str
+    """A sentence."""
+    since_ns: int
+    """Unix time."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionState:
+    """The session of an edge that is open."""
+
+    session: str
+    """Its id, hexadecimal."""
+    software: str
+    """The edge's."""
+    method: str
+    levers: str
+    """What ``--profile auto`` sends beside the video and why; empty without."""
+    lockstep: bool
+    duration_s: float
+    source_size: tuple[int, int]
+    base_size: tuple[int, int]
+    fps: float
+    budget_bps: int
+    mean_bps: int
+    """Over the session, all that crossed the line."""
+    total_bps: float | None
+    """Over the budget's window, like the two below; None while the link is lost."""
+    base_bps: float | None
+    roi_bps: float | None
+    delay_p50_ms: float | None
+    """Capture to overlay over the session; None in lockstep, and before the first."""
+    delay_p95_ms: float | None
+    picture_age_s: float | None
+    """Since the newest picture was captured; None in lockstep."""
+    frames_received: int
+    frames_decoded: int
+    frames_untracked: int
+    """Decoded, and passed over by detection and tracking for want of time."""
+    gaps: int
+    lost: int
+    """Messages."""
+    corrupt: int
+    keyframe_requests: int
+    stills_received: int
+    still_outcomes: Mapping[str, int]
+    """What became of the objects in them."""
+    stills_not_sent: Mapping[str, int]
+    """Why candidates have no still: the edge's counts, by reason."""
+    tracks: int
+    tracks_refined: int
+    class_changes: int
+    detections: int
+    backlog_stills: int
+    """That came after an outage; `backlog_video_s` likewise."""
+    backlog_video_s: float
+    backlog_working: int
+    """Objects of the backlog that have come and are not where they belong yet."""
+    edge_frames_dropped: int | None
+    """At the edge before encoding, all; None before its first report, as all below."""
+    edge_frames_dropped_cpu: int | None
+    edge_encode_ms: float | None
+    edge_detect_ms: float | None
+    edge_still_queue: int | None
+    edge_failed: tuple[FailedPart, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeState:
+    """One edge, as this ground sees it."""
+
+    edge: str
+    link: LinkState
+    link_since_ns: int
+    """Unix time."""
+    silent_s: float
+    """For how long nothing has come."""
+    unusable_messages: int
+    """Damaged, foreign, or of another version."""
+    sessions_ended: int
+    session: SessionState | None
+    failed: tuple[FailedPart, ...]
+    """Of this edge's reception."""
+
+
+@dataclass(frozen=True, slots=True)
+class GroundState:
+    """All edges, and the ground's own parts."""
+
+    at_ns: int
+    """Unix time."""
+    version: str
+    detector: str
+    classifier: str
+    calibrated: bool
+    """Whether a still's probability of a class is one: it was fitted to how often it is right."""
+    edges: tuple[EdgeState, ...]
+    failed: tuple[FailedPart, ...]
+    """Models, recordings and other sinks."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+class StateMaker:
+    """Makes states, and remembers since when each link is as it is. ``clock`` is Unix time without steps."""
+
+    def __init__(
+        self,
+        clock: Callable[[], int],
+        *,
+        detector: str = "",
+        classifier: str = "",
+        calibrated: bool = False,
+        failures: Failures | None = None,
+    ) -> None:
+        self._clock = clock
+        self._detector, self._classifier, self._calibrated = detector, classifier, calibrated
+        self._failures = failures
+        self._links: dict[str, tuple[LinkState, int]] = {}
+        self._left_out: dict[str, tuple[str, int, int]] = {}
+        """By edge: session, frames that it left out for want of link, and when that last rose."""
+
+    def make(self, edges: Iterable[tuple[str, EdgeSessions]]) -> GroundState:
+        """The state now."""
+        now_ns = self._clock()
+        made = tuple(self._edge(edge, sessions, now_ns) for edge, sessions in edges)
+        known = {one.edge for one in made}
+        for memory in (self._links, self._left_out):
+            for edge in memory.keys() - known:
+                del memory[edge]
+        return GroundState(
+            at_ns=now_ns,
+            version=__version__,
+            detector=self._detector,
+            classifier=self._classifier,
+            calibrated=self._calibrated,
+            edges=made,
+            failed=() if self._failures is None else _failed(self._failures),
+        )
+
+    def _edge(self, edge: str, sessions: EdgeSessions, now_ns: int) -> EdgeState:
+        session = sessions.session  # it may end in its thread meanwhile
+        link = self._link(edge, sessions, session, now_ns)
+        before, since_ns = self._links.get(edge, (None, now_ns))
+        if link != before:
+            since_ns = now_ns - round(sessions.silent_s * SECOND_NS) if link == "lost" else now_ns
+            self._links[edge] = link, since_ns
+        return EdgeState(
+            edge=edge,
+            link=link,
+            link_since_ns=since_ns,
+            silent_s=sessions.silent_s,
+            unusable_messages=sessions.unusable,
+            sessions_ended=sessions.ended,
+            session=None if session is None else _session(session, sessions, link=link, now_ns=now_ns),
+            failed=_failed(sessions.failures),
+        )
+
+    def _link(
+        self, edge: str, sessions: EdgeSessions, session: GroundSession | None, now_ns: int
+    ) -> LinkState:
+        if session is None:
+            return "ended" if sessions.ended else "waiting"
+        if sessions.silent_s > LOST_S and not session.lockstep:
+            return "lost"
+        left_out = _left_out(session.last_status)
+        key = f"{session.info.session_id:016x}"
+        known_key, known, rose_ns = self._left_out.get(edge, (key, left_out, 0))
+        if known_key != key or left_out < known:
+            known, rose_ns = left_out, 0
+        if left_out > known:
+            rose_ns = now_ns
+        self._left_out[edge] = key, left_out, rose_ns
+        return "thin" if now_ns - rose_ns < _THIN_S * SECOND_NS else "up"
+
+
+def _left_out(status: Status | None) -> int:
+    """Frames that the edge dropped because the link had no room."""
+    return 0 if status is None else status.health.frames_dropped - status.health.frames_dropped_cpu
+
+
+def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState, now_ns: int) -> SessionState:
+    info, pipeline, counters, status = session.info, session.pipeline, session.counters, session.last_status
+    now: Traffic | None = None if link == "lost" else session.traffic
+    captured_ns = None if session.lockstep else session.newest_captured_ns
+    health = None if status is None else status.health
+    totals = session.backlog.totals
+    return SessionState(
+        session=f"{info.session_id:016x}",
+        software=info.software,
+        method=info.method,
+        levers=session.levers,
+        lockstep=session.lockstep,
+        duration_s=session.duration_s,
+        source_size=info.source_size,
+        base_size=info.base_size,
+        fps=info.fps,
+        budget_bps=info.budget_bps,
+        mean_bps=session.ledger.summary(session.duration_s).total_bps,
+        total_bps=None if now is None else now.total_bps,
+        base_bps=None if now is None else now.base_bps,
+        roi_bps=None if now is None else now.roi_bps,
+        delay_p50_ms=None if session.lockstep else session.overlay_latency.percentile(50),
+        delay_p95_ms=None if session.lockstep else session.overlay_latency.percentile(95),
+        picture_age_s=None if captured_ns is None else max(0.0, (now_ns - captured_ns) / SECOND_NS),
+        frames_received=session.frames_received,
+        frames_decoded=session.frames_decoded,
+        frames_untracked=session.frames_untracked,
+        gaps=counters.gaps,
+        lost=counters.lost,
+        corrupt=counters.corrupt,
+        keyframe_requests=counters.keyframe_requests,
+        stills_received=session.stills_received,
+        still_outcomes=dict(pipeline.outcomes),
+        stills_not_sent=dict(session.not_sent),
+        tracks=pipeline.tracks,
+        tracks_refined=pipeline.refined,
+        class_changes=pipeline.class_changes,
+        detections=pipeline.detections_run,
+        backlog_stills=totals.stills,
+        backlog_video_s=totals.video_s,
+        backlog_working=sessions.backlog.working,
+        edge_frames_dropped=None if health is None else health.frames_dropped,
+        edge_frames_dropped_cpu=None if health is None else health.frames_dropped_cpu,
+        edge_encode_ms=None if health is None else health.encode_ms,
+        edge_detect_ms=None if health is None else health.detect_ms,
+        edge_still_queue=None if health is None else health.still_queue,
+        edge_failed=()
+        if status is None
+        else tuple(
+            FailedPart(one.part, one.reason, session.to_local_ns(one.failed_ns))
+            for one in status.failed
+            if not one.working
+        ),
+    )
+
+
+def _failed(failures: Failures) -> tuple[FailedPart, ...]:
+    return tuple(FailedPart(one.part, one.reason, one.since_ns) for one in failures.parts if not one.working)
