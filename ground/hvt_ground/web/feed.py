@@ -17,7 +17,7 @@ from hvt_ground.state import EdgeState, FailedPart, GroundState, SessionState
 from hvt_ground.web.pictures import Pictures, jpeg
 from hvt_ground.web.viewers import EdgePage, Hub, text
 
-__all__ = ["SessionFeed", "state_message"]
+__all__ = ["SessionFeed", "state_loads", "state_message"]
 
 _LATE_NS = 300_000_000
 """Behind the link by so much, pictures are decoded and not coded again until it has caught up."""
@@ -170,6 +170,20 @@ def state_message(state: GroundState) -> str:
         for one in state.edges
     }
     return text("state", at=state.at_ns // _MILLION, edges=edges, failed=[*map(_failure, state.failed)])
+
+
+def state_loads(state: GroundState) -> dict[str, tuple[float, float, float, float]]:
+    """By edge, where it is known: Unix milliseconds, and bits a second: all, the base stream, the budget."""
+    return {
+        one.edge: (
+            state.at_ns // _MILLION,
+            one.session.total_bps,
+            one.session.base_bps,
+            one.session.budget_bps,
+        )
+        for one in state.edges
+        if one.session is not None and one.session.total_bps is not None and one.session.base_bps is not None
+    }
 
 
 def _words(session: SessionState, *, calibrated: bool) -> list[str]:

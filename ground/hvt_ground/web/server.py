@@ -19,7 +19,7 @@ from hvt_common.protocol.messages import Info
 from hvt_ground.control import EdgeClient
 from hvt_ground.state import GroundState
 from hvt_ground.web.access import Access, is_loopback, own_tokens
-from hvt_ground.web.feed import SessionFeed, state_message
+from hvt_ground.web.feed import SessionFeed, state_loads, state_message
 from hvt_ground.web.requests import EdgeRequests
 from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
 from hvt_ground.web.viewers import EdgePage, Hub
@@ -81,8 +81,8 @@ class WebPage:
 
     def show(self, state: GroundState) -> None:
         """Give out how all edges are; for any thread."""
-        message = state_message(state)
-        self._hub.post(lambda: self._hub.state(message))
+        message, loads = state_message(state), state_loads(state)
+        self._hub.post(lambda: self._hub.state(message, loads))
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +28,8 @@ _MOST_RETAINED = 2000
 _MOST_STILLS = 60
 _MOST_STILL_BYTES = 24 * 2**20
 _MOST_NOTICES = 100
+_MOST_LOADS = 240
+"""One a second."""
 
 
 def text(kind: str, **content: Any) -> str:
@@ -167,6 +169,7 @@ class Hub:
         self.viewers: set[Viewer] = set()
         self._streams = self._demands = 0
         self._state = ""
+        self._loads: dict[str, deque[Sequence[float]]] = {}
 
     def post(self, call: Callable[[], None]) -> None:
         """Have it done in the loop's thread; for any thread. After the loop's end nothing is done."""
@@ -229,9 +232,11 @@ class Hub:
         edge.notices.append(message)
         self._to_all(message)
 
-    def state(self, message: str) -> None:
-        """How all edges are."""
+    def state(self, message: str, loads: Mapping[str, Sequence[float]]) -> None:
+        """How all edges are; ``loads`` is what the plot shows of each, and is remembered for newcomers."""
         self._state = message
+        for edge, load in loads.items():
+            self._loads.setdefault(edge, deque(maxlen=_MOST_LOADS)).append(load)
         self._to_all(message)
 
     # From the viewers
@@ -255,6 +260,7 @@ class Hub:
         """Show it this edge from now on, beginning with what it needs for the picture of now."""
         viewer.leave_video()
         viewer.watches = (edge_name, rung)
+        viewer.put(text("loads", edge=edge_name, rows=list(self._loads.get(edge_name, ()))))
         edge = self.edges.get(edge_name)
         if edge is not None:
             for message in (*edge.notices, *edge.stills):

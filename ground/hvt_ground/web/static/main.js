@@ -30,6 +30,8 @@ const by = (id) => document.getElementById(id);
 
 /** @type {Map<string, Message>} */
 const sessions = new Map();
+/** @type {Map<string, string>} */
+const links = new Map();
 /** @type {string | null} */
 let chosen = null;
 let rungs = Player.rungs();
@@ -75,6 +77,9 @@ function onMessage(message, payload) {
       break;
     case "state":
       onGroundState(message);
+      break;
+    case "loads":
+      plot.fill(message.edge, message.rows);
       break;
     case "thumbnail":
       wall.thumbnail(message.edge, payload);
@@ -178,7 +183,7 @@ function showAge() {
   const old = player.live && shown.frame >= 0 && performance.now() - shown.at > GAP_MS;
   by("stage").classList.toggle("old", old);
   by("gap").hidden = !old && shown.frame >= 0;
-  by("gap").textContent = shown.frame < 0 ? "waiting for a picture" : `last picture, ${seconds(ms)} old`;
+  by("gap").textContent = shown.frame < 0 ? waitingWords() : `last picture, ${seconds(ms)} old`;
   if (shown.frame < 0) by("age").textContent = "";
   else if (!player.live) by("age").textContent = `of ${clock(shown.captured)}, ${seconds(ms)} ago`;
   else by("age").textContent = lockstep ? "flown in lockstep: no age" : `picture ${seconds(ms)} old`;
@@ -186,6 +191,8 @@ function showAge() {
   by("pause").textContent = by("video").paused && !player.live ? "Play" : "Pause";
 }
 setInterval(showAge, 200);
+
+const waitingWords = () => (links.get(chosen) === "ended" ? "the flight has ended" : "waiting for a picture");
 
 /** @param {number} ms */
 const seconds = (ms) => (Math.abs(ms) < 10000 ? `${(ms / 1000).toFixed(1)} s` : `${Math.round(ms / 1000)} s`);
@@ -264,6 +271,7 @@ async function keyframe() {
 function onGroundState(message) {
   for (const [edge, state] of Object.entries(message.edges)) {
     wall.state(edge, state, message.at);
+    links.set(edge, state.link);
     if (state.total !== null) plot.add(edge, { at: message.at, total: state.total, base: state.base, budget: state.budget });
     if (edge !== chosen) continue;
     const words = [`${LINK_WORDS[state.link]} since ${clock(state.since)}`, ...state.words];

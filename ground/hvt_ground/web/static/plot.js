@@ -22,6 +22,12 @@ export class Plot {
     if (edge === this.edge) this.draw();
   }
 
+  /** What was before this page was opened. @param {string} edge @param {number[][]} rows */
+  fill(edge, rows) {
+    this.rows.set(edge, rows.map(([at, total, base, budget]) => ({ at, total, base, budget })));
+    this.draw();
+  }
+
   /** @param {string} edge */
   show(edge) {
     this.edge = edge;

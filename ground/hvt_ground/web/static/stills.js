@@ -37,7 +37,7 @@ export class Stills {
     }
     const words = make("span", "words", button);
     words.textContent = sentence(still);
-    make("small", "", words).textContent = `${clock(still.captured)} · ${still.reason}${still.stored ? " · came afterwards" : ""}`;
+    make("small", "", words).textContent = `${clock(still.captured)} · ${reasonOf(still)}${still.stored ? " · came afterwards" : ""}`;
     button.addEventListener("click", () => this.open(still));
     this.list.prepend(item);
     while (this.list.children.length > MOST) this.list.lastElementChild.remove();
@@ -50,7 +50,7 @@ export class Stills {
       picture.closest("figure").hidden = !still.shows.includes(which);
       if (still.shows.includes(which)) picture.src = address(still, which);
     }
-    this.large.querySelector("#large-text").textContent = `${sentence(still)} · ${clock(still.captured)} · ${still.reason}`;
+    this.large.querySelector("#large-text").textContent = `${sentence(still)} · ${clock(still.captured)} · ${reasonOf(still)}`;
     this.large.showModal();
   }
 }
@@ -59,12 +59,15 @@ export class Stills {
 const address = (still, which) => `/stills/${encodeURIComponent(still.edge)}/${still.id}/${which}`;
 
 /** @param {Still} still */
+const reasonOf = (still) => (still.reason === "asked" ? "on demand" : still.reason);
+
+/** @param {Still} still */
 function sentence(still) {
   const track = still.track === null ? "" : `track ${still.track}: `;
   if (still.unread) return `${track}${still.after}, not read${still.note ? ` (${still.note})` : ""}`;
   if (still.doubted) return `${track}doubted, was ${still.before}`;
   const sure = `${Math.round(still.sureness * 100)} %`;
-  return still.before === still.after ? `${track}${still.after}, ${sure}` : `${track}${still.before} → ${still.after}, ${sure}`;
+  return still.before === still.after || !still.before ? `${track}${still.after}, ${sure}` : `${track}${still.before} → ${still.after}, ${sure}`;
 }
 
 /** @param {number} ms */
