@@ -80,9 +80,9 @@ def _glass_to_glass(port: int, lasts_s: float) -> None:
         time.sleep(lasts_s)
         ages = sorted(page.evaluate("window.ages"))
         browser.close()
-    cut = statistics.quantiles(ages, n=20)
+    parts = statistics.quantiles(ages, n=20)
     print(
-        f"glass to glass: {len(ages)} pictures, p50 {cut[9]:.0f} ms, p95 {cut[18]:.0f} ms, max {ages[-1]} ms"
+        f"glass to glass: {len(ages)} pictures, p50 {parts[9]:.0f} ms, p95 {parts[18]:.0f} ms, max {ages[-1]} ms"
     )
 
 

@@ -18,7 +18,7 @@ from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.runtime.reporting import StatusLine, check_writable
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
-from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
+from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, key_pair
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
@@ -79,9 +79,6 @@ class Ground:
             view: LiveView | None = None
             if config.view or config.serve:
                 view = stack.enter_context(LiveView("spawn" if config.view else "serve"))
-            page = None if config.web is None else stack.enter_context(self._open_page(config.web))
-            outputs = Outputs(models.failures)
-            stack.callback(outputs.close)
             settings = LinkSettings(
                 role="ground",
                 listen=config.listen,
@@ -90,6 +87,9 @@ class Ground:
                 insecure=config.insecure,
                 links=2 if config.links == 2 else 1,
             )
+            page = None if config.web is None else stack.enter_context(self._open_page(config.web, settings))
+            outputs = Outputs(models.failures)
+            stack.callback(outputs.close)
             session = stack.enter_context(open_session(settings))
             if page is not None:
                 page.use(EdgeClient.of_session(session, settings))
@@ -140,10 +140,10 @@ class Ground:
                 f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
             ) from None
 
-    def _open_page(self, address: str) -> WebPage:
+    def _open_page(self, address: str, settings: LinkSettings) -> WebPage:
         with needs_extra("'hvt[web]'"):  # only now: who serves none starts faster
             from hvt_ground.web import WebPage  # noqa: PLC0415
-        return WebPage(address, clock=self._clock)
+        return WebPage(address, clock=self._clock, keys=key_pair(settings))
 
     def _say_where(self, line: StatusLine, *, pages: Sequence[str]) -> None:
         config = self._config

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import ssl
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 from urllib.parse import urlsplit
@@ -34,17 +36,24 @@ _END_S = 2.0
 class WebPage:
     """Serves the page at ``address`` (HOST:PORT) while the context lasts; ``clock`` is the ground's.
 
-    Raises `UserError` where the address cannot be used.
+    ``keys``, a certificate and its key, encrypt it beyond loopback. Raises `UserError` where the address, the tokens or
+    the keys cannot be used.
     """
 
-    def __init__(self, address: str, *, clock: Callable[[], int]) -> None:
+    def __init__(
+        self, address: str, *, clock: Callable[[], int], keys: tuple[Path, Path] | None = None
+    ) -> None:
         host, port = _parsed(address)
         tokens = {} if is_loopback(host) else own_tokens()
+        keys = keys if tokens else None
+        if keys is not None:
+            _check_keys(*keys)
         self._clock = clock
         self._socket = _bound(host, port)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
         self.links = tuple(
-            f"http://{shown}:{port}/" + (f"?token={tokens[role]} ({role})" if tokens else "")
+            f"{'http' if keys is None else 'https'}://{shown}:{port}/"
+            + (f"?token={tokens[role]} ({role})" if tokens else "")
             for role in (("operator", "viewer") if tokens else ("operator",))
         )
         """What to open, one for each role."""
@@ -53,6 +62,8 @@ class WebPage:
         self._hub = Hub(self._loop)
         config = uvicorn.Config(
             make_site(Access(tokens), self._hub, EdgeRequests(self._control)),
+            ssl_certfile=None if keys is None else keys[0],
+            ssl_keyfile=None if keys is None else keys[1],
             http=_BoundedProtocol,
             ws="websockets-sansio",
             loop="asyncio",
@@ -135,6 +146,15 @@ def _parsed(address: str) -> tuple[str, int]:
     if not host or not port or parts.path or parts.query:
         raise UserError(f"--web {address!r} is not accepted: give HOST:PORT, such as 127.0.0.1:8080")
     return host, port
+
+
+def _check_keys(certificate: Path, key: Path) -> None:
+    try:
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        raise UserError(
+            f"--web cannot use the keys {certificate} and {key} ({error.strerror or error})"
+        ) from None
 
 
 def _bound(host: str, port: int) -> socket.socket:

@@ -6,6 +6,7 @@ import http.client
 import json
 import os
 import socket
+import ssl
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
@@ -15,7 +16,9 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 
 from hvt_common.errors import UserError
+from hvt_common.transport.zenoh_config import key_pair
 from hvt_ground.web import WebPage
+from programs.fleet_keys import Fleet
 from programs.processes import eventually, free_ports
 
 
@@ -130,6 +133,25 @@ def test_elsewhere_nothing_is_shown_without_the_token(public, state_folder):
     assert asked(public, "/", Cookie=cookie)[0] == 200
     with joined(public, additional_headers={"Cookie": cookie}) as viewer:
         assert json.loads(viewer.recv())["role"] == "viewer"
+
+
+def test_the_keys_of_the_link_encrypt_the_page(port, tmp_path, state_folder):
+    """Tokens and pictures would cross a network in clear, though there are keys."""
+    fleet = Fleet(tmp_path / "own")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    keys = key_pair(fleet.settings("base", "ground"))
+    trust = ssl.create_default_context(cafile=tmp_path / "own" / "ca.pem")
+    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=keys) as page:
+        token = json.loads((state_folder / "web-tokens.json").read_text())["operator"]
+        assert all(one.startswith("https://") for one in page.links)
+        connection = http.client.HTTPSConnection("127.0.0.1", port, timeout=10, context=trust)
+        connection.request("GET", f"/?token={token}")
+        answer = connection.getresponse()
+        assert answer.status == 303
+        assert "Secure" in answer.headers["set-cookie"]
+        connection.close()
+    with pytest.raises(UserError, match="cannot use the keys"):
+        WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=(tmp_path / "a", tmp_path / "b"))
 
 
 def test_a_viewer_commands_nothing(public, state_folder):
