@@ -36,8 +36,8 @@ _END_S = 2.0
 class WebPage:
     """Serves the page at ``address`` (HOST:PORT) while the context lasts; ``clock`` is the ground's.
 
-    ``keys``, a certificate and its key, encrypt it beyond loopback. Raises `UserError` where the address, the tokens or
-    the keys cannot be used.
+    ``keys``, a certificate and its key, encrypt it beyond loopback. Raises `UserError` where the address, the tokens
+    or the keys cannot be used.
     """
 
     def __init__(
@@ -51,11 +51,8 @@ class WebPage:
         self._clock = clock
         self._socket = _bound(host, port)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
-        self.links = tuple(
-            f"{'http' if keys is None else 'https'}://{shown}:{port}/"
-            + (f"?token={tokens[role]} ({role})" if tokens else "")
-            for role in (("operator", "viewer") if tokens else ("operator",))
-        )
+        start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
+        self.links = tuple(f"{start}?token={token} ({role})" for role, token in tokens.items()) or (start,)
         """What to open, one for each role."""
         self._client: EdgeClient | None = None
         self._loop = asyncio.new_event_loop()
