@@ -167,12 +167,14 @@ class Group:
         *,
         many: bool = False,
         shown_default: str = "",
+        bare: str = "",
     ) -> Any:
         """Declare a dataclass field that is also a flag ``--its-name`` and a TOML key ``its-name``.
 
-        With ``many`` the flag may be given several times and the value is a tuple.
+        With ``many`` the flag may be given several times and the value is a tuple; ``bare`` is what the flag means
+        where no value is given.
         """
-        more = {"kind": kind, "many": many, "shown_default": shown_default}
+        more = {"kind": kind, "many": many, "shown_default": shown_default, "bare": bare}
         return self._field(default, help_line, more)
 
     def switch(self, help_line: str, *, default: bool = False) -> Any:
@@ -296,10 +298,13 @@ def _flags(config_class: type, *, program: str, description: str, rare: bool) ->
         kind: SettingType = field.metadata["kind"]
         shown = field.metadata["shown_default"] or _shown(kind, field.default)
         shown_help = f"{help_line} [{shown}]" if shown else help_line
+        bare = field.metadata["bare"]
         into.add_argument(
             _flag(field),
             metavar=kind.metavar,
             action="append" if field.metadata["many"] else "store",
+            nargs="?" if bare else None,
+            const=bare or None,
             help=argparse.SUPPRESS if hidden else shown_help,
         )
     return parser

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hvt_common.errors import FlightError, UserError, needs_extra
 from hvt_common.protocol.channels import check_edge_pattern
@@ -20,10 +20,11 @@ from hvt_common.runtime.health_server import METRICS_TYPE, Answer, HealthServer
 from hvt_common.runtime.reporting import StatusLine, check_writable
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
-from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings
+from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, key_pair
 from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
+from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
 from hvt_ground.perception.models import stills_calibrated
 from hvt_ground.recordings.folder import RecordingsFolder
@@ -36,6 +37,9 @@ from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.state import GroundState, StateMaker
 from hvt_ground.status import completed, status_text, summary
 from hvt_ground.wiring import Models, SessionFactory
+
+if TYPE_CHECKING:
+    from hvt_ground.web import WebPage
 
 __all__ = ["Ground"]
 
@@ -88,8 +92,6 @@ class Ground:
             retention = Retention(config.keep, config.keep_video)
             index = RecordingsFolder(config.record_folder, retention, failures=models.failures)
             stack.enter_context(index)
-            outputs = Outputs(models.failures)
-            stack.callback(outputs.close)
             settings = LinkSettings(
                 role="ground",
                 listen=config.listen,
@@ -98,19 +100,26 @@ class Ground:
                 insecure=config.insecure,
                 links=2 if config.links == 2 else 1,
             )
+            page = None if config.web is None else stack.enter_context(self._open_page(config.web, settings))
+            outputs = Outputs(models.failures)
+            stack.callback(outputs.close)
             session = stack.enter_context(open_session(settings))
+            if page is not None:
+                page.use(EdgeClient.of_session(session, settings))
             self._make_record_folder()
             index.open()
             factory = SessionFactory(
-                config, models, clock=self._clock, outputs=outputs, view=view, index=index
+                config, models, clock=self._clock, outputs=outputs, view=view, page=page, index=index
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
-            self._say_where(line, page="" if view is None else view.page)
+            self._say_where(
+                line, pages=(*(() if view is None else (view.page,)), *(page.links if page else ()))
+            )
             try:
-                self._serve(link, factory, line, watch, models.failures)
+                self._serve(link, factory, line, watch, models.failures, page)
                 self._close_edges()
             except Exception as error:
                 raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
@@ -147,13 +156,18 @@ class Ground:
                 f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
             ) from None
 
-    def _say_where(self, line: StatusLine, *, page: str) -> None:
+    def _open_page(self, address: str, settings: LinkSettings) -> WebPage:
+        with needs_extra("'hvt[web]'"):  # only now: who serves none starts faster
+            from hvt_ground.web import WebPage  # noqa: PLC0415
+        return WebPage(address, clock=self._clock, keys=key_pair(settings))
+
+    def _say_where(self, line: StatusLine, *, pages: Sequence[str]) -> None:
         config = self._config
         if config.connect:
             line.note(f"hvt-ground: connecting to {', '.join(config.connect)}")
         if config.listen or not (config.connect or config.zenoh_config):
             line.note(f"hvt-ground: listening on {', '.join(config.listen or (DEFAULT_ENDPOINT,))}")
-        if page:
+        for page in filter(None, pages):
             line.note(f"hvt-ground: watch at {page}")
 
     # Who watches
@@ -191,6 +205,7 @@ class Ground:
         line: StatusLine,
         watch: LinkWatch,
         failures: Failures,
+        page: WebPage | None,
     ) -> None:
         config, polls = self._config, 0
         maker = StateMaker(
@@ -211,6 +226,8 @@ class Ground:
             polls += 1
             if polls % _STATUS_EVERY_POLLS == 0:
                 self._state = maker.make([(edge, one.sessions) for edge, one in sorted(self._edges.items())])
+                if page is not None:
+                    page.show(self._state)
                 line.show(status_text(self._state) or ("no link" if watch.trouble else "no edge yet"))
             if config.once and self._all_ended():
                 return

@@ -13,9 +13,10 @@ from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import Limit, parse_limit
 
-__all__ = ["DETECTOR", "MOTION", "NONE", "GroundConfig", "check"]
+__all__ = ["DEFAULT_PAGE", "DETECTOR", "MOTION", "NONE", "GroundConfig", "check"]
 
 DETECTOR, NONE, MOTION = "detector", "none", "motion"
+DEFAULT_PAGE = "127.0.0.1:8080"
 
 
 def _age(text: str, *, name: str) -> Limit:
@@ -126,6 +127,12 @@ class GroundConfig:
     )
     view: bool = _FILES.switch("also open the Rerun viewer")
     serve: bool = _FILES.switch("also serve the Rerun web viewer on this machine")
+    web: str | None = _FILES.option(
+        TEXT,
+        None,
+        f"also serve the page for browsers at HOST:PORT; alone: {DEFAULT_PAGE}; beyond this machine it takes a token",
+        bare=DEFAULT_PAGE,
+    )
     metrics: str | None = _FILES.option(
         TEXT,
         None,

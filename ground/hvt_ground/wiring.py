@@ -11,7 +11,7 @@ from functools import partial
 from itertools import chain
 from itertools import count as count_from
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector
@@ -40,6 +40,9 @@ from hvt_ground.sinks.still_files import StillFiles
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.sinks.tracks_table import TrackTable
 
+if TYPE_CHECKING:  # who serves no page needs no web server
+    from hvt_ground.web import WebPage
+
 __all__ = ["Models", "SessionFactory", "make_backlog_perception", "make_pipeline", "output_path"]
 
 S = TypeVar("S", bound=SinkWriter[Any])
@@ -50,8 +53,8 @@ _LOCKSTEP_WAIT_S = 10.0
 class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
-    All that they write to is of ``outputs``; ``view`` is a viewer, None shows nothing live; ``index`` learns of the
-    recordings.
+    All that they write to is of ``outputs``; ``view`` is a viewer and ``page`` the page for browsers, None shows
+    nothing live; ``index`` learns of the recordings.
     """
 
     def __init__(
@@ -62,6 +65,7 @@ class SessionFactory:
         clock: Callable[[], int],
         outputs: Outputs,
         view: LiveView | None,
+        page: WebPage | None = None,
         index: Sink[RecordingRow] | None = None,
     ) -> None:
         self._config = config
@@ -69,6 +73,7 @@ class SessionFactory:
         self._clock = clock
         self._outputs = outputs
         self._view = view
+        self._page = page
         self._index = index
         self._paths: set[Path] = set()
         """Taken by this process."""
@@ -93,6 +98,8 @@ class SessionFactory:
         if self._view is not None:
             open_live = partial(_live_recorder, settings, self._view)
             sinks.append(self._outputs.open(f"live view of {edge}", open_live))
+        if self._page is not None:
+            sinks.append(self._outputs.open(f"web page of {edge}", self._page.feed(info)))
         if config.tracks is not None:
             names = partial(output_path, config.tracks, suffix=".csv", edge=edge, stamp=stamp)
             open_table = partial(self._opened, TrackTable, names)

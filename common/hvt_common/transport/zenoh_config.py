@@ -16,7 +16,14 @@ import zenoh
 from hvt_common.errors import UserError
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
 
-__all__ = ["DEFAULT_ENDPOINT", "LinkSettings", "configure", "connect_endpoints", "without_build_paths"]
+__all__ = [
+    "DEFAULT_ENDPOINT",
+    "LinkSettings",
+    "configure",
+    "connect_endpoints",
+    "key_pair",
+    "without_build_paths",
+]
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -114,6 +121,16 @@ def configure(settings: LinkSettings) -> tuple[zenoh.Config, tuple[str, ...]]:
     for endpoint in effective:
         _check_reach(endpoint, allowed=settings.insecure or _has_keys(said, endpoint))
     return config, effective
+
+
+def key_pair(settings: LinkSettings) -> tuple[Path, Path] | None:
+    """The certificate and the key with which this machine listens; None without. Raises like `configure`."""
+    _, said = _read_config(settings.zenoh_config)
+    try:
+        tls = said["transport"]["link"]["tls"]
+        return Path(tls["listen_certificate"]), Path(tls["listen_private_key"])
+    except (KeyError, TypeError):
+        return None
 
 
 def _read_config(path: Path | None) -> tuple[zenoh.Config, dict[str, Any]]:

@@ -40,6 +40,11 @@ class YuvPicture:
         self.size = (picture.width, picture.height)
 
     @property
+    def frame(self) -> av.VideoFrame:
+        """As libavcodec gives it, for who codes it again."""
+        return self._picture
+
+    @property
     def nbytes(self) -> int:
         """Of its pixels."""
         return sum(plane.buffer_size for plane in self._picture.planes)

@@ -317,6 +317,11 @@ class EdgeClient:
         settings = LinkSettings(role="client", connect=endpoints, zenoh_config=zenoh_config)
         return cls(stack.enter_context(open_session(settings)), requester=Requester.of(settings), stack=stack)
 
+    @classmethod
+    def of_session(cls, session: zenoh.Session, settings: LinkSettings) -> EdgeClient:
+        """Ask through a session that is open, which its owner closes."""
+        return cls(session, requester=Requester.of(settings))
+
     def nobody(self) -> str:
         """What to tell a user where `names` is empty."""
         return f"no edge is there{_link_hint(self._session)}"

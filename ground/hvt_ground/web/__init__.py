@@ -1,0 +1,11 @@
+"""The page that anyone opens: the live picture, stills and events of all edges in a browser.
+
+A sink (`feed`) turns each session into messages, `viewers` gives them out, `site` says what can be asked for, and
+`server` runs it. The pages' own files are in ``static``.
+"""
+
+from __future__ import annotations
+
+from hvt_ground.web.server import WebPage
+
+__all__ = ["WebPage"]

@@ -1,0 +1,104 @@
+"""Who may open the page, and what for: tokens, roles, and requests that come from our own page alone.
+
+On loopback everybody on this machine is an operator; elsewhere a token says who somebody is.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import os
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from pathlib import Path
+from typing import Literal
+from urllib.parse import urlsplit
+
+import platformdirs
+
+from hvt_common.errors import UserError
+
+__all__ = ["COOKIE", "HEADERS", "Access", "Role", "is_loopback", "own_tokens"]
+
+Role = Literal["viewer", "operator"]
+
+COOKIE = "hvt"
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; media-src blob:; "
+        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-cache",
+}
+_LEAST_TOKEN = 16
+_LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches it."""
+    return host in _LOOPBACK or host.startswith("127.")
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """``tokens`` by role; empty on loopback, where there are none."""
+
+    tokens: Mapping[Role, str]
+
+    def role(self, headers: Mapping[str, str], *, token: str | None = None) -> Role | None:
+        """What a request may do; None is nothing. ``token`` is that of a link, else the cookie counts."""
+        if not self.tokens:
+            # Another site's name may be made to lead here: only our own names are answered.
+            host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
+            return "operator" if is_loopback(host) else None
+        given = (token or _cookie(headers.get("cookie", ""))).encode()
+        found = [role for role, known in self.tokens.items() if hmac.compare_digest(given, known.encode())]
+        return found[0] if found else None
+
+    @staticmethod
+    def same_origin(headers: Mapping[str, str]) -> bool:
+        """Whether a page of ours asks, not one of another site that a browser has open beside it."""
+        origin = headers.get("origin", "")
+        return bool(origin) and urlsplit(origin).netloc == headers.get("host", "")
+
+
+def _cookie(header: str) -> str:
+    try:
+        found = SimpleCookie(header).get(COOKIE)
+    except CookieError:
+        return ""
+    return "" if found is None else found.value
+
+
+def own_tokens(folder: Path | None = None) -> Mapping[Role, str]:
+    """The tokens of this machine's page, made when first needed; readable by this user alone.
+
+    Raises `UserError` where the file cannot be used.
+    """
+    folder = folder or platformdirs.user_state_path("hvt")
+    file = folder / "web-tokens.json"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not file.exists():
+            made = {"operator": secrets.token_urlsafe(24), "viewer": secrets.token_urlsafe(24)}
+            number = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(number, "w", encoding="utf-8") as out:
+                json.dump(made, out)
+        if file.stat().st_mode & 0o077:
+            raise UserError(f"{file} can be read by others: chmod 600 it, or remove it for new tokens")
+        known = json.loads(file.read_text(encoding="utf-8"))
+        tokens: dict[Role, str] = {"operator": str(known["operator"]), "viewer": str(known["viewer"])}
+    except OSError as error:
+        raise UserError(
+            f"the tokens of --web cannot be kept in {file} ({error.strerror}): XDG_STATE_HOME names another place"
+        ) from None
+    except (ValueError, KeyError, TypeError):
+        tokens = {}
+    if not tokens or any(len(one) < _LEAST_TOKEN for one in tokens.values()):
+        raise UserError(f"{file} holds no tokens: remove it, and new ones are made")
+    return tokens

@@ -1,0 +1,223 @@
+"""From events of a session to messages for browsers: a sink of the ground, in a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.messages import Info
+from hvt_common.runtime.process import lower_priority
+from hvt_common.units import bitrate_text, counts_text
+from hvt_ground.events import Event, MessageTiming, Notice, Overlay, Refinement, VideoSample
+from hvt_ground.state import EdgeState, FailedPart, GroundState, SessionState
+from hvt_ground.web.pictures import Pictures, jpeg
+from hvt_ground.web.viewers import EdgePage, Hub, text
+
+__all__ = ["SessionFeed", "state_loads", "state_message"]
+
+_LATE_NS = 300_000_000
+"""Behind the link by so much, pictures are decoded and not coded again until it has caught up."""
+_TOO_LATE_NS = 3_000_000_000
+"""By so much, those up to the next keyframe are passed over."""
+_SHOWN_BY_BROWSERS = ("image/jpeg", "image/png", "image/webp")
+_MILLION = 1_000_000
+
+
+class SessionFeed:
+    """Writes one session of an edge to the page of it. ``clock`` is the ground's, Unix nanoseconds."""
+
+    path = None
+
+    def __init__(self, info: Info, page: EdgePage, hub: Hub, *, clock: Callable[[], int]) -> None:
+        lower_priority()  # viewers never slow down what receives and records
+        self._info = info
+        self._page = page
+        self._hub = hub
+        self._clock = clock
+        self._pictures = Pictures(info)
+        self._offset_ns = 0
+        self._late_ns = 0
+        self._stills = 0
+        session = {
+            "edge": info.edge,
+            "session": f"{info.session_id:016x}",
+            "baseSize": info.base_size,
+            "sourceSize": info.source_size,
+            "viewScale": info.view_scale,
+            "viewOffset": info.view_offset_px,
+            "fps": info.fps,
+            "method": info.method,
+            "pace": info.pace,
+            "budget": info.budget_bps,
+            "software": info.software,
+        }
+        hub.post(partial(hub.begin, page, session))
+
+    def log(self, item: Event) -> None:
+        """Give out one event."""
+        match item:
+            case VideoSample(stored=False):
+                self._video(item)
+            case MessageTiming(kind=Channel.BASE):
+                self._offset_ns = item.clock_offset_ns
+                self._late_ns = self._clock() - item.received_ns
+            case Overlay(stored=False):
+                self._hub.post(partial(self._hub.overlay, self._page, self._overlay(item)))
+            case Refinement():
+                self._still(item)
+            case Notice():
+                message = self._text("notice", item, level=item.level, text=item.text, at=time.time())
+                self._hub.post(partial(self._hub.notice, self._page, message))
+
+    def skipped(self, count: int) -> None:  # noqa: ARG002 - one is as bad as many
+        """Pictures may be missing."""
+        self._pictures.gap()
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """Nothing is held back."""
+
+    def _video(self, sample: VideoSample) -> None:
+        if self._late_ns > _TOO_LATE_NS and not sample.keyframe:
+            self._pictures.gap()
+            return
+        made = self._pictures.add(
+            sample, wanted=self._page.wanted, now_ns=self._clock(), hurry=self._late_ns > _LATE_NS
+        )
+        captured_ms = self._captured_ms(sample.capture_ns)
+        for one in made:
+            give = partial(self._hub.made, self._page, one)
+            self._hub.post(partial(give, frame_index=sample.frame_index, captured_ms=captured_ms))
+
+    def _captured_ms(self, capture_ns: int) -> float:
+        """By the ground's clock. In lockstep capture is media time: there the picture is from now."""
+        if self._info.pace == "lockstep":
+            return self._clock() / _MILLION
+        return (capture_ns - self._offset_ns) / _MILLION
+
+    def _text(self, kind: str, item: Overlay | Refinement | Notice, **content: Any) -> str:
+        captured_ms = round(self._captured_ms(item.capture_ns), 1)
+        return text(kind, edge=self._info.edge, frame=item.frame_index, captured=captured_ms, **content)
+
+    def _overlay(self, item: Overlay) -> str:
+        doubted = [False] * len(item.classes) if item.doubted is None else item.doubted.tolist()
+        sure = [False] * len(item.classes) if item.sure is None else item.sure.tolist()
+        rows = zip(
+            item.track_ids.tolist(),
+            item.boxes_base_px.round(1).tolist(),
+            item.classes,
+            item.confidences.tolist(),
+            item.refined.tolist(),
+            doubted,
+            sure,
+            strict=True,
+        )
+        tracks = [
+            {"id": track, "box": box, "name": name, "sureness": round(sureness, 2)}
+            | {word: 1 for word, holds in (("read", read), ("doubted", doubt), ("sure", known)) if holds}
+            for track, box, name, sureness, read, doubt, known in rows
+        ]
+        return self._text("overlay", item, tracks=tracks)
+
+    def _still(self, item: Refinement) -> None:
+        self._stills += 1
+        still = f"{self._info.session_id & 0xFFFFFF:06x}-{self._stills}"
+        pictures: list[tuple[str, str, bytes, str]] = []
+        if item.media_type in _SHOWN_BY_BROWSERS:
+            pictures.append((still, "still", item.still, item.media_type))
+        elif item.still_bgr is not None:
+            pictures.append((still, "still", jpeg(item.still_bgr, quality_pct=90), "image/jpeg"))
+        if item.base_crop_bgr is not None and item.base_crop_bgr.size:
+            pictures.append((still, "base", jpeg(item.base_crop_bgr), "image/jpeg"))
+        message = self._text(
+            "still",
+            item,
+            id=still,
+            shows=[which for _, which, _, _ in pictures],
+            sequence=item.still_sequence,
+            shown=item.shown_index,
+            track=item.track_id,
+            box=[round(value, 1) for value in item.box_base_px],
+            crop=None if item.crop_base_px is None else [round(value, 1) for value in item.crop_base_px],
+            before=item.class_before,
+            after=item.class_after,
+            sureness=round(item.confidence, 2),
+            reason=item.reason,
+            stored=item.stored,
+            unread=item.unread,
+            doubted=item.doubted,
+            sure=item.sure,
+            note=item.note,
+        )
+        self._hub.post(partial(self._hub.still, self._page, message, pictures))
+
+
+def state_message(state: GroundState) -> str:
+    """How all edges are, for the wall and the plot; the words that an operator reads are made here."""
+    edges = {
+        one.edge: {
+            "link": one.link,
+            "since": one.link_since_ns // _MILLION,
+            "total": None if one.session is None else one.session.total_bps,
+            "base": None if one.session is None else one.session.base_bps,
+            "budget": None if one.session is None else one.session.budget_bps,
+            "words": [] if one.session is None else _words(one.session, calibrated=state.calibrated),
+            "failed": [*map(_failure, one.failed), *_edge_failures(one)],
+        }
+        for one in state.edges
+    }
+    return text("state", at=state.at_ns // _MILLION, edges=edges, failed=[*map(_failure, state.failed)])
+
+
+def state_loads(state: GroundState) -> dict[str, tuple[float, float, float, float]]:
+    """By edge, where it is known: Unix milliseconds, and bits a second: all, the base stream, the budget."""
+    return {
+        one.edge: (
+            state.at_ns // _MILLION,
+            one.session.total_bps,
+            one.session.base_bps,
+            one.session.budget_bps,
+        )
+        for one in state.edges
+        if one.session is not None and one.session.total_bps is not None and one.session.base_bps is not None
+    }
+
+
+def _words(session: SessionState, *, calibrated: bool) -> list[str]:
+    """The session in a few sentences; what is not known is left out."""
+    words = []
+    if session.total_bps is not None:
+        words.append(f"{bitrate_text(session.total_bps)} of {bitrate_text(session.budget_bps)}")
+    if session.delay_p50_ms is not None and session.delay_p95_ms is not None:
+        words.append(
+            f"capture to boxes {session.delay_p50_ms:.0f} ms, at most {session.delay_p95_ms:.0f} ms for 95 %"
+        )
+    not_sent = session.stills_not_sent
+    why = f" (not sent: {counts_text(not_sent, most=3)})" if not_sent else ""
+    words.append(f"{session.stills_received} stills{why}")
+    trust = "" if calibrated else "; the probability of a class is not calibrated"
+    words.append(f"{session.tracks} tracks, {session.tracks_refined} refined by stills{trust}")
+    if session.gaps:
+        words.append(f"{session.gaps} gaps, {session.lost} messages lost")
+    if session.backlog_stills or session.backlog_video_s:
+        words.append(
+            f"from outages {session.backlog_stills} stills, {session.backlog_video_s:.0f} s of video"
+        )
+    if session.levers:
+        words.append(session.levers)
+    return words
+
+
+def _edge_failures(one: EdgeState) -> list[str]:
+    return (
+        [] if one.session is None else [f"at the edge: {_failure(part)}" for part in one.session.edge_failed]
+    )
+
+
+def _failure(part: FailedPart) -> str:
+    """Without the reason: it may name files of this machine."""
+    at = time.strftime("%H:%M:%S", time.gmtime(part.since_ns // 1_000_000_000))
+    return f"{part.part} does not work since {at} UTC"

@@ -1,0 +1,173 @@
+"""The web server: a thread of its own with a loop of its own, whose end nobody waits long for."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import ssl
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+from urllib.parse import urlsplit
+
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.messages import Info
+from hvt_ground.control import EdgeClient
+from hvt_ground.state import GroundState
+from hvt_ground.web.access import Access, is_loopback, own_tokens
+from hvt_ground.web.feed import SessionFeed, state_loads, state_message
+from hvt_ground.web.requests import EdgeRequests
+from hvt_ground.web.site import MOST_MESSAGE_BYTES, make_site
+from hvt_ground.web.viewers import EdgePage, Hub
+
+__all__ = ["WebPage"]
+
+_MOST_CONNECTIONS = 256
+_FIRST_REQUEST_S = 10.0
+_END_S = 2.0
+
+
+class WebPage:
+    """Serves the page at ``address`` (HOST:PORT) while the context lasts; ``clock`` is the ground's.
+
+    ``keys``, a certificate and its key, encrypt it beyond loopback. Raises `UserError` where the address, the tokens
+    or the keys cannot be used.
+    """
+
+    def __init__(
+        self, address: str, *, clock: Callable[[], int], keys: tuple[Path, Path] | None = None
+    ) -> None:
+        host, port = _parsed(address)
+        tokens = {} if is_loopback(host) else own_tokens()
+        keys = keys if tokens else None
+        if keys is not None:
+            _check_keys(*keys)
+        self._clock = clock
+        self._socket = _bound(host, port)
+        shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
+        start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
+        self.links = tuple(f"{start}?token={token} ({role})" for role, token in tokens.items()) or (start,)
+        """What to open, one for each role."""
+        self._client: EdgeClient | None = None
+        self._loop = asyncio.new_event_loop()
+        self._hub = Hub(self._loop)
+        config = uvicorn.Config(
+            make_site(Access(tokens), self._hub, EdgeRequests(self._control)),
+            ssl_certfile=None if keys is None else keys[0],
+            ssl_keyfile=None if keys is None else keys[1],
+            http=_BoundedProtocol,
+            ws="websockets-sansio",
+            loop="asyncio",
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            ws_max_size=MOST_MESSAGE_BYTES,
+            ws_per_message_deflate=False,
+            h11_max_incomplete_event_size=16384,
+            timeout_keep_alive=10,
+            timeout_graceful_shutdown=1,
+            server_header=False,
+        )
+        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)  # what browsers send is their affair
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._run, name="hvt-web", daemon=True)
+
+    def use(self, client: EdgeClient) -> None:
+        """Ask edges through it from now on."""
+        self._client = client
+
+    def feed(self, info: Info) -> Callable[[], SessionFeed]:
+        """What opens a sink for a session, in the sink's thread."""
+        page = EdgePage(info.edge)
+        return lambda: SessionFeed(info, page, self._hub, clock=self._clock)
+
+    def show(self, state: GroundState) -> None:
+        """Give out how all edges are; for any thread."""
+        message, loads = state_message(state), state_loads(state)
+        self._hub.post(lambda: self._hub.state(message, loads))
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._server.should_exit = True
+        self._thread.join(_END_S + 1)
+
+    def _control(self) -> EdgeClient:
+        if self._client is None:
+            raise UserError("the link is not open yet")
+        return self._client
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._server.serve(sockets=[self._socket]))
+        finally:
+            self._socket.close()
+            self._loop.close()
+
+
+class _BoundedProtocol(H11Protocol):
+    """Refuses connections above a number, and closes those that ask for nothing."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        if len(self.connections) > _MOST_CONNECTIONS:
+            transport.write(
+                b"HTTP/1.1 503 Service Unavailable\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
+            )
+            transport.close()
+            return
+        self.loop.call_later(_FIRST_REQUEST_S, self._close_silent, transport)
+
+    def _close_silent(self, transport: asyncio.Transport) -> None:
+        if self.cycle is None and transport.get_protocol() is self:
+            transport.close()
+
+
+def _parsed(address: str) -> tuple[str, int]:
+    try:
+        parts = urlsplit(f"//{address}")
+        host, port = parts.hostname or "", parts.port or 0
+    except ValueError:
+        host, port = "", 0
+    if not host or not port or parts.path or parts.query:
+        raise UserError(f"--web {address!r} is not accepted: give HOST:PORT, such as 127.0.0.1:8080")
+    return host, port
+
+
+def _check_keys(certificate: Path, key: Path) -> None:
+    try:
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        raise UserError(
+            f"--web cannot use the keys {certificate} and {key} ({error.strerror or error})"
+        ) from None
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    try:
+        family, *_, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
+            0
+        ]
+        made = socket.socket(family, socket.SOCK_STREAM)
+    except OSError as error:
+        raise UserError(f"--web {host}:{port} cannot be used ({error.strerror}): give another host") from None
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        made.bind(where)
+        made.listen(128)
+    except OSError as error:
+        made.close()
+        raise UserError(f"--web {host}:{port} cannot be used ({error.strerror}): give another port") from None
+    made.setblocking(False)
+    return made

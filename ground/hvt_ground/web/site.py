@@ -1,0 +1,255 @@
+"""The addresses of the page: its files, the WebSocket of each viewer, pictures of stills, and what may be asked."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.resources import files
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from hvt_common.errors import UserError
+from hvt_ground.web.access import COOKIE, HEADERS, Access, Role
+from hvt_ground.web.pictures import RUNGS
+from hvt_ground.web.requests import BadRequestError, BusyError, EdgeRequests
+from hvt_ground.web.viewers import Hub, Viewer, packed, text
+
+__all__ = ["MOST_MESSAGE_BYTES", "make_site"]
+
+MOST_MESSAGE_BYTES = 4096
+_MOST_VIEWERS = 64
+_MOST_MESSAGES_A_S = 30
+_COOKIE_S = 30 * 86400
+_KINDS = {"js": "text/javascript", "css": "text/css", "html": "text/html", "svg": "image/svg+xml"}
+_FILES = {
+    one.name: (one.read_bytes(), _KINDS[kind])
+    for one in files("hvt_ground.web").joinpath("static").iterdir()
+    if (kind := one.name.rpartition(".")[2]) in _KINDS
+}
+"""Read once: what is asked for is a name of this table, never a path."""
+
+
+class Site:
+    """What the addresses do."""
+
+    def __init__(self, access: Access, hub: Hub, edge_requests: EdgeRequests) -> None:
+        self._access = access
+        self._hub = hub
+        self._requests = edge_requests
+
+    async def index(self, request: Request) -> Response:
+        """The page; a link with a token gives it to the browser to keep."""
+        token = request.query_params.get("token")
+        if token is None:
+            return _file("index.html")
+        response = RedirectResponse("/", 303)
+        secure = request.url.scheme == "https"
+        response.set_cookie(COOKIE, token, _COOKIE_S, httponly=True, samesite="lax", secure=secure)
+        return response
+
+    async def file(self, request: Request) -> Response:
+        """One of its files."""
+        return _file(request.path_params["name"])
+
+    async def still(self, request: Request) -> Response:
+        """A picture of a still, or of what the base showed there."""
+        edge = self._hub.edges.get(request.path_params["edge"])
+        found = edge and edge.pictures.get(request.path_params["still"], request.path_params["which"])
+        if not found:
+            return PlainTextResponse("there is no such picture any more", 404)
+        return Response(
+            found[0], media_type=found[1], headers={"Cache-Control": "private, max-age=3600, immutable"}
+        )
+
+    async def request_still(self, request: Request) -> Response:
+        """A still of a box: JPEG behind a head, as over the WebSocket."""
+        try:
+            edge, body = self._edge(request), await _json_body(request)
+            data, about = await run_in_threadpool(self._requests.request_still, edge, body)
+        except UserError as error:
+            return _refusal(error)
+        return Response(packed("still", data, edge=edge, **about), media_type="application/octet-stream")
+
+    async def keyframe(self, request: Request) -> Response:
+        """Ask for a keyframe."""
+        try:
+            edge = self._edge(request)
+            await run_in_threadpool(self._requests.keyframe, edge)
+        except UserError as error:
+            return _refusal(error)
+        return Response(status_code=204)
+
+    def _edge(self, request: Request) -> str:
+        """Only one that is known: names become keys of the link."""
+        edge: str = request.path_params["edge"]
+        if edge not in self._hub.edges:
+            raise BadRequestError("there is no such edge")
+        return edge
+
+    async def socket(self, socket: WebSocket) -> None:
+        """A viewer from its coming to its leaving."""
+        if len(self._hub.viewers) >= _MOST_VIEWERS:
+            await socket.send_denial_response(PlainTextResponse("too many viewers", 503))
+            return
+        await socket.accept()
+        viewer = Viewer()
+        role: Role = socket.scope["role"]
+        viewer.put(text("hello", role=role, rungs=RUNGS, now=_now_ms()))
+        self._hub.join(viewer)
+        tasks = [asyncio.ensure_future(one) for one in (self._receive(socket, viewer), _send(socket, viewer))]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self._hub.leave(viewer)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            with suppress(RuntimeError, WebSocketDisconnect):
+                await socket.close(1008)
+
+    async def _receive(self, socket: WebSocket, viewer: Viewer) -> None:
+        """Until it leaves, or says what no page of ours would."""
+        times: deque[float] = deque(maxlen=_MOST_MESSAGES_A_S)
+        while True:
+            try:
+                message = json.loads(await socket.receive_text())
+                _obey(self._hub, viewer, message)
+            except (WebSocketDisconnect, RuntimeError, KeyError, TypeError, ValueError, RecursionError):
+                return
+            now_s = time.monotonic()
+            if len(times) == times.maxlen and now_s - times[0] < 1:
+                return
+            times.append(now_s)
+
+
+def _obey(hub: Hub, viewer: Viewer, message: dict[str, Any]) -> None:
+    """Raises `ValueError` and the like for what is no message."""
+    match message["type"]:
+        case "watch":
+            edge = message["edge"]
+            if edge is None:
+                hub.leave_edge(viewer)
+                return
+            if message["rung"] not in RUNGS or not isinstance(edge, str):
+                raise ValueError("no rung")
+            hub.watch(viewer, edge, message["rung"])
+        case "wall":
+            hub.show_wall(viewer, shown=message["shown"] is True)
+        case "time":
+            viewer.put(text("time", sent=float(message["sent"]), now=_now_ms()))
+        case _:
+            raise ValueError("no message")
+
+
+async def _send(socket: WebSocket, viewer: Viewer) -> None:
+    """What is queued, as fast as it is taken; one that takes nothing is closed for want of an answer to a ping."""
+    with suppress(WebSocketDisconnect, RuntimeError, ConnectionError):
+        while True:
+            message = await viewer.take()
+            kind = "text" if isinstance(message, str) else "bytes"
+            await socket.send({"type": "websocket.send", kind: message})
+
+
+async def _json_body(request: Request) -> dict[str, Any]:
+    """The JSON that came; `BadRequestError` where it is none."""
+    body = b""
+    try:
+        async with asyncio.timeout(5):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > MOST_MESSAGE_BYTES:
+                    raise BadRequestError("too much was sent")
+        found = json.loads(body or b"{}")
+    except (ValueError, RecursionError, TimeoutError, ClientDisconnect):
+        raise BadRequestError("this is no JSON") from None
+    if not isinstance(found, dict):
+        raise BadRequestError("this is no JSON object")
+    return found
+
+
+def _refusal(error: UserError) -> Response:
+    status = 400 if isinstance(error, BadRequestError) else 429 if isinstance(error, BusyError) else 409
+    return PlainTextResponse(str(error), status)
+
+
+def _file(name: str) -> Response:
+    if name not in _FILES:
+        return PlainTextResponse("there is nothing here", 404)
+    data, media_type = _FILES[name]
+    return Response(data, media_type=media_type)
+
+
+def _now_ms() -> float:
+    return round(time.time_ns() / 1e6, 1)
+
+
+class _Guard:
+    """Lets through who may; adds the headers that hold for every answer."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app = app
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+
+        async def guarded(message: Any) -> None:
+            if message["type"].endswith("http.response.start") or message["type"] == "http.response.start":
+                known = {name for name, _ in message["headers"]}
+                extra = [(name.lower().encode(), value.encode()) for name, value in HEADERS.items()]
+                message["headers"] = [*message["headers"], *(one for one in extra if one[0] not in known)]
+            await send(message)
+
+        refusal = self._refusal(scope)
+        if refusal is None:
+            await self._app(scope, receive, guarded)
+        elif scope["type"] == "http":
+            await refusal(scope, receive, guarded)
+        else:
+            await WebSocket(scope, receive, guarded).send_denial_response(refusal)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        token = None
+        if scope["type"] == "http" and scope["path"] == "/":
+            token = Request(scope).query_params.get("token")
+        role = self._access.role(headers, token=token)
+        if role is None:
+            what = (
+                "give the link that hvt-ground showed at its start" if self._access.tokens else "unknown host"
+            )
+            return PlainTextResponse(what, 401 if self._access.tokens else 403)
+        scope["role"] = role
+        acts = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")
+        if acts and not self._access.same_origin(headers):
+            return PlainTextResponse("this comes from another site", 403)
+        if acts and scope["type"] == "http" and role != "operator":
+            return PlainTextResponse("only an operator may do this", 403)
+        return None
+
+
+def make_site(access: Access, hub: Hub, edge_requests: EdgeRequests) -> Callable[..., Any]:
+    """The ASGI application."""
+    site = Site(access, hub, edge_requests)
+    routes = [
+        Route("/", site.index),
+        Route("/static/{name}", site.file),
+        Route("/stills/{edge}/{still}/{which}", site.still),
+        Route("/edges/{edge}/still", site.request_still, methods=["POST"]),
+        Route("/edges/{edge}/keyframe", site.keyframe, methods=["POST"]),
+        WebSocketRoute("/ws", site.socket),
+    ]
+    return _Guard(Starlette(routes=routes), access)

@@ -1,0 +1,74 @@
+// The strip of stills, each beside what the base stream showed there; a click opens the pair large.
+
+import { make } from "./wall.js";
+
+const MOST = 60;
+
+/** @typedef {{id: string, edge: string, frame: number, captured: number, shows: string[], track: number | null,
+ *    before: string, after: string, sureness: number, reason: string, stored: boolean, unread: boolean,
+ *    doubted: boolean, note: string}} Still */
+
+export class Stills {
+  /** @param {HTMLElement} list @param {HTMLDialogElement} large */
+  constructor(list, large) {
+    this.list = list;
+    this.large = large;
+  }
+
+  reset() {
+    this.list.replaceChildren();
+  }
+
+  /** @param {Still} still */
+  add(still) {
+    const item = document.createElement("li");
+    const button = make("button", "", item);
+    button.dataset.still = still.id;
+    const pair = make("span", "pair", button);
+    for (const which of ["still", "base"]) {
+      if (!still.shows.includes(which)) {
+        make("span", "none", pair);
+        continue;
+      }
+      const picture = make("img", "", pair);
+      picture.src = address(still, which);
+      picture.loading = "lazy";
+      picture.alt = which === "still" ? `still of ${still.after}` : "what the base stream showed";
+    }
+    const words = make("span", "words", button);
+    words.textContent = sentence(still);
+    make("small", "", words).textContent = `${clock(still.captured)} · ${reasonOf(still)}${still.stored ? " · came afterwards" : ""}`;
+    button.addEventListener("click", () => this.open(still));
+    this.list.prepend(item);
+    while (this.list.children.length > MOST) this.list.lastElementChild.remove();
+  }
+
+  /** @param {Still} still */
+  open(still) {
+    for (const which of ["still", "base"]) {
+      const picture = /** @type {HTMLImageElement} */ (this.large.querySelector(`#large-${which}`));
+      picture.closest("figure").hidden = !still.shows.includes(which);
+      if (still.shows.includes(which)) picture.src = address(still, which);
+    }
+    this.large.querySelector("#large-text").textContent = `${sentence(still)} · ${clock(still.captured)} · ${reasonOf(still)}`;
+    this.large.showModal();
+  }
+}
+
+/** @param {Still} still @param {string} which */
+const address = (still, which) => `/stills/${encodeURIComponent(still.edge)}/${still.id}/${which}`;
+
+/** @param {Still} still */
+const reasonOf = (still) => (still.reason === "asked" ? "on demand" : still.reason);
+
+/** @param {Still} still */
+function sentence(still) {
+  const track = still.track === null ? "" : `track ${still.track}: `;
+  if (still.unread) return `${track}${still.after}, not read${still.note ? ` (${still.note})` : ""}`;
+  if (still.doubted) return `${track}doubted, was ${still.before}`;
+  const sure = `${Math.round(still.sureness * 100)} %`;
+  return still.before === still.after || !still.before ? `${track}${still.after}, ${sure}` : `${track}${still.before} → ${still.after}, ${sure}`;
+}
+
+/** @param {number} ms */
+export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour12: false });

@@ -1,0 +1,92 @@
+// The wall: each edge with a small picture, its link, its budget and what happened last.
+
+/** @typedef {{link: string, since: number, total: number | null, budget: number | null}} EdgeState */
+
+export class Wall {
+  /** @param {HTMLElement} root @param {HTMLElement} nobody @param {(edge: string) => void} onChoose */
+  constructor(root, nobody, onChoose) {
+    this.root = root;
+    this.nobody = nobody;
+    this.onChoose = onChoose;
+    /** @type {Map<string, Record<string, HTMLElement>>} */
+    this.cards = new Map();
+  }
+
+  /** @param {string} edge */
+  card(edge) {
+    const known = this.cards.get(edge);
+    if (known) return known;
+    const button = document.createElement("button");
+    button.className = "edge";
+    button.dataset.edge = edge;
+    const picture = make("img", "picture", button);
+    picture.alt = "";
+    picture.width = 320;
+    picture.height = 180;
+    const about = make("span", "about", button);
+    const top = make("span", "top", about);
+    const light = make("span", "light", top);
+    make("b", "", top).textContent = edge;
+    const state = make("span", "state", top);
+    const bar = make("meter", "bar", about);
+    bar.setAttribute("aria-label", "Share of the budget in use");
+    const last = make("span", "last", about);
+    button.addEventListener("click", () => this.onChoose(edge));
+    const card = { button, picture, light, state, bar, last };
+    this.cards.set(edge, card);
+    this.nobody.hidden = true;
+    const after = [...this.cards.keys()].sort();
+    const next = after[after.indexOf(edge) + 1];
+    this.root.insertBefore(button, next ? this.cards.get(next).button : null);
+    return card;
+  }
+
+  /** @param {string} edge @param {Uint8Array} data */
+  thumbnail(edge, data) {
+    const { picture } = this.card(edge);
+    const old = picture.src;
+    picture.onload = () => {
+      if (old) URL.revokeObjectURL(old);
+    };
+    picture.src = URL.createObjectURL(new Blob([data], { type: "image/jpeg" }));
+  }
+
+  /** @param {string} edge @param {string} text */
+  event(edge, text) {
+    this.card(edge).last.textContent = text;
+  }
+
+  /** @param {string} edge @param {EdgeState} state @param {number} now */
+  state(edge, state, now) {
+    const card = this.card(edge);
+    card.light.dataset.state = state.link;
+    card.state.textContent = `${state.link} ${lasting(now - state.since)}`;
+    const known = state.total !== null && state.budget !== null;
+    card.bar.value = known ? Math.min(1, state.total / state.budget) : 0;
+    card.bar.title = known ? `${kbps(state.total)} of ${kbps(state.budget)}` : "";
+  }
+
+  /** @param {string | null} chosen */
+  mark(chosen) {
+    this.root.classList.toggle("alone", chosen === null);
+    for (const [edge, { button }] of this.cards) button.setAttribute("aria-current", String(edge === chosen));
+  }
+}
+
+/** @param {string} kind @param {string} name @param {Element} into @returns {any} */
+export function make(kind, name, into) {
+  const made = document.createElement(kind);
+  if (name) made.className = name;
+  into.append(made);
+  return made;
+}
+
+/** @param {number} ms */
+function lasting(ms) {
+  const seconds = Math.max(0, Math.round(ms / 1000));
+  if (seconds < 100) return `${seconds} s`;
+  return seconds < 6000 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
+}
+
+/** @param {number} bps */
+export const kbps = (bps) => (bps >= 1e6 ? `${(bps / 1e6).toFixed(2)} Mbps` : `${Math.round(bps / 1e3)} kbps`);

@@ -1,0 +1,349 @@
+"""Who looks at what: every viewer has a bounded queue, every edge a memory of what a newcomer needs.
+
+All of this lives in the thread of the web server's loop; `Hub.post` is the way in for others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from hvt_ground.web.fmp4 import Fragment, Start
+from hvt_ground.web.pictures import RUNGS, THUMBNAIL, Made, Rung
+
+__all__ = ["EdgePage", "Hub", "StillPictures", "Viewer", "packed", "text"]
+
+_MOST_QUEUED = 400
+_MOST_QUEUED_BYTES = 4 * 2**20
+"""Of a viewer; above, it loses pictures up to the next keyframe."""
+_MOST_TEXTS = 2000
+"""What is not video is not dropped: who lets so much of it lie is gone."""
+_MOST_RETAINED_BYTES = 16 * 2**20
+_MOST_RETAINED = 2000
+"""Fragments since the last keyframe."""
+_MOST_STILLS = 60
+_MOST_STILL_BYTES = 24 * 2**20
+_MOST_NOTICES = 100
+_MOST_LOADS = 240
+"""One a second."""
+
+
+def text(kind: str, **content: Any) -> str:
+    """A message in words."""
+    return json.dumps({"type": kind, **content}, separators=(",", ":"), ensure_ascii=False)
+
+
+def packed(kind: str, payload: bytes, **content: Any) -> bytes:
+    """A message with a payload: the length of its head in two bytes, the head as JSON, the payload."""
+    head = text(kind, **content).encode()
+    return len(head).to_bytes(2) + head + payload
+
+
+class Viewer:
+    """The queue of one connection. ``watches`` is an edge and a rung."""
+
+    def __init__(self) -> None:
+        self.watches: tuple[str, Rung] | None = None
+        self.wall = False
+        self.lost = 0
+        """Messages of video that it was too slow for."""
+        self.hopeless = False
+        """It takes nothing at all any more."""
+        self._queue: deque[tuple[str | bytes, bool]] = deque()
+        self._bytes = 0
+        self._texts = 0
+        self._waits_for_keyframe = False
+        self._there = asyncio.Event()
+
+    def put(self, message: str | bytes) -> None:
+        """Queue what is not to be lost."""
+        if self._texts >= _MOST_TEXTS:
+            self.hopeless = True
+            self._there.set()
+            return
+        self._texts += 1
+        self._add(message, video=False)
+
+    def put_video(self, message: str | bytes, *, begins: bool) -> None:
+        """Queue a message of the live picture; ``begins``: it can be used without those before it."""
+        if self._waits_for_keyframe and not begins:
+            self.lost += 1
+            return
+        if len(self._queue) - self._texts >= _MOST_QUEUED or self._bytes >= _MOST_QUEUED_BYTES:
+            self._drop_video()
+            if not begins:
+                self.lost += 1
+                self._waits_for_keyframe = True
+                return
+        self._waits_for_keyframe = False
+        self._add(message, video=True)
+
+    def leave_video(self) -> None:
+        """Forget what is queued of the picture that was watched."""
+        self._drop_video()
+        self._waits_for_keyframe = False
+
+    @property
+    def empty(self) -> bool:
+        """Whether `take` would wait."""
+        return not self._queue
+
+    async def take(self) -> str | bytes:
+        """The next message."""
+        while not self._queue:
+            self._there.clear()
+            await self._there.wait()
+            if self.hopeless:
+                raise ConnectionError("the viewer takes nothing")
+        message, video = self._queue.popleft()
+        self._bytes -= len(message)
+        self._texts -= not video
+        return message
+
+    def _add(self, message: str | bytes, *, video: bool) -> None:
+        self._queue.append((message, video))
+        self._bytes += len(message)
+        self._there.set()
+
+    def _drop_video(self) -> None:
+        others = [one for one in self._queue if not one[1]]
+        self.lost += len(self._queue) - len(others)
+        self._queue = deque(others)
+        self._bytes = sum(len(message) for message, _ in others)
+
+
+@dataclass(slots=True)
+class _Stream:
+    """What is under way on one rung, for those who join."""
+
+    number: int
+    start: tuple[str, bytes] | None = None
+    fragments: list[bytes] = field(default_factory=list)
+    size_bytes: int = 0
+
+
+class StillPictures:
+    """Pictures of stills by name, the newest ones."""
+
+    def __init__(self) -> None:
+        self._pictures: OrderedDict[tuple[str, str], tuple[bytes, str]] = OrderedDict()
+        self._bytes = 0
+
+    def add(self, still: str, which: str, picture: bytes, media_type: str) -> None:
+        """Take one; the oldest make room."""
+        self._pictures[still, which] = (picture, media_type)
+        self._bytes += len(picture)
+        while self._bytes > _MOST_STILL_BYTES or len(self._pictures) > 2 * _MOST_STILLS:
+            self._bytes -= len(self._pictures.popitem(last=False)[1][0])
+
+    def get(self, still: str, which: str) -> tuple[bytes, str] | None:
+        """The picture and its media type."""
+        return self._pictures.get((still, which))
+
+
+class EdgePage:
+    """One edge as the page knows it."""
+
+    def __init__(self, edge: str) -> None:
+        self.edge = edge
+        self.session: dict[str, Any] = {}
+        self.stills: deque[str] = deque(maxlen=_MOST_STILLS)
+        self.notices: deque[str] = deque(maxlen=_MOST_NOTICES)
+        self.pictures = StillPictures()
+        self.thumbnail: bytes | None = None
+        self.wanted: Mapping[Rung, int] = {}
+        """Read by the thread that makes them; another number is another stream, which begins with a start."""
+        self.streams: dict[Rung, _Stream] = {}
+
+
+class Hub:
+    """Gives out what the edges' feeds post. Build it with the loop it will live in."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self.edges: dict[str, EdgePage] = {}
+        self.viewers: set[Viewer] = set()
+        self._streams = self._demands = 0
+        self._state = ""
+        self._loads: dict[str, deque[Sequence[float]]] = {}
+
+    def post(self, call: Callable[[], None]) -> None:
+        """Have it done in the loop's thread; for any thread. After the loop's end nothing is done."""
+        try:
+            self._loop.call_soon_threadsafe(call)
+        except RuntimeError:
+            if not self._loop.is_closed():
+                raise
+
+    # From the feeds
+
+    def begin(self, edge: EdgePage, session: dict[str, Any]) -> None:
+        """A session begins: the streams of the former one are over."""
+        self.edges[edge.edge] = edge
+        edge.session = session
+        edge.streams.clear()
+        self._to_all(text("session", **session))
+        self._want(edge)
+
+    def made(self, edge: EdgePage, made: Made, *, frame_index: int, captured_ms: float) -> None:
+        """Give out a start, a fragment, a JPEG or a thumbnail."""
+        rung, item = made.rung, made.item
+        about = {"edge": edge.edge, "frame": frame_index, "captured": round(captured_ms, 1)}
+        if rung == THUMBNAIL:
+            assert isinstance(item, bytes)
+            edge.thumbnail = packed("thumbnail", item, **about)
+            for viewer in self.viewers:
+                if viewer.wall:
+                    viewer.put_video(edge.thumbnail, begins=True)
+            return
+        if isinstance(item, Start):
+            stream = edge.streams[rung] = self._new_stream()
+            head = text("start", edge=edge.edge, rung=rung, codec=item.codec, stream=stream.number)
+            stream.start = (head, packed("init", item.data, stream=stream.number))
+            self._begin(edge, rung)
+        elif isinstance(item, Fragment):
+            self._fragment(edge, rung, item, about)
+        else:
+            message = packed("jpeg", item, **about)
+            for viewer in self._watching(edge, rung):
+                viewer.put_video(message, begins=True)
+
+    def overlay(self, edge: EdgePage, message: str) -> None:
+        """Boxes at a frame, for those who watch."""
+        for viewer in self.viewers:
+            if viewer.watches and viewer.watches[0] == edge.edge:
+                viewer.put_video(message, begins=False)
+
+    def still(self, edge: EdgePage, message: str, pictures: list[tuple[str, str, bytes, str]]) -> None:
+        """A still that was read, with its pictures."""
+        for still, which, picture, media_type in pictures:
+            edge.pictures.add(still, which, picture, media_type)
+        edge.stills.append(message)
+        for viewer in self.viewers:
+            if viewer.watches and viewer.watches[0] == edge.edge:
+                viewer.put(message)
+
+    def notice(self, edge: EdgePage, message: str) -> None:
+        """An event; the wall shows the last one of each edge."""
+        edge.notices.append(message)
+        self._to_all(message)
+
+    def state(self, message: str, loads: Mapping[str, Sequence[float]]) -> None:
+        """How all edges are; ``loads`` is what the plot shows of each, and is remembered for newcomers."""
+        self._state = message
+        for edge, load in loads.items():
+            self._loads.setdefault(edge, deque(maxlen=_MOST_LOADS)).append(load)
+        self._to_all(message)
+
+    # From the viewers
+
+    def join(self, viewer: Viewer) -> None:
+        """A newcomer learns which edges there are."""
+        self.viewers.add(viewer)
+        for edge in self.edges.values():
+            viewer.put(text("session", **edge.session))
+            if edge.notices:
+                viewer.put(edge.notices[-1])
+        if self._state:
+            viewer.put(self._state)
+
+    def leave(self, viewer: Viewer) -> None:
+        """It is gone."""
+        self.viewers.discard(viewer)
+        self._want_all()
+
+    def watch(self, viewer: Viewer, edge_name: str, rung: Rung) -> None:
+        """Show it this edge from now on, beginning with what it needs for the picture of now."""
+        viewer.leave_video()
+        viewer.watches = (edge_name, rung)
+        viewer.put(text("loads", edge=edge_name, rows=list(self._loads.get(edge_name, ()))))
+        edge = self.edges.get(edge_name)
+        if edge is not None:
+            for message in (*edge.notices, *edge.stills):
+                viewer.put(message)
+            self._join_stream(viewer, edge.streams.get(rung))
+        self._want_all()
+
+    def leave_edge(self, viewer: Viewer) -> None:
+        """It looks at no edge."""
+        viewer.leave_video()
+        viewer.watches = None
+        self._want_all()
+
+    def show_wall(self, viewer: Viewer, *, shown: bool) -> None:
+        """Send it thumbnails of all edges, or no more."""
+        viewer.wall = shown
+        if shown:
+            for edge in self.edges.values():
+                if edge.thumbnail is not None:
+                    viewer.put_video(edge.thumbnail, begins=True)
+        self._want_all()
+
+    # Within
+
+    def _new_stream(self) -> _Stream:
+        self._streams += 1
+        return _Stream(self._streams)
+
+    def _begin(self, edge: EdgePage, rung: Rung) -> None:
+        for viewer in self._watching(edge, rung):
+            viewer.leave_video()
+            self._join_stream(viewer, edge.streams[rung])
+
+    def _join_stream(self, viewer: Viewer, stream: _Stream | None) -> None:
+        if stream is None or stream.start is None:
+            return
+        for one in stream.start:
+            viewer.put(one)
+        for index, fragment in enumerate(stream.fragments):
+            viewer.put_video(fragment, begins=index == 0)
+
+    def _fragment(self, edge: EdgePage, rung: Rung, item: Fragment, about: dict[str, Any]) -> None:
+        stream = edge.streams.get(rung)
+        if stream is None:
+            return
+        message = packed(
+            "fragment",
+            item.data,
+            **about,
+            stream=stream.number,
+            media=round(item.media_s, 5),
+            duration=round(item.duration_s, 5),
+            key=item.keyframe,
+        )
+        if (
+            item.keyframe
+            or stream.size_bytes > _MOST_RETAINED_BYTES
+            or len(stream.fragments) > _MOST_RETAINED
+        ):
+            stream.fragments.clear()
+            stream.size_bytes = 0
+        if item.keyframe or stream.fragments:
+            stream.fragments.append(message)
+            stream.size_bytes += len(message)
+        for viewer in self._watching(edge, rung):
+            viewer.put_video(message, begins=item.keyframe)
+
+    def _watching(self, edge: EdgePage, rung: Rung) -> list[Viewer]:
+        return [one for one in self.viewers if one.watches == (edge.edge, rung)]
+
+    def _to_all(self, message: str) -> None:
+        for viewer in self.viewers:
+            viewer.put(message)
+
+    def _want_all(self) -> None:
+        for edge in self.edges.values():
+            self._want(edge)
+
+    def _want(self, edge: EdgePage) -> None:
+        wanted: set[Rung] = {rung for rung in RUNGS if self._watching(edge, rung)}
+        if any(viewer.wall for viewer in self.viewers):
+            wanted.add(THUMBNAIL)
+        self._demands += 1
+        edge.wanted = {rung: edge.wanted.get(rung, self._demands) for rung in wanted}
+        for rung in [rung for rung in edge.streams if rung not in wanted]:
+            del edge.streams[rung]  # it begins anew with the next one who looks

@@ -1,0 +1,123 @@
+"""The rungs of the live picture, from a real base stream."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from hvt_ground.events import VideoSample
+from hvt_ground.web.fmp4 import Fragment, Start
+from hvt_ground.web.pictures import Pictures
+from media.moving_square import FPS, SIZE, STEP_PX, moving_square
+from rigs.messages import INFO
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[VideoSample]:
+    """Four seconds of a square that moves, one keyframe."""
+    return [
+        VideoSample(index, 10**18 + index * 10**9 // FPS, data, keyframe)
+        for index, (data, keyframe) in enumerate(moving_square("libx265", 60))
+    ]
+
+
+def pictures() -> Pictures:
+    return Pictures(replace(INFO, base_size=SIZE, source_size=SIZE, fps=FPS))
+
+
+def fed(made: Pictures, samples, rungs, *, hurry=False, number=1) -> list:
+    wanted = dict.fromkeys(rungs, number)
+    return [
+        one
+        for sample in samples
+        for one in made.add(sample, wanted=wanted, now_ns=sample.capture_ns, hurry=hurry)
+    ]
+
+
+def shown(made) -> list[np.ndarray]:
+    """What a player shows of a start and fragments."""
+    data = b"".join(one.item.data for one in made)
+    with av.open(io.BytesIO(data), format="mp4") as container:
+        return [frame.to_ndarray(format="bgr24") for frame in container.decode(video=0)]
+
+
+def place(picture: np.ndarray) -> int:
+    """The left side of the square."""
+    return int(np.argmax(picture[70, :, 1] > 130))
+
+
+@pytest.mark.parametrize("rung", ["hevc", "h264"])
+def test_each_picture_is_given_out_at_once(samples, rung):
+    """The page would show every picture one later."""
+    made = pictures()
+    for index, sample in enumerate(samples):
+        came = fed(made, [sample], {rung})
+        assert len([one for one in came if isinstance(one.item, Fragment)]) == 1
+        assert isinstance(came[0].item, Start) == (index == 0)
+
+
+@pytest.mark.parametrize(("rung", "count"), [("hevc", 31), ("h264", 30)])
+def test_who_begins_to_look_in_the_middle_sees_the_picture_of_now(samples, rung, count):
+    """He would wait for the next keyframe, which may be a minute away."""
+    made = pictures()
+    assert fed(made, samples[:30], set()) == []
+    came = fed(made, samples[30:], {rung})
+    seen = shown(came)
+    assert len(seen) == (60 if rung == "hevc" else 30)
+    assert count <= len(seen)
+    assert [place(one) for one in seen[-30:]] == pytest.approx(
+        [index * STEP_PX for index in range(30, 60)], abs=2
+    )
+
+
+def test_keyframes_of_the_coded_stream_come_every_two_seconds(samples):
+    """Who joins would decode everything since the first one looked."""
+    came = [one.item for one in fed(pictures(), samples, {"h264"}) if isinstance(one.item, Fragment)]
+    keyframes = [index for index, one in enumerate(came) if one.keyframe]
+    assert keyframes[:2] == [0, 30]
+
+
+def test_single_pictures_come_twice_a_second_and_thumbnails_once(samples):
+    """A thin browser would be given all pictures, or none."""
+    came = fed(pictures(), samples, {"jpeg", "thumbnail"})
+    jpegs = [one.item for one in came if one.rung == "jpeg"]
+    assert len(jpegs) == 8
+    assert len([one for one in came if one.rung == "thumbnail"]) == 4
+    assert cv2.imdecode(np.frombuffer(jpegs[-1], np.uint8), cv2.IMREAD_COLOR).shape == (SIZE[1], SIZE[0], 3)
+
+
+def test_after_a_gap_nothing_comes_before_the_keyframe(samples):
+    """The page would show a broken picture."""
+    made = pictures()
+    fed(made, samples[:20], {"h264", "hevc"})
+    made.gap()
+    assert fed(made, samples[25:40], {"h264", "hevc", "jpeg"}) == []
+    again = [replace(one, frame_index=100 + one.frame_index) for one in samples[:10]]
+    came = fed(made, again, {"h264", "hevc"})
+    assert {one.rung for one in came} == {"h264", "hevc"}
+    assert [place(one) for one in shown([one for one in came if one.rung == "hevc"])][-1] == pytest.approx(
+        36, abs=2
+    )
+
+
+def test_in_a_hurry_pictures_are_decoded_and_not_coded_again(samples):
+    """On a slow machine the page would fall behind more and more."""
+    made = pictures()
+    fed(made, samples[:10], {"h264"})
+    assert fed(made, samples[10:20], {"h264"}, hurry=True) == []
+    assert len(fed(made, samples[20:30], {"h264"})) == 10
+
+
+def test_garbage_ends_nothing(samples):
+    """One damaged unit would take the page of an edge away."""
+    made = pictures()
+    fed(made, samples[:5], {"h264", "hevc"})
+    broken = replace(samples[5], data=b"\0\0\1" + bytes(range(200)))
+    fed(made, [broken, replace(samples[6], data=b"")], {"h264", "hevc"})
+    came = fed(made, samples, {"h264"}, number=2)
+    assert len(shown(came)) >= 59

@@ -1,0 +1,301 @@
+"""The page's server: who may come in, and what nobody can break from outside."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import socket
+import ssl
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from hvt_common.errors import UserError
+from hvt_common.transport.zenoh_config import key_pair
+from hvt_ground.cli import main
+from hvt_ground.web import WebPage
+from programs.fleet_keys import Fleet
+from programs.processes import eventually, free_ports
+
+
+@pytest.fixture(autouse=True)
+def state_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path / "hvt"
+
+
+@pytest.fixture
+def port() -> int:
+    return free_ports(1)[0]
+
+
+@pytest.fixture
+def local(port) -> Iterator[int]:
+    """A page on loopback."""
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns):
+        yield port
+
+
+@pytest.fixture
+def public(port) -> Iterator[int]:
+    """A page that other machines reach."""
+    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns):
+        yield port
+
+
+def asked(port: int, path: str, method: str = "GET", body: bytes = b"", **headers: str):
+    """Status, headers and text of one answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path, body=body or None, headers=named)
+    answer = connection.getresponse()
+    text = answer.read().decode(errors="replace")
+    connection.close()
+    return answer.status, dict(answer.getheaders()), text
+
+
+def joined(port: int, **more) -> ClientConnection:
+    """A viewer."""
+    return connect(f"ws://127.0.0.1:{port}/ws", origin=f"http://127.0.0.1:{port}", open_timeout=10, **more)
+
+
+def ended(viewer: ClientConnection) -> None:
+    """Take what comes until the connection is closed, which raises."""
+    while True:
+        viewer.recv(timeout=5)
+
+
+def greets(port: int) -> bool:
+    """Whether a viewer is let in and told who it is."""
+    with joined(port) as viewer:
+        return json.loads(viewer.recv(timeout=5))["type"] == "hello"
+
+
+def test_on_this_machine_the_page_opens_without_more(local):
+    """Who tries it out would have to look for a password first."""
+    status, headers, text = asked(local, "/")
+    assert status == 200
+    assert "<title>HVT</title>" in text
+    assert "unsafe" not in headers["content-security-policy"]
+    assert greets(local)
+
+
+def test_all_files_of_the_page_are_there_and_nothing_else(local):
+    """The page would stay blank, or show files of this machine."""
+    for name in ("main.js", "page.css", "player.js", "icon.svg"):
+        assert asked(local, f"/static/{name}")[0] == 200
+    for path in (
+        "/static/../server.py",
+        "/static/%2e%2e%2fserver.py",
+        "/etc/passwd",
+        "/static/",
+        "/stills/a/b/c",
+    ):
+        status, _, text = asked(local, path)
+        assert status == 404
+        assert os.sep + "hvt" not in text
+
+
+def test_another_sites_name_for_this_machine_is_not_served(local):
+    """A page of another site could have its name lead here, and read everything."""
+    assert asked(local, "/", Host=f"evil.example:{local}")[0] == 403
+
+
+def test_a_page_of_another_site_cannot_watch_or_command(local):
+    """What a browser has open beside this page could fly along."""
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"ws://127.0.0.1:{local}/ws", origin="http://evil.example")
+    assert refused.value.response.status_code == 403
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://127.0.0.1:{local}/ws")
+    assert asked(local, "/edges/uav-1/keyframe", "POST", b"{}", Origin="http://evil.example")[0] == 403
+
+
+def test_elsewhere_nothing_is_shown_without_the_token(public, state_folder):
+    """Whoever finds the port would see the pictures."""
+    tokens = json.loads((state_folder / "web-tokens.json").read_text())
+    assert (state_folder / "web-tokens.json").stat().st_mode & 0o777 == 0o600
+    for path in ("/", "/static/main.js", "/?token=wrong", "/stills/a/b/still"):
+        status, _, text = asked(public, path, Cookie="hvt=wrong")
+        assert status == 401
+        assert tokens["operator"] not in text
+    with pytest.raises(InvalidStatus) as refused:
+        joined(public)
+    assert refused.value.response.status_code == 401
+    status, headers, _ = asked(public, f"/?token={tokens['viewer']}")
+    assert (status, headers["location"]) == (303, "/")
+    assert "HttpOnly" in headers["set-cookie"]
+    cookie = f"hvt={tokens['viewer']}"
+    assert asked(public, "/", Cookie=cookie)[0] == 200
+    with joined(public, additional_headers={"Cookie": cookie}) as viewer:
+        assert json.loads(viewer.recv())["role"] == "viewer"
+
+
+def test_the_keys_of_the_link_encrypt_the_page(port, tmp_path, state_folder):
+    """Tokens and pictures would cross a network in clear, though there are keys."""
+    fleet = Fleet(tmp_path / "own")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    keys = key_pair(fleet.settings("base", "ground"))
+    trust = ssl.create_default_context(cafile=tmp_path / "own" / "ca.pem")
+    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=keys) as page:
+        token = json.loads((state_folder / "web-tokens.json").read_text())["operator"]
+        assert all(one.startswith("https://") for one in page.links)
+        connection = http.client.HTTPSConnection("127.0.0.1", port, timeout=10, context=trust)
+        connection.request("GET", f"/?token={token}")
+        answer = connection.getresponse()
+        assert answer.status == 303
+        assert "Secure" in answer.headers["set-cookie"]
+        connection.close()
+    with pytest.raises(UserError, match="cannot use the keys"):
+        WebPage(f"0.0.0.0:{port}", clock=time.time_ns, keys=(tmp_path / "a", tmp_path / "b"))
+
+
+def test_a_viewer_commands_nothing(public, state_folder):
+    """A link that was given away to watch would spend the budget."""
+    tokens = json.loads((state_folder / "web-tokens.json").read_text())
+    origin = f"http://127.0.0.1:{public}"
+    for role, expected in (("viewer", 403), ("operator", 400)):
+        status, _, _ = asked(
+            public, "/edges/uav-1/still", "POST", b"{}", Cookie=f"hvt={tokens[role]}", Origin=origin
+        )
+        assert status == expected
+
+
+def test_the_links_at_the_start_open_the_page(port, state_folder):
+    """Nobody would know the token."""
+    with WebPage(f"0.0.0.0:{port}", clock=time.time_ns) as page:
+        tokens = json.loads((state_folder / "web-tokens.json").read_text())
+        assert any(f"?token={tokens['operator']}" in one for one in page.links)
+        assert len(page.links) == 2
+
+
+@pytest.mark.parametrize("content", ["", "nonsense", "[]", '{"operator": "x", "viewer": "y"}'])
+def test_a_spoilt_token_file_is_one_sentence(port, state_folder, content):
+    """The ground would start with a traceback, or with an empty password."""
+    state_folder.mkdir()
+    file = state_folder / "web-tokens.json"
+    file.write_text(content)
+    file.chmod(0o600)
+    with pytest.raises(UserError, match="holds no tokens"):
+        WebPage(f"0.0.0.0:{port}", clock=time.time_ns)
+    file.chmod(0o644)
+    with pytest.raises(UserError, match="read by others"):
+        WebPage(f"0.0.0.0:{port}", clock=time.time_ns)
+
+
+def test_a_busy_port_or_a_wrong_address_is_one_sentence(port, capsys):
+    """The ground would seem to serve, and the page would be another program's."""
+    with socket.create_server(("127.0.0.1", port)):
+        with pytest.raises(UserError, match="another port"):
+            WebPage(f"127.0.0.1:{port}", clock=time.time_ns)
+        assert main(["--web", f"127.0.0.1:{port}", "--detector", "motion", "--classifier", "none"]) == 2
+    assert "another port" in capsys.readouterr().err
+    for wrong in ("8080", "127.0.0.1", "host:port", ":8080", "127.0.0.1:99999", "a b:80", "127.0.0.1:80/x"):
+        with pytest.raises(UserError, match="--web"):
+            WebPage(wrong, clock=time.time_ns)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "nonsense",
+        "[]",
+        "null",
+        "{}",
+        '{"type": "watch"}',
+        '{"type": "watch", "edge": 5, "rung": "h264"}',
+        '{"type": "watch", "edge": "a", "rung": {}}',
+        '{"type": "time", "sent": "x"}',
+        '{"type": []}',
+        "[" * 4000,
+        b"\x00\xff" * 100,
+    ],
+)
+def test_nonsense_closes_that_connection_alone(local, message):
+    """One broken browser would take the page from all others."""
+    with joined(local) as viewer:
+        viewer.send(message)
+        with pytest.raises(ConnectionClosed):
+            ended(viewer)
+    assert greets(local)
+
+
+def test_frames_of_a_megabyte_are_refused(local):
+    """Some of them would fill the memory of the ground."""
+    for _ in range(5):
+        with joined(local) as viewer, suppress(ConnectionClosed):
+            viewer.send("x" * 2**20)
+            ended(viewer)
+    status, _, _ = asked(
+        local, "/edges/uav-1/still", "POST", b"x" * 2**20, Origin=f"http://127.0.0.1:{local}"
+    )
+    assert status == 400
+    assert greets(local)
+
+
+def test_two_hundred_viewers_are_as_many_as_are_let_in(local):
+    """The ground would spend itself on viewers."""
+    refused = 0
+    with ExitStack() as let_in:
+        for _ in range(200):
+            try:
+                let_in.enter_context(joined(local))
+            except InvalidHandshake:
+                refused += 1
+        assert 100 <= refused <= 180
+
+    def is_room() -> bool:
+        with suppress(InvalidHandshake):
+            return greets(local)
+        return False
+
+    eventually(is_room, within_s=10, what="others are let in")
+
+
+def test_five_hundred_connections_that_say_nothing_leave_room(local):
+    """A port scanner would close the page to those who need it."""
+    silent = [socket.create_connection(("127.0.0.1", local)) for _ in range(500)]
+    time.sleep(0.5)
+    closed = 0
+    for one in silent:
+        one.setblocking(False)
+        with suppress(BlockingIOError):
+            closed += one.recv(100) is not None
+    assert closed >= 200
+    for one in silent:
+        one.close()
+    time.sleep(0.5)
+    assert greets(local)
+
+
+def test_what_is_no_http_disturbs_nothing(local):
+    """Another protocol on the port would stop the page."""
+    for data in (
+        b"\x16\x03\x01\x02\x00",
+        b"GET / HTTP/9.9\r\n\r\n",
+        b"A" * 100_000,
+        b"POST / HTTP/1.1\r\n" * 50,
+    ):
+        with socket.create_connection(("127.0.0.1", local), timeout=5) as raw:
+            try:
+                raw.sendall(data)
+                raw.shutdown(socket.SHUT_WR)
+                while raw.recv(4096):
+                    pass
+            except OSError:
+                pass
+    assert greets(local)
+
+
+def test_the_server_ends_while_viewers_watch(port):
+    """The ground would hang at its end."""
+    with ExitStack() as viewers:
+        with WebPage(f"127.0.0.1:{port}", clock=time.time_ns):
+            viewers.enter_context(joined(port)).recv()
+            began_s = time.monotonic()
+        assert time.monotonic() - began_s < 4

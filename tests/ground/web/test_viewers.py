@@ -1,0 +1,108 @@
+"""Viewers of one edge: newcomers begin in the middle, slow ones lose pictures, nobody waits for another."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+
+import pytest
+
+from hvt_ground.web.fmp4 import Fragment, Start
+from hvt_ground.web.pictures import Made
+from hvt_ground.web.viewers import EdgePage, Hub, Viewer
+
+
+def fragment(number: int, *, keyframe: bool = False, size: int = 10) -> Made:
+    return Made("h264", Fragment(bytes(size), number / 10, 0.1, keyframe))
+
+
+def kinds(viewer: Viewer) -> list[str]:
+    """What waits in its queue, in order."""
+    found = []
+    while not viewer.empty:
+        message = asyncio.run(viewer.take())
+        if isinstance(message, bytes):
+            message = message[2 : 2 + int.from_bytes(message[:2])].decode()
+        said = json.loads(message)
+        found.append(said["type"] + (f" {said['frame']}" if said["type"] == "fragment" else ""))
+    return found
+
+
+@pytest.fixture
+def hub() -> Iterator[Hub]:
+    loop = asyncio.new_event_loop()
+    yield Hub(loop)
+    loop.close()
+
+
+def flown(hub: Hub, *, frames: int, keyframe_every: int) -> EdgePage:
+    """An edge of which so many frames have come."""
+    edge = EdgePage("uav-1")
+    hub.begin(edge, {"edge": "uav-1"})
+    hub.made(edge, Made("h264", Start("avc1.42c01f", b"start")), frame_index=0, captured_ms=0)
+    for number in range(frames):
+        hub.made(
+            edge, fragment(number, keyframe=number % keyframe_every == 0), frame_index=number, captured_ms=0
+        )
+    return edge
+
+
+def test_who_joins_between_keyframes_begins_at_the_last_one(hub):
+    """The picture would stay black until the next keyframe, or be broken."""
+    flown(hub, frames=26, keyframe_every=10)
+    viewer = Viewer()
+    hub.watch(viewer, "uav-1", "h264")
+    assert kinds(viewer)[1:] == ["start", "init", *(f"fragment {number}" for number in range(20, 26))]
+
+
+def test_a_slow_viewer_goes_on_at_a_keyframe_and_loses_no_words(hub):
+    """It would see a broken picture, or fill the memory of the ground."""
+    edge = flown(hub, frames=1, keyframe_every=10)
+    slow, quick = Viewer(), Viewer()
+    for viewer in (slow, quick):
+        hub.join(viewer)
+        hub.watch(viewer, "uav-1", "h264")
+    for number in range(1, 1005):
+        made = fragment(number, keyframe=number % 100 == 0, size=20_000)
+        hub.made(edge, made, frame_index=number, captured_ms=0)
+        hub.notice(edge, json.dumps({"type": "notice"})) if number % 500 == 0 else None
+        if number % 100 == 99:
+            assert len([one for one in kinds(quick) if one.startswith("fragment")]) >= 99
+    came = kinds(slow)
+    assert slow.lost > 500
+    assert quick.lost == 0
+    assert came.count("notice") == 2
+    frames = [int(one.split()[1]) for one in came if one.startswith("fragment")]
+    assert len(frames) < 450
+    assert frames[0] % 100 == 0
+    assert frames == list(range(frames[0], 1005))
+
+
+def test_nothing_is_made_for_nobody(hub):
+    """The ground would spend a processor on pictures that nobody looks at."""
+    edge = flown(hub, frames=3, keyframe_every=10)
+    viewer, other = Viewer(), Viewer()
+    for one in (viewer, other):
+        hub.join(one)
+    assert not edge.wanted
+    hub.watch(viewer, "uav-1", "h264")
+    hub.watch(other, "uav-1", "jpeg")
+    hub.show_wall(other, shown=True)
+    assert set(edge.wanted) == {"h264", "jpeg", "thumbnail"}
+    hub.leave(other)
+    assert set(edge.wanted) == {"h264"}
+    first = edge.wanted["h264"]
+    hub.leave_edge(viewer)
+    hub.watch(viewer, "uav-1", "h264")
+    assert edge.wanted["h264"] != first, "a stream that nobody saw the start of would go on"
+    hub.leave_edge(viewer)
+    assert not edge.wanted
+
+
+def test_who_takes_nothing_at_all_is_given_up():
+    """A browser that hangs would hold what is not dropped for ever."""
+    viewer = Viewer()
+    for _ in range(3000):
+        viewer.put("words")
+    assert viewer.hopeless

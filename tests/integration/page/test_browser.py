@@ -1,0 +1,219 @@
+"""The page in a real browser, on a real flight: what an operator sees and can do."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from programs.processes import Link, Running, eventually, free_ports
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.timeout(180),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt install chromium)"),
+]
+
+_PIXELS = """() => {
+  const video = document.getElementById("video");
+  const canvas = document.createElement("canvas");
+  canvas.width = 64; canvas.height = 36;
+  const context = canvas.getContext("2d");
+  context.drawImage(video, 0, 0, 64, 36);
+  return Array.from(context.getImageData(0, 0, 64, 36).data).join();
+}"""
+
+
+@dataclass
+class Flight:
+    """An edge that flies, and the page that shows it."""
+
+    address: str
+    edge: Running
+    browser: Any
+
+    def page(self, fragment: str = "", **more) -> Any:
+        """Another viewer, with nothing kept from the others."""
+        page = self.browser.new_context(**more).new_page()
+        page.set_default_timeout(20_000)
+        page.goto(f"{self.address}#{fragment}")
+        return page
+
+
+@pytest.fixture(scope="module")
+def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
+    from playwright.sync_api import sync_playwright
+
+    folder = tmp_path_factory.mktemp("page")
+    port = free_ports(1)[0]
+    with Link(folder) as link, sync_playwright() as playwright:
+        ground = link.ground(
+            *(
+                "--record",
+                "flight.rrd",
+                "--detector",
+                "motion",
+                "--classifier",
+                "none",
+                "--web",
+                f"127.0.0.1:{port}",
+            )
+        )
+        ground.until(f"watch at http://127.0.0.1:{port}/")
+        edge = link.edge(
+            *("--source", str(long_scene), "--source-fps", "10", "--fps", "10", "--size", "640x360"),
+            *("--preset", "ultrafast", "--budget", "500kbps", "--video-share", "0.6", "--edge-id", "uav-1"),
+            *("--detector", "motion", "--cooldown", "0s"),
+        )
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield Flight(f"http://127.0.0.1:{port}/", edge, browser)
+        browser.close()
+        assert ground.alive
+        assert "Traceback" not in ground.said
+
+
+@pytest.fixture
+def page(flight: Flight) -> Iterator[Any]:
+    page = flight.page()
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    yield page
+    assert errors == []
+    page.context.close()
+
+
+def frame(page: Any) -> int:
+    """The frame that the browser shows; -1 before the first."""
+    return int(page.locator("#age").get_attribute("data-frame") or -1)
+
+
+def shows(page: Any, *, after: int = -1, within_s: float = 20) -> int:
+    """Wait until it shows a later frame."""
+    eventually(lambda: frame(page) > after, within_s=within_s, what="a picture is shown")
+    return frame(page)
+
+
+def test_the_picture_moves_at_the_rate_of_the_stream(page):
+    """An operator would watch a picture that stands still."""
+    first = shows(page)
+    seen = set()
+    began_s = time.monotonic()
+    while time.monotonic() - began_s < 3:
+        seen.add(page.evaluate(_PIXELS))
+        time.sleep(0.05)
+    assert frame(page) - first > 15
+    assert len(seen) > 10
+    assert "H.264" in page.inner_text("#rung") or "HEVC" in page.inner_text("#rung")
+    assert int(page.locator("#age").get_attribute("data-ms")) < 3000
+
+
+def test_boxes_are_drawn_on_the_frame_that_is_shown(page):
+    """Boxes would run before or behind what they are about."""
+    shows(page)
+    drawn = """() => {
+      const canvas = document.getElementById("boxes");
+      return canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value);
+    }"""
+    eventually(lambda: page.evaluate(drawn), within_s=20, what="a box is drawn")
+    page.locator("#objects-title").click()
+    eventually(lambda: page.locator("#tracks button").count(), within_s=10, what="the tracks are listed")
+
+
+def test_a_click_brings_a_still_of_that_place(page):
+    """The operator could look, and not look closer."""
+    shows(page)
+    page.locator("#boxes").click(position={"x": 300, "y": 150})
+    image = page.locator("#answer-picture")
+    image.wait_for(state="visible")
+    eventually(lambda: image.evaluate("one => one.naturalWidth") > 10, within_s=10, what="the still is shown")
+    assert "pixels of the camera" in page.inner_text("#answer-text")
+    strip = page.locator("#stills img")
+    eventually(strip.count, within_s=20, what="the strip shows stills")
+    eventually(
+        lambda: strip.first.evaluate("one => one.naturalWidth") > 4, within_s=10, what="its picture is loaded"
+    )
+    page.locator("#stills button").first.click()
+    assert page.locator("#large").is_visible()
+    page.keyboard.press("Escape")
+    page.locator("#keyframe").click()
+
+
+def test_a_second_viewer_joins_between_keyframes(flight, page):
+    """Who comes later would wait for a keyframe, which may be a minute away."""
+    shows(page)
+    second = flight.page()
+    began = shows(second)
+    assert shows(page) - began < 100
+    shows(second, after=began + 10)
+    second.context.close()
+
+
+def test_a_thin_browser_gets_single_pictures(flight):
+    """A browser without Media Source would show nothing."""
+    page = flight.page("rung=jpeg")
+    first = shows(page)
+    shows(page, after=first + 8)
+    assert "single pictures" in page.inner_text("#rung")
+    assert page.locator("#still-picture").evaluate("one => one.naturalWidth") == 640
+    page.context.close()
+
+
+def test_a_gap_greys_the_last_picture_and_ends_with_the_next(flight, page):
+    """An operator would take an old picture for the one of now."""
+    shows(page)
+    page.locator("#gap").wait_for(state="hidden")
+    flight.edge.process.send_signal(signal.SIGSTOP)
+    try:
+        page.locator("#stage.old").wait_for()
+        assert "old" in page.inner_text("#gap")
+        last = frame(page)
+        time.sleep(1.5)
+    finally:
+        flight.edge.process.send_signal(signal.SIGCONT)
+    page.locator("#stage:not(.old)").wait_for()
+    shows(page, after=last + 5)
+
+
+def test_steps_back_and_to_the_picture_of_now(page):
+    """What was missed could not be looked at again."""
+    first = shows(page)
+    shows(page, after=first + 70)
+    page.keyboard.press("Space")
+    time.sleep(0.5)
+    paused = frame(page)
+    page.keyboard.press("ArrowLeft")
+    eventually(lambda: frame(page) <= paused - 40, within_s=10, what="an earlier picture is shown")
+    assert "ago" in page.inner_text("#age")
+    page.keyboard.press("l")
+    shows(page, after=paused + 5)
+
+
+def test_the_page_fits_a_phone(flight):
+    """Half of it would lie beside the screen."""
+    page = flight.page(viewport={"width": 390, "height": 844}, color_scheme="light")
+    shows(page)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.context.close()
+
+
+def test_nothing_jumps_while_the_picture_comes(flight):
+    """Who wants to click on a car would hit a button that just moved there."""
+    page = flight.page()
+    shows(page)
+    page.evaluate("""() => {
+      window.shift = 0;
+      new PerformanceObserver((list) => list.getEntries().forEach((one) => { window.shift += one.value; }))
+        .observe({ type: "layout-shift" });
+    }""")
+    time.sleep(4)
+    assert page.evaluate("window.shift") < 0.1
+    page.context.close()
