@@ -15,6 +15,7 @@ from hvt_common.errors import FlightError, UserError
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, reason_of
+from hvt_common.runtime.process import notify_systemd
 from hvt_common.runtime.reporting import StatusLine, check_writable
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
@@ -159,6 +160,8 @@ class Ground:
             failures=failures,
         )
         while not self._stop.wait(_POLL_S):
+            if polls % _STATUS_EVERY_POLLS == 0:
+                notify_systemd("WATCHDOG=1")
             ports = link.ports()
             self._leave_edges(ports)
             for port in ports:
