@@ -7,7 +7,7 @@ from typing import NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
-from hvt_common.runtime.process import leave, limit_malloc_arenas, notify_systemd, stop_on_signals
+from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, start_log, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
@@ -41,12 +41,7 @@ def _run(argv: Sequence[str] | None) -> int:
     limit_malloc_arenas()
     release_log = start_log("hvt-edge", quiet=config.quiet)
     stop = stop_on_signals()
-
-    def on_started() -> None:
-        release_log()
-        notify_systemd("READY=1")
-
-    content = Edge(config, stop=stop, on_started=on_started).run()
+    content = Edge(config, stop=stop, on_started=release_log).run()
     print_table(title(content), table(content))
     if config.summary is not None:
         write_json(config.summary, content)

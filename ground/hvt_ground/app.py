@@ -93,6 +93,7 @@ class Ground:
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
+            notify_systemd("READY=1")
             self._say_where(line, page="" if view is None else view.page)
             try:
                 self._serve(link, factory, line, watch, models.failures)

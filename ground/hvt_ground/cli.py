@@ -8,7 +8,7 @@ from typing import NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence, needs_extra
-from hvt_common.runtime.process import leave, limit_malloc_arenas, notify_systemd, stop_on_signals
+from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, start_log, write_json
 from hvt_ground.config import GroundConfig, check
 
@@ -54,12 +54,7 @@ def _run(argv: Sequence[str] | None) -> int:
     leave_out_pandas()
     release_log = start_log("hvt-ground", quiet=config.quiet)
     stop = stop_on_signals()
-
-    def on_started() -> None:
-        release_log()
-        notify_systemd("READY=1")
-
-    sessions = Ground(config, stop=stop, on_started=on_started).run()
+    sessions = Ground(config, stop=stop, on_started=release_log).run()
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
     if not sessions:
