@@ -11,7 +11,7 @@ from hvt_common.errors import FlightError, UserError
 from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
-from hvt_common.runtime.process import with_lower_priority
+from hvt_common.runtime.process import notify_systemd, with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import EdgeConfig, check_rate
@@ -113,6 +113,7 @@ class Edge:
                 reply=stages.transmitter.reply,
             )
             self._on_started()
+            notify_systemd("READY=1")
             if not source.live:
                 wait_for_ground(
                     link.has_ground,

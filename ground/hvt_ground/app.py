@@ -17,6 +17,7 @@ from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.runtime.health_server import METRICS_TYPE, Answer, HealthServer
+from hvt_common.runtime.process import notify_systemd
 from hvt_common.runtime.reporting import StatusLine, check_writable
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
@@ -115,6 +116,7 @@ class Ground:
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
+            notify_systemd("READY=1")
             self._say_where(
                 line, pages=(*(() if view is None else (view.page,)), *(page.links if page else ()))
             )
@@ -216,6 +218,8 @@ class Ground:
             failures=failures,
         )
         while not self._stop.wait(_POLL_S):
+            if polls % _STATUS_EVERY_POLLS == 0:
+                notify_systemd("WATCHDOG=1")
             ports = link.ports()
             self._leave_edges(ports)
             for port in ports:

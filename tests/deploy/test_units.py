@@ -88,6 +88,16 @@ def test_unit_stops_like_ctrl_c_and_does_not_retry_a_wrong_configuration(unit: P
     )
 
 
+@pytest.mark.parametrize("name", ["hvt-edge@.service", "hvt-ground.service"])
+def test_unit_may_take_its_time_to_be_ready(name: str) -> None:
+    """Without it, systemd's limit of 90 s would kill a small board that loads its networks, again and again."""
+    service = _read(DEPLOY / "systemd" / name)["Service"]
+    assert (service["Type"], service["TimeoutStartSec"]) == ("notify", "infinity")
+    assert "AF_UNIX" in service["RestrictAddressFamilies"], (
+        "without it nobody is told, and the start never ends"
+    )
+
+
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
 def test_unit_writes_where_it_may(unit: Path) -> None:
     """ProtectSystem=strict makes all else read-only: a working directory outside loses the recording."""

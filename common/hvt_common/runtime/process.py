@@ -1,4 +1,7 @@
-"""What a process sets up for itself: the signals that stop it, its threads' priority, its memory allocator."""
+"""What a process sets up for itself: the signals that stop it, its threads' priority, its memory allocator.
+
+And what it tells systemd.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import contextlib
 import ctypes
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable
@@ -18,6 +22,7 @@ __all__ = [
     "leave",
     "limit_malloc_arenas",
     "lower_priority",
+    "notify_systemd",
     "stop_on_signals",
     "with_lower_priority",
 ]
@@ -49,6 +54,20 @@ def stop_on_signals() -> threading.Event:
         if one is not signal.SIGHUP or signal.getsignal(one) is not signal.SIG_IGN:
             signal.signal(one, lambda *_: stop.set())
     return stop
+
+
+def notify_systemd(state: str) -> None:
+    """Send ``READY=1`` or ``WATCHDOG=1`` to systemd, where it started this process with ``Type=notify``.
+
+    The protocol is that of sd_notify(3): one datagram to the socket that ``NOTIFY_SOCKET`` names. A socket that is
+    gone or full is no reason to stop: systemd draws its own conclusion.
+    """
+    name = os.environ.get("NOTIFY_SOCKET", "")
+    if not name:
+        return
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as to:
+        to.setblocking(False)  # the loop that says it is alive must not stand still here
+        to.sendto(state.encode(), "\0" + name[1:] if name.startswith("@") else name)
 
 
 def leave(code: int) -> NoReturn:

@@ -1,0 +1,53 @@
+"""What the programs tell systemd, on the socket that it gives them."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hvt_common.runtime.process import notify_systemd
+from programs.processes import START_S, Link
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.fixture(params=["path", "abstract"])
+def systemd(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[socket.socket]:
+    """What systemd listens on, of either kind."""
+    name = str(tmp_path / "notify") if request.param == "path" else f"@hvt-{tmp_path}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(name.replace("@", "\0", 1))
+        listening.settimeout(START_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        yield listening
+
+
+def test_a_ground_is_ready_and_goes_on_telling_that_it_lives(systemd: socket.socket, tmp_path: Path) -> None:
+    """A start would never end; or the watchdog would kill a ground that works, every 30 s."""
+    with Link(tmp_path) as link:
+        ground = link.ground("--detector", "motion", "--classifier", "none")
+        assert systemd.recv(64) == b"READY=1"
+        systemd.settimeout(10)
+        assert [systemd.recv(64) for _ in range(3)] == [b"WATCHDOG=1"] * 3
+        ground.stop()
+
+
+def test_an_edge_is_ready_before_any_ground_is_there(systemd: socket.socket, tmp_path: Path) -> None:
+    """A drone that boots before its ground would hang in its start."""
+    with Link(tmp_path) as link:
+        edge = link.edge("--source", "demo", "--method", "M0")
+        assert systemd.recv(64) == b"READY=1"
+        edge.stop()
+
+
+def test_a_socket_that_is_gone_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ground would end because who looks after it does not listen."""
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
+    notify_systemd("READY=1")
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    notify_systemd("READY=1")
