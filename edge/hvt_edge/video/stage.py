@@ -112,8 +112,9 @@ class BaseStage:
             self.backlog.base(unit, now_ns=now_ns, sent=decision.to_link)
             if decision.to_link:  # a probe; what it builds on was not sent
                 self.transmitter.base(unit, now_ns=now_ns, after_hole=not unit.keyframe)
-            else:
+            elif self.backlog.offline:
                 self.transmitter.store_base(unit, now_ns=now_ns)
+            # On the way back none of it is on the line: the budget has to get room for the keyframe to go on with.
             return
         line_bytes = self.transmitter.base(unit, now_ns=now_ns)
         if unit.keyframe:
