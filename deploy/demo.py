@@ -37,6 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     settings = {"--seed": arguments.seed, "--picture": arguments.picture}
     subprocess.run([BIN / "hvt-study", "demo", FOLDER, *EDGES, *_flags(settings)], check=True)
     print(f"the picture: {arguments.picture}\nthe recording: {BIN / 'rerun'} {arguments.out}")
+    print(f"live in a browser: {BIN / 'hvt-ground'} --web & {BIN / 'hvt-edge'} --source demo:codes")
+    print("  and open http://127.0.0.1:8080")
     return 0
 
 
