@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import NoReturn
 
 from hvt_common.config import load, to_toml
@@ -14,10 +15,22 @@ from hvt_ground.config import GroundConfig, check
 
 __all__ = ["main", "program"]
 
-_DESCRIPTION = (
-    "Receive what edges publish over Zenoh: decode, detect, track, refine classes by the stills, and record "
-    "all of it for the Rerun viewer."
-)
+_DESCRIPTION = """Receive what edges publish over Zenoh: decode, detect, track, refine classes by
+the stills, and record all of it for the Rerun viewer.
+
+Other commands, each with --help:
+  hvt-ground status                      how a ground that runs is
+  hvt-ground recordings                  what a folder of recordings holds
+  hvt-ground still | tracks | keyframe   ask an edge, in flight
+  hvt-ground set-budget | set-method     command it
+  hvt-ground edges                       which edges are there
+  hvt-ground keys                        make keys, and say who may do what"""
+_COMMANDS = {
+    "keys": "hvt_ground.pki.command",
+    "recordings": "hvt_ground.recordings.command",
+    "status": "hvt_ground.control.watch",
+}
+"""By name, the module whose ``run`` takes the words that follow; imported for none but its own."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,18 +45,9 @@ def program() -> NoReturn:
 
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
-    if words[:1] == ["keys"]:
-        from hvt_ground.pki import command as keys  # noqa: PLC0415 - who serves edges needs neither of these
-
-        return keys.run(words[1:])
-    if words[:1] == ["status"]:
-        from hvt_ground.control import watch  # noqa: PLC0415
-
-        return watch.run(words[1:])
-    if words[:1] == ["recordings"]:
-        from hvt_ground.recordings import command as recordings  # noqa: PLC0415
-
-        return recordings.run(words[1:])
+    if words and words[0] in _COMMANDS:
+        code: int = import_module(_COMMANDS[words[0]]).run(words[1:])
+        return code
     if words and not words[0].startswith("-"):
         from hvt_ground.control import command as control  # noqa: PLC0415
 
