@@ -58,6 +58,7 @@ class SessionState:
     base_size: tuple[int, int]
     fps: float
     budget_bps: int
+    """As it is now, like the method; what was commanded shows within half a minute."""
     mean_bps: int
     """Over the session, all that crossed the line."""
     total_bps: float | None
@@ -226,14 +227,14 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
     return SessionState(
         session=f"{info.session_id:016x}",
         software=info.software,
-        method=info.method,
+        method=session.method,
         levers=session.levers,
         lockstep=session.lockstep,
         duration_s=session.duration_s,
         source_size=info.source_size,
         base_size=info.base_size,
         fps=info.fps,
-        budget_bps=info.budget_bps,
+        budget_bps=session.budget_bps,
         mean_bps=session.ledger.summary(session.duration_s).total_bps,
         total_bps=None if now is None else now.total_bps,
         base_bps=None if now is None else now.base_bps,

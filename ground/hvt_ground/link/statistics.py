@@ -222,6 +222,8 @@ class SessionAccount:
         self._emit = emit
         self._next_traffic_ns = 0
         self.last_traffic: Traffic | None = None
+        self.budget_bps = info.budget_bps
+        """As it is now."""
 
     def count(self, row: Channel, account: Account, item: Received, *, at_ns: int) -> None:
         """Take the bytes of a message on the line."""
@@ -277,7 +279,7 @@ class SessionAccount:
             base_bps=ledger.window_bytes(Account.BASE, at_ns) * to_bps,
             roi_bps=ledger.window_bytes(Account.ROI, at_ns) * to_bps,
             total_bps=ledger.window_bytes(None, at_ns) * to_bps,
-            budget_bps=self._info.budget_bps,
+            budget_bps=self.budget_bps,
             receive_latency_ms=None if lockstep else self.receive_latency.percentile(50),
             overlay_latency_ms=None if lockstep else self.overlay_latency.percentile(50),
             tracks=tracks,

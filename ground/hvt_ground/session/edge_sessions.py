@@ -165,7 +165,9 @@ class EdgeSessions:
     def _refresh_clock(self, session: GroundSession, now_ns: int) -> None:
         """Ask the edge for its time now and then; nothing waits for the answer."""
         while (answer := self.port.take_info()) is not None:
-            self._learn(answer)
+            info = self._learn(answer)
+            if info is not None and info.session_id == session.info.session_id:
+                session.learn(info)
         if now_ns >= self._next_clock_ns and self.port.present.is_set():
             self._next_clock_ns = now_ns + _CLOCK_EVERY_NS
             self.port.request_info(session.info.session_id)

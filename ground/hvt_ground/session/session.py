@@ -73,6 +73,9 @@ class GroundSession:
         self.sinks = sinks
         self._queued = [one for one in sinks if isinstance(one, QueuedSink)]
         self.info = info
+        """As the session began."""
+        self.budget_bps, self.method = info.budget_bps, info.method
+        """As they are now, some seconds late."""
         self.lockstep = info.pace == "lockstep"
         self._clock_offset = ClockOffset() if reports is None else reports.clock_offset
         self._account = SessionAccount(info, clock=clock, clock_offset=self._clock_offset, emit=self._emit)
@@ -218,6 +221,11 @@ class GroundSession:
         self._account.time(kind, item, header, handled=delivered)
         if delivered and header.kind == BacklogKind.STILL and header.session_id == self.info.session_id:
             self._statistics.stored_still(header.number)
+
+    def learn(self, info: Info) -> None:
+        """What the edge says of the session now: budget and method may be others than at its beginning."""
+        self.budget_bps, self.method = info.budget_bps, info.method
+        self._account.budget_bps = info.budget_bps
 
     def count(self, counters: StreamCounters) -> None:
         """Note what the reassembly has counted in this session so far."""

@@ -164,6 +164,7 @@ def state_message(state: GroundState) -> str:
             "total": None if one.session is None else one.session.total_bps,
             "base": None if one.session is None else one.session.base_bps,
             "budget": None if one.session is None else one.session.budget_bps,
+            "method": None if one.session is None else one.session.method,
             "words": [] if one.session is None else _words(one.session, calibrated=state.calibrated),
             "failed": [*map(_failure, one.failed), *_edge_failures(one)],
         }

@@ -1,4 +1,4 @@
-"""What an operator may ask of an edge from the page: a closer look, a keyframe."""
+"""What an operator may ask of an edge from the page: a closer look, a keyframe, another budget or method."""
 
 from __future__ import annotations
 
@@ -61,6 +61,18 @@ class EdgeRequests:
         """Have a picture coded that needs none before it."""
         with _one_of(self._free):
             self._client()[edge].keyframe()
+
+    def set(self, edge: str, body: Mapping[str, Any]) -> None:
+        """Set the total budget (``kbps``) or who gets a still (``method``), from the next keyframe on."""
+        match body:
+            case {"kbps": int() | float() as kbps} if not isinstance(kbps, bool) and 1 <= kbps < 1e6:
+                with _one_of(self._free):
+                    self._client()[edge].set_budget(round(kbps * 1000))
+            case {"method": str() as method} if 0 < len(method) <= 32:
+                with _one_of(self._free):
+                    self._client()[edge].set_method(method)
+            case _:
+                raise BadRequestError("give kbps, from 1 on, or method, such as M5")
 
 
 class _one_of:  # noqa: N801 - reads as a word

@@ -90,6 +90,15 @@ class Site:
             return _refusal(error)
         return Response(status_code=204)
 
+    async def settings(self, request: Request) -> Response:
+        """Set budget or method."""
+        try:
+            edge, body = self._edge(request), await _json_body(request)
+            await run_in_threadpool(self._requests.set, edge, body)
+        except UserError as error:
+            return _refusal(error)
+        return Response(status_code=204)
+
     def _edge(self, request: Request) -> str:
         """Only one that is known: names become keys of the link."""
         edge: str = request.path_params["edge"]
@@ -250,6 +259,7 @@ def make_site(access: Access, hub: Hub, edge_requests: EdgeRequests) -> Callable
         Route("/stills/{edge}/{still}/{which}", site.still),
         Route("/edges/{edge}/still", site.request_still, methods=["POST"]),
         Route("/edges/{edge}/keyframe", site.keyframe, methods=["POST"]),
+        Route("/edges/{edge}/settings", site.settings, methods=["POST"]),
         WebSocketRoute("/ws", site.socket),
     ]
     return _Guard(Starlette(routes=routes), access)

@@ -217,3 +217,22 @@ def test_nothing_jumps_while_the_picture_comes(flight):
     time.sleep(4)
     assert page.evaluate("window.shift") < 0.1
     page.context.close()
+
+
+def test_an_operator_sets_the_budget(flight):
+    """A link that has become thin would want somebody at a command line."""
+    page = flight.page()
+    shows(page)
+
+    def said(words: str) -> bool:
+        return words in page.locator("#settings-text").text_content()
+
+    page.locator("#budget").fill("300")
+    page.locator("#settings button").click()
+    eventually(lambda: said("300 kbps from now on"), within_s=20, what="it is set")
+    assert "300 kbps" in page.locator("#facts").text_content()
+    page.locator("#budget").fill("10")
+    page.locator("#settings button").click()
+    refused = ("wait two seconds", "takes at least")
+    eventually(lambda: any(map(said, refused)), within_s=20, what="the edge's refusal")
+    page.context.close()

@@ -19,6 +19,8 @@ const LINK_WORDS = {
 };
 const WAIT_FOR_NAMED_MS = 1500;
 const MOST_EVENTS = 200;
+const SET_MS = 30000;
+const METHODS = ["M0", "M1", "M2", "M3", "M4", "M5", "M6"];
 const RUNG_WORDS = {
   hevc: "HEVC, as received",
   h264: "H.264, coded again",
@@ -32,6 +34,8 @@ const by = (id) => document.getElementById(id);
 const sessions = new Map();
 /** @type {Map<string, string>} */
 const links = new Map();
+/** When this page last set something, by edge. @type {Map<string, number>} */
+const setAt = new Map();
 /** @type {string | null} */
 let chosen = null;
 let rungs = Player.rungs();
@@ -133,6 +137,7 @@ function choose(edge) {
   plot.show(edge);
   shown = { frame: -1, captured: 0, at: 0 };
   by("answer").hidden = true;
+  by("settings-text").textContent = "";
   describe();
   watch();
 }
@@ -155,6 +160,7 @@ function describe() {
   by("stage").style.aspectRatio = `${width} / ${height}`;
   by("stage").style.maxWidth = `calc(72vh * ${width / height})`;
   boxes.size = session.baseSize;
+  showSettings();
 }
 
 function stepDown() {
@@ -265,6 +271,40 @@ async function keyframe() {
   if (typeof reply === "string") tell(reply, null);
 }
 
+/** @param {object} content @param {object} now of the session, once it is set @param {string} words */
+async function set(content, now, words) {
+  if (role !== "operator" || !chosen) return;
+  const edge = chosen;
+  by("settings-text").textContent = "asking the edge";
+  const reply = await post(`/edges/${encodeURIComponent(edge)}/settings`, content);
+  if (typeof reply !== "string") {
+    Object.assign(sessions.get(edge) ?? {}, now);
+    setAt.set(edge, performance.now());
+  }
+  if (edge !== chosen) return;
+  by("settings-text").textContent = typeof reply === "string" ? reply : words;
+  describe();
+}
+
+/** What the edge flies with now; not under somebody's fingers. */
+function showSettings() {
+  const session = sessions.get(chosen);
+  if (!session || by("settings").contains(document.activeElement)) return;
+  by("budget").value = String(Math.round(session.budget / 1000));
+  by("method").value = session.method;
+}
+
+for (const name of METHODS) make("option", "", by("method")).textContent = name;
+by("settings").addEventListener("submit", (/** @type {Event} */ event) => {
+  event.preventDefault();
+  const kbps = Number(by("budget").value);
+  set({ kbps }, { budget: 1000 * kbps }, `${kbps} kbps from now on`);
+});
+by("method").addEventListener("change", () => {
+  const method = by("method").value;
+  set({ method }, { method }, `stills by ${method} from now on`);
+});
+
 // Link and events
 
 /** @param {Message} message */
@@ -273,7 +313,11 @@ function onGroundState(message) {
     wall.state(edge, state, message.at);
     links.set(edge, state.link);
     if (state.total !== null) plot.add(edge, { at: message.at, total: state.total, base: state.base, budget: state.budget });
+    const session = sessions.get(edge);
+    const fresh = performance.now() - (setAt.get(edge) ?? -Infinity) < SET_MS; // the ground learns of it later
+    if (session && state.budget !== null && !fresh) Object.assign(session, { budget: state.budget, method: state.method });
     if (edge !== chosen) continue;
+    describe();
     const words = [`${LINK_WORDS[state.link]} since ${clock(state.since)}`, ...state.words];
     by("link-text").textContent = words.join(" · ");
     const failed = [...state.failed, ...message.failed];
@@ -311,7 +355,7 @@ by("answer-close").addEventListener("click", () => {
   by("answer").hidden = true;
 });
 addEventListener("keydown", (event) => {
-  if (event.target instanceof HTMLButtonElement || by("large").open || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (/** @type {Element} */ (event.target).closest("button, input, select") || by("large").open || event.ctrlKey || event.metaKey || event.altKey) return;
   const act = { " ": "pause", ArrowLeft: "back", ArrowRight: "forward", l: "now", k: "keyframe" }[event.key];
   if (!act) return;
   event.preventDefault();
