@@ -185,7 +185,7 @@ class Ground:
             age_s = (self._clock() - state.at_ns) / SECOND_NS
             return make(state) if age_s < _STUCK_S else Answer(b"it stands still\n", status=503)
 
-        def alive() -> Answer:
+        def ready() -> Answer:
             return of_state(lambda _state: Answer(b"ok\n"))
 
         answers = {
@@ -193,8 +193,9 @@ class Ground:
             "/state.json": lambda: of_state(
                 lambda state: Answer(json.dumps(state.as_dict()).encode(), "application/json")
             ),
-            "/healthz": alive,
-            "/readyz": alive,
+            # While networks load it is alive, and not ready.
+            "/healthz": lambda: Answer(b"starting\n") if self._state is None else ready(),
+            "/readyz": ready,
         }
         return HealthServer(address, answers, name="--metrics")
 

@@ -62,7 +62,7 @@ def test_a_ground_in_service_can_be_watched(tmp_path):
         assert found["hvt_budget_bits_per_second", "uav-1"] == 800_000
         assert found["hvt_received_bits_per_second", "uav-1"] > 0
         assert found["hvt_link", "uav-1"] == 1
-        assert read(address, "/healthz") == b"ok\n"
+        assert read(address, "/healthz") == read(address, "/readyz") == b"ok\n"
         said = status("--at", address)
         assert said.returncode == 0, said.stderr
         assert "uav-1" in said.stdout
