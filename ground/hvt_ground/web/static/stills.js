@@ -33,7 +33,7 @@ export class Stills {
       const picture = make("img", "", pair);
       picture.src = address(still, which);
       picture.loading = "lazy";
-      picture.alt = which === "still" ? `still of ${still.after}` : "what the base stream showed";
+      picture.alt = which === "still" ? `still: ${sentence(still)}` : "what the base stream showed";
     }
     const words = make("span", "words", button);
     words.textContent = sentence(still);
@@ -63,6 +63,7 @@ const reasonOf = (still) => (still.reason === "asked" ? "on demand" : still.reas
 
 /** @param {Still} still */
 function sentence(still) {
+  if (still.track === null && still.reason === "asked") return "a closer look"; // of a place, whatever is there
   const track = still.track === null ? "" : `track ${still.track}: `;
   if (still.unread) return `${track}${still.after}, not read${still.note ? ` (${still.note})` : ""}`;
   if (still.doubted) return `${track}doubted, was ${still.before}`;
