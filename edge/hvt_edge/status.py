@@ -98,7 +98,9 @@ class StatusReporter:
     def send(self, state: str) -> None:
         """Send the report, made for the moment at which it may go."""
         self.counts.measure_cpu(perception_ns=self.stills.analyzer.spent_ns)
-        self.transmitter.status(lambda at_ns: self._status(state, at_ns), now_ns=self.loop_clock())
+        self.transmitter.status(
+            lambda at_ns: self._status(state, at_ns), now_ns=self.loop_clock(), last=state == "ended"
+        )
         self._sequence += 1
 
     def _levers_text(self) -> str:

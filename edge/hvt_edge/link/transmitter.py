@@ -85,6 +85,7 @@ class Transmitter:
         """Of the last access unit sent; -1 before the first."""
         self.still_sequence = -1
         self._newest: StillEnvelope | None = None
+        self._ended = False
 
     def base(self, unit: AccessUnit, *, now_ns: int, after_hole: bool = False) -> int:
         """Send one access unit as soon as the budget's window has room for it; return its line bytes.
@@ -146,13 +147,18 @@ class Transmitter:
             self.budget.most_still_bytes, STILL_ATTACHMENT_BYTES, DELIVERIES[Channel.ROI].encoding
         )
 
-    def still(self, envelope: StillEnvelope, *, now_ns: int, copy: bool = False) -> None:
-        """Send one still that `still_allowance_bytes` admitted at this very time; ``copy``: it was sent before.
+    def still(self, envelope: StillEnvelope, *, now_ns: int, copy: str = "") -> None:
+        """Send one still that `still_allowance_bytes` admitted at this very time; ``copy``: why it is sent again.
 
         Where another thread has taken the allowance since, it waits until there is one again, as everything does.
+        Its outcome is noted with its bytes: ``sent``, or ``dropped`` once the run has ended.
         """
         still, encoding = envelope.still, envelope.encoding
         with self._lock:
+            if self._ended:
+                self.ledger.record_outcome("dropped", "ended")
+                return
+            self.ledger.record_outcome("sent", copy or still.reason)
             self.still_sequence = max(self.still_sequence, still.sequence)
             at_ns = self._still_at_ns(envelope, now_ns)
             attachment = envelope.header_at(at_ns, flags=self._flags).pack(still.data)
@@ -240,12 +246,14 @@ class Transmitter:
         """Send the edge's own tracks of one decision step, made for the moment at which they may go."""
         self._metadata(Channel.TRACKS, make, now_ns=now_ns)
 
-    def status(self, make: Callable[[int], Status], *, now_ns: int) -> None:
+    def status(self, make: Callable[[int], Status], *, now_ns: int, last: bool = False) -> None:
         """Send the once-a-second report, made for the moment at which it may go.
 
-        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment.
+        ``make(at_ns)`` runs while nothing else is counted: what it reads of the ledger is of one moment. Behind the
+        ``last`` one go no stills and no tracks, whichever thread still has some: a ground that has all that it names
+        closes the session.
         """
-        self._metadata(Channel.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns)
+        self._metadata(Channel.STATUS, lambda at_ns: make(at_ns).pack(), now_ns=now_ns, last=last)
 
     def reply(self, channel: Channel, payload: bytes) -> bytes:
         """Count an answer to a query, and let it go at once: the link puts it on the line as this returns.
@@ -289,9 +297,14 @@ class Transmitter:
         with self._lock:
             self.ledger.record_outcome(outcome, reason)  # type: ignore[arg-type]
 
-    def _metadata(self, channel: Channel, make: Callable[[int], bytes], *, now_ns: int) -> None:
+    def _metadata(
+        self, channel: Channel, make: Callable[[int], bytes], *, now_ns: int, last: bool = False
+    ) -> None:
         """Send what belongs to neither stream as soon as the budget's window has room for it."""
         with self._lock:
+            if self._ended:
+                return
+            self._ended = last
             size_bytes = _GROWTH_BYTES + self._line_bytes(channel, make(now_ns), 0)
             at_ns = self.budget.earliest_ns(size_bytes, now_ns=now_ns)
             payload = make(at_ns)

@@ -17,7 +17,7 @@ from hvt_edge.stills.crop_job import CropJob, expected_bytes
 from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
 from hvt_edge.stills.merging import group
 from hvt_edge.stills.on_demand import OnDemand, OnDemandStill
-from hvt_edge.stills.outbox import AGAIN, Outbox, OutboxStill
+from hvt_edge.stills.outbox import Outbox, OutboxStill
 from hvt_edge.stills.policy.base import STILL_OVERHEAD_BYTES, Method, Request, Step
 from hvt_edge.stills.policy.cost import CostModel
 from hvt_edge.stills.suppression import Gate, Suppression
@@ -50,9 +50,9 @@ class ChooserSettings:
 class Chooser:
     """Decides at each step which candidates get a still, and codes pending stills as the budget allows.
 
-    ``on_outcome(outcome, reason)`` is called with ``sent``, ``deferred`` or ``dropped`` for every candidate that a
-    step did not simply pass over; ``observe(candidates, step)`` with all tracks of each step, those that rest
-    included. Stills that grounds request go before all others.
+    ``on_outcome(outcome, reason)`` is called with ``deferred`` or ``dropped`` for every candidate that a step did not
+    simply pass over, and whose still does not go to the link; ``observe(candidates, step)`` with all tracks of each
+    step, those that rest included. Stills that grounds request go before all others.
 
     A still that is overdue is sent again, as it was, before pending ones that are less useful, and only where it is
     allowed: it holds up nobody, because what it shows grows old.
@@ -206,7 +206,6 @@ class Chooser:
                 return
             # Something newer of its track says more.
             if sent.track_id not in self.outbox and len(sent.still.data) <= allowance(sent.still):
-                self.on_outcome("sent", AGAIN)
                 self.outbox.sent_again(sent)
                 yield sent
 
@@ -264,7 +263,6 @@ class Chooser:
             self.on_outcome("deferred", "stored")
         else:
             self.outbox.sent(pending, still, now_ns=now_ns, resend=resend)
-            self.on_outcome("sent", still.reason)
 
     def _record_sent(self, request: Request, still: Still, *, now_ns: int) -> None:
         for one in (request.candidate, *request.also):

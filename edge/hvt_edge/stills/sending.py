@@ -9,7 +9,7 @@ from hvt_edge.backlog.stage import BacklogStage
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.stills.crop_job import CropJob
 from hvt_edge.stills.maker import Allowance, NoStill, StillMaker
-from hvt_edge.stills.outbox import Outbox, OutboxStill
+from hvt_edge.stills.outbox import AGAIN, Outbox, OutboxStill
 
 __all__ = ["StillSender"]
 
@@ -43,7 +43,7 @@ class StillSender:
             self._store(coded, now_ns=now_ns, counted=True)
             return
         coded.envelope = coded.envelope or self.transmitter.envelope(coded.still)
-        self.transmitter.still(coded.envelope, now_ns=now_ns, copy=coded.copies > 1)
+        self.transmitter.still(coded.envelope, now_ns=now_ns, copy=AGAIN if coded.copies > 1 else "")
 
     def store_lost(self, now_ns: int) -> None:
         """Store what was sent before the link went away, or came back, and no report has named."""

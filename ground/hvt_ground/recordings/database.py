@@ -99,7 +99,8 @@ def read_index(folder: Path) -> list[RecordingRow]:
         for more in ("mode=ro", "mode=ro&immutable=1"):  # the latter where nothing may be written beside it
             try:
                 with closing(sqlite3.connect(f"{where}?{more}", uri=True, timeout=_BUSY_S)) as database:
-                    return _rows(database)
+                    # Version 0: another process has begun to make it, and its tables come in a moment.
+                    return _rows(database) if _version(database, path) else []
             except sqlite3.OperationalError:
                 if "immutable" in more:
                     raise

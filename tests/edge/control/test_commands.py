@@ -66,7 +66,7 @@ def test_what_is_asked_for_goes_before_the_methods_own():
     rig.run(75, others=True)
     assert [header.reason for header, _ in rig.out.stills[before : before + 1]] == ["asked"]
     assert len(rig.out.stills) > before + 1, "and the others go on afterwards"
-    assert rig.outcomes["sent", "asked"] == 1
+    assert rig.ledger.outcomes("sent")["asked"] == 1
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "residual"])

@@ -392,14 +392,14 @@ def test_two_threads_keep_one_account():
                 now_ns = NOW_NS + number * 1_000_000
                 if rig.sender.still_allowance_bytes(now_ns, still=still()) > 200:
                     rig.sender.still(rig.sender.envelope(still(200, sequence=number)), now_ns=now_ns)
-                rig.sender.outcome("sent", f"reason{number % 20}")
+                rig.sender.outcome("deferred", f"reason{number % 20}")
         except BaseException as error:  # noqa: BLE001
             errors.append(error)
 
     def report(at_ns: int) -> Status:
         account = rig.ledger.summary(1.0)
         assert account.line_bytes == sum(size for size in (rig.ledger.line_bytes,))
-        return status(at_ns, reasons=len(rig.ledger.outcomes("sent")))
+        return status(at_ns, reasons=len(rig.ledger.outcomes("deferred")))
 
     thread = threading.Thread(target=stills)
     thread.start()
@@ -417,7 +417,21 @@ def test_two_threads_keep_one_account():
         if row is Channel.BASE
     ]
     assert sequences == list(range(1_500))
-    assert sum(rig.ledger.outcomes("sent").values()) == 1_500
+    assert sum(rig.ledger.outcomes("deferred").values()) == 1_500
+    assert sum(rig.ledger.outcomes("sent").values()) == rig.ledger.messages(Account.ROI) > 0
+
+
+def test_behind_the_last_report_goes_nothing():
+    """A ground has closed the session: what a slow thread still had would be sent, counted and never received."""
+    rig = Rig()
+    rig.sender.still(rig.sender.envelope(still()), now_ns=NOW_NS)
+    rig.sender.status(status, now_ns=NOW_NS, last=True)
+    before = rig.ledger.line_bytes, len(rig.out.puts)
+    rig.sender.still(rig.sender.envelope(still(sequence=1)), now_ns=NOW_NS)
+    rig.sender.tracks(lambda _at_ns: bytes(40), now_ns=NOW_NS)
+    assert (rig.ledger.line_bytes, len(rig.out.puts)) == before
+    assert rig.ledger.outcomes("sent") == {"utility": 1}
+    assert rig.ledger.outcomes("dropped") == {"ended": 1}
 
 
 def test_attachments_are_messagepack_arrays():
@@ -450,7 +464,7 @@ def test_a_second_copy_has_the_same_number_and_bytes_and_is_counted():
         rig.sender.still(envelope, now_ns=NOW_NS + number * 1_000_000)
     now_ns = NOW_NS + 2_000_000
     line_bytes, allowance = rig.ledger.line_bytes, rig.sender.still_allowance_bytes(now_ns)
-    rig.sender.still(envelopes[1], now_ns=now_ns, copy=True)
+    rig.sender.still(envelopes[1], now_ns=now_ns, copy="again")
     (_, data, attachment, _), (_, again, second, _) = rig.out.puts[1], rig.out.puts[3]
     header, copy = RoiHeader.parse(attachment, data), RoiHeader.parse(second, again)
     assert data == again
@@ -471,7 +485,7 @@ def test_a_second_copy_does_not_confuse_the_pacer():
     for number, envelope in enumerate(envelopes):
         rig.sender.base(unit(number), now_ns=NOW_NS + number * 66_000_000)
         rig.sender.still(envelope, now_ns=NOW_NS + number * 66_000_000)
-    rig.sender.still(envelopes[0], now_ns=NOW_NS + 1_300_000_000, copy=True)
+    rig.sender.still(envelopes[0], now_ns=NOW_NS + 1_300_000_000, copy="again")
     report = feedback(sequence=0, send_ns=NOW_NS, base_sequence=2, still_sequence=2)
     sent = (rig.sender.base_sequence, rig.sender.still_sequence)
     pacer.on_report(PrimaryReceiver().judge(report, sent=sent, now_ns=NOW_NS + 1_400_000_000))

@@ -203,10 +203,10 @@ class Rig:
 
     def __init__(self, *, detector=None) -> None:
         self.out, self.outcomes = Out(), Counter()
-        self.memory, self.keyframes = TrackMemory(), KeyframeRequests()
+        self.memory, self.keyframes, self.ledger = TrackMemory(), KeyframeRequests(), Ledger()
         sender = Transmitter(
             self.out,
-            ledger=Ledger(),
+            ledger=self.ledger,
             budget=RollingBudget(BudgetSettings(400_000, 200_000, fps=15)),
             edge_id="edge-1",
             session_id=1,
@@ -248,7 +248,7 @@ def test_a_track_gets_its_stills_when_they_are_due():
     assert [one.frame_index for one in rig.out.stills] == [0, 15]
     for one in rig.out.stills:
         np.testing.assert_allclose(one.box_source_px, square_box(one.frame_index), atol=6)
-    assert rig.outcomes["sent", "due"] == len(rig.out.stills)
+    assert rig.ledger.outcomes("sent") == {"due": len(rig.out.stills)}
     assert rig.stage.analyzer.tracks == 1
     assert rig.stage.analyzer.mean_ms > 0
 

@@ -114,6 +114,7 @@ class Rig:
             left.append(left[-1] - len(one.still.data))
             coded.append(one)
             self.sent.append(one.still)
+            self.outcomes["sent", "again" if one.copies > 1 else one.still.reason] += 1
         return coded
 
     def stills(self, allowance: int) -> list[int]:

@@ -70,9 +70,10 @@ class Rig:
         self.config = check(EdgeConfig(**argv, video_share=share, preset="ultrafast"))
         self.out, self.outcomes, self.keyframes = Out(), Counter(), KeyframeRequests()
         self.budget = RollingBudget(BudgetSettings(self.config.budget_bps, self.config.base_bps, fps=15))
+        self.ledger = Ledger()
         self.sender = Transmitter(
             self.out,
-            ledger=Ledger(),
+            ledger=self.ledger,
             budget=self.budget,
             edge_id="edge-1",
             session_id=SESSION,
