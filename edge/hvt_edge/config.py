@@ -212,7 +212,12 @@ class EdgeConfig:
     tiles: str = _MODELS_RARE.option(
         TEXT, "off", "detect in tiles of the source too: CxR, auto, or off; needs --candidates source"
     )
-    detect_every: int = _MODELS_RARE.option(integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame")
+    detect_every: int | None = _MODELS_RARE.option(
+        integer(1, 1000, unit=" frames"),
+        None,
+        "detect on every n-th frame",
+        shown_default="5; with few frames a second less",
+    )
     confidence: float | None = _MODELS.option(
         number(0.01, 1),
         None,

@@ -69,8 +69,11 @@ class GroundConfig:
     )
     labels: Path | None = _MODELS.option(PATH, None, "class names of the classifier, one a line")
     detector_labels: Path | None = _MODELS_RARE.option(PATH, None, "class names of the detector, one a line")
-    detect_every: int = _MODELS.option(
-        integer(1, 1000, unit=" frames"), 5, "detect on every n-th frame, less when behind"
+    detect_every: int | None = _MODELS.option(
+        integer(1, 1000, unit=" frames"),
+        None,
+        "detect on every n-th frame, less when behind",
+        shown_default="5; with few frames a second less",
     )
     confidence: float | None = _MODELS.option(
         number(0.01, 1),

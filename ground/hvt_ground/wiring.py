@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from hvt_common.inference.classify import Classifier
-from hvt_common.inference.detect import Detector
+from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.units import Limit, bitrate_text
@@ -200,7 +200,7 @@ def make_pipeline(
         parts,
         view=info.view,
         fps=info.fps,
-        detect_every=config.detect_every,
+        detect_every=detect_every(config.detect_every, fps=info.fps),
         emit=emit,
         wants_base=isinstance(reader, Redetection),
     )
@@ -213,7 +213,7 @@ def make_backlog_perception(config: GroundConfig, models: Models, *, info: Info)
         take_models=models.take,
         tracker_of=lambda: _tracker(config, info),
         reader_of=lambda detector, classifier: _reader(config, detector, classifier, info=info),
-        detect_every=config.detect_every,
+        detect_every=detect_every(config.detect_every, fps=info.fps),
     )
 
 

@@ -50,7 +50,12 @@ def test_what_is_said_without_flags_is_the_low_regime():
     config = settled()
     assert (config.budget_bps, config.base_bps) == (800_000, 650_000)
     assert (config.size, config.fps, config.method) == (None, 15.0, "M5")
-    assert (config.jpeg_quality, config.padding, config.cooldown, config.detect_every) == (65, 0.15, 2.0, 5)
+    assert (config.jpeg_quality, config.padding, config.cooldown, config.detect_every) == (
+        65,
+        0.15,
+        2.0,
+        None,
+    )
 
 
 @pytest.mark.parametrize(

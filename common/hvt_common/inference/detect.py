@@ -24,6 +24,7 @@ __all__ = [
     "USUAL_CONFIDENCE",
     "Detector",
     "OnnxDetector",
+    "detect_every",
     "open_detector",
     "warm_up",
 ]
@@ -93,6 +94,14 @@ def open_detector(
     path = resolve_model(spec, role="detector", words=(MOTION, *plug_in_names()))
     model = open_model(path, settings=ModelSettings(threads=threads, provider=provider))
     return OnnxDetector(model, labels=labels, confidence=confidence, nms_iou=nms_iou, size=size)
+
+
+def detect_every(given: int | None, *, fps: float) -> int:
+    """Frames from one detection to the next: as given, else three a second, and every fifth frame at least.
+
+    In a third of a second most objects still overlap themselves; with few frames a second every frame counts.
+    """
+    return given or min(5, max(1, round(fps / 3)))
 
 
 def warm_up(detector: Detector, size: tuple[int, int]) -> None:

@@ -154,8 +154,9 @@ class ByteTracker:
         self._widen_for(seen)
         first = self._updated_index is None
         match, free = self._match(seen, growth=self._growth(frame_index))
+        gap = 1 if self._updated_index is None else frame_index - self._updated_index
         self._updated_index = frame_index
-        self._correct(seen, match, frame_index)
+        self._correct(seen, match, frame_index, gap=gap)
         retained = self._retire(match, frame_index)
         self._start(seen.take(free), frame_index, confirmed=first)
         retained = np.concatenate((retained, np.ones(len(self._table) - len(retained), bool)))
@@ -270,13 +271,13 @@ class ByteTracker:
     def _fused(self, iou: _Floats, seen: TrackerInput) -> _Floats:
         return iou * seen.confidences if self._settings.fuse_scores else iou
 
-    def _correct(self, seen: TrackerInput, match: _Indices, frame_index: int) -> None:
-        """Take each matched detection into its track."""
+    def _correct(self, seen: TrackerInput, match: _Indices, frame_index: int, *, gap: int) -> None:
+        """Take each matched detection into its track; ``gap`` frames after the update before."""
         table, settings = self._table, self._settings
         rows = (match >= 0).nonzero()[0]
         columns = match[rows]
         states = table.states[rows]
-        kalman.correct(states, seen.measured[columns])
+        kalman.correct(states, seen.measured[columns], gap=gap)
         table.states[rows] = states
         phase = table.phase[rows]
         table.overdue[rows] |= (phase == LOST) & (frame_index - table.seen[rows] > self._buffer_frames + 1)

@@ -98,10 +98,16 @@ def predict(states: States) -> None:
     states[:, VAR_P:] += noise
 
 
-def correct(states: States, measured: npt.NDArray[np.float64]) -> None:
-    """Take in one measurement (x, y, a, h) a state, in place; ``measured`` is (N, 4) in the order of ``states``."""
+def correct(states: States, measured: npt.NDArray[np.float64], *, gap: int = 1) -> None:
+    """Take in one measurement (x, y, a, h) a state, in place; ``measured`` is (N, 4) in the order of ``states``.
+
+    ``gap`` is the number of frames since the measurement before. The authors' noise of the aspect ratio averages it
+    over some ten measurements, one a frame; where those are rare, what drives into the picture would keep the shape
+    of its bonnet for seconds. So a measurement counts for the more, the longer nothing was measured.
+    """
     height_squared = np.square(states[:, POSITION, 3])[:, None]
-    innovation_var = states[:, VAR_P] + (_MEASURED_BY_HEIGHT * height_squared + _MEASURED_FIXED)
+    measured_var = _MEASURED_BY_HEIGHT * height_squared + _MEASURED_FIXED / gap**2
+    innovation_var = states[:, VAR_P] + measured_var
     gain = states[:, VAR_P:VAR_V] / innovation_var[:, None]
     states[:, :VAR_P] += gain * (measured - states[:, POSITION])[:, None]
     states[:, VAR_V] -= gain[:, 1] * states[:, COV_PV]

@@ -7,7 +7,7 @@ import time
 from functools import partial
 from typing import Literal, cast
 
-from hvt_common.inference.detect import MOTION, Detector, open_detector, warm_up
+from hvt_common.inference.detect import MOTION, Detector, detect_every, open_detector, warm_up
 from hvt_common.inference.scores import default_confidence, is_calibrated, uncalibrated
 from hvt_common.inference.tiles import detect_whole, tiled
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings, weak_confidence
@@ -53,7 +53,7 @@ def make_analyzer(config: EdgeConfig, *, detector: FailingDetector, view: View) 
         ByteTracker(settings, fps=config.nominal_fps),
         view=view,
         settings=AnalyzerSettings(
-            detect_every=config.detect_every,
+            detect_every=detect_every(config.detect_every, fps=config.nominal_fps),
             candidates=cast('Literal["decoded", "source"]', config.candidates),
         ),
     )

@@ -92,6 +92,7 @@ class Pipeline:
     ) -> None:
         self._parts = parts
         self._detect_every = detect_every
+        self._base_size = view.base_size
         self._frame_ns = SECOND_NS / fps
         self._turn_s = _TURN_SHARE / fps
         self._turn_key = object()
@@ -207,7 +208,7 @@ class Pipeline:
             raise ValueError(f"frame {frame_index} lies before the newest frame, {self._now.picture_index}")
         fused = self._parts.fusion.listed(self._own_at(frame_index))
         shown = self._parts.refiner.preview(fused.tracks)
-        return _overlay(fused, shown, self._capture_ns(frame_index))
+        return _overlay(fused, shown, self._capture_ns(frame_index), base_size=self._base_size)
 
     def take_results(self) -> list[StillResult]:
         """Return and forget the results of stills that the edge has not been sent yet."""
@@ -270,7 +271,8 @@ class Pipeline:
         self._stills.update(self._now)
         if own.frame_index > self._listed_frame:
             self._listed_frame = own.frame_index
-            self._emit(_overlay(fused, self._parts.refiner.shown(fused.tracks), capture_ns))
+            shown = self._parts.refiner.shown(fused.tracks)
+            self._emit(_overlay(fused, shown, capture_ns, base_size=self._base_size))
 
     def _carry_merges(self) -> None:
         for survivor_id, merged_id in self._parts.fusion.take_merged():
@@ -278,13 +280,16 @@ class Pipeline:
             self._history.rename_track(survivor_id, merged_id)
 
 
-def _overlay(fused: FusedTracks, shown: ShownClasses, capture_ns: int) -> Overlay:
+def _overlay(
+    fused: FusedTracks, shown: ShownClasses, capture_ns: int, *, base_size: tuple[int, int]
+) -> Overlay:
     tracks = fused.tracks
+    limits = np.array([*base_size, *base_size], np.float32)  # the tracker lets boxes leave the picture
     return Overlay(
         frame_index=tracks.frame_index,
         capture_ns=capture_ns,
         track_ids=tracks.ids,
-        boxes_base_px=tracks.boxes_xyxy_px,
+        boxes_base_px=np.clip(tracks.boxes_xyxy_px, 0, limits),
         base_classes=shown.base_classes,
         classes=shown.classes,
         confidences=shown.confidences,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from hvt_common.errors import UserError
 from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
-from hvt_common.inference.detect import OnnxDetector, open_detector
+from hvt_common.inference.detect import OnnxDetector, detect_every, open_detector
 from hvt_common.inference.detect_heads import (
     EndToEndHead,
     UltralyticsHead,
@@ -475,3 +475,10 @@ def test_the_real_classifier_is_no_detector(data: Path) -> None:
     """Swapping the two model options would be noticed only by an empty recording."""
     with pytest.raises(UserError, match=r"probs \(\?, 1001\) float32; logits \(\?, 1001\) float32"):
         open_detector(str(data / "models/mobilenet_v2_imagenet.onnx"))
+
+
+@pytest.mark.parametrize(("fps", "every"), [(0.5, 1), (2, 1), (5, 2), (10, 3), (15, 5), (60, 5)])
+def test_the_detector_runs_three_times_a_second_where_frames_are_few(fps: float, every: int) -> None:
+    """At 2 frames a second every fifth would be one look in 2.5 s: what moves is never in one place twice."""
+    assert detect_every(None, fps=fps) == every
+    assert detect_every(7, fps=fps) == 7

@@ -301,6 +301,18 @@ def test_a_small_fast_object_is_confirmed_between_rare_detections() -> None:
     assert found[3.0] == [[], [1], [1], [1], [1], [1]]
 
 
+def test_what_drives_into_the_picture_keeps_its_width() -> None:
+    """Its bonnet is wide and flat; a box of that shape around the whole car would be twice as wide as the car."""
+    tracker, boxes = ByteTracker(fps=15), []
+    for frame in range(0, 31, 5):
+        bottom = min(430, 260 + 8 * frame)  # it comes from above, and what of it is in the picture grows
+        tracks = tracker.update(seen((300, 230, 400, bottom)), frame_index=frame)
+        boxes.append(tracks.boxes_xyxy_px[0])
+    widths = [x2 - x1 for x1, _, x2, _ in boxes]
+    assert max(widths) < 160, "100 is right; as with a detection a frame it was 400, and the track was lost"
+    assert widths[-1] == pytest.approx(100, abs=10)
+
+
 @pytest.mark.parametrize("every", [1, 5])
 @pytest.mark.parametrize(("hidden_frames", "same"), [(20, True), (25, True), (45, False)])
 def test_lost_tracks_are_remembered_in_frames_not_in_updates(
