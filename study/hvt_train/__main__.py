@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hvt_common.errors import UserError, exit_with_sentence, needs_extra
+from hvt_common.inference.runtimes.onnx_file import check_onnx_file
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER as CLASSIFIER
 from hvt_common.inference.store import EMBEDDED_DETECTOR as DETECTOR
 from hvt_common.inference.store import embedded_models
@@ -24,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments = _parser().parse_args(argv)
-    run = {"eval": _evaluate, "curve": _curve}.get(arguments.command, _train)
+    run = {"eval": _evaluate, "curve": _curve, "join": _join}.get(arguments.command, _train)
     return run(arguments)
 
 
@@ -75,12 +76,28 @@ def _parser() -> argparse.ArgumentParser:
     own.add_argument("--seeds", type=int, default=8, help="held-out scenes")
     own.add_argument("--every", type=int, default=10, help="frames of the clip: every n-th")
     own.add_argument("--threads", type=int, default=1)
+    own = commands.add_parser("join", help=f"make the embedded {DETECTOR} of a trained one and YOLOX-nano")
+    own.add_argument("aerial", type=Path, metavar="TRAINED.onnx")
+    own.add_argument(
+        "street", type=Path, metavar="YOLOX_NANO.onnx", help="`hvt-models fetch yolox-nano` has it"
+    )
+    own.add_argument("--out", type=Path, required=True, metavar="FILE.onnx")
     own = commands.add_parser("curve", help="draw the training curve of a log")
     own.add_argument("log", type=Path)
     own.add_argument("--out", type=Path, required=True, metavar="SVG")
     own.add_argument("--title", default="")
     own.add_argument("--quality", default="validation")
     return parser
+
+
+def _join(arguments: argparse.Namespace) -> int:
+    with needs_extra("onnx"):
+        from hvt_train.join import join  # noqa: PLC0415
+
+    for path in (arguments.aerial, arguments.street):
+        check_onnx_file(path)
+    join(arguments.aerial, arguments.street, arguments.out)
+    return 0
 
 
 def _curve(arguments: argparse.Namespace) -> int:

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.errors import UserError
-from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES
+from hvt_common.inference.class_names import COCO_NAMES, VISDRONE_NAMES, group_of
 from hvt_common.inference.detect_heads import ACCEPTED_HEADS, Head, choose_head
 from hvt_common.inference.labels import metadata_labels, read_labels
 from hvt_common.inference.letterbox import Letterboxer, as_bgr
@@ -136,6 +137,7 @@ class OnnxDetector:
         self._fixed_size = _fixed_size(model, size)
         self._output_index, self.head = _find_head(model, self._fixed_size or (_TRIAL_SIDE, _TRIAL_SIDE))
         self.class_names = _class_names(model, self.head, labels)
+        self._rivals = _rivals(self.class_names)
         dtype = model.inputs[0].dtype
         assert dtype is not None
         self._letterboxer = Letterboxer(
@@ -150,7 +152,8 @@ class OnnxDetector:
         output = self.model.run(tensor)[self._output_index].astype(np.float32, copy=False)
         found = self.head.decode(output, confidence=self._confidence, input_size=input_size)
         if self.head.suppresses:
-            candidates = found.boxes_input_px, found.scores, found.class_ids
+            rivals = self._rivals[np.minimum(found.class_ids, len(self._rivals) - 1)]
+            candidates = found.boxes_input_px, found.scores, rivals
             selected = suppress(*candidates, iou=self._nms_iou, any_class_iou=_TWIN_IOU)
         else:
             selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
@@ -166,6 +169,15 @@ class OnnxDetector:
         shrink = min(1.0, _MAX_FREE_SIDE / max(image_size))
         width, height = (-int(-side * shrink // _CELL) * _CELL for side in image_size)
         return max(width, _CELL), max(height, _CELL)
+
+
+def _rivals(class_names: tuple[str, ...]) -> npt.NDArray[np.int32]:
+    """(C,) the number of the group of each class: one place holds one vehicle, whatever it is called.
+
+    A class without a group stands for itself.
+    """
+    groups = [group_of(name) or name for name in class_names]
+    return np.array([groups.index(group) for group in groups], np.int32)
 
 
 def _fixed_size(model: OnnxModel, size: tuple[int, int] | None) -> tuple[int, int] | None:

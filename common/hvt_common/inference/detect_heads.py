@@ -43,7 +43,7 @@ Array = npt.NDArray[np.float32]
 
 ACCEPTED_HEADS = "YOLOX (1, A, 5+C), Ultralytics (1, 4+C, A) and end-to-end (1, N, 6)"
 
-_YOLOX_STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64))
+_YOLOX_STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (8, 16, 32, 12, 24, 48))
 _ULTRALYTICS_STRIDES: tuple[tuple[int, ...], ...] = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32), (16, 32))
 _MAX_LOG_SIZE = 20.0  # e^20 strides: far outside every image, and still finite in float32
 

@@ -8,16 +8,16 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper
 from torch import nn
+
+from hvt_train.learning.halve import halve
 
 __all__ = ["export_onnx", "metadata"]
 
 _OPSET = 17
-_SMALL = 64  # arrays up to this many numbers stay float32: they weigh nothing
 
 
 def metadata(
@@ -69,27 +69,10 @@ def export_onnx(
             dynamo=False,
         )
     model = onnx.load_from_string(buffer.getvalue())
-    _halve(model.graph)
+    halve(model.graph)
     helper.set_model_props(model, dict(properties))
     model.producer_name, model.producer_version = "hvt_train", ""
     onnx.checker.check_model(model)
     partial = path.with_suffix(".part")
     partial.write_bytes(model.SerializeToString())
     partial.replace(path)
-
-
-def _halve(graph: onnx.GraphProto) -> None:
-    """Store large float32 weights as float16, each behind a Cast that onnxruntime folds away at load."""
-    casts = []
-    for weight in graph.initializer:
-        values = numpy_helper.to_array(weight)
-        if values.dtype != np.float32 or values.size <= _SMALL:
-            continue
-        name = weight.name
-        weight.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}.half"))
-        casts.append(
-            helper.make_node("Cast", [f"{name}.half"], [name], name=f"{name}.widen", to=TensorProto.FLOAT)
-        )
-    nodes = [*casts, *graph.node]
-    del graph.node[:]
-    graph.node.extend(nodes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from hvt_common.inference.detect import open_detector
 from hvt_common.inference.runtimes.model import open_model
 from hvt_common.inference.scores import default_confidence
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR, embedded_models
+from hvt_common.values import iou
 from hvt_scene import Scene
 from hvt_study.cli import main
 from hvt_train.evaluate import (
@@ -29,7 +31,7 @@ def test_they_are_there_and_small_together():
     """A fresh installation would have no model, or a package too large for a thin link."""
     sizes = [path.stat().st_size for path in embedded_models().values()]
     assert all(size > 10_000 for size in sizes)
-    assert sum(sizes) < 4_000_000
+    assert sum(sizes) < 6_000_000
 
 
 @pytest.mark.parametrize("name", embedded_models())
@@ -103,6 +105,23 @@ def test_vehicles_and_people_that_training_never_saw(data, tmp_path):
     assert minsk["recall"] >= 0.95
     assert minsk["precision"] >= 0.60
     assert scored["hit_uav"]["person"]["recall"] >= 0.35, "most of these flights were trained on"
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", ["uav123_car10", "uavdt_S0601", "otb_Crossing"])
+def test_what_is_seen_aslant(data, name):
+    """A camera that does not look straight down would show a street with nobody in it."""
+    folder = data / "aerial" / "sequences_dev" / name
+    labels = np.loadtxt(folder / "gt" / "gt.txt", delimiter=",")[::8]
+    detector = open_detector(EMBEDDED_DETECTOR, confidence=default_confidence(EMBEDDED_DETECTOR))
+    found = 0
+    for frame, _, x, y, width, height in labels[:, :6]:
+        picture = cv2.imread(str(folder / "img1" / f"{int(frame):06d}.jpg"))
+        scale = min(1280 / picture.shape[1], 720 / picture.shape[0])
+        boxes = detector.detect(cv2.resize(picture, None, fx=scale, fy=scale)).boxes_xyxy_px / scale
+        truth = np.array([[x, y, x + width, y + height]], np.float32)
+        found += bool(len(boxes)) and iou(boxes, truth).max() >= 0.5
+    assert found / len(labels) >= 0.65
 
 
 @pytest.mark.realdata

@@ -143,7 +143,7 @@ def test_a_store_that_fails_in_an_outage_costs_what_it_would_have_stored(link, t
 def test_a_model_that_fails_leaves_the_video(link, tmp_path):
     """The flight would end in the first bright minute of a model that cannot bear light."""
     model = failing_in_the_light(tmp_path / "model.onnx")
-    scene = pictures(tmp_path / "clip", [30] * 40 + [200] * 60 + [30] * 500)
+    scene = pictures(tmp_path / "clip", [30] * 40 + [200] * 150 + [30] * 500)
     with watched(link, "--source", str(scene), "--detector", str(model), "--provider", "cpu") as (
         edge,
         watcher,

@@ -104,14 +104,15 @@ def shows(page: Any, *, after: int = -1, within_s: float = 20) -> int:
 
 def test_the_picture_moves_at_the_rate_of_the_stream(page):
     """An operator would watch a picture that stands still."""
-    first = shows(page)
-    seen = set()
-    began_s = time.monotonic()
-    while time.monotonic() - began_s < 3:
+    first, began_s = shows(page), time.monotonic()
+    seen: set[str] = set()
+
+    def moved() -> bool:
         seen.add(page.evaluate(_PIXELS))
-        time.sleep(0.05)
-    assert frame(page) - first > 15
-    assert len(seen) > 10
+        return len(seen) > 20
+
+    eventually(moved, within_s=20, what="other pixels")
+    assert frame(page) - first > 4 * (time.monotonic() - began_s), "a stream of 15, on a machine that is busy"
     assert "H.264" in page.inner_text("#rung") or "HEVC" in page.inner_text("#rung")
     assert int(page.locator("#age").get_attribute("data-ms")) < 3000
 

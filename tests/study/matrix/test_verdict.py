@@ -9,6 +9,7 @@ import pytest
 
 from hvt_common.config import load
 from hvt_common.errors import UserError
+from hvt_common.inference.detect import detect_every
 from hvt_edge.config import EdgeConfig, with_profile
 from hvt_edge.config import check as check_edge
 from hvt_edge.stills.policy.registry import METHODS as REGISTRY
@@ -105,8 +106,12 @@ def test_the_command_flies_what_was_compared(name):
     shape = VideoShape(1.0, (960, 540)) if chosen else VideoShape()
     ours = config_of(["--source", "my clip.mp4", *edge_flags(spec, budget_bps=200_000, shape=shape)])
     own = {"pace", "threads", "profile", "confidence"}
-    blind = {"detect_every", "camera_motion"} if method.startswith("M0") else set()
-    for field in EdgeConfig.__dataclass_fields__.keys() - own - blind:
+    own |= {"detect_every"}
+    if method.startswith("M0"):
+        own |= {"camera_motion"}
+    else:
+        assert detect_every(theirs.detect_every, fps=theirs.nominal_fps) == ours.detect_every
+    for field in EdgeConfig.__dataclass_fields__.keys() - own:
         if field == "still_codec" and not codec:
             continue
         assert getattr(theirs, field) == getattr(ours, field), field

@@ -125,6 +125,23 @@ def test_what_runs_a_network_is_logged(tmp_path: Path, caplog: pytest.LogCapture
 
 
 @needs_bf16
+@pytest.mark.parametrize("size", [4, 96])
+def test_auto_takes_openvino_only_where_it_is_quicker(tmp_path: Path, size: int) -> None:
+    """The embedded detector took half as much again in bf16 as in float32 on a processor that has bf16."""
+    weights = np.random.default_rng(1).normal(size=(size, 3, 7, 7)).astype(np.float32)
+    path = save(
+        tmp_path / "m.onnx",
+        [helper.make_node("Conv", ["x", "w"], ["y"])],
+        inputs={"x": (1, 3, "h", "w")},
+        outputs={"y": (1, size, "a", "b")},
+        constants={"w": weights},
+    )
+    chosen = open_model(path, settings=ModelSettings(provider="auto")).provider
+    (percent,) = map(int, re.findall(r"takes (\d+)% of ", chosen.why))
+    assert chosen.provider == ("openvino" if percent < 80 else "cpu"), chosen.why
+
+
+@needs_bf16
 def test_auto_falls_back_where_openvino_cannot_read_a_model(tmp_path: Path) -> None:
     """A model that ran yesterday would not start today because OpenVINO was installed for another."""
     path = save(
