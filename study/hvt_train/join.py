@@ -176,13 +176,13 @@ def _aerial_part(model: onnx.ModelProto) -> onnx.ModelProto:
     parts = {name for node in graph.node if output in node.output for name in node.input}
     if _OWN not in parts:
         return model
-    kept = [
+    nodes = [
         node for node in graph.node if not node.output[0].startswith(PREFIX) and output not in node.output
     ]
-    for node in kept:
+    for node in nodes:
         node.output[:] = [output if name == _OWN else name for name in node.output]
     weights = [one for one in graph.initializer if not one.name.startswith(PREFIX)]
-    part = helper.make_graph(kept, graph.name, graph.input, graph.output, weights)
+    part = helper.make_graph(nodes, graph.name, graph.input, graph.output, weights)
     aerial = helper.make_model(part, opset_imports=model.opset_import, ir_version=model.ir_version)
     helper.set_model_props(aerial, {one.key: one.value for one in model.metadata_props})
     return aerial
@@ -213,13 +213,13 @@ def _levels_of(model: onnx.ModelProto, path: Path, *, opset: int) -> tuple[onnx.
     if len(levels) != len(_STRIDES):
         raise UserError(f"{path} has {len(levels)} levels of box, objectness and classes; YOLOX-nano has 3")
     # What stands behind them only puts them into one list.
-    needed, kept = set(levels), []
+    needed, nodes = set(levels), []
     for node in reversed(graph.node):
         if needed.intersection(node.output):
             needed.update(node.input)
-            kept.append(node)
+            nodes.append(node)
     del graph.node[:]
-    graph.node.extend(reversed(kept))
+    graph.node.extend(reversed(nodes))
     return graph, levels
 
 

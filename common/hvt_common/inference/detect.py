@@ -137,7 +137,7 @@ class OnnxDetector:
         self._fixed_size = _fixed_size(model, size)
         self._output_index, self.head = _find_head(model, self._fixed_size or (_TRIAL_SIDE, _TRIAL_SIDE))
         self.class_names = _class_names(model, self.head, labels)
-        self._rivals = _rivals(self.class_names)
+        self._group_ids = _group_ids(self.class_names)
         dtype = model.inputs[0].dtype
         assert dtype is not None
         self._letterboxer = Letterboxer(
@@ -152,8 +152,8 @@ class OnnxDetector:
         output = self.model.run(tensor)[self._output_index].astype(np.float32, copy=False)
         found = self.head.decode(output, confidence=self._confidence, input_size=input_size)
         if self.head.suppresses:
-            rivals = self._rivals[np.minimum(found.class_ids, len(self._rivals) - 1)]
-            candidates = found.boxes_input_px, found.scores, rivals
+            group_ids = self._group_ids[np.minimum(found.class_ids, len(self._group_ids) - 1)]
+            candidates = found.boxes_input_px, found.scores, group_ids
             selected = suppress(*candidates, iou=self._nms_iou, any_class_iou=_TWIN_IOU)
         else:
             selected = np.argsort(-found.scores, kind="stable")[:MAX_DETECTIONS]
@@ -171,7 +171,7 @@ class OnnxDetector:
         return max(width, _CELL), max(height, _CELL)
 
 
-def _rivals(class_names: tuple[str, ...]) -> npt.NDArray[np.int32]:
+def _group_ids(class_names: tuple[str, ...]) -> npt.NDArray[np.int32]:
     """(C,) the number of the group of each class: one place holds one vehicle, whatever it is called.
 
     A class without a group stands for itself.
