@@ -160,9 +160,8 @@ def join(aerial: Path, street: Path, out: Path) -> None:
 
     graph = helper.make_graph(nodes, "joined", ours.graph.input, ours.graph.output, weights)
     model = helper.make_model(graph, opset_imports=ours.opset_import, ir_version=ours.ir_version)
-    helper.set_model_props(
-        model, properties | {"hvt.joined": "YOLOX-nano (Megvii, Apache-2.0), COCO weights"}
-    )
+    properties |= {"hvt.joined": "YOLOX-nano (Megvii, Apache-2.0), COCO weights", "hvt.enlarge_to": "1280"}
+    helper.set_model_props(model, properties)
     model.producer_name = "hvt_train"
     onnx.checker.check_model(model)
     partial = out.with_suffix(".part")

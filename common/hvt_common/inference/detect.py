@@ -40,6 +40,9 @@ _CELL = 32  # input sides are multiples of the largest usual stride
 _TRIAL_SIDE = 256
 _MAX_FREE_SIDE = 1920
 _MAX_SIDE = 8192
+_ENLARGE_TO = "hvt.enlarge_to"
+_MOST_ENLARGED = 2.0
+"""Beyond that nothing more is found, and the time grows with the square."""
 _TWIN_IOU = 0.8
 """Two boxes that overlap more are one object, whatever their classes: networks call one vehicle a car and a van. A
 rider and the bicycle below overlap less."""
@@ -135,6 +138,7 @@ class OnnxDetector:
         self._confidence = confidence
         self._nms_iou = nms_iou
         self._fixed_size = _fixed_size(model, size)
+        self._enlarge_to = _enlarge_to(model)
         self._output_index, self.head = _find_head(model, self._fixed_size or (_TRIAL_SIDE, _TRIAL_SIDE))
         self.class_names = _class_names(model, self.head, labels)
         self._group_ids = _group_ids(self.class_names)
@@ -163,12 +167,28 @@ class OnnxDetector:
         return Detections(boxes[inside], found.scores[selected][inside], class_ids[inside])
 
     def input_size(self, image_size: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) in pixels that the network gets for an image of this (width, height)."""
+        """(width, height) in pixels that the network gets for an image of this (width, height).
+
+        A network that was trained for small objects may want small images enlarged (``hvt.enlarge_to`` in its
+        metadata): on a base stream of 640x360 a car is six pixels long, and lies within one cell.
+        """
         if self._fixed_size is not None:
             return self._fixed_size
-        shrink = min(1.0, _MAX_FREE_SIDE / max(image_size))
-        width, height = (-int(-side * shrink // _CELL) * _CELL for side in image_size)
+        longest = max(image_size)
+        scale = min(max(1.0, min(self._enlarge_to / longest, _MOST_ENLARGED)), _MAX_FREE_SIDE / longest)
+        width, height = (-int(-side * scale // _CELL) * _CELL for side in image_size)
         return max(width, _CELL), max(height, _CELL)
+
+
+def _enlarge_to(model: OnnxModel) -> int:
+    """The longer side in pixels to which small images are enlarged, ``hvt.enlarge_to`` of the metadata; 0: none."""
+    text = model.metadata.get(_ENLARGE_TO, "0")
+    if not (text.isascii() and text.isdigit() and len(text) <= 4 and int(text) <= _MAX_FREE_SIDE):
+        raise UserError(
+            f"model {model.path} has {_ENLARGE_TO} '{text:.80}' in its metadata; a whole number up to"
+            f" {_MAX_FREE_SIDE} is accepted"
+        )
+    return int(text)
 
 
 def _group_ids(class_names: tuple[str, ...]) -> npt.NDArray[np.int32]:

@@ -117,5 +117,5 @@ def export_detector(
         path,
         example=torch.zeros(1, 3, 256, 320),
         free={"images": {2: "height", 3: "width"}, "output": {1: "cells"}},
-        properties=properties,
+        properties=properties | {"hvt.enlarge_to": "1280"},
     )

@@ -317,6 +317,28 @@ def test_a_free_input_takes_the_size_of_the_image_or_of_the_user(tmp_path: Path)
     assert OnnxDetector(open_model(path), size=(416, 320)).input_size((1280, 720)) == (416, 320)
 
 
+def test_a_network_for_small_objects_has_small_images_enlarged(tmp_path: Path) -> None:
+    """On a thermal camera's 640x512 a person is four pixels wide, half of what the network was trained on."""
+    path = colour_detector(tmp_path / "m.onnx", "yolox", size=None, metadata={"hvt.enlarge_to": "1280"})
+    detector = OnnxDetector(open_model(path))
+    sizes = [(640, 512), (854, 480), (1280, 720), (1920, 1080), (320, 240)]
+    assert [detector.input_size(size) for size in sizes] == [
+        (1280, 1024),
+        (1280, 736),
+        (1280, 736),
+        (1920, 1088),
+        (640, 480),
+    ]
+    image = np.zeros((64, 96, 3), np.uint8)
+    image[16:24, 40:48] = (0, 255, 0)
+    found = open_detector(str(path), confidence=0.9).detect(image)
+    np.testing.assert_allclose(found.boxes_xyxy_px[:1], [[40, 16, 44, 20]], atol=0.05)
+    for text in ("big", "-1", "1921", "1" * 9000):
+        path = colour_detector(tmp_path / "m.onnx", "yolox", size=None, metadata={"hvt.enlarge_to": text})
+        with pytest.raises(UserError, match="a whole number up to 1920"):
+            open_detector(str(path))
+
+
 def test_names_come_from_file_then_metadata_then_the_usual_lists(tmp_path: Path) -> None:
     """Overlays would show numbers, or wrong words."""
     named = str(colour_detector(tmp_path / "a.onnx", "ultralytics", metadata={"names": RGB}))
