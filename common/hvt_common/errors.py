@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import select
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -38,12 +40,31 @@ class Parser(argparse.ArgumentParser):
 def exit_with_sentence(
     run: Callable[[Sequence[str] | None], int], *, program: str, argv: Sequence[str] | None
 ) -> int:
-    """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError`, said on stderr."""
+    """Return the exit code of ``run(argv)``: 2 after a `UserError`, 1 after a `FlightError`, said on stderr.
+
+    Standard output that nobody reads any more, as after ``| head``, ends the program with 1 and no word.
+    """
     try:
-        return run(argv)
+        code = run(argv)
+        print(end="", flush=True)  # no error where there is no standard output at all
     except (UserError, FlightError) as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
+    except BrokenPipeError:
+        if sys.stdout is None or not _reader_left():
+            raise
+        return 1
+    return code
+
+
+def _reader_left() -> bool:
+    """Standard output has no reader; what is still to be written then goes nowhere, also at exit."""
+    output = select.poll()
+    output.register(sys.stdout.fileno(), 0)
+    if not output.poll(0):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return True
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hvt_common.errors import UserError
+from hvt_common.errors import FlightError, UserError
 from hvt_study.cache.results import CacheError, ResultCache, content_key
 from hvt_study.runs.columns import COLUMNS
 from hvt_study.runs.match_total import first_budget, match, within
@@ -190,6 +190,10 @@ def _or_refused(fly: Callable[[], _T]) -> _T:
     try:
         return fly()
     except CacheError:
+        raise
+    except FlightError as error:  # in the middle of a flight the edge makes this of it
+        if isinstance(error.__cause__, CacheError):
+            raise error.__cause__ from None
         raise
     except UserError as error:
         raise _RefusedError(str(error)) from None

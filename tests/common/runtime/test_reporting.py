@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -92,3 +94,25 @@ def test_a_result_that_cannot_be_written_is_a_sentence_and_code_1(tmp_path, caps
     assert exit_with_sentence(flight, program="hvt-edge", argv=[]) == 1
     said = capsys.readouterr().err
     assert said == f"hvt-edge: {tmp_path}/gone/summary.json cannot be written (No such file or directory)\n"
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("reader", ["true", "head -1"])
+def test_a_reader_that_leaves_ends_the_program_without_a_word(reader, unbuffered):
+    """``hvt-models list | head`` would end in a traceback."""
+    program = (
+        "from hvt_common.errors import exit_with_sentence as run\n"
+        "def say(argv):\n"
+        "    for line in range(100_000): print(line)\n"
+        "    return 0\n"
+        "raise SystemExit(run(say, program='x', argv=[]))"
+    )
+    told = subprocess.run(
+        ["bash", "-c", f'"$0" -c "$1" | {reader}; echo ${{PIPESTATUS[0]}}', sys.executable, program],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        check=True,
+    )
+    assert told.stderr == ""
+    assert told.stdout.splitlines()[-1] == "1"

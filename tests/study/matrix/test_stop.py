@@ -14,20 +14,22 @@ from studies.small_study import PATIENT_S, arguments, entries, flights, said, st
 METHODS = ("--methods", "M0,R0,M5", "--regimes", "150kbps")
 
 
-def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path):
+@pytest.mark.parametrize("full_for", ["detections", "flights"])
+def test_a_full_disk_is_one_sentence_and_what_is_finished_stays(scene, tmp_path, full_for):
     """Hours of flights would be lost with the one that no longer fitted."""
     out = tmp_path / "out"
     first = study("run", *arguments(scene, out, "--methods", "M0", "--regimes", "150kbps"), folder=tmp_path)
     assert first.wait(PATIENT_S) == 0, said(tmp_path)
     before, rows = entries(out / "cache"), (out / "results.parquet").read_bytes()
-    limit = 2500  # bytes of a file: what is remembered of a picture fits, a flight does not
+    pictures, flight = (_sizes(out / "cache" / folder) for folder in ("detections", "flights"))
+    limit = {"detections": min(pictures), "flights": (max(pictures) + min(flight)) // 2}[full_for]
     full = study(
         "run",
         *arguments(scene, out, "--methods", "M0,R0", "--regimes", "150kbps", "--jobs", "1"),
         folder=tmp_path,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
-    assert full.wait(PATIENT_S) == 2
+    assert full.wait(PATIENT_S) == 2, said(tmp_path)
     lines = said(tmp_path).splitlines()
     assert len([line for line in lines if "cannot be written (File too large)" in line]) == 1, lines
     assert lines[-1].startswith("hvt-study: ")
@@ -75,3 +77,7 @@ def test_nothing_is_left_running(scene, tmp_path, how):
     assert "Traceback" not in words
     if how == signal.SIGINT:
         assert words.endswith("hvt-study: interrupted\n")
+
+
+def _sizes(folder):
+    return [path.stat().st_size for path in folder.rglob("*") if path.is_file() and path.suffix != ".lock"]
