@@ -12,13 +12,13 @@ from typing import Any, Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.messages import Status
-from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Traffic
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 
-__all__ = ["EdgeState", "FailedPart", "GroundState", "LinkState", "StateMaker"]
+__all__ = ["EdgeState", "GroundState", "LinkState", "StateMaker"]
 
 LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
 """``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out for want of link; ``lost``:
@@ -28,17 +28,6 @@ LOST_S = 3.0
 """A report comes once a second: nothing for so long is no accident."""
 _THIN_S = 5.0
 """So long after the last frame that was left out for want of link it counts as thin."""
-
-
-@dataclass(frozen=True, slots=True)
-class FailedPart:
-    """A part that does not work now."""
-
-    part: str
-    reason: str
-    """A sentence."""
-    since_ns: int
-    """Unix time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +163,7 @@ class StateMaker:
             classifier=self._classifier,
             calibrated=self._calibrated,
             edges=made,
-            failed=() if self._failures is None else _failed(self._failures),
+            failed=() if self._failures is None else self._failures.now,
         )
 
     def _edge(self, edge: str, sessions: EdgeSessions, now_ns: int) -> EdgeState:
@@ -192,7 +181,7 @@ class StateMaker:
             unusable_messages=sessions.unusable,
             sessions_ended=sessions.ended,
             session=None if session is None else _session(session, sessions, link=link, now_ns=now_ns),
-            failed=_failed(sessions.failures),
+            failed=sessions.failures.now,
         )
 
     def _link(
@@ -272,7 +261,3 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
             if not one.working
         ),
     )
-
-
-def _failed(failures: Failures) -> tuple[FailedPart, ...]:
-    return tuple(FailedPart(one.part, one.reason, one.since_ns) for one in failures.parts if not one.working)
