@@ -253,6 +253,11 @@ class EdgeConfig:
     )
     record_base: Path | None = _FILES.option(PATH, None, "also keep the base stream in this Matroska file")
     truth: Path | None = _FILES_RARE.option(PATH, None, "write the demo's ground truth, MOTChallenge form")
+    metrics: str | None = _FILES_RARE.option(
+        TEXT,
+        None,
+        "answer Prometheus (/metrics), /healthz, /readyz and hvt-edge status at HOST:PORT, unencrypted",
+    )
     summary: Path | None = _FILES.option(PATH, None, "write the summary as JSON")
     quiet: bool = _FILES.switch("no status line")
 

@@ -1,0 +1,4 @@
+"""How an edge is: `state` once a second as one value, by the `heartbeat` of its loop, told as `metrics`.
+
+`system` reads what the machine tells of itself.
+"""
