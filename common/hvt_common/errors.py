@@ -19,12 +19,18 @@ class UserError(Exception):
     loudly.
     """
 
+    said = False
+    """Whether the log has the sentence already."""
+
 
 class FlightError(Exception):
     """Something that went wrong after the start and cannot be put right: one sentence, and exit code 1.
 
     A supervisor starts the program again, which may help.
     """
+
+    said = False
+    """As of `UserError`."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -42,7 +48,8 @@ def exit_with_sentence(
     try:
         return run(argv)
     except (UserError, FlightError) as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        if not error.said:
+            print(f"{program}: {error}", file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
 
 

@@ -101,7 +101,7 @@ class Edge:
                     clock=world.clock,
                     hint=FewFoundHint(config.detector, confidence=track_confidence(config)),
                 )
-            line = stack.enter_context(StatusLine(quiet=config.quiet))
+            line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             link = world.open_link(stack, config)
             stages = build_stages(
                 stack,

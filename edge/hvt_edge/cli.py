@@ -7,11 +7,13 @@ from typing import NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
+from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
-from hvt_common.runtime.reporting import print_table, start_log, write_json
+from hvt_common.runtime.reporting import print_table, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.summary import table, title
+from hvt_edge.world import World
 
 __all__ = ["main", "program"]
 
@@ -39,12 +41,23 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = check(config)
     limit_malloc_arenas()
-    release_log = start_log("hvt-edge", quiet=config.quiet)
+    world = World()
+    log = start_log(
+        "hvt-edge",
+        quiet=config.quiet,
+        form=config.log_format,
+        edge=config.edge_id,
+        session=f"{world.session_id:016x}",
+    )
     stop = stop_on_signals()
-    content = Edge(config, stop=stop, on_started=release_log).run()
-    print_table(title(content), table(content))
-    if config.summary is not None:
-        write_json(config.summary, content)
+    with log.ending():
+        content = Edge(config, stop=stop, on_started=log.release, world=world).run()
+        if log.as_json:
+            log.result(content)
+        else:
+            print_table(title(content), table(content))
+        if config.summary is not None:
+            write_json(config.summary, content)
     return 0
 
 

@@ -110,7 +110,7 @@ class Ground:
             factory = SessionFactory(
                 config, models, clock=self._clock, outputs=outputs, view=view, page=page, index=index
             )
-            line = stack.enter_context(StatusLine(quiet=config.quiet))
+            line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
