@@ -122,6 +122,8 @@ class Pipeline:
         self._listed_frame = -1
         self._track_ids = DistinctIds()
         self.detections_run = 0
+        self.doubted = 0
+        """Of the tracks that are shown, those that stills doubt."""
         self.steps_used = 0
         """Reports of the edge's tracks that were taken in."""
 
@@ -129,6 +131,11 @@ class Pipeline:
     def tracks(self) -> int:
         """Distinct tracks so far, whoever saw them."""
         return self._track_ids.count
+
+    @property
+    def stills_waiting(self) -> int:
+        """For their base frame."""
+        return self._stills.waiting
 
     @property
     def history_bytes(self) -> int:
@@ -270,7 +277,9 @@ class Pipeline:
         self._stills.update(self._now)
         if own.frame_index > self._listed_frame:
             self._listed_frame = own.frame_index
-            self._emit(_overlay(fused, self._parts.refiner.shown(fused.tracks), capture_ns))
+            shown = self._parts.refiner.shown(fused.tracks)
+            self.doubted = int(shown.doubted.sum())
+            self._emit(_overlay(fused, shown, capture_ns))
 
     def _carry_merges(self) -> None:
         for survivor_id, merged_id in self._parts.fusion.take_merged():
