@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import subprocess
+import sys
 import threading
 import urllib.error
 import urllib.request
@@ -53,6 +55,12 @@ def series(address: str) -> dict[str, float]:
     return found
 
 
+def status(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """``hvt-edge status``."""
+    command = [sys.executable, "-m", "hvt_edge.cli", "status", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
 @pytest.fixture
 def address() -> str:
     """Where an edge answers."""
@@ -89,6 +97,13 @@ def test_an_edge_says_how_it_is_from_its_start_to_its_flight(tmp_path, address):
         assert found["hvt_edge_sent_bits_per_second"] > 0
         assert "hvt_edge_temperature_celsius" not in found or found["hvt_edge_temperature_celsius"] > 0
         assert asked(address, "/healthz") == asked(address, "/readyz") == (200, "ok\n")
+        said = status("--at", address)
+        assert said.returncode == 0, said.stderr
+        assert "uav-1" in said.stdout
+        assert "a ground listens" in said.stdout
+        assert json.loads(status("--at", address, "--json").stdout)["session"] == now["session"]
+        nobody = status("--at", f"127.0.0.1:{free_ports(1)[0]}")
+        assert (nobody.returncode, "no edge answers at" in nobody.stderr) == (1, True)
         busy = link.edge("--source", "demo", "--metrics", address, name="busy")
         assert busy.wait(within_s=60) == 2
         assert f"--metrics {address} cannot be listened on" in busy.said
