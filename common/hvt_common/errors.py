@@ -21,12 +21,18 @@ class UserError(Exception):
     loudly.
     """
 
+    said = False
+    """Whether the log has the sentence already."""
+
 
 class FlightError(Exception):
     """Something that went wrong after the start and cannot be put right: one sentence, and exit code 1.
 
     A supervisor starts the program again, which may help.
     """
+
+    said = False
+    """As of `UserError`."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -48,7 +54,8 @@ def exit_with_sentence(
         code = run(argv)
         print(end="", flush=True)  # no error where there is no standard output at all
     except (UserError, FlightError) as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        if not error.said:
+            print(f"{program}: {error}", file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
     except BrokenPipeError:
         if sys.stdout is None or not _reader_left():

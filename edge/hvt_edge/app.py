@@ -7,15 +7,19 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
-from hvt_common.errors import FlightError, UserError
+from hvt_common.errors import FlightError, UserError, needs_extra
 from hvt_common.inference.few_found import FewFoundHint
 from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.runtime.health_server import HealthServer, state_answers
 from hvt_common.runtime.process import notify_systemd, with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
+from hvt_common.values import View
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.link_control import wait_for_ground
+from hvt_edge.health.heartbeat import Heartbeat
+from hvt_edge.health.state import StateMaker, lacks
 from hvt_edge.link.publisher import EdgeLink
 from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.loop.lockstep import LockstepPace
@@ -26,7 +30,7 @@ from hvt_edge.perception.guarded_detector import GuardedDetector
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import closing_on
-from hvt_edge.status import StatusReporter
+from hvt_edge.status import StatusReporter, status_text
 from hvt_edge.summary import summary
 from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store, track_confidence
 from hvt_edge.world import World
@@ -34,6 +38,10 @@ from hvt_edge.world import World
 __all__ = ["Edge"]
 
 _GOODBYE_S = 1.5
+_STUCK_S = 5.0
+"""A loop that has not turned for so long, and two frames longer, hangs."""
+_SILENT_S = 3.0
+"""A source that has given no frame for so long, likewise, has failed."""
 
 
 class Edge:
@@ -59,6 +67,8 @@ class Edge:
         self._loop_clock = LoopClock(self._world.clock, lockstep=self._lockstep)
         self._counts = FrameCounts()
         self._failures = self._world.failures
+        self._heartbeat: Heartbeat | None = None
+        """None before the parts are built."""
         self._reached = False
         """Whether anybody has subscribed to the video."""
         self.ledger = Ledger(window_ns=config.window_ns)
@@ -73,6 +83,8 @@ class Edge:
         check_files(config)
         check_codecs(config)
         with ExitStack() as stack:
+            if config.metrics is not None:
+                stack.enter_context(self._health_server(config.metrics))
             source = stack.enter_context(world.open_source(config))
             check_truth(config.truth, source)
             check_store(config, live=source.live)
@@ -89,7 +101,7 @@ class Edge:
                     clock=world.clock,
                     hint=FewFoundHint(config.detector, confidence=track_confidence(config)),
                 )
-            line = stack.enter_context(StatusLine(quiet=config.quiet))
+            line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             link = world.open_link(stack, config)
             stages = build_stages(
                 stack,
@@ -105,7 +117,9 @@ class Edge:
                 loop_clock=self._loop_clock,
                 wait_until=self._wait_until,
             )
-            status = self._status_reporter(stages)
+            heartbeat = Heartbeat(self._state_maker(stages, link, source.view), clock=world.clock)
+            self._heartbeat = heartbeat
+            status = self._status_reporter(stages, heartbeat)
             link.listen(
                 info=stages.info.info,
                 control=stages.commands.answer,
@@ -121,10 +135,11 @@ class Edge:
                     wait_s=config.wait,
                     stop=self._stop,
                     note=line.note,
+                    turn=lambda: heartbeat.turn("waiting"),
                 )
             stages.operating.start(world.clock())
             try:
-                self._play(source, stages, link, status, line)
+                self._play(source, stages, link, status, heartbeat, line)
             except UserError as error:
                 if not self._counts.encoded:
                     raise
@@ -135,7 +150,13 @@ class Edge:
         return self._summary(stages, link)
 
     def _play(
-        self, source: Source, stages: Stages, link: EdgeLink, status: StatusReporter, line: StatusLine
+        self,
+        source: Source,
+        stages: Stages,
+        link: EdgeLink,
+        status: StatusReporter,
+        heartbeat: Heartbeat,
+        line: StatusLine,
     ) -> None:
         """Take one frame after the other; once a second report."""
         next_status_ns = restarts = 0
@@ -150,6 +171,8 @@ class Edge:
                 if source.restarts != restarts:  # another picture than the last
                     restarts = source.restarts
                     stages.keyframes.require(self._loop_clock())
+                if frame is not None:
+                    self._counts.newest_came_ns = self._world.clock()
                 pace.step(frame, missed=source.missed)
                 del frame  # 9 MB at 1080p, while the next is read
                 now_ns = self._loop_clock()
@@ -158,11 +181,15 @@ class Edge:
                     stages.stills.note_load(self._counts.captured, self._counts.unanalyzed, now_ns=now_ns)
                     status.send("running")
                     self._reached |= link.has_subscriber(Channel.BASE)
-                    line.show(status.line(self._link_text(stages, link)))
+                    if heartbeat.state is not None:
+                        line.show(status_text(heartbeat.state, paused_s=self._counts.paused_ns / SECOND_NS))
                     if stages.reconfiguration.wants_keyframe(now_ns):
                         stages.keyframes.require(now_ns)
+                heartbeat.turn("running")  # in lockstep a second of the stream may take longer
         if not source.live:
-            stages.link_control.finish(stop=self._stop, note=line.note)
+            stages.link_control.finish(
+                stop=self._stop, note=line.note, turn=lambda: heartbeat.turn("running")
+            )
 
     def _make_pace(self, source: Source, stages: Stages, link: EdgeLink) -> LockstepPace | RealtimePace:
         if self._lockstep:
@@ -196,30 +223,50 @@ class Edge:
         if not self._lockstep and (wait_ns := at_ns - self._world.clock()) > 0:
             self._stop.wait(wait_ns / SECOND_NS)
 
-    def _status_reporter(self, stages: Stages) -> StatusReporter:
-        return StatusReporter(
+    def _state_maker(self, stages: Stages, link: EdgeLink, view: View) -> StateMaker:
+        return StateMaker(
             self._config,
             session_id=self._world.session_id,
+            view=view,
             operating=stages.operating,
             ledger=self.ledger,
             counts=self._counts,
             keyframes=stages.keyframes,
             transmitter=stages.transmitter,
             stills=stages.stills,
+            backlog=stages.backlog,
+            link=link,
             inbox=self._world.inbox,
             failures=self._failures,
             clock=self._world.clock,
             loop_clock=self._loop_clock,
         )
 
-    @staticmethod
-    def _link_text(stages: Stages, link: EdgeLink) -> str:
-        ground = "no link" if link.trouble else "no ground listens"
-        if link.has_ground():
-            ground = "a ground listens"
-        elif link.has_subscriber(Channel.BASE):
-            ground = "somebody watches who reports nothing"
-        return f"{ground}  {'' if stages.backlog is None else stages.backlog.text()}".rstrip()
+    def _status_reporter(self, stages: Stages, heartbeat: Heartbeat) -> StatusReporter:
+        return StatusReporter(
+            self._config,
+            heartbeat=heartbeat,
+            operating=stages.operating,
+            session_id=self._world.session_id,
+            ledger=self.ledger,
+            transmitter=stages.transmitter,
+            failures=self._failures,
+            loop_clock=self._loop_clock,
+        )
+
+    def _health_server(self, address: str) -> HealthServer:
+        with needs_extra("'hvt[metrics]'"):
+            from hvt_edge.health.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
+
+        frame_s = 1 / self._config.nominal_fps
+        answers = state_answers(
+            lambda: None if self._heartbeat is None else self._heartbeat.state,
+            clock=self._world.clock,
+            stuck_s=_STUCK_S + 2 * frame_s,
+            metrics_text=metrics_text,
+            lacks=lambda state: lacks(state, patience_s=_SILENT_S + 2 * frame_s),
+        )
+        return HealthServer(address, answers, name="--metrics")
 
     def _say_goodbye(self, stages: Stages, link: EdgeLink, status: StatusReporter) -> None:
         """Say that this was all, and let the ground finish."""

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence
+from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
-from hvt_common.runtime.reporting import print_table, start_log, write_json
+from hvt_common.runtime.reporting import print_table, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.health import watch
 from hvt_edge.summary import table, title
+from hvt_edge.world import World
 
 __all__ = ["main", "program"]
 
 _DESCRIPTION = (
     "Publish a camera or clip over Zenoh: a low-bitrate HEVC base stream, and sharp stills of what matters, "
-    "within a hard bit budget."
+    "within a hard bit budget. hvt-edge status tells how one that runs with --metrics is."
 )
 
 
@@ -32,6 +36,9 @@ def program() -> NoReturn:
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    words = sys.argv[1:] if argv is None else list(argv)
+    if words and words[0] == "status":
+        return watch.run(words[1:])
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
     config = with_profile(config, given=given.values)
     if given.print_config:
@@ -39,12 +46,23 @@ def _run(argv: Sequence[str] | None) -> int:
         return 0
     config = check(config)
     limit_malloc_arenas()
-    release_log = start_log("hvt-edge", quiet=config.quiet)
+    world = World()
+    log = start_log(
+        "hvt-edge",
+        quiet=config.quiet,
+        form=config.log_format,
+        edge=config.edge_id,
+        session=f"{world.session_id:016x}",
+    )
     stop = stop_on_signals()
-    content = Edge(config, stop=stop, on_started=release_log).run()
-    print_table(title(content), table(content))
-    if config.summary is not None:
-        write_json(config.summary, content)
+    with log.ending():
+        content = Edge(config, stop=stop, on_started=log.release, world=world).run()
+        if log.as_json:
+            log.result(content)
+        else:
+            print_table(title(content), table(content))
+        if config.summary is not None:
+            write_json(config.summary, content)
     return 0
 
 

@@ -28,6 +28,7 @@ from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_DETECTOR
 from hvt_common.inference.tiles import parse_tiles
 from hvt_common.protocol.channels import EdgeKeys
+from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import bitrate_text
 from hvt_common.video.still_codecs import still_codec
@@ -258,7 +259,15 @@ class EdgeConfig:
     )
     record_base: Path | None = _FILES.option(PATH, None, "also keep the base stream in this Matroska file")
     truth: Path | None = _FILES_RARE.option(PATH, None, "write the demo's ground truth, MOTChallenge form")
+    metrics: str | None = _FILES_RARE.option(
+        TEXT,
+        None,
+        "answer Prometheus (/metrics), /healthz, /readyz and hvt-edge status at HOST:PORT, unencrypted",
+    )
     summary: Path | None = _FILES.option(PATH, None, "write the summary as JSON")
+    log_format: str = _FILES_RARE.option(
+        choice(*LOG_FORMATS), "text", "json: one object a line, also the status now and then and the summary"
+    )
     quiet: bool = _FILES.switch("no status line")
 
     def store_bytes(self, *, live: bool) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
+from typing import Literal
 
 from hvt_common import __version__
 from hvt_common.protocol.ledger import Ledger
@@ -16,19 +17,16 @@ from hvt_common.protocol.messages import (
     fitted_text,
 )
 from hvt_common.runtime.failures import Failures
-from hvt_common.units import SECOND_NS, bitrate_text
+from hvt_common.units import bitrate_text
 from hvt_common.values import View
 from hvt_edge.config import EdgeConfig
-from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.health.heartbeat import Heartbeat
+from hvt_edge.health.state import EdgeState, LinkState
 from hvt_edge.link.transmitter import Transmitter
-from hvt_edge.loop.counts import FrameCounts
-from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.point import Levers, LoopClock, Operating
-from hvt_edge.stills.stage import StillStage
 
-__all__ = ["InfoReporter", "StatusReporter"]
+__all__ = ["InfoReporter", "StatusReporter", "status_text"]
 
-_MILLION = 1_000_000
 _PART_BYTES, _REASON_BYTES, _LEVERS_BYTES = 24, 160, 120
 _LEVERS_REST = 10
 
@@ -74,20 +72,16 @@ class InfoReporter:
 
 @dataclass(eq=False)
 class StatusReporter:
-    """Sends ``status`` and makes the status line; in the frame loop."""
+    """Sends ``status`` and makes the status line, from the state that it has made; in the frame loop."""
 
     config: EdgeConfig
     _: KW_ONLY
-    session_id: int
+    heartbeat: Heartbeat
     operating: Operating
+    session_id: int
     ledger: Ledger
-    counts: FrameCounts
-    keyframes: KeyframeRequests
     transmitter: Transmitter
-    stills: StillStage
-    inbox: FeedbackInbox
     failures: Failures
-    clock: Callable[[], int]
     loop_clock: LoopClock
 
     def __post_init__(self) -> None:
@@ -95,61 +89,37 @@ class StatusReporter:
         self._reported: Levers | None = None
         self._reported_sequence = 0
 
-    def send(self, state: str) -> None:
+    def send(self, phase: Literal["running", "ended"]) -> None:
         """Send the report, made for the moment at which it may go."""
-        self.counts.measure_cpu(perception_ns=self.stills.analyzer.spent_ns)
+        state = self.heartbeat.beat(phase)
         self.transmitter.status(
-            lambda at_ns: self._status(state, at_ns), now_ns=self.loop_clock(), last=state == "ended"
+            lambda at_ns: self._status(state, at_ns), now_ns=self.loop_clock(), last=phase == "ended"
         )
         self._sequence += 1
 
-    def _levers_text(self) -> str:
+    def _levers_text(self, levers: Levers) -> str:
         """Where a lever was moved, and now and then: on a thin link a sentence a second is not free."""
-        levers, sent = self.operating.now.levers, self._reported
+        sent = self._reported
         moved = sent is None or (levers.tracks, levers.stills) != (sent.tracks, sent.stills)
         if not moved and self._sequence - self._reported_sequence < _LEVERS_REST:
             return ""
         self._reported, self._reported_sequence = levers, self._sequence
         return fitted_text(levers.says, _LEVERS_BYTES)
 
-    def line(self, link: str) -> str:
-        """The status line."""
-        config, now, ledger, counts = self.config, self.operating.now, self.ledger, self.counts
-        rate_bps = ledger.window_bytes(None, self.loop_clock()) * 8 * SECOND_NS / ledger.window_ns
-        parts = [
-            f"{config.edge_id} {counts.duration_s(config.nominal_fps):6.1f} s",
-            f"{bitrate_text(rate_bps)} of {bitrate_text(now.total_bps)}",
-            f"auto, {now.method}" if config.measures else now.method,
-            f"stills {sum(ledger.outcomes('sent').values())}, {self.stills.pending} pending",
-            f"tracks {self.stills.analyzer.tracks}",
-            link,
-        ]
-        if now.levers.says:
-            parts.append(now.levers.says)
-        if counts.dropped_cpu:
-            parts.append(f"{counts.dropped_cpu} frames dropped: slow machine")
-        if counts.paused_ns:
-            parts.append(f"clip {counts.paused_ns / SECOND_NS:.0f} s longer: slow machine")
-        parts += [f"{one.part.upper()} FAILED" for one in self.failures.parts if not one.working]
-        return "  ".join(parts)
-
-    def _status(self, state: str, at_ns: int) -> Status:
+    def _status(self, state: EdgeState, at_ns: int) -> Status:
         """Totals, outcomes and health at ``at_ns``.
 
         In lockstep no field depends on this machine's speed: the same input gives the same bytes.
         """
-        counts, stills, transmitter = self.counts, self.stills, self.transmitter
-        account = self.ledger.summary(counts.duration_s(self.config.nominal_fps))
-        worst, now = account.worst_window_bps, self.operating.now
-        measured = self.config.pace != "lockstep"
-        reported_ns = self.inbox.received_ns
-        age_ms = -1 if reported_ns is None else max(0, (self.clock() - reported_ns) // _MILLION)
+        account = self.ledger.summary(state.duration_s)
+        worst, frames, transmitter = account.worst_window_bps, state.frames, self.transmitter
+        measured, reported_s = not state.lockstep, state.link.reported_s
         return Status(
             session_id=self.session_id,
             sequence=self._sequence,
-            state=state,
+            state=state.state,
             send_ns=at_ns,
-            media_ns=max(0, at_ns - now.started_ns),
+            media_ns=max(0, at_ns - self.operating.now.started_ns),
             last_base_sequence=transmitter.base_sequence,
             last_still_sequence=transmitter.still_sequence,
             base_bytes=account.base_bytes,
@@ -166,20 +136,20 @@ class StatusReporter:
             deferred=account.outcomes["deferred"],
             dropped=account.outcomes["dropped"],
             health=Health(
-                frames_captured=counts.captured,
-                frames_encoded=counts.encoded,
-                frames_dropped=counts.dropped,
-                keyframes=self.keyframes.sent,
-                tracks=stills.analyzer.tracks,
+                frames_captured=frames.captured,
+                frames_encoded=frames.encoded,
+                frames_dropped=frames.dropped,
+                keyframes=state.keyframes,
+                tracks=state.tracks,
                 base_queue=0,  # the base stream has no queue: frames are dropped before they are encoded
-                still_queue=stills.pending,
-                encode_ms=counts.encode_ms if measured else 0.0,
-                detect_ms=stills.analyzer.mean_ms if measured else 0.0,
-                feedback_age_ms=age_ms if measured else -1,
-                frames_dropped_cpu=counts.dropped_cpu,
-                frames_unanalyzed=counts.unanalyzed,
-                cores_needed=counts.cpu.now.needed if measured else 0.0,
-                cores_free=counts.cpu.now.free if measured else 0.0,
+                still_queue=state.stills_pending,
+                encode_ms=(state.encode_ms or 0.0) if measured else 0.0,
+                detect_ms=(state.perception_ms or 0.0) if measured else 0.0,
+                feedback_age_ms=round(1000 * reported_s) if measured and reported_s is not None else -1,
+                frames_dropped_cpu=frames.dropped_cpu,
+                frames_unanalyzed=frames.unanalyzed,
+                cores_needed=(state.cores_needed or 0.0) if measured else 0.0,
+                cores_free=(state.cores_free or 0.0) if measured else 0.0,
             ),
             failed=tuple(
                 FailedPart(
@@ -191,5 +161,36 @@ class StatusReporter:
                 )
                 for one in self.failures.parts[:MOST_FAILED_PARTS]
             ),
-            levers=self._levers_text(),
+            levers=self._levers_text(state.levers),
         )
+
+
+def status_text(state: EdgeState, *, paused_s: float = 0.0) -> str:
+    """The status line; ``paused_s``: by how much a clip is played longer than it is."""
+    operating, link, backlog = state.operating, state.link, state.backlog
+    parts = [
+        f"{state.edge} {state.duration_s:6.1f} s",
+        f"{bitrate_text(state.total_bps or 0)} of {bitrate_text(operating.allowed_bps)}",
+        f"auto, {state.method}" if operating.profile == "auto" else state.method,
+        f"stills {state.stills_sent}, {state.stills_pending} pending",
+        f"tracks {state.tracks}",
+        _link_text(link),
+    ]
+    if backlog is not None and (backlog.stills or backlog.segments):
+        parts.append(f"kept {backlog.stills} stills, {backlog.video_s:.0f} s")
+    if state.levers.says:
+        parts.append(state.levers.says)
+    if state.frames.dropped_cpu:
+        parts.append(f"{state.frames.dropped_cpu} frames dropped: slow machine")
+    if paused_s:
+        parts.append(f"clip {paused_s:.0f} s longer: slow machine")
+    parts += [f"{one.part.upper()} FAILED" for one in state.failed]
+    return "  ".join(parts)
+
+
+def _link_text(link: LinkState) -> str:
+    if link.ground:
+        return "a ground listens"
+    if link.watched:
+        return "somebody watches who reports nothing"
+    return "no link" if link.trouble else "no ground listens"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections import defaultdict, deque
@@ -16,13 +15,12 @@ from hvt_common.errors import FlightError, UserError, needs_extra
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, reason_of
-from hvt_common.runtime.health_server import METRICS_TYPE, Answer, HealthServer
+from hvt_common.runtime.health_server import HealthServer, state_answers
 from hvt_common.runtime.process import notify_systemd
 from hvt_common.runtime.reporting import StatusLine, check_writable
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, key_pair
-from hvt_common.units import SECOND_NS
 from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
@@ -112,7 +110,7 @@ class Ground:
             factory = SessionFactory(
                 config, models, clock=self._clock, outputs=outputs, view=view, page=page, index=index
             )
-            line = stack.enter_context(StatusLine(quiet=config.quiet))
+            line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
@@ -175,28 +173,12 @@ class Ground:
     # Who watches
 
     def _health_server(self, address: str) -> HealthServer:
-        with needs_extra("'hvt[ground]'"):
+        with needs_extra("'hvt[metrics]'"):
             from hvt_ground.metrics import metrics_text  # noqa: PLC0415 - who is not watched needs no Prometheus
 
-        def of_state(make: Callable[[GroundState], Answer]) -> Answer:
-            state = self._state
-            if state is None:
-                return Answer(b"it has not begun\n", status=503)
-            age_s = (self._clock() - state.at_ns) / SECOND_NS
-            return make(state) if age_s < _STUCK_S else Answer(b"it stands still\n", status=503)
-
-        def ready() -> Answer:
-            return of_state(lambda _state: Answer(b"ok\n"))
-
-        answers = {
-            "/metrics": lambda: of_state(lambda state: Answer(metrics_text(state), METRICS_TYPE)),
-            "/state.json": lambda: of_state(
-                lambda state: Answer(json.dumps(state.as_dict()).encode(), "application/json")
-            ),
-            # While networks load it is alive, and not ready.
-            "/healthz": lambda: Answer(b"starting\n") if self._state is None else ready(),
-            "/readyz": ready,
-        }
+        answers = state_answers(
+            lambda: self._state, clock=self._clock, stuck_s=_STUCK_S, metrics_text=metrics_text
+        )
         return HealthServer(address, answers, name="--metrics")
 
     # Serving

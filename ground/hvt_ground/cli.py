@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hvt_common.config import load, to_toml
 from hvt_common.errors import exit_with_sentence, needs_extra
+from hvt_common.runtime.log import start_log
 from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signals
-from hvt_common.runtime.reporting import print_table, say, start_log, write_json
+from hvt_common.runtime.reporting import print_table, say, write_json
 from hvt_ground.config import GroundConfig, check
 
 __all__ = ["main", "program"]
@@ -56,7 +57,6 @@ def _run(argv: Sequence[str] | None) -> int:
     with needs_extra("'hvt[ground]'"):  # only now: without Rerun this is a sentence, not a traceback
         from hvt_ground.app import Ground  # noqa: PLC0415
         from hvt_ground.sinks.rerun.sdk import leave_out_pandas  # noqa: PLC0415
-        from hvt_ground.status import table  # noqa: PLC0415
     config, requested = load(GroundConfig, argv, program="hvt-ground", description=_DESCRIPTION)
     if requested.print_config:
         print(to_toml(config), end="")
@@ -64,16 +64,26 @@ def _run(argv: Sequence[str] | None) -> int:
     config = check(config)
     limit_malloc_arenas()
     leave_out_pandas()
-    release_log = start_log("hvt-ground", quiet=config.quiet)
+    log = start_log("hvt-ground", quiet=config.quiet, form=config.log_format)
     stop = stop_on_signals()
-    sessions = Ground(config, stop=stop, on_started=release_log).run()
+    with log.ending():
+        sessions = Ground(config, stop=stop, on_started=log.release).run()
+        if log.as_json:
+            log.result(sessions)
+        else:
+            _print(sessions)
+        if config.summary is not None:
+            write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
+    return 0
+
+
+def _print(sessions: list[dict[str, Any]]) -> None:
+    from hvt_ground.status import table  # noqa: PLC0415
+
     for content in sessions:
         print_table(f"{content['edge']}: received", table(content))
     if not sessions:
         say("hvt-ground: no edge was heard")
-    if config.summary is not None:
-        write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
-    return 0
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, 
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
+from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import Limit, parse_limit
 
@@ -142,6 +143,9 @@ class GroundConfig:
         "answer Prometheus (/metrics), /healthz, /readyz and hvt-ground status at HOST:PORT, unencrypted",
     )
     summary: Path | None = _FILES.option(PATH, None, "write the summary as JSON")
+    log_format: str = _FILES_RARE.option(
+        choice(*LOG_FORMATS), "text", "json: one object a line, also the status now and then and the summary"
+    )
     quiet: bool = _FILES.switch("no status line")
 
     @property

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
-from prometheus_client import CollectorRegistry, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
+from prometheus_client.core import Metric
 
+from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
 from hvt_common.units import SECOND_NS
 from hvt_ground.state import GroundState, SessionState
 
@@ -15,23 +14,25 @@ __all__ = ["metrics_text"]
 
 _LINKS = ("waiting", "up", "thin", "lost", "ended")
 
-_Value = Callable[[SessionState], float | None]
-_GAUGES: dict[str, tuple[str, _Value]] = {
+_GAUGES: Table[SessionState] = {
     "hvt_budget_bits_per_second": ("The edge's budget.", lambda one: one.budget_bps),
     "hvt_received_bits_per_second": ("Over the budget's window, all channels.", lambda one: one.total_bps),
     "hvt_received_base_bits_per_second": ("Likewise, the base stream.", lambda one: one.base_bps),
     "hvt_received_still_bits_per_second": ("Likewise, stills.", lambda one: one.roi_bps),
-    "hvt_overlay_delay_p50_seconds": ("Capture to overlay.", lambda one: _seconds(one.delay_p50_ms)),
-    "hvt_overlay_delay_p95_seconds": ("Capture to overlay.", lambda one: _seconds(one.delay_p95_ms)),
+    "hvt_overlay_delay_p50_seconds": ("Capture to overlay.", lambda one: seconds(one.delay_p50_ms)),
+    "hvt_overlay_delay_p95_seconds": ("Capture to overlay.", lambda one: seconds(one.delay_p95_ms)),
     "hvt_picture_age_seconds": ("Since the newest picture was captured.", lambda one: one.picture_age_s),
     "hvt_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),
     "hvt_tracks_refined": ("Of these, refined by a still.", lambda one: one.tracks_refined),
+    "hvt_tracks_doubted": ("Shown, and doubted by stills.", lambda one: one.tracks_doubted),
+    "hvt_stills_waiting": ("To be read.", lambda one: one.stills_waiting),
+    "hvt_budget_used_ratio": ("Of the edge's budget.", lambda one: one.budget_share),
     "hvt_backlog_objects_working": ("Stored objects in hand.", lambda one: one.backlog_working),
-    "hvt_edge_detect_seconds": ("A detection at the edge.", lambda one: _seconds(one.edge_detect_ms)),
-    "hvt_edge_encode_seconds": ("A picture at the edge.", lambda one: _seconds(one.edge_encode_ms)),
+    "hvt_edge_detect_seconds": ("A detection at the edge.", lambda one: seconds(one.edge_detect_ms)),
+    "hvt_edge_encode_seconds": ("A picture at the edge.", lambda one: seconds(one.edge_encode_ms)),
     "hvt_edge_stills_waiting": ("Stills in the edge's queue.", lambda one: one.edge_still_queue),
 }
-_COUNTERS: dict[str, tuple[str, _Value]] = {
+_COUNTERS: Table[SessionState] = {
     "hvt_frames_received": ("Access units.", lambda one: one.frames_received),
     "hvt_frames_decoded": ("Pictures.", lambda one: one.frames_decoded),
     "hvt_frames_untracked": ("Passed over by perception.", lambda one: one.frames_untracked),
@@ -47,57 +48,32 @@ _COUNTERS: dict[str, tuple[str, _Value]] = {
 
 
 def metrics_text(state: GroundState) -> bytes:
-    """The text format, version 0.0.4. Counters are of the open session, and begin anew with the next."""
-    registry = CollectorRegistry(auto_describe=False)
-    registry.register(_State(state))
-    return generate_latest(registry)
+    """The text format. Counters are of the open session, and begin anew with the next."""
+    return exposition(_metrics(state))
 
 
-class _State(Collector):
-    def __init__(self, state: GroundState) -> None:
-        self._state = state
-
-    def collect(self) -> Iterator[Metric]:
-        state = self._state
-        yield GaugeMetricFamily("hvt_state_timestamp_seconds", "Of this state.", state.at_ns / SECOND_NS)
-        link = GaugeMetricFamily("hvt_link", "1 for what the link is.", labels=("edge", "link"))
-        since = GaugeMetricFamily("hvt_link_since_timestamp_seconds", "Since when.", labels=("edge",))
-        unusable = CounterMetricFamily("hvt_messages_unusable", "Damaged or foreign.", labels=("edge",))
-        ended = CounterMetricFamily("hvt_sessions_ended", "Sessions.", labels=("edge",))
-        failed = GaugeMetricFamily("hvt_part_failed", "1: does not work now.", labels=("part", "edge"))
-        not_sent = CounterMetricFamily(
-            "hvt_stills_not_sent", "Candidates without a still.", labels=("edge", "reason")
-        )
-        for part in state.failed:
-            failed.add_metric((part.part, ""), 1)
-        for one in state.edges:
-            for name in _LINKS:
-                link.add_metric((one.edge, name), name == one.link)
-            since.add_metric((one.edge,), one.link_since_ns / SECOND_NS)
-            unusable.add_metric((one.edge,), one.unusable_messages)
-            ended.add_metric((one.edge,), one.sessions_ended)
-            at_edge = () if one.session is None else one.session.edge_failed
-            for part in (*one.failed, *at_edge):
-                failed.add_metric((part.part, one.edge), 1)
-            for reason, count in ({} if one.session is None else one.session.stills_not_sent).items():
-                not_sent.add_metric((one.edge, reason), count)
-        yield from (link, since, unusable, ended, failed, not_sent)
-        yield from self._of_sessions(_GAUGES, GaugeMetricFamily)
-        yield from self._of_sessions(_COUNTERS, CounterMetricFamily)
-
-    def _of_sessions(
-        self,
-        table: dict[str, tuple[str, _Value]],
-        family_of: type[GaugeMetricFamily | CounterMetricFamily],
-    ) -> Iterator[Metric]:
-        for name, (says, value_of) in table.items():
-            family = family_of(name, says, labels=("edge",))
-            for one in self._state.edges:
-                value = None if one.session is None else value_of(one.session)
-                if value is not None:
-                    family.add_metric((one.edge,), value)
-            yield family
-
-
-def _seconds(ms: float | None) -> float | None:
-    return None if ms is None else ms / 1000
+def _metrics(state: GroundState) -> Iterator[Metric]:
+    yield Gauge("hvt_state_timestamp_seconds", "Of this state.", state.at_ns / SECOND_NS)
+    link = Gauge("hvt_link", "1 for what the link is.", labels=("edge", "link"))
+    since = Gauge("hvt_link_since_timestamp_seconds", "Since when.", labels=("edge",))
+    unusable = Counter("hvt_messages_unusable", "Damaged or foreign.", labels=("edge",))
+    ended = Counter("hvt_sessions_ended", "Sessions.", labels=("edge",))
+    failed = Gauge("hvt_part_failed", "1: does not work now.", labels=("part", "edge"))
+    not_sent = Counter("hvt_stills_not_sent", "Candidates without a still.", labels=("edge", "reason"))
+    for part in state.failed:
+        failed.add_metric((part.part, ""), 1)
+    for one in state.edges:
+        for name in _LINKS:
+            link.add_metric((one.edge, name), name == one.link)
+        since.add_metric((one.edge,), one.link_since_ns / SECOND_NS)
+        unusable.add_metric((one.edge,), one.unusable_messages)
+        ended.add_metric((one.edge,), one.sessions_ended)
+        at_edge = () if one.session is None else one.session.edge_failed
+        for part in (*one.failed, *at_edge):
+            failed.add_metric((part.part, one.edge), 1)
+        for reason, count in ({} if one.session is None else one.session.stills_not_sent).items():
+            not_sent.add_metric((one.edge, reason), count)
+    yield from (link, since, unusable, ended, failed, not_sent)
+    sessions = [(one.edge, one.session) for one in state.edges if one.session is not None]
+    yield from of_table(_GAUGES, Gauge, sessions)
+    yield from of_table(_COUNTERS, Counter, sessions)

@@ -11,14 +11,14 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from hvt_common import __version__
-from hvt_common.protocol.messages import Status
-from hvt_common.runtime.failures import Failures
+from hvt_common.protocol.messages import WIRE_VERSION, Status
+from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Traffic
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 
-__all__ = ["EdgeState", "FailedPart", "GroundState", "LinkState", "StateMaker"]
+__all__ = ["EdgeState", "GroundState", "LinkState", "StateMaker"]
 
 LinkState = Literal["waiting", "up", "thin", "lost", "ended"]
 """``waiting`` for a keyframe to begin with; ``up``; ``thin``: the edge leaves frames out for want of link; ``lost``:
@@ -28,17 +28,6 @@ LOST_S = 3.0
 """A report comes once a second: nothing for so long is no accident."""
 _THIN_S = 5.0
 """So long after the last frame that was left out for want of link it counts as thin."""
-
-
-@dataclass(frozen=True, slots=True)
-class FailedPart:
-    """A part that does not work now."""
-
-    part: str
-    reason: str
-    """A sentence."""
-    since_ns: int
-    """Unix time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +52,8 @@ class SessionState:
     """Over the session, all that crossed the line."""
     total_bps: float | None
     """Over the budget's window, like the two below; None while the link is lost."""
+    budget_share: float | None
+    """What that is of the budget."""
     base_bps: float | None
     roi_bps: float | None
     delay_p50_ms: float | None
@@ -80,12 +71,16 @@ class SessionState:
     corrupt: int
     keyframe_requests: int
     stills_received: int
+    stills_waiting: int
+    """For their turn or their base frame."""
     still_outcomes: Mapping[str, int]
     """What became of the objects in them."""
     stills_not_sent: Mapping[str, int]
     """Why candidates have no still: the edge's counts, by reason."""
     tracks: int
     tracks_refined: int
+    tracks_doubted: int
+    """Shown now, and nothing of what is looked for as stills have it."""
     class_changes: int
     detections: int
     backlog_stills: int
@@ -127,6 +122,8 @@ class GroundState:
     at_ns: int
     """Unix time."""
     version: str
+    schema_version: int
+    """Of the messages on the wire."""
     detector: str
     classifier: str
     calibrated: bool
@@ -170,11 +167,12 @@ class StateMaker:
         return GroundState(
             at_ns=now_ns,
             version=__version__,
+            schema_version=WIRE_VERSION,
             detector=self._detector,
             classifier=self._classifier,
             calibrated=self._calibrated,
             edges=made,
-            failed=() if self._failures is None else _failed(self._failures),
+            failed=() if self._failures is None else self._failures.now,
         )
 
     def _edge(self, edge: str, sessions: EdgeSessions, now_ns: int) -> EdgeState:
@@ -192,7 +190,7 @@ class StateMaker:
             unusable_messages=sessions.unusable,
             sessions_ended=sessions.ended,
             session=None if session is None else _session(session, sessions, link=link, now_ns=now_ns),
-            failed=_failed(sessions.failures),
+            failed=sessions.failures.now,
         )
 
     def _link(
@@ -237,6 +235,7 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         budget_bps=session.budget_bps,
         mean_bps=session.ledger.summary(session.duration_s).total_bps,
         total_bps=None if now is None else now.total_bps,
+        budget_share=None if now is None else now.total_bps / session.budget_bps,
         base_bps=None if now is None else now.base_bps,
         roi_bps=None if now is None else now.roi_bps,
         delay_p50_ms=None if session.lockstep else session.overlay_latency.percentile(50),
@@ -250,10 +249,12 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         corrupt=counters.corrupt,
         keyframe_requests=counters.keyframe_requests,
         stills_received=session.stills_received,
+        stills_waiting=session.worker.stills_queued + pipeline.stills_waiting,
         still_outcomes=dict(pipeline.outcomes),
         stills_not_sent=dict(session.not_sent),
         tracks=pipeline.tracks,
         tracks_refined=pipeline.refined,
+        tracks_doubted=pipeline.doubted,
         class_changes=pipeline.class_changes,
         detections=pipeline.detections_run,
         backlog_stills=totals.stills,
@@ -272,7 +273,3 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
             if not one.working
         ),
     )
-
-
-def _failed(failures: Failures) -> tuple[FailedPart, ...]:
-    return tuple(FailedPart(one.part, one.reason, one.since_ns) for one in failures.parts if not one.working)

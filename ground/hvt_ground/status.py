@@ -6,13 +6,13 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
-from hvt_common.runtime.failures import Failures
+from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS, bitrate_text, counts_text
 from hvt_ground.events import Event
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import QueuedSink, Sink
-from hvt_ground.state import EdgeState, FailedPart, GroundState
+from hvt_ground.state import EdgeState, GroundState
 
 __all__ = ["completed", "status_text", "summary", "table"]
 

@@ -42,6 +42,8 @@ def test_an_edge_is_ready_before_any_ground_is_there(systemd: socket.socket, tmp
     with Link(tmp_path) as link:
         edge = link.edge("--source", "demo", "--method", "M0")
         assert systemd.recv(64) == b"READY=1"
+        systemd.settimeout(10)
+        assert [systemd.recv(64) for _ in range(3)] == [b"WATCHDOG=1"] * 3, "it waits for a ground"
         edge.stop()
 
 

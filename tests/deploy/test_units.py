@@ -93,6 +93,7 @@ def test_unit_may_take_its_time_to_be_ready(name: str) -> None:
     """Without it, systemd's limit of 90 s would kill a small board that loads its networks, again and again."""
     service = _read(DEPLOY / "systemd" / name)["Service"]
     assert (service["Type"], service["TimeoutStartSec"]) == ("notify", "infinity")
+    assert float(service["WatchdogSec"]) >= 30, "a frame each ten seconds is no loop that hangs"
     assert "AF_UNIX" in service["RestrictAddressFamilies"], (
         "without it nobody is told, and the start never ends"
     )

@@ -13,6 +13,7 @@ import urllib.request
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from hvt_common.protocol.messages import WIRE_VERSION
 from programs.processes import Link, eventually, free_ports
 
 pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
@@ -67,7 +68,11 @@ def test_a_ground_in_service_can_be_watched(tmp_path):
         assert said.returncode == 0, said.stderr
         assert "uav-1" in said.stdout
         state = json.loads(status("--at", address, "--json").stdout)
-        assert state["edges"][0]["session"]["frames_received"] > 5
+        session = state["edges"][0]["session"]
+        assert session["frames_received"] > 5
+        assert 0 < session["budget_share"] <= 1
+        assert (session["stills_waiting"], session["tracks_doubted"]) == (0, 0), "video alone"
+        assert state["schema_version"] == WIRE_VERSION
         with pytest.raises(urllib.error.HTTPError, match="404"):
             read(address, "/../../etc/passwd")
         host, _, port = address.partition(":")

@@ -53,6 +53,12 @@ def done(tmp_path, module, words, without):
         ("hvt_study.cli", ("read", "demo:codes", "--out", "out"), ("rapidocr",), "hvt[reading]"),
         ("hvt_study.cli", ("score", "a.csv", "--truth", "gt.txt"), ("sklearn",), "hvt[study]"),
         ("hvt_ground.cli", ("--help",), ("rerun",), "hvt[ground]"),
+        (
+            "hvt_edge.cli",
+            ("--source", "demo", "--metrics", "127.0.0.1:1"),
+            ("prometheus_client",),
+            "hvt[metrics]",
+        ),
         ("hvt_ground.cli", ("keys", "list"), ("cryptography",), "hvt[ground]"),
         ("hvt_train", ("detector", "--out", "out"), ("torch",), "torch onnx"),
         ("hvt_study.cli", ("train", "--data", "yolo:a", "--out", "b.onnx"), ("torch",), "torch onnx"),

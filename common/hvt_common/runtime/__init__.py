@@ -1,4 +1,4 @@
-"""What every process needs: `clock`, `failures`, `plug_ins`, `process` (signals), `reporting`, `statistics`.
+"""What every process needs: `clock`, `failures`, `log`, `plug_ins`, `process` (signals), `reporting`, `statistics`.
 
-`health_server` answers who watches one.
+`health_server` answers who watches one, `prometheus` in the words of metrics, `status_command` in a table.
 """

@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 from hvt_common.errors import UserError
 from hvt_common.units import SECOND_NS
 
-__all__ = ["Failure", "Failures", "Retried", "RetryPause", "reason_of"]
+__all__ = ["FailedPart", "Failure", "Failures", "Retried", "RetryPause", "reason_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -43,6 +43,17 @@ class Failure:
     working: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class FailedPart:
+    """A part that does not work now."""
+
+    part: str
+    reason: str
+    """A sentence."""
+    since_ns: int
+    """Unix time."""
+
+
 class Failures:
     """Which parts of a process have failed since its start. Thread-safe."""
 
@@ -57,6 +68,11 @@ class Failures:
     def parts(self) -> tuple[Failure, ...]:
         """In the order of their first failure."""
         return tuple(self._parts.values())
+
+    @property
+    def now(self) -> tuple[FailedPart, ...]:
+        """Those that do not work now."""
+        return tuple(FailedPart(one.part, one.reason, one.since_ns) for one in self.parts if not one.working)
 
     def failed(self, part: str, reason: str) -> None:
         """It has stopped. The log says so once, however often it is tried in vain."""

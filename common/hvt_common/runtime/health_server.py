@@ -7,6 +7,7 @@ seconds, and whoever does something else with the port disturbs nobody but other
 from __future__ import annotations
 
 import contextlib
+import json
 import socket
 import threading
 from collections.abc import Callable, Mapping
@@ -14,14 +15,15 @@ from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from socketserver import ThreadingMixIn
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self, TypeVar
 from urllib.parse import urlsplit
 
 from hvt_common.errors import UserError
+from hvt_common.units import SECOND_NS
 
-__all__ = ["METRICS_TYPE", "Answer", "HealthServer"]
+__all__ = ["Answer", "HealthServer", "State", "state_answers"]
 
-METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+_METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """Of Prometheus' text format."""
 
 _MOST_AT_ONCE = 16
@@ -36,6 +38,61 @@ class Answer:
     body: bytes
     media_type: str = "text/plain; charset=utf-8"
     status: int = 200
+
+
+class State(Protocol):
+    """What a program knows of itself at one moment."""
+
+    @property
+    def at_ns(self) -> int:
+        """Unix time."""
+        ...
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        ...
+
+
+_State = TypeVar("_State", bound=State)
+
+
+def state_answers(
+    newest: Callable[[], _State | None],
+    *,
+    clock: Callable[[], int],
+    stuck_s: float,
+    metrics_text: Callable[[_State], bytes],
+    lacks: Callable[[_State], str] = lambda _state: "",
+) -> dict[str, Callable[[], Answer]]:
+    """Answers of a program that makes a state each second; after ``stuck_s`` without it stands still.
+
+    ``lacks`` says what keeps it from serving though it is alive; empty for nothing.
+    """
+
+    def of_state(make: Callable[[_State], Answer]) -> Answer:
+        state = newest()
+        if state is None:
+            return Answer(b"it has not begun\n", status=503)
+        age_s = (clock() - state.at_ns) / SECOND_NS
+        return make(state) if age_s < stuck_s else Answer(b"it stands still\n", status=503)
+
+    def said(state: _State, *, ready: bool) -> Answer:
+        why = lacks(state)
+        if ready:
+            return Answer(f"{why or 'ok'}\n".encode(), status=503 if why else 200)
+        return Answer(f"ok{why and '; '}{why}\n".encode())
+
+    def alive() -> Answer:  # while networks load it is, and not ready
+        return Answer(b"starting\n") if newest() is None else of_state(lambda state: said(state, ready=False))
+
+    return {
+        "/metrics": lambda: of_state(lambda state: Answer(metrics_text(state), _METRICS_TYPE)),
+        "/state.json": lambda: of_state(
+            lambda state: Answer(json.dumps(state.as_dict()).encode(), "application/json")
+        ),
+        "/healthz": alive,
+        "/readyz": lambda: of_state(lambda state: said(state, ready=True)),
+    }
 
 
 class HealthServer:

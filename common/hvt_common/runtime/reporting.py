@@ -1,14 +1,13 @@
-"""What a run reports: log, status line, and at its end a table and a JSON file."""
+"""What a run reports: a status line, and at its end a table and a JSON file."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import logging
-import logging.handlers
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -19,62 +18,27 @@ from rich.table import Table
 from rich.text import Text
 
 from hvt_common.errors import FlightError, UserError
+from hvt_common.runtime.log import STATUS_LOGGER
 
-__all__ = ["StatusLine", "check_writable", "print_table", "say", "start_log", "write_json"]
+__all__ = ["StatusLine", "check_writable", "print_table", "say", "write_json"]
 
 _PLAIN_EVERY = 5
-
-
-def start_log(program: str, *, quiet: bool) -> Callable[[], None]:
-    """Buffer the log until the returned function is called, then write it to stderr.
-
-    So a start that fails writes one sentence and nothing else. Unless ``quiet``, the provider of each network is
-    logged.
-    """
-    stream = logging.StreamHandler()
-    stream.setFormatter(logging.Formatter(f"{program}: %(message)s"))
-    held = _HeldLog(stream)
-    logging.basicConfig(level=logging.WARNING, handlers=[held], force=True)
-    logging.getLogger("hvt_common.inference.runtimes.model").setLevel(
-        logging.WARNING if quiet else logging.INFO
-    )
-    return held.say_on
-
-
-class _HeldLog(logging.handlers.MemoryHandler):
-    """Buffers records until `say_on`; without it they are discarded."""
-
-    def __init__(self, target: logging.Handler) -> None:
-        super().__init__(10_000, target=target, flushOnClose=False)
-        self._free = False
-
-    def say_on(self) -> None:
-        """Write the buffered records, and from now on each at once."""
-        self._free = True
-        self.flush()
-
-    def shouldFlush(self, record: logging.LogRecord) -> bool:  # noqa: ARG002, N802 - the library's name
-        """At once, when free."""
-        return self._free
-
-    def flush(self) -> None:
-        """Discard at exit what is still buffered: logging itself would write it."""
-        if self._free:
-            super().flush()
 
 
 class StatusLine:
     """One line on a terminal, rewritten in place; elsewhere every fifth update is a line, so that logs stay short.
 
-    A closed pipe, a lost terminal or a full disk silences it; the run goes on.
+    With ``as_json`` those lines and all notes go to the log. A closed pipe, a lost terminal or a full disk silences
+    it; the run goes on.
     """
 
-    def __init__(self, *, quiet: bool) -> None:
+    def __init__(self, *, quiet: bool, as_json: bool = False) -> None:
         self._console = _Console(stderr=True, highlight=False, emoji=False)
         self._quiet = quiet
         self._updates = 0
+        self._log = logging.getLogger(STATUS_LOGGER) if as_json else None
         self._live: Live | None = None
-        if self._console.is_terminal and not quiet:
+        if self._console.is_terminal and not (quiet or as_json):
             self._live = Live(console=self._console, auto_refresh=False, transient=True)
 
     def show(self, text: str) -> None:
@@ -84,14 +48,20 @@ class StatusLine:
                 self._live.update(Text(text, overflow="ellipsis", no_wrap=True), refresh=True)
             elif not self._quiet:
                 if self._updates % _PLAIN_EVERY == 0:
-                    print(text, file=sys.stderr, flush=True)
+                    self._print(text)
                 self._updates += 1
 
     def note(self, text: str) -> None:
         """Print a lasting line above the status line."""
         if not self._quiet:
             with _going_on(sys.stderr):
-                self._console.print(text, markup=False, soft_wrap=True)
+                self._print(text)
+
+    def _print(self, text: str) -> None:
+        if self._log is not None:
+            self._log.info("%s", text)
+        else:
+            self._console.print(text, markup=False, soft_wrap=True)
 
     def __enter__(self) -> Self:
         if self._live is not None:

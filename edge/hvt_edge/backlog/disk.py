@@ -99,7 +99,7 @@ class Store:
     ) -> None:
         self.path = path
         self._file = path / FILE_NAME
-        self._max_bytes = max_bytes
+        self.max_bytes = max_bytes
         self._file_bytes = max_bytes - _LOG_BYTES
         self._session = f"{session_id:016x}"
         self._session_id = session_id
@@ -290,7 +290,7 @@ class Store:
             if (least := next(self._ranked(kind, "ASC"), None)) is None:
                 return
             if not self.evicted_stills + self.evicted_segments:
-                megabytes = self._max_bytes // 10**6
+                megabytes = self.max_bytes // 10**6
                 _log.warning("the store is full (--store %d MB): the least useful goes", megabytes)
             # Not `remove`: where even this takes space that is not there, all would go in vain.
             with self._disk():

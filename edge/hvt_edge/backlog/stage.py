@@ -101,6 +101,7 @@ class BacklogStage:
         self._probed_ns = 0
         self.frames = 0
         """Stored and not sent."""
+        self.folder, self.max_bytes = store.path, store.max_bytes
         self.breaks = 0
         """How often what was in flight has been taken for lost."""
         self._worker = StoreWorker(
@@ -251,11 +252,6 @@ class BacklogStage:
     def numbers(self) -> StoreNumbers:
         """What is kept and what was done."""
         return self._worker.numbers
-
-    def text(self) -> str:
-        """For the status line; empty where nothing is kept."""
-        numbers = self.numbers
-        return "" if numbers.empty else f"kept {numbers.stills} stills, {numbers.video_s:.0f} s"
 
     def send_no_more(self) -> None:
         """Before the last report to the ground, which says how much there was."""

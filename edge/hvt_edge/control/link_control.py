@@ -81,10 +81,21 @@ class LinkControl:
             return True
         return self.pacer.admits_base(now_ns) and self.transmitter.base_wait_ns(now_ns) <= _MOST_WAIT_NS
 
-    def finish(self, *, stop: threading.Event, note: Callable[[str], None]) -> None:
-        """After the last frame of a recorded source: send what was stored."""
+    def finish(
+        self,
+        *,
+        stop: threading.Event,
+        note: Callable[[str], None],
+        turn: Callable[[], None] = lambda: None,
+    ) -> None:
+        """After the last frame of a recorded source: send what was stored, and call ``turn`` meanwhile."""
+
+        def before_frame(now_ns: int) -> None:
+            turn()
+            self._after_last(now_ns)
+
         if self.backlog is not None:
-            self.backlog.finish(before_frame=self._after_last, stop=stop, note=note)
+            self.backlog.finish(before_frame=before_frame, stop=stop, note=note)
 
     def _after_last(self, now_ns: int) -> None:
         self.stills.store_lost(now_ns)
@@ -132,8 +143,12 @@ def wait_for_ground(
     wait_s: float,
     stop: threading.Event,
     note: Callable[[str], None],
+    turn: Callable[[], None] = lambda: None,
 ) -> None:
-    """Until a ground subscribes, or for ``--wait``: a recorded source can wait for its audience."""
+    """Until a ground subscribes, or for ``--wait``: a recorded source can wait for its audience.
+
+    ``turn`` is called meanwhile.
+    """
     if has_ground():
         return
     deadline_s = time.monotonic() + wait_s
@@ -142,4 +157,5 @@ def wait_for_ground(
         if time.monotonic() >= deadline_s:
             note(f"{edge_id}: no ground yet; playing on, one may join at any time")
             return
+        turn()
         stop.wait(0.02)

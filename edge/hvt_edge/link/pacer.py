@@ -180,6 +180,11 @@ class Pacer:
         return self._round_trip_ns
 
     @property
+    def measured_round_trip_ns(self) -> int | None:
+        """The same; None until one was measured."""
+        return None if self._round_trip.empty else self._round_trip_ns
+
+    @property
     def at_ceiling(self) -> bool:
         """Whether the rate is the ceiling."""
         return self._controller.at_ceiling

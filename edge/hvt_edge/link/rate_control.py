@@ -100,6 +100,11 @@ class LeastDelay:
         self._least = delay_ns if self._least is None else min(self._least, delay_ns)
         return self._least if self._former is None else min(self._former, self._least)
 
+    @property
+    def empty(self) -> bool:
+        """Whether none was taken in."""
+        return self._since_ns is None
+
 
 @dataclass(frozen=True, slots=True)
 class _Judged:

@@ -26,6 +26,8 @@ class FrameCounts:
     encode_ns: int = 0
     paused_ns: int = 0
     """How long the clock of a clip stood still, because the machine was too slow to play it in real time."""
+    newest_came_ns: int | None = None
+    """When the source gave the newest frame; None before the first."""
     last_index: int = -1
     first_capture_ns: int | None = None
     last_capture_ns: int = 0

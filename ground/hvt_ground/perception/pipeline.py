@@ -123,6 +123,8 @@ class Pipeline:
         self._listed_frame = -1
         self._track_ids = DistinctIds()
         self.detections_run = 0
+        self.doubted = 0
+        """Of the tracks that are shown, those that stills doubt."""
         self.steps_used = 0
         """Reports of the edge's tracks that were taken in."""
 
@@ -130,6 +132,11 @@ class Pipeline:
     def tracks(self) -> int:
         """Distinct tracks so far, whoever saw them."""
         return self._track_ids.count
+
+    @property
+    def stills_waiting(self) -> int:
+        """For their base frame."""
+        return self._stills.waiting
 
     @property
     def history_bytes(self) -> int:
@@ -272,6 +279,7 @@ class Pipeline:
         if own.frame_index > self._listed_frame:
             self._listed_frame = own.frame_index
             shown = self._parts.refiner.shown(fused.tracks)
+            self.doubted = int(shown.doubted.sum())
             self._emit(_overlay(fused, shown, capture_ns, base_size=self._base_size))
 
     def _carry_merges(self) -> None:

@@ -91,6 +91,11 @@ class PerceptionWorker(ABC):
         """Nothing is queued, and nothing is in hand."""
 
     @property
+    def stills_queued(self) -> int:
+        """Stills that are not read yet."""
+        return 0
+
+    @property
     def accepts_jobs(self) -> bool:
         """Whether `submit` takes another."""
         return True
@@ -176,6 +181,11 @@ class RealtimeWorker(PerceptionWorker):
         """Nothing waits, and nothing is in hand."""
         # What is in hand is asked for last: it is taken from what waits, and never put back.
         return not (self._has_news() or self._jobs or self._last_jobs or self._in_hand)
+
+    @property
+    def stills_queued(self) -> int:
+        """Stills that are not read yet."""
+        return len(self._stills)
 
     @property
     def accepts_jobs(self) -> bool:

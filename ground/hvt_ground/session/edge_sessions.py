@@ -13,6 +13,7 @@ from hvt_common.protocol.clock_offset import ClockOffset
 from hvt_common.protocol.messages import BacklogHeader, Info, RoiHeader, Status, TrackStep, WireError
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, RetryPause, reason_of
+from hvt_common.runtime.log import log_fields
 from hvt_common.transport.inbox import Received
 from hvt_ground.backlog.edge_backlog import EdgeBacklog
 from hvt_ground.backlog.recordings import BacklogRecordings
@@ -276,6 +277,7 @@ class EdgeSessions:
             return
         self.port.used.set()
         self._next_clock_ns = time.monotonic_ns() + _CLOCK_EVERY_NS
+        log_fields(session=f"{info.session_id:016x}")
         self.session = self._open_session(info, self._reports)
         self.failures.works(self._part)
         for packet in self._pre_session.take():
@@ -297,6 +299,7 @@ class EdgeSessions:
                 step()
             except Exception as error:  # noqa: BLE001 - the steps after it are due all the same
                 self._say_failed(error, session)
+        log_fields(session="")
 
     def _report_end(self, session: GroundSession) -> None:
         session.report()
@@ -359,6 +362,7 @@ class EdgeThread:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
+        log_fields(edge=self.sessions.port.edge)
         try:
             while not self._finished():
                 item = self._inbox.get(timeout_s=0.05)

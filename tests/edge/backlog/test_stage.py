@@ -189,10 +189,8 @@ def test_asking_for_the_video_of_an_empty_store_is_refused(tmp_path):
     """Whoever asks would wait for something that never comes."""
     rig = Rig(tmp_path / "store")
     assert not rig.backlog.send_video()
-    assert rig.backlog.text() == ""
     rig.play(0, 5, linked=True)
     rig.play(5, 35, linked=False)
     eventually(lambda: rig.backlog.numbers.video_s > 1.9, within_s=10, what="the frames are on disk")
     assert rig.backlog.send_video()
-    assert rig.backlog.text() == "kept 0 stills, 2 s"
     rig.backlog.close()

@@ -79,6 +79,11 @@ class StillStage:
         self.outcomes: Counter[str] = Counter()
         """What became of each object in the others."""
 
+    @property
+    def waiting(self) -> int:
+        """Stills whose base frame may still come."""
+        return len(self._pending)
+
     def take(self, stills: Sequence[ReceivedStill], now: Progress) -> None:
         """Take stills in the order in which they came; those whose base frame may still come wait for it."""
         self._pending += stills

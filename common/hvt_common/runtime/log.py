@@ -1,0 +1,152 @@
+"""The log of a program: lines for people, or one JSON object a line for programs."""
+
+from __future__ import annotations
+
+import json
+import logging
+import logging.handlers
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from types import MappingProxyType, TracebackType
+from typing import Any
+
+from hvt_common.errors import FlightError, UserError
+
+__all__ = ["LOG_FORMATS", "STATUS_LOGGER", "Log", "log_fields", "start_log"]
+
+LOG_FORMATS = ("text", "json")
+STATUS_LOGGER = "hvt.status"
+"""Of the lines that are a status line else; in JSON only."""
+
+_fields: ContextVar[Mapping[str, str]] = ContextVar("hvt_log_fields", default=MappingProxyType({}))
+
+
+def log_fields(**fields: str) -> None:
+    """Name what all further lines of this thread are about, such as ``edge``; empty for nothing."""
+    _fields.set({name: value for name, value in {**_fields.get(), **fields}.items() if value})
+
+
+def start_log(program: str, *, quiet: bool, form: str = "text", **fields: str) -> Log:
+    """Buffer the log until `Log.release`, then write it to stderr. So a start that fails says one sentence.
+
+    Unless ``quiet``, the provider of each network is logged, and with ``form="json"`` a line of status now and then.
+    ``fields`` are of every JSON line.
+    """
+    stream = logging.StreamHandler()
+    as_json = form == "json"
+    stream.setFormatter(
+        _JsonFormatter(program, fields) if as_json else logging.Formatter(f"{program}: %(message)s")
+    )
+    held = _HeldLog(stream)
+    held.addFilter(_with_fields)
+    logging.basicConfig(level=logging.WARNING, handlers=[held], force=True)
+    for name in ("hvt_common.inference.runtimes.model", *((STATUS_LOGGER,) if as_json else ())):
+        logging.getLogger(name).setLevel(logging.WARNING if quiet else logging.INFO)
+    log = Log(program, held, as_json=as_json)
+    if as_json:
+        logging.captureWarnings(capture=True)
+        sys.excepthook = log.crashed
+        threading.excepthook = lambda args: log.crashed(
+            args.exc_type, args.exc_value or args.exc_type(), args.exc_traceback
+        )
+    return log
+
+
+class Log:
+    """What `start_log` began."""
+
+    def __init__(self, program: str, held: _HeldLog, *, as_json: bool) -> None:
+        self._logger = logging.getLogger(program)
+        self._held = held
+        self.as_json = as_json
+        """One JSON object a line."""
+
+    def release(self) -> None:
+        """Write what is buffered, and from now on each line at once."""
+        self._held.say_on()
+
+    def result(self, content: Any) -> None:
+        """What a run came to, as one JSON line."""
+        self._write(logging.INFO, "ended", hvt_content={"summary": content})
+
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """Within it what ends the program with a sentence is one JSON line; what is buffered then is discarded."""
+        try:
+            yield
+        except (UserError, FlightError) as error:
+            if self.as_json:
+                self._write(logging.ERROR, str(error))
+                error.said = True
+            raise
+
+    def crashed(self, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        """A bug: its traceback, as one JSON line."""
+        self.release()
+        self._logger.critical("%s: %s", kind.__name__, error, exc_info=(kind, error, trace))
+
+    def _write(self, level: int, message: str, **extra: Any) -> None:
+        """Past what is buffered."""
+        record = self._logger.makeRecord(
+            self._logger.name, level, __file__, 0, message, (), None, extra=extra
+        )
+        self._held.target.handle(record)
+
+
+class _HeldLog(logging.handlers.MemoryHandler):
+    """Buffers records until `say_on`; without it they are discarded."""
+
+    target: logging.Handler
+
+    def __init__(self, target: logging.Handler) -> None:
+        super().__init__(10_000, target=target, flushOnClose=False)
+        self._free = False
+
+    def say_on(self) -> None:
+        """Write the buffered records, and from now on each at once."""
+        self._free = True
+        self.flush()
+
+    def shouldFlush(self, record: logging.LogRecord) -> bool:  # noqa: ARG002, N802 - the library's name
+        """At once, when free."""
+        return self._free
+
+    def flush(self) -> None:
+        """Discard at exit what is still buffered: logging itself would write it."""
+        if self._free:
+            super().flush()
+
+
+def _with_fields(record: logging.LogRecord) -> bool:
+    """In the thread that logs: a line that is buffered may be written by another."""
+    record.hvt_fields = _fields.get()
+    return True
+
+
+class _JsonFormatter(logging.Formatter):
+    """``time`` (ISO 8601, UTC), ``level``, ``program``, ``logger``, ``message``, what it is about, ``traceback``."""
+
+    def __init__(self, program: str, fields: Mapping[str, str]) -> None:
+        super().__init__()
+        self._program = program
+        self._fields = dict(fields)
+
+    def format(self, record: logging.LogRecord) -> str:
+        at = datetime.fromtimestamp(record.created, UTC)
+        line = {
+            "time": at.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            "level": record.levelname.lower(),
+            "program": self._program,
+            "logger": record.name,
+            "message": record.getMessage(),
+            **self._fields,
+            **getattr(record, "hvt_fields", {}),
+            **getattr(record, "hvt_content", {}),
+        }
+        if record.exc_info and record.exc_info[0] is not None:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False, default=str)

@@ -1,0 +1,78 @@
+"""``status``: how a program that runs with ``--metrics`` is, from another shell."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from hvt_common.errors import FlightError, Parser
+from hvt_common.runtime.reporting import say
+
+__all__ = ["StatusCommand"]
+
+_PATIENCE_S = 5.0
+_MOST_BYTES = 16 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class StatusCommand:
+    """``PROGRAM status``: prints the state as ``table`` makes it, which raises where it is another program's."""
+
+    program: str
+    what: str
+    """The kind of program, for people."""
+    address: str
+    """Where it answers, if nothing else is said."""
+    table: Callable[[dict[str, Any]], Table]
+
+    def run(self, argv: Sequence[str]) -> int:
+        """Print it once, or each second; `FlightError` where none answers."""
+        arguments = self._parser().parse_args(argv)
+        address: str = arguments.at
+        if not arguments.watch:
+            state, table = self._requested(address)
+            if arguments.json:
+                say(json.dumps(state))
+            else:
+                Console(highlight=False).print(table)
+            return 0
+        try:
+            if arguments.json:
+                while True:
+                    print(json.dumps(self._requested(address)[0]), flush=True)
+                    time.sleep(1)
+            with Live(self._requested(address)[1], refresh_per_second=4) as live:
+                while True:
+                    time.sleep(1)
+                    live.update(self._requested(address)[1])
+        except KeyboardInterrupt:
+            return 0
+
+    def _requested(self, address: str) -> tuple[dict[str, Any], Table]:
+        try:
+            with urllib.request.urlopen(f"http://{address}/state.json", timeout=_PATIENCE_S) as answer:
+                state: dict[str, Any] = json.loads(answer.read(_MOST_BYTES))
+            return state, self.table(state)
+        except (OSError, urllib.error.URLError, ValueError, KeyError, TypeError):
+            raise FlightError(
+                f"no {self.what} answers at {address}: start one with --metrics {address}, or say where it is with --at"
+            ) from None
+
+    def _parser(self) -> argparse.ArgumentParser:
+        parser = Parser(prog=f"{self.program} status", description=__doc__)
+        parser.add_argument(
+            "--at", default=self.address, metavar="HOST:PORT", help=f"its --metrics [{self.address}]"
+        )
+        parser.add_argument("--watch", action="store_true", help="again each second, until Ctrl-C")
+        parser.add_argument("--json", action="store_true", help="the whole state, a line each time")
+        return parser

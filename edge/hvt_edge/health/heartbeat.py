@@ -1,0 +1,38 @@
+"""The frame loop says once a second that it turns: a state for who watches, and a word for systemd's watchdog.
+
+Whoever lets the loop wait for something that may take long turns it meanwhile: a clip waits for its ground, a camera
+that is away yields a step without a frame each second. Only a loop that hangs says nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from hvt_common.runtime.process import notify_systemd
+from hvt_common.units import SECOND_NS
+from hvt_edge.health.state import EdgeState, Phase, StateMaker
+
+__all__ = ["Heartbeat"]
+
+
+class Heartbeat:
+    """In the frame loop; ``clock`` is wall time, in lockstep too."""
+
+    def __init__(self, maker: StateMaker, *, clock: Callable[[], int]) -> None:
+        self._maker = maker
+        self._clock = clock
+        self._due_ns = 0
+        self.state: EdgeState | None = None
+        """The newest; None before the first. Any thread may read it."""
+
+    def beat(self, phase: Phase) -> EdgeState:
+        """Make a state now."""
+        self._due_ns = self._clock() + SECOND_NS
+        self.state = self._maker.make(phase)
+        notify_systemd("WATCHDOG=1")
+        return self.state
+
+    def turn(self, phase: Phase) -> None:
+        """Make one if the last is a second old."""
+        if self._clock() >= self._due_ns:
+            self.beat(phase)

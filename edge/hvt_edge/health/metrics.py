@@ -1,0 +1,88 @@
+"""An edge's state as Prometheus reads it. What a ground tells too has the same name and the same value."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from prometheus_client.core import Metric
+
+from hvt_common.runtime.prometheus import Counter, Gauge, Table, exposition, of_table, seconds
+from hvt_common.units import SECOND_NS
+from hvt_edge.health.state import BacklogState, EdgeState
+
+__all__ = ["metrics_text"]
+
+_GAUGES: Table[EdgeState] = {
+    "hvt_budget_bits_per_second": ("The edge's budget.", lambda one: one.operating.budget_bps),
+    "hvt_edge_allowed_bits_per_second": ("What may be sent now.", lambda one: one.operating.allowed_bps),
+    "hvt_edge_budget_used_ratio": ("Of what may be sent.", lambda one: one.budget_share),
+    "hvt_edge_ground_listens": ("1 while a ground does.", lambda one: one.link.ground),
+    "hvt_edge_link_rate_bits_per_second": ("As measured.", lambda one: one.link.rate_bps),
+    "hvt_edge_round_trip_seconds": ("Of the link.", lambda one: seconds(one.link.round_trip_ms)),
+    "hvt_edge_source_silent_seconds": ("Since its last frame.", lambda one: one.source_silent_s),
+    "hvt_edge_encode_seconds": ("A picture at the edge.", lambda one: seconds(one.encode_ms)),
+    "hvt_edge_detect_seconds": ("A detection at the edge.", lambda one: seconds(one.perception_ms)),
+    "hvt_edge_stills_waiting": ("Stills in the edge's queue.", lambda one: one.stills_pending),
+    "hvt_edge_stills_in_flight": ("Sent, not reported.", lambda one: one.stills_in_flight),
+    "hvt_edge_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),
+    "hvt_edge_cores_needed": ("Cores for every frame.", lambda one: one.cores_needed),
+    "hvt_edge_cores_free": ("Cores that others leave.", lambda one: one.cores_free),
+    "hvt_edge_temperature_celsius": ("Of the hottest zone.", lambda one: one.system.temperature_c),
+    "hvt_edge_wireless_quality": ("As the driver counts.", lambda one: one.system.wireless_quality),
+    "hvt_edge_wireless_dbm": ("Level of the signal.", lambda one: one.system.wireless_dbm),
+}
+_COUNTERS: Table[EdgeState] = {
+    "hvt_edge_frames_captured": ("Of the source.", lambda one: one.frames.captured),
+    "hvt_edge_frames_encoded": ("Pictures.", lambda one: one.frames.encoded),
+    "hvt_edge_frames_dropped": ("Before encoding.", lambda one: one.frames.dropped),
+    "hvt_edge_frames_dropped_cpu": ("Of these, for want of CPU.", lambda one: one.frames.dropped_cpu),
+    "hvt_edge_frames_unanalyzed": ("Skipped by perception.", lambda one: one.frames.unanalyzed),
+    "hvt_edge_keyframes": ("Keyframes.", lambda one: one.keyframes),
+    "hvt_edge_keyframe_requests": ("Of grounds, served.", lambda one: one.keyframe_requests),
+    "hvt_edge_stills_sent": ("Stills.", lambda one: one.stills_sent),
+    "hvt_edge_messages_unusable": ("Damaged or foreign.", lambda one: one.link.unusable_messages),
+}
+_STORE_GAUGES: Table[BacklogState] = {
+    "hvt_edge_offline": ("1 while frames are stored.", lambda one: one.offline),
+    "hvt_edge_store_bytes": ("Stored.", lambda one: one.disk_bytes),
+    "hvt_edge_store_limit_bytes": ("--store.", lambda one: one.limit_bytes),
+    "hvt_edge_store_disk_free_bytes": ("Of its disk.", lambda one: one.disk_free_bytes),
+    "hvt_edge_store_stills": ("Stored stills.", lambda one: one.stills),
+    "hvt_edge_store_video_seconds": ("Stored video.", lambda one: one.video_s),
+}
+_STORE_COUNTERS: Table[BacklogState] = {
+    "hvt_edge_store_sent_stills": ("Stored stills that arrived.", lambda one: one.sent_stills),
+    "hvt_edge_store_evicted_stills": ("Given up for want of space.", lambda one: one.evicted_stills),
+}
+
+
+def metrics_text(state: EdgeState) -> bytes:
+    """The text format. Counters are of this run."""
+    return exposition(_metrics(state))
+
+
+def _metrics(state: EdgeState) -> Iterator[Metric]:
+    edge = state.edge
+    yield Gauge("hvt_state_timestamp_seconds", "Of this state.", state.at_ns / SECOND_NS)
+    sent = Gauge("hvt_edge_sent_bits_per_second", "Over the budget's window.", labels=("edge", "channel"))
+    channels = {
+        "base": state.base_bps,
+        "roi": state.roi_bps,
+        "backlog": state.backlog_bps,
+        "meta": state.meta_bps,
+    }
+    for channel, bps in channels.items():
+        if bps is not None:
+            sent.add_metric((edge, channel), bps)
+    failed = Gauge("hvt_part_failed", "1: does not work now.", labels=("part", "edge"))
+    for part in state.failed:
+        failed.add_metric((part.part, edge), 1)
+    not_sent = Counter("hvt_stills_not_sent", "Candidates without a still.", labels=("edge", "reason"))
+    for reason, count in state.stills_not_sent.items():
+        not_sent.add_metric((edge, reason), count)
+    yield from (sent, failed, not_sent)
+    yield from of_table(_GAUGES, Gauge, [(edge, state)])
+    yield from of_table(_COUNTERS, Counter, [(edge, state)])
+    stores = [] if state.backlog is None else [(edge, state.backlog)]
+    yield from of_table(_STORE_GAUGES, Gauge, stores)
+    yield from of_table(_STORE_COUNTERS, Counter, stores)

@@ -1,0 +1,337 @@
+"""What an edge knows at one moment, as one value.
+
+Made once a second (`StateMaker`). Status line, the wire's `Status`, metrics and ``hvt-edge status`` read from it what
+they have in common, so that none of them says what another does not. What is not known is None, never 0.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from hvt_common import __version__
+from hvt_common.protocol.channels import Channel
+from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.protocol.messages import WIRE_VERSION
+from hvt_common.runtime.failures import FailedPart, Failures
+from hvt_common.units import SECOND_NS
+from hvt_common.values import View
+from hvt_edge.backlog.stage import BacklogStage
+from hvt_edge.config import EdgeConfig
+from hvt_edge.health.system import SystemReading, read_system
+from hvt_edge.link.feedback import FeedbackInbox
+from hvt_edge.link.publisher import EdgeLink
+from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.loop.counts import FrameCounts
+from hvt_edge.loop.cpu import Cores
+from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.operating.point import Levers, LoopClock, Operating
+from hvt_edge.stills.stage import StillStage
+
+__all__ = [
+    "BacklogState",
+    "EdgeState",
+    "Frames",
+    "LinkState",
+    "OperatingState",
+    "Phase",
+    "StateMaker",
+    "lacks",
+]
+
+Phase = Literal["waiting", "running", "ended"]
+"""``waiting``: a clip waits for its first ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class OperatingState:
+    """The operating point."""
+
+    source_size: tuple[int, int]
+    base_size: tuple[int, int]
+    fps: float
+    """Frames a second that are coded, where nothing is dropped."""
+    decimation: int
+    """Each n-th source frame is coded."""
+    profile: str | None
+    preset: str
+    budget_bps: int
+    """As set or commanded."""
+    allowed_bps: int
+    """What may be sent now: less than the budget where the link carries less."""
+    base_budget_bps: int
+    """The base stream's share."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Since the start."""
+
+    captured: int
+    encoded: int
+    dropped_link: int
+    """Before encoding: the link had no room."""
+    dropped_cpu: int
+    """Before encoding: the machine was behind."""
+    unanalyzed: int
+    """Skipped by perception for want of time."""
+
+    @property
+    def dropped(self) -> int:
+        """Before encoding, all."""
+        return self.dropped_link + self.dropped_cpu
+
+
+@dataclass(frozen=True, slots=True)
+class LinkState:
+    """What the edge knows of its link."""
+
+    ground: bool
+    """Whether a ground listens."""
+    since_ns: int
+    """Since when that is so. Unix time."""
+    watched: bool
+    """Whether anybody listens to the video, also who reports nothing."""
+    trouble: str | None
+    """Why no ground can be reached, where that is known."""
+    reported_s: float | None
+    """Since a ground reported last."""
+    round_trip_ms: float | None
+    rate_bps: int | None
+    """What the link was found to carry; None where nobody measures it."""
+    unusable_messages: int
+    """Of grounds: damaged, foreign, or of another version."""
+
+
+@dataclass(frozen=True, slots=True)
+class BacklogState:
+    """What is stored while the link is away, and sent afterwards."""
+
+    offline: bool
+    """Frames and stills go into the store now."""
+    stills: int
+    """In the store, like the two below."""
+    segments: int
+    video_s: float
+    disk_bytes: int
+    limit_bytes: int
+    disk_free_bytes: int | None
+    """Of the disk that it lies on."""
+    frames_stored: int
+    """By this session."""
+    sent_stills: int
+    sent_video_s: float
+    evicted_stills: int
+    """Given up for want of space."""
+    evicted_segments: int
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeState:
+    """The edge and its session."""
+
+    at_ns: int
+    """Unix time, as all times here."""
+    version: str
+    schema_version: int
+    """Of the messages on the wire."""
+    edge: str
+    session: str
+    """Its id, hexadecimal."""
+    state: Phase
+    lockstep: bool
+    duration_s: float
+    method: str
+    levers: Levers
+    """What is sent beside the video, and why."""
+    operating: OperatingState
+    total_bps: float | None
+    """Over the budget's window, like those below; None before the first frame."""
+    base_bps: float | None
+    roi_bps: float | None
+    backlog_bps: float | None
+    meta_bps: float | None
+    budget_share: float | None
+    """What is used of what may be sent."""
+    frames: Frames
+    source_silent_s: float | None
+    """Since the source gave its last frame; None before the first."""
+    keyframes: int
+    keyframe_requests: int
+    """Of grounds, that were served."""
+    stills_sent: int
+    stills_pending: int
+    stills_in_flight: int
+    """Sent, and in no report yet."""
+    stills_not_sent: Mapping[str, int]
+    """Why candidates have no still, by reason."""
+    tracks: int
+    encode_ms: float | None
+    """Mean of one frame, since the start; like the next."""
+    perception_ms: float | None
+    cores_needed: float | None
+    """Processor cores for every frame, had none been left out."""
+    cores_free: float | None
+    """That other processes leave."""
+    system: SystemReading
+    link: LinkState
+    backlog: BacklogState | None
+    """None where nothing is stored."""
+    failed: tuple[FailedPart, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def lacks(state: EdgeState, *, patience_s: float) -> str:
+    """What keeps an edge whose loop turns from sending pictures; empty for nothing."""
+    if state.state == "waiting":
+        return "it waits for a ground"
+    silent_s = state.source_silent_s
+    if silent_s is not None and silent_s < patience_s:
+        return ""
+    said = "no picture yet" if silent_s is None else f"no picture for {silent_s:.0f} s"
+    return "; ".join([said, *(f"{one.part}: {one.reason}" for one in state.failed if one.part == "source")])
+
+
+@dataclass(eq=False)
+class StateMaker:
+    """Makes states, and remembers since when the link is as it is; in the frame loop."""
+
+    config: EdgeConfig
+    _: KW_ONLY
+    session_id: int
+    view: View
+    operating: Operating
+    ledger: Ledger
+    counts: FrameCounts
+    keyframes: KeyframeRequests
+    transmitter: Transmitter
+    stills: StillStage
+    backlog: BacklogStage | None
+    link: EdgeLink
+    inbox: FeedbackInbox
+    failures: Failures
+    clock: Callable[[], int]
+    loop_clock: LoopClock
+
+    def __post_init__(self) -> None:
+        self._ground, self._since_ns = False, self.clock()
+
+    def make(self, phase: Phase) -> EdgeState:
+        """The state now."""
+        config, counts, ledger, analyzer = self.config, self.counts, self.ledger, self.stills.analyzer
+        counts.measure_cpu(perception_ns=analyzer.spent_ns)
+        now_ns, now, cores = self.clock(), self.operating.now, counts.cpu.now
+        total_bps = self._bps(None)
+        outcomes = Counter(ledger.outcomes("deferred")) + Counter(ledger.outcomes("dropped"))
+        came_ns = counts.newest_came_ns
+        return EdgeState(
+            at_ns=now_ns,
+            version=__version__,
+            schema_version=WIRE_VERSION,
+            edge=config.edge_id,
+            session=f"{self.session_id:016x}",
+            state=phase,
+            lockstep=config.pace == "lockstep",
+            duration_s=counts.duration_s(config.nominal_fps),
+            method=now.method,
+            levers=now.levers,
+            operating=OperatingState(
+                source_size=self.view.source_size,
+                base_size=self.view.base_size,
+                fps=config.nominal_fps / now.decimation,
+                decimation=now.decimation,
+                profile=config.profile,
+                preset=config.preset,
+                budget_bps=now.budget_bps,
+                allowed_bps=now.total_bps,
+                base_budget_bps=now.base_bps,
+            ),
+            total_bps=total_bps,
+            base_bps=self._bps(Account.BASE),
+            roi_bps=self._bps(Account.ROI),
+            backlog_bps=self._bps(Account.BACKLOG),
+            meta_bps=self._bps(Account.META),
+            budget_share=None if total_bps is None else total_bps / now.total_bps,
+            frames=Frames(
+                captured=counts.captured,
+                encoded=counts.encoded,
+                dropped_link=counts.dropped_link,
+                dropped_cpu=counts.dropped_cpu,
+                unanalyzed=counts.unanalyzed,
+            ),
+            source_silent_s=None if came_ns is None else max(0.0, (now_ns - came_ns) / SECOND_NS),
+            keyframes=self.keyframes.sent,
+            keyframe_requests=self.keyframes.served,
+            stills_sent=sum(ledger.outcomes("sent").values()),
+            stills_pending=self.stills.pending,
+            stills_in_flight=self.stills.outbox.unacknowledged,
+            stills_not_sent=dict(outcomes),
+            tracks=analyzer.tracks,
+            encode_ms=counts.encode_ms if counts.encoded else None,
+            perception_ms=analyzer.mean_ms if analyzer.frames else None,
+            cores_needed=None if cores == Cores() else cores.needed,
+            cores_free=None if cores == Cores() else cores.free,
+            system=read_system(),
+            link=self._link(now_ns),
+            backlog=None if self.backlog is None else _backlog(self.backlog),
+            failed=self.failures.now,
+        )
+
+    def _bps(self, account: Account | None) -> float | None:
+        if not self.counts.encoded:
+            return None
+        return self.ledger.window_bytes(account, self.loop_clock()) * 8 * SECOND_NS / self.ledger.window_ns
+
+    def _link(self, now_ns: int) -> LinkState:
+        link, pacer, reported_ns = self.link, self.transmitter.pacer, self.inbox.received_ns
+        ground = link.has_ground()
+        if ground != self._ground:
+            self._ground, self._since_ns = ground, now_ns
+        round_trip_ns = None if pacer is None else pacer.measured_round_trip_ns
+        return LinkState(
+            ground=ground,
+            since_ns=self._since_ns,
+            watched=link.has_subscriber(Channel.BASE),
+            trouble=link.trouble or None,
+            reported_s=None if reported_ns is None else max(0, now_ns - reported_ns) / SECOND_NS,
+            round_trip_ms=None if round_trip_ns is None else round_trip_ns / 1e6,
+            rate_bps=None if pacer is None or round_trip_ns is None else pacer.rate_bps,
+            unusable_messages=link.unusable,
+        )
+
+
+def _backlog(backlog: BacklogStage) -> BacklogState:
+    numbers = backlog.numbers
+    return BacklogState(
+        offline=backlog.offline,
+        stills=numbers.stills,
+        segments=numbers.segments,
+        video_s=numbers.video_s,
+        disk_bytes=numbers.disk_bytes,
+        limit_bytes=backlog.max_bytes,
+        disk_free_bytes=_free_bytes(backlog.folder),
+        frames_stored=backlog.frames,
+        sent_stills=numbers.sent_stills,
+        sent_video_s=numbers.sent_video_s,
+        evicted_stills=numbers.evicted_stills,
+        evicted_segments=numbers.evicted_segments,
+    )
+
+
+def _free_bytes(folder: Path) -> int | None:
+    """Where it will be, before it is made."""
+    for path in (folder.absolute(), *folder.absolute().parents):
+        try:
+            return shutil.disk_usage(path).free
+        except FileNotFoundError:
+            continue
+        except OSError:
+            break
+    return None

@@ -1,0 +1,48 @@
+"""What the machine tells of itself: how hot it is, and how well its wireless link is."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["SystemReading", "read_system"]
+
+_ZONES = "sys/class/thermal/thermal_zone*/temp"
+_WIRELESS = "proc/net/wireless"
+_HEAD_LINES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class SystemReading:
+    """None where the system does not tell."""
+
+    temperature_c: float | None = None
+    """Of the hottest zone."""
+    wireless_quality: float | None = None
+    """As the driver counts it, of 70 with most."""
+    wireless_dbm: float | None = None
+
+
+def read_system(root: Path = Path("/")) -> SystemReading:
+    """Read it now; ``root`` is where ``sys`` and ``proc`` are."""
+    quality, level = _wireless(root / _WIRELESS)
+    return SystemReading(_hottest_c(root), quality, level)
+
+
+def _hottest_c(root: Path) -> float | None:
+    hottest: float | None = None
+    for zone in root.glob(_ZONES):
+        with contextlib.suppress(OSError, ValueError):  # a sensor that is switched off answers with an error
+            here = int(zone.read_text(encoding="ascii")) / 1000
+            hottest = here if hottest is None else max(hottest, here)
+    return hottest
+
+
+def _wireless(path: Path) -> tuple[float | None, float | None]:
+    """Quality and level of the first interface (proc(5)): ``wlan0: 0000  54.  -56.  -256 …``."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        _, _, rest = path.read_text(encoding="ascii").splitlines()[_HEAD_LINES].partition(":")
+        _, quality, level = (float(one) for one in rest.split()[:3])
+        return quality, level if level < 0 else None  # above, a driver of old counts in units of its own
+    return None, None

@@ -1,0 +1,119 @@
+"""The log as programs read it: one JSON object a line, of real flights and of programs that fail."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from datetime import datetime
+
+import pytest
+
+from programs.processes import Link
+
+pytestmark = [pytest.mark.integration, pytest.mark.timeout(180)]
+
+JSON = ("--log-format", "json")
+SMALL = (
+    "--fps",
+    "5",
+    "--size",
+    "320x192",
+    "--detector",
+    "motion",
+    "--edge-id",
+    "uav-1",
+    "--max-frames",
+    "40",
+)
+
+
+def lines(said: str) -> list[dict]:
+    """Each must be an object."""
+    return [json.loads(line) for line in said.splitlines()]
+
+
+def test_a_flight_is_told_in_objects_on_both_sides(tmp_path):
+    """A collector of logs would have to guess at what people read."""
+    with Link(tmp_path) as link:
+        ground = link.ground("--detector", "motion", "--classifier", "none", "--once", *JSON)
+        edge = link.edge("--source", "demo", *SMALL, *JSON)
+        summary = edge.finish()
+        ground.finish()
+    flown, received = lines(edge.said), lines(ground.said)
+    assert edge.told == ground.told == "", "the table is for people"
+    assert {(one["program"], one["edge"], one["session"]) for one in flown} == {
+        ("hvt-edge", "uav-1", summary["session"])
+    }
+    assert all(datetime.fromisoformat(one["time"]).utcoffset().seconds == 0 for one in flown + received)
+    assert any("a ground listens" in one["message"] for one in flown if one["logger"] == "hvt.status")
+    assert flown[-1]["summary"] == summary
+    assert received[-1]["summary"][0]["session"] == summary["session"]
+    assert {one["level"] for one in flown} == {"info"}
+
+
+EDGES = """
+import logging, threading
+from hvt_common.runtime.log import log_fields, start_log
+log = start_log("hvt-ground", quiet=True, form="json")
+def serve(edge):
+    log_fields(edge=edge, session="1f")
+    logging.getLogger("hvt_ground.link").warning("%s: damaged", edge)
+    log_fields(session="")
+    logging.getLogger("hvt_ground.link").warning("%s: ended", edge)
+for edge in ("uav-1", "uav-2"):
+    thread = threading.Thread(target=serve, args=(edge,))
+    thread.start()
+    thread.join()
+logging.getLogger("hvt_ground").warning("of none")
+log.release()
+"""
+
+
+def test_a_line_of_one_edge_names_it():
+    """Of a ground of many edges nobody could tell whose line it is."""
+    done = subprocess.run([sys.executable, "-c", EDGES], capture_output=True, text=True, check=True)
+    told = [(one["message"], one.get("edge"), one.get("session")) for one in lines(done.stderr)]
+    assert told == [
+        ("uav-1: damaged", "uav-1", "1f"),
+        ("uav-1: ended", "uav-1", None),
+        ("uav-2: damaged", "uav-2", "1f"),
+        ("uav-2: ended", "uav-2", None),
+        ("of none", None, None),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(("--source", "none.mp4"), "none.mp4"), (("--source", "demo", "--metrics", "none"), "--metrics 'none'")],
+)
+def test_what_ends_a_start_is_one_object(tmp_path, words, said):
+    """The one line that says why a service does not run would be the one that the collector drops."""
+    command = [sys.executable, "-m", "hvt_edge.cli", *words, *JSON]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    (line,) = lines(done.stderr)
+    assert said in line["message"]
+    assert (line["level"], line["edge"]) == ("error", "edge-1")
+
+
+BUG = """
+import threading
+from hvt_common.runtime.log import start_log
+log = start_log("hvt-edge", quiet=True, form="json", edge="uav-1")
+def bug():
+    raise ValueError("of a thread")
+thread = threading.Thread(target=bug)
+thread.start()
+thread.join()
+raise KeyError("of the program")
+"""
+
+
+def test_a_traceback_is_inside_its_object():
+    """Each of its lines would be an entry of its own, between those of other services."""
+    done = subprocess.run([sys.executable, "-c", BUG], capture_output=True, text=True, check=False)
+    first, second = lines(done.stderr)
+    assert "ValueError: of a thread" in first["traceback"]
+    assert second["traceback"].startswith("Traceback")
+    assert (first["level"], second["message"]) == ("critical", "KeyError: 'of the program'")
