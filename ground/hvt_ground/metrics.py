@@ -25,12 +25,12 @@ _GAUGES: Table[SessionState] = {
     "hvt_tracks": ("Distinct tracks of the session.", lambda one: one.tracks),
     "hvt_tracks_refined": ("Of these, refined by a still.", lambda one: one.tracks_refined),
     "hvt_tracks_doubted": ("Shown, and doubted by stills.", lambda one: one.tracks_doubted),
-    "hvt_stills_waiting": ("To be read.", lambda one: one.stills_waiting),
+    "hvt_stills_pending": ("To be read.", lambda one: one.stills_pending),
     "hvt_budget_used_ratio": ("Of the edge's budget.", lambda one: one.budget_share),
     "hvt_backlog_objects_working": ("Stored objects in hand.", lambda one: one.backlog_working),
     "hvt_edge_detect_seconds": ("A detection at the edge.", lambda one: seconds(one.edge_detect_ms)),
     "hvt_edge_encode_seconds": ("A picture at the edge.", lambda one: seconds(one.edge_encode_ms)),
-    "hvt_edge_stills_waiting": ("Stills in the edge's queue.", lambda one: one.edge_still_queue),
+    "hvt_edge_stills_pending": ("Stills in the edge's queue.", lambda one: one.edge_still_queue),
 }
 _COUNTERS: Table[SessionState] = {
     "hvt_frames_received": ("Access units.", lambda one: one.frames_received),

@@ -71,7 +71,7 @@ class SessionState:
     corrupt: int
     keyframe_requests: int
     stills_received: int
-    stills_waiting: int
+    stills_pending: int
     """For their turn or their base frame."""
     still_outcomes: Mapping[str, int]
     """What became of the objects in them."""
@@ -249,7 +249,7 @@ def _session(session: GroundSession, sessions: EdgeSessions, *, link: LinkState,
         corrupt=counters.corrupt,
         keyframe_requests=counters.keyframe_requests,
         stills_received=session.stills_received,
-        stills_waiting=session.worker.stills_queued + pipeline.stills_waiting,
+        stills_pending=session.worker.stills_queued + pipeline.stills_pending,
         still_outcomes=dict(pipeline.outcomes),
         stills_not_sent=dict(session.not_sent),
         tracks=pipeline.tracks,

@@ -71,7 +71,7 @@ def test_a_ground_in_service_can_be_watched(tmp_path):
         session = state["edges"][0]["session"]
         assert session["frames_received"] > 5
         assert 0 < session["budget_share"] <= 1
-        assert (session["stills_waiting"], session["tracks_doubted"]) == (0, 0), "video alone"
+        assert (session["stills_pending"], session["tracks_doubted"]) == (0, 0), "video alone"
         assert state["schema_version"] == WIRE_VERSION
         with pytest.raises(urllib.error.HTTPError, match="404"):
             read(address, "/../../etc/passwd")

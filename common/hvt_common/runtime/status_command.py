@@ -63,9 +63,10 @@ class StatusCommand:
             with urllib.request.urlopen(f"http://{address}/state.json", timeout=_PATIENCE_S) as answer:
                 state: dict[str, Any] = json.loads(answer.read(_MOST_BYTES))
             return state, self.table(state)
-        except (OSError, urllib.error.URLError, ValueError, KeyError, TypeError):
+        except (OSError, urllib.error.URLError, ValueError, KeyError, TypeError, AttributeError):
             raise FlightError(
-                f"no {self.what} answers at {address}: start one with --metrics {address}, or say where it is with --at"
+                f"no {self.what} answers at {address}: start one with --metrics {address}, or say where it is with "
+                "--at"
             ) from None
 
     def _parser(self) -> argparse.ArgumentParser:

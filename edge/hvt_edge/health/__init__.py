@@ -1,5 +1,4 @@
-"""How an edge is: `state` once a second as one value, by the `heartbeat` of its loop, told as `metrics`, or to a
-`watch` from another shell.
+"""How an edge is: `state` once a second as one value, by the `heartbeat` of its loop.
 
-`system` reads what the machine tells of itself.
+`metrics` and `watch` tell it to programs and to people in another shell; `system` reads what the machine tells.
 """

@@ -134,9 +134,9 @@ class Pipeline:
         return self._track_ids.count
 
     @property
-    def stills_waiting(self) -> int:
+    def stills_pending(self) -> int:
         """For their base frame."""
-        return self._stills.waiting
+        return self._stills.pending
 
     @property
     def history_bytes(self) -> int:

@@ -80,7 +80,7 @@ class StillStage:
         """What became of each object in the others."""
 
     @property
-    def waiting(self) -> int:
+    def pending(self) -> int:
         """Stills whose base frame may still come."""
         return len(self._pending)
 
