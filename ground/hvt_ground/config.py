@@ -137,6 +137,11 @@ class GroundConfig:
         f"also serve the page for browsers at HOST:PORT; alone: {DEFAULT_PAGE}; beyond this machine it takes a token",
         bare=DEFAULT_PAGE,
     )
+    web_proxy: str | None = _FILES_RARE.option(
+        TEXT,
+        None,
+        "a reverse proxy shows the page at this host; it says in X-HVT-Role who is viewer or operator",
+    )
     metrics: str | None = _FILES.option(
         TEXT,
         None,
@@ -167,6 +172,8 @@ def check(config: GroundConfig) -> GroundConfig:
     """Return the configuration; `UserError` where settings contradict."""
     _check_files(config)
     _check_retention(config)
+    if config.web_proxy is not None and config.web is None:
+        raise UserError(f"--web-proxy {config.web_proxy} is given without --web: give --web too")
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):

@@ -25,7 +25,7 @@ from hvt_common.protocol.messages import (
     TrackStepDecoder,
 )
 from hvt_common.transport.inbox import Received
-from hvt_common.units import SECOND_NS, counts_text
+from hvt_common.units import SECOND_NS, bitrate_text, counts_text
 from hvt_common.values import Tracks
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.backlog.perception import BacklogPerception
@@ -224,6 +224,8 @@ class GroundSession:
 
     def learn(self, info: Info) -> None:
         """What the edge says of the session now: budget and method may be others than at its beginning."""
+        if (info.budget_bps, info.method) != (self.budget_bps, self.method):
+            self.note("info", f"budget {bitrate_text(info.budget_bps)}, {info.method} from now on")
         self.budget_bps, self.method = info.budget_bps, info.method
         self._account.budget_bps = info.budget_bps
 

@@ -1,6 +1,6 @@
 """Who may open the page, and what for: tokens, roles, and requests that come from our own page alone.
 
-On loopback everybody on this machine is an operator; elsewhere a token says who somebody is.
+On loopback everybody on this machine is an operator, or a reverse proxy says who somebody is; elsewhere a token does.
 """
 
 from __future__ import annotations
@@ -13,18 +13,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 from urllib.parse import urlsplit
 
 import platformdirs
 
 from hvt_common.errors import UserError
 
-__all__ = ["COOKIE", "HEADERS", "Access", "Role", "is_loopback", "own_tokens"]
+__all__ = ["COOKIE", "HEADERS", "ROLE_HEADER", "Access", "Role", "is_loopback", "own_tokens"]
 
 Role = Literal["viewer", "operator"]
 
 COOKIE = "hvt"
+ROLE_HEADER = "X-HVT-Role"
+"""In it a reverse proxy names the role."""
 HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; media-src blob:; "
@@ -36,6 +38,7 @@ HEADERS = {
     "Cache-Control": "no-cache",
 }
 _LEAST_TOKEN = 16
+_FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
@@ -46,19 +49,34 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """``tokens`` by role; empty on loopback, where there are none."""
+    """``tokens`` by role, empty on loopback, where are none; ``proxy`` is the host for which one answers there."""
 
     tokens: Mapping[Role, str]
+    proxy: str | None = None
 
     def role(self, headers: Mapping[str, str], *, token: str | None = None) -> Role | None:
         """What a request may do; None is nothing. ``token`` is that of a link, else the cookie counts."""
         if not self.tokens:
             # Another site's name may be made to lead here: only our own names are answered.
             host = urlsplit(f"//{headers.get('host', '')}").hostname or ""
-            return "operator" if is_loopback(host) else None
+            if not is_loopback(host) and host != self.proxy:
+                return None
+            if self.proxy is None:  # what came through a proxy that nobody told of may come from anywhere
+                return None if any(one in headers for one in _FORWARDED) else "operator"
+            said = headers.get(ROLE_HEADER.lower())
+            return next((role for role in get_args(Role) if role == said), None)
         given = (token or _cookie(headers.get("cookie", ""))).encode()
         found = [role for role, known in self.tokens.items() if hmac.compare_digest(given, known.encode())]
         return found[0] if found else None
+
+    @property
+    def refusal(self) -> tuple[str, int]:
+        """What somebody without a role is told, and the status."""
+        if self.tokens:
+            return "give the link that hvt-ground showed at its start", 401
+        if self.proxy is not None:
+            return f"the proxy of {self.proxy} has to say in {ROLE_HEADER} who is viewer or operator", 403
+        return "unknown host, or a reverse proxy without --web-proxy", 403
 
     @staticmethod
     def same_origin(headers: Mapping[str, str]) -> bool:

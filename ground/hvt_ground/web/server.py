@@ -36,14 +36,21 @@ _END_S = 2.0
 class WebPage:
     """Serves the page at ``address`` (HOST:PORT) while the context lasts; ``clock`` is the ground's.
 
-    ``keys``, a certificate and its key, encrypt it beyond loopback. Raises `UserError` where the address, the tokens
-    or the keys cannot be used.
+    ``keys``, a certificate and its key, encrypt it beyond loopback. ``proxy`` is the host for which a reverse proxy
+    on this machine answers. Raises `UserError` where the address, the tokens or the keys cannot be used.
     """
 
     def __init__(
-        self, address: str, *, clock: Callable[[], int], keys: tuple[Path, Path] | None = None
+        self,
+        address: str,
+        *,
+        clock: Callable[[], int],
+        keys: tuple[Path, Path] | None = None,
+        proxy: str | None = None,
     ) -> None:
         host, port = _parsed(address)
+        if proxy is not None:
+            _check_proxy(proxy, address, local=is_loopback(host))
         tokens = {} if is_loopback(host) else own_tokens()
         keys = keys if tokens else None
         if keys is not None:
@@ -52,13 +59,14 @@ class WebPage:
         self._socket = _bound(host, port)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
         start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
-        self.links = tuple(f"{start}?token={token} ({role})" for role, token in tokens.items()) or (start,)
+        by_token = tuple(f"{start}?token={token} ({role})" for role, token in tokens.items())
+        self.links = by_token or (start if proxy is None else f"https://{proxy}/",)
         """What to open, one for each role."""
         self._client: EdgeClient | None = None
         self._loop = asyncio.new_event_loop()
         self._hub = Hub(self._loop)
         config = uvicorn.Config(
-            make_site(Access(tokens), self._hub, EdgeRequests(self._control)),
+            make_site(Access(tokens, proxy), self._hub, EdgeRequests(self._control)),
             ssl_certfile=None if keys is None else keys[0],
             ssl_keyfile=None if keys is None else keys[1],
             http=_BoundedProtocol,
@@ -143,6 +151,16 @@ def _parsed(address: str) -> tuple[str, int]:
     if not host or not port or parts.path or parts.query:
         raise UserError(f"--web {address!r} is not accepted: give HOST:PORT, such as 127.0.0.1:8080")
     return host, port
+
+
+def _check_proxy(proxy: str, address: str, *, local: bool) -> None:
+    if not local:
+        raise UserError(
+            f"--web-proxy {proxy} needs a page on this machine alone, and --web is {address}: give "
+            "127.0.0.1 as its host"
+        )
+    if urlsplit(f"//{proxy}").hostname != proxy:
+        raise UserError(f"--web-proxy {proxy!r} is not accepted: give a host, such as hvt.example.org")
 
 
 def _check_keys(certificate: Path, key: Path) -> None:

@@ -237,10 +237,7 @@ class _Guard:
             token = Request(scope).query_params.get("token")
         role = self._access.role(headers, token=token)
         if role is None:
-            what = (
-                "give the link that hvt-ground showed at its start" if self._access.tokens else "unknown host"
-            )
-            return PlainTextResponse(what, 401 if self._access.tokens else 403)
+            return PlainTextResponse(*self._access.refusal)
         scope["role"] = role
         acts = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD")
         if acts and not self._access.same_origin(headers):

@@ -64,6 +64,11 @@ def joined(port: int, **more) -> ClientConnection:
     return connect(f"ws://127.0.0.1:{port}/ws", origin=f"http://127.0.0.1:{port}", open_timeout=10, **more)
 
 
+def reached(port: int) -> socket.socket:
+    """As a proxy on this machine does."""
+    return socket.create_connection(("127.0.0.1", port), timeout=10)
+
+
 def ended(viewer: ClientConnection) -> None:
     """Take what comes until the connection is closed, which raises."""
     while True:
@@ -114,6 +119,45 @@ def test_a_page_of_another_site_cannot_watch_or_command(local):
     with pytest.raises(InvalidStatus):
         connect(f"ws://127.0.0.1:{local}/ws")
     assert asked(local, "/edges/uav-1/keyframe", "POST", b"{}", Origin="http://evil.example")[0] == 403
+
+
+def test_a_proxy_says_who_somebody_is(port):
+    """A team that logs in at its own door would share one token."""
+    with WebPage(f"127.0.0.1:{port}", clock=time.time_ns, proxy="hvt.example.org") as page:
+        assert page.links == ("https://hvt.example.org/",)
+        host, origin = "hvt.example.org", "https://hvt.example.org"
+        for role in ("viewer", "operator"):
+            headers = {"X-HVT-Role": role, "Host": host}
+            assert asked(port, "/", **headers)[0] == 200
+            with connect(
+                f"ws://{host}/ws", sock=reached(port), origin=origin, additional_headers={"X-HVT-Role": role}
+            ) as one:
+                assert json.loads(one.recv())["role"] == role
+            answer = asked(port, "/edges/uav-1/keyframe", "POST", b"{}", Origin=origin, **headers)
+            assert answer[0] == (403 if role == "viewer" else 400), answer[2]
+        for role in ("", "admin", "operator, viewer"):
+            assert asked(port, "/", Host=host, X_HVT_Role=role)[0] == 403
+        assert asked(port, "/", Host=host)[0] == asked(port, "/")[0] == 403
+        assert asked(port, "/", Host="evil.example", X_HVT_Role="operator")[0] == 403
+
+
+def test_a_proxy_that_nobody_told_of_lets_nobody_in(local):
+    """Everybody who comes through it would seem to sit at this machine, and be an operator."""
+    status, _, text = asked(local, "/", X_Forwarded_For="192.0.2.7")
+    assert (status, "--web-proxy" in text) == (403, True)
+
+
+@pytest.mark.parametrize(
+    ("address", "proxy", "sentence"),
+    [
+        ("0.0.0.0", "hvt.example.org", "needs a page on this machine alone"),
+        ("127.0.0.1", "https://hvt.example.org/", "give a host, such as hvt.example.org"),
+    ],
+)
+def test_a_proxy_that_cannot_be_is_refused(port, address, proxy, sentence):
+    """The role would come from anybody, or from nobody."""
+    with pytest.raises(UserError, match=sentence):
+        WebPage(f"{address}:{port}", clock=time.time_ns, proxy=proxy)
 
 
 def test_elsewhere_nothing_is_shown_without_the_token(public, state_folder):

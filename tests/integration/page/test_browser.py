@@ -198,6 +198,19 @@ def test_steps_back_and_to_the_picture_of_now(page):
     shows(page, after=paused + 5)
 
 
+def test_an_event_leads_to_its_picture(page):
+    """Who reads that something happened would search two minutes for it."""
+    shows(page)
+    page.locator("#budget").fill("400")
+    page.locator("#settings button").click()
+    event = page.locator("#events li", has_text="budget 400 kbps").get_by_role("button")
+    event.wait_for(timeout=60_000)
+    newest = shows(page, after=frame(page) + 20)
+    event.click()
+    eventually(lambda: frame(page) < newest - 10, within_s=10, what="the picture of that time")
+    assert "ago" in page.inner_text("#age")
+
+
 def test_the_page_fits_a_phone(flight):
     """Half of it would lie beside the screen."""
     page = flight.page(viewport={"width": 390, "height": 844}, color_scheme="light")
@@ -210,13 +223,23 @@ def test_nothing_jumps_while_the_picture_comes(flight):
     """Who wants to click on a car would hit a button that just moved there."""
     page = flight.page()
     shows(page)
+    stills = page.locator("#stills li")
+    eventually(lambda: stills.count(), within_s=20, what="a still")
+    page.locator("#stills").hover()
+    seen = stills.count()
     page.evaluate("""() => {
       window.shift = 0;
-      new PerformanceObserver((list) => list.getEntries().forEach((one) => { window.shift += one.value; }))
-        .observe({ type: "layout-shift" });
+      window.moved = [];
+      const note = (one) => {
+        window.shift += one.value;
+        window.moved.push(...one.sources.map(({ node }) => node?.id || node?.parentElement?.id || String(node)));
+      };
+      new PerformanceObserver((list) => list.getEntries().forEach(note)).observe({ type: "layout-shift" });
     }""")
     time.sleep(4)
-    assert page.evaluate("window.shift") < 0.1
+    assert page.evaluate("window.shift") < 0.1, page.evaluate("window.moved")
+    page.mouse.move(5, 5)
+    eventually(lambda: stills.count() > seen, within_s=20, what="what came meanwhile")
     page.context.close()
 
 

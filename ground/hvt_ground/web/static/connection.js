@@ -4,10 +4,11 @@
 
 const PAUSES_MS = [300, 1000, 2000, 4000];
 const SILENT_MS = 6000;
+const NOTHING = new Uint8Array(0);
 
 export class Connection {
   /**
-   * @param {(message: Message, payload: Uint8Array | null) => void} onMessage
+   * @param {(message: Message, payload: Uint8Array) => void} onMessage empty where there is none
    * @param {(state: "connected" | "waiting") => void} onState
    */
   constructor(onMessage, onState) {
@@ -47,7 +48,7 @@ export class Connection {
     };
     socket.onmessage = (event) => {
       this.heard = performance.now();
-      if (typeof event.data === "string") this.take(JSON.parse(event.data), null);
+      if (typeof event.data === "string") this.take(JSON.parse(event.data), NOTHING);
       else this.take(...unpacked(event.data));
     };
     socket.onclose = () => {
@@ -58,7 +59,7 @@ export class Connection {
     };
   }
 
-  /** @param {Message} message @param {Uint8Array | null} payload */
+  /** @param {Message} message @param {Uint8Array} payload */
   take(message, payload) {
     if (message.type !== "time") {
       this.onMessage(message, payload);

@@ -10,6 +10,7 @@ import { Wall, kbps, make } from "./wall.js";
 /** @typedef {import("./connection.js").Message} Message */
 
 const GAP_MS = 1000; // without a new picture
+/** @type {Record<string, string>} */
 const LINK_WORDS = {
   waiting: "waiting for a keyframe",
   up: "link up",
@@ -21,6 +22,7 @@ const WAIT_FOR_NAMED_MS = 1500;
 const MOST_EVENTS = 200;
 const SET_MS = 30000;
 const METHODS = ["M0", "M1", "M2", "M3", "M4", "M5", "M6"];
+/** @type {Record<string, string>} */
 const RUNG_WORDS = {
   hevc: "HEVC, as received",
   h264: "H.264, coded again",
@@ -36,8 +38,8 @@ const sessions = new Map();
 const links = new Map();
 /** When this page last set something, by edge. @type {Map<string, number>} */
 const setAt = new Map();
-/** @type {string | null} */
-let chosen = null;
+/** Empty before there is one. */
+let chosen = "";
 let rungs = Player.rungs();
 let role = "viewer";
 let shown = { frame: -1, captured: 0, at: 0 };
@@ -52,7 +54,7 @@ const connection = new Connection(onMessage, onState);
 
 const wanted = new URLSearchParams(location.hash.slice(1)).get("rung");
 if (wanted && rungs.includes(wanted)) rungs = rungs.slice(rungs.indexOf(wanted));
-wall.mark(null);
+wall.mark("");
 
 /** @param {"connected" | "waiting"} state */
 function onState(state) {
@@ -62,7 +64,7 @@ function onState(state) {
   if (chosen) watch();
 }
 
-/** @param {Message} message @param {Uint8Array | null} payload */
+/** @param {Message} message @param {Uint8Array} payload */
 function onMessage(message, payload) {
   const mine = message.edge === chosen;
   switch (message.type) {
@@ -124,7 +126,7 @@ function chooseFirst() {
   const [first] = [...sessions.keys()].sort();
   if (named && sessions.has(named)) choose(named);
   else if (!named && sessions.size) choose(first);
-  else setTimeout(() => chosen ?? choose(first), WAIT_FOR_NAMED_MS);
+  else setTimeout(() => chosen || choose(first), WAIT_FOR_NAMED_MS);
 }
 
 /** @param {string} edge */
@@ -132,7 +134,7 @@ function choose(edge) {
   if (edge === chosen) return;
   chosen = edge;
   history.replaceState(null, "", `#${new URLSearchParams({ edge, ...(wanted ? { rung: wanted } : {}) })}`);
-  document.querySelector("main").hidden = false;
+  by("main").hidden = false;
   wall.mark(edge);
   plot.show(edge);
   shown = { frame: -1, captured: 0, at: 0 };
@@ -329,8 +331,16 @@ function onGroundState(message) {
 function addEvent(message) {
   const item = document.createElement("li");
   item.className = message.level;
-  const time = make("time", "", item);
+  const time = make("button", "", item);
   time.textContent = clock(message.at * 1000);
+  time.setAttribute("aria-label", `the picture of ${clock(message.at * 1000)}`);
+  time.addEventListener("click", () => {
+    if (player.show(message.captured)) showAge();
+    else {
+      time.disabled = true;
+      time.title = "no longer at hand: see the recording";
+    }
+  });
   make("span", "", item).textContent = message.text;
   by("events").prepend(item);
   while (by("events").children.length > MOST_EVENTS) by("events").lastElementChild.remove();
@@ -338,6 +348,7 @@ function addEvent(message) {
 
 // Keys and buttons
 
+/** @type {Record<string, () => void>} */
 const actions = {
   pause: () => {
     if (player.live) player.pause();

@@ -6,6 +6,10 @@ const KEPT_S = 125; // for steps back
 const BEHIND_S = 0.8; // beyond, it jumps
 const HURRY_FRAMES = 2.5;
 const MOST_WAITING = 600;
+// Safari on a phone has only the former.
+const MANAGED = "ManagedMediaSource" in window;
+/** @type {typeof MediaSource} */
+const Source = /** @type {any} */ (window).ManagedMediaSource ?? window.MediaSource;
 
 export class Player {
   /**
@@ -48,8 +52,7 @@ export class Player {
 
   /** The rungs that this browser can show, best first. */
   static rungs() {
-    const source = window.ManagedMediaSource || window.MediaSource;
-    const can = (/** @type {string} */ codec) => Boolean(source && source.isTypeSupported(`video/mp4; codecs="${codec}"`));
+    const can = (/** @type {string} */ codec) => Boolean(Source?.isTypeSupported(`video/mp4; codecs="${codec}"`));
     return [...(can("hvc1.1.6.L93.B0") ? ["hevc"] : []), ...(can("avc1.42c01f") ? ["h264"] : []), "jpeg"];
   }
 
@@ -66,22 +69,23 @@ export class Player {
   start(start) {
     this.reset();
     this.stream = start.stream;
-    const source = new (window.ManagedMediaSource || window.MediaSource)();
     const type = `video/mp4; codecs="${start.codec}"`;
-    if (!source.constructor.isTypeSupported(type)) {
+    if (!Source?.isTypeSupported(type)) {
       this.onFailed();
       return;
     }
     this.image.hidden = true;
     this.video.hidden = false;
-    if (window.ManagedMediaSource) this.video.disableRemotePlayback = true;
+    if (MANAGED) this.video.disableRemotePlayback = true;
+    const source = new Source();
     const old = this.video.src;
     this.video.src = URL.createObjectURL(source);
     if (old) URL.revokeObjectURL(old);
     source.addEventListener("sourceopen", () => {
       if (this.stream !== start.stream) return;
-      this.buffer = source.addSourceBuffer(type);
-      this.buffer.addEventListener("updateend", () => this.pump());
+      const buffer = source.addSourceBuffer(type);
+      buffer.addEventListener("updateend", () => this.pump());
+      this.buffer = buffer;
       this.pump();
     }, { once: true });
   }
@@ -120,13 +124,29 @@ export class Player {
     this.video.pause();
   }
 
-  /** Seconds from here; into the future as far as there is any. @param {number} seconds */
+  /**
+   * Seconds from here; into the future as far as there is any.
+   * @param {number} seconds
+   */
   step(seconds) {
     const { buffered } = this.video;
     if (!buffered.length) return;
     this.live = false;
     const at = this.video.currentTime + seconds;
     this.video.currentTime = Math.max(buffered.start(0) + 0.01, Math.min(at, buffered.end(buffered.length - 1) - 0.01));
+  }
+
+  /**
+   * Stop at the picture of a time, where it is still at hand.
+   * @param {number} captured @returns {boolean} whether it is
+   */
+  show(captured) {
+    const picture = this.pictures.filter((one) => one.captured <= captured + 1).pop();
+    const { buffered } = this.video;
+    if (!picture || !buffered.length || picture.media < buffered.start(0)) return false;
+    this.pause();
+    this.video.currentTime = Math.min(picture.media + 0.01, buffered.end(buffered.length - 1) - 0.01);
+    return true;
   }
 
   /** Play on from here. */
@@ -182,7 +202,10 @@ export class Player {
     this.catchUp(false);
   }
 
-  /** Keep to the newest picture. @param {boolean} jump */
+  /**
+   * Keep to the newest picture.
+   * @param {boolean} jump
+   */
   catchUp(jump) {
     const { video } = this;
     const newest = this.pictures[this.pictures.length - 1];

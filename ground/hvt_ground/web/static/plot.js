@@ -22,7 +22,10 @@ export class Plot {
     if (edge === this.edge) this.draw();
   }
 
-  /** What was before this page was opened. @param {string} edge @param {number[][]} rows */
+  /**
+   * What was before this page was opened.
+   * @param {string} edge @param {number[][]} rows
+   */
   fill(edge, rows) {
     this.rows.set(edge, rows.map(([at, total, base, budget]) => ({ at, total, base, budget })));
     this.draw();

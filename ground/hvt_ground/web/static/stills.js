@@ -13,14 +13,41 @@ export class Stills {
   constructor(list, large) {
     this.list = list;
     this.large = large;
+    /**
+     * Those that came while somebody was about to click on another.
+     * @type {Still[]}
+     */
+    this.pending = [];
+    this.pointed = false;
+    list.addEventListener("pointerenter", (event) => {
+      this.pointed = event.pointerType === "mouse";
+    });
+    list.addEventListener("pointerleave", () => {
+      this.pointed = false;
+      this.showPending();
+    });
+    list.addEventListener("focusout", () => setTimeout(() => this.showPending()));
   }
 
   reset() {
+    this.pending = [];
     this.list.replaceChildren();
   }
 
   /** @param {Still} still */
   add(still) {
+    this.pending.push(still);
+    if (this.pending.length > MOST) this.pending.shift();
+    this.showPending();
+  }
+
+  showPending() {
+    if (this.pointed || this.list.contains(document.activeElement)) return;
+    for (const still of this.pending.splice(0)) this.show(still);
+  }
+
+  /** @param {Still} still */
+  show(still) {
     const item = document.createElement("li");
     const button = make("button", "", item);
     button.dataset.still = still.id;
@@ -40,18 +67,23 @@ export class Stills {
     make("small", "", words).textContent = `${clock(still.captured)} · ${reasonOf(still)}${still.stored ? " · came afterwards" : ""}`;
     button.addEventListener("click", () => this.open(still));
     this.list.prepend(item);
-    while (this.list.children.length > MOST) this.list.lastElementChild.remove();
+    while (this.list.children.length > MOST) this.list.lastElementChild?.remove();
   }
 
   /** @param {Still} still */
   open(still) {
     for (const which of ["still", "base"]) {
-      const picture = /** @type {HTMLImageElement} */ (this.large.querySelector(`#large-${which}`));
-      picture.closest("figure").hidden = !still.shows.includes(which);
+      const picture = this.part(`#large-${which}`);
+      picture.parentElement.hidden = !still.shows.includes(which);
       if (still.shows.includes(which)) picture.src = address(still, which);
     }
-    this.large.querySelector("#large-text").textContent = `${sentence(still)} · ${clock(still.captured)} · ${reasonOf(still)}`;
+    this.part("#large-text").textContent = `${sentence(still)} · ${clock(still.captured)} · ${reasonOf(still)}`;
     this.large.showModal();
+  }
+
+  /** @param {string} selector @returns {any} */
+  part(selector) {
+    return this.large.querySelector(selector);
   }
 }
 

@@ -8,7 +8,7 @@ export class Wall {
     this.root = root;
     this.nobody = nobody;
     this.onChoose = onChoose;
-    /** @type {Map<string, Record<string, HTMLElement>>} */
+    /** @type {Map<string, Record<string, any>>} */
     this.cards = new Map();
   }
 
@@ -36,8 +36,7 @@ export class Wall {
     this.cards.set(edge, card);
     this.nobody.hidden = true;
     const after = [...this.cards.keys()].sort();
-    const next = after[after.indexOf(edge) + 1];
-    this.root.insertBefore(button, next ? this.cards.get(next).button : null);
+    this.root.insertBefore(button, this.cards.get(after[after.indexOf(edge) + 1])?.button ?? null);
     return card;
   }
 
@@ -61,14 +60,15 @@ export class Wall {
     const card = this.card(edge);
     card.light.dataset.state = state.link;
     card.state.textContent = `${state.link} ${lasting(now - state.since)}`;
-    const known = state.total !== null && state.budget !== null;
-    card.bar.value = known ? Math.min(1, state.total / state.budget) : 0;
-    card.bar.title = known ? `${kbps(state.total)} of ${kbps(state.budget)}` : "";
+    const { total, budget } = state;
+    const known = total !== null && budget !== null;
+    card.bar.value = known ? Math.min(1, total / budget) : 0;
+    card.bar.title = known ? `${kbps(total)} of ${kbps(budget)}` : "";
   }
 
-  /** @param {string | null} chosen */
+  /** @param {string} chosen empty for none */
   mark(chosen) {
-    this.root.classList.toggle("alone", chosen === null);
+    this.root.classList.toggle("alone", !chosen);
     for (const [edge, { button }] of this.cards) button.setAttribute("aria-current", String(edge === chosen));
   }
 }
