@@ -13,6 +13,7 @@ from hvt_common.runtime.process import leave, limit_malloc_arenas, stop_on_signa
 from hvt_common.runtime.reporting import print_table, write_json
 from hvt_edge.app import Edge
 from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.doctor import command as doctor
 from hvt_edge.health import watch
 from hvt_edge.summary import table, title
 from hvt_edge.world import World
@@ -21,7 +22,8 @@ __all__ = ["main", "program"]
 
 _DESCRIPTION = (
     "Publish a camera or clip over Zenoh: a low-bitrate HEVC base stream, and sharp stills of what matters, "
-    "within a hard bit budget. hvt-edge status tells how one that runs with --metrics is."
+    "within a hard bit budget. hvt-edge doctor [SETTINGS] checks what a flight needs; hvt-edge status tells how "
+    "one that runs with --metrics is."
 )
 
 
@@ -39,6 +41,9 @@ def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     if words and words[0] == "status":
         return watch.run(words[1:])
+    if words and words[0] == "doctor":
+        limit_malloc_arenas()
+        return doctor.run(words[1:])
     config, given = load(EdgeConfig, argv, program="hvt-edge", description=_DESCRIPTION)
     config = with_profile(config, given=given.values)
     if given.print_config:

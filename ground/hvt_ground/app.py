@@ -35,7 +35,7 @@ from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.state import GroundState, StateMaker
 from hvt_ground.status import completed, status_text, summary
-from hvt_ground.wiring import Models, SessionFactory
+from hvt_ground.wiring import Models, SessionFactory, make_link_settings
 
 if TYPE_CHECKING:
     from hvt_ground.web import WebPage
@@ -91,14 +91,7 @@ class Ground:
             retention = Retention(config.keep, config.keep_video)
             index = RecordingsFolder(config.record_folder, retention, failures=models.failures)
             stack.enter_context(index)
-            settings = LinkSettings(
-                role="ground",
-                listen=config.listen,
-                connect=config.connect,
-                zenoh_config=config.zenoh_config,
-                insecure=config.insecure,
-                links=2 if config.links == 2 else 1,
-            )
+            settings = make_link_settings(config)
             page = None if config.web is None else stack.enter_context(self._open_page(config.web, settings))
             outputs = Outputs(models.failures)
             stack.callback(outputs.close)

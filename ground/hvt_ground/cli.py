@@ -20,6 +20,7 @@ _DESCRIPTION = """Receive what edges publish over Zenoh: decode, detect, track, 
 the stills, and record all of it for the Rerun viewer.
 
 Other commands, each with --help:
+  hvt-ground doctor [SETTINGS]           what a ground with them needs, and lacks
   hvt-ground status                      how a ground that runs is
   hvt-ground recordings                  what a folder of recordings holds
   hvt-ground still | tracks | keyframe   ask an edge, in flight
@@ -27,6 +28,7 @@ Other commands, each with --help:
   hvt-ground edges                       which edges are there
   hvt-ground keys                        make keys, and say who may do what"""
 _COMMANDS = {
+    "doctor": "hvt_ground.doctor.command",
     "keys": "hvt_ground.pki.command",
     "recordings": "hvt_ground.recordings.command",
     "status": "hvt_ground.control.watch",

@@ -17,6 +17,7 @@ from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.perception import BacklogPerception
 from hvt_ground.backlog.recordings import BacklogRecording
@@ -43,7 +44,14 @@ from hvt_ground.sinks.tracks_table import TrackTable
 if TYPE_CHECKING:  # who serves no page needs no web server
     from hvt_ground.web import WebPage
 
-__all__ = ["Models", "SessionFactory", "make_backlog_perception", "make_pipeline", "output_path"]
+__all__ = [
+    "Models",
+    "SessionFactory",
+    "make_backlog_perception",
+    "make_link_settings",
+    "make_pipeline",
+    "output_path",
+]
 
 S = TypeVar("S", bound=SinkWriter[Any])
 
@@ -169,6 +177,18 @@ class SessionFactory:
 def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:
     view.start_again()
     return Recorder(replace(settings, live_url=view.url))
+
+
+def make_link_settings(config: GroundConfig) -> LinkSettings:
+    """How the ground takes part in Zenoh."""
+    return LinkSettings(
+        role="ground",
+        listen=config.listen,
+        connect=config.connect,
+        zenoh_config=config.zenoh_config,
+        insecure=config.insecure,
+        links=2 if config.links == 2 else 1,
+    )
 
 
 def make_pipeline(

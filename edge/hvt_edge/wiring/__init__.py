@@ -4,8 +4,8 @@ from hvt_edge.wiring.link import make_link_settings
 from hvt_edge.wiring.perception import make_detector, track_confidence, warm_up_for
 from hvt_edge.wiring.stages import Stages, build_stages
 from hvt_edge.wiring.stills import check_codecs
-from hvt_edge.wiring.storing import check_files, check_store
-from hvt_edge.wiring.video import base_size, default_size
+from hvt_edge.wiring.storing import check_files, check_store, store_folder
+from hvt_edge.wiring.video import base_size, default_size, make_encoder
 
 __all__ = [
     "Stages",
@@ -16,7 +16,9 @@ __all__ = [
     "check_store",
     "default_size",
     "make_detector",
+    "make_encoder",
     "make_link_settings",
+    "store_folder",
     "track_confidence",
     "warm_up_for",
 ]

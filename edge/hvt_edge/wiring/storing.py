@@ -29,6 +29,11 @@ def check_files(config: EdgeConfig) -> None:
         check_writable(path, name=name)
 
 
+def store_folder(config: EdgeConfig) -> Path:
+    """Where what is captured while the link is down is kept."""
+    return config.store_folder or default_folder(config.edge_id)
+
+
 def default_folder(edge_id: str) -> Path:
     """Where programs keep what outlives them: ``$XDG_STATE_HOME`` or ``~/.local/state``, then ``hvt/<edge>``."""
     state = os.environ.get("XDG_STATE_HOME", "")
@@ -47,7 +52,7 @@ def check_store(config: EdgeConfig, *, live: bool) -> None:
     """Raise `UserError` now where a store could not be made in mid-flight; makes nothing."""
     if not config.store_bytes(live=live):
         return
-    path = config.store_folder or default_folder(config.edge_id)
+    path = store_folder(config)
     try:
         there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
         usable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
@@ -78,7 +83,7 @@ def make_backlog(
     max_bytes = config.store_bytes(live=live)
     if not max_bytes:
         return None
-    path = config.store_folder or default_folder(config.edge_id)
+    path = store_folder(config)
     oldest_ns = max(0, clock() - round(config.store_age * SECOND_NS))
     return BacklogStage(
         Store(path, max_bytes=max_bytes, session_id=session_id, info=info, oldest_ns=oldest_ns),

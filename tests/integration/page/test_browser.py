@@ -224,7 +224,7 @@ def test_nothing_jumps_while_the_picture_comes(flight):
     page = flight.page()
     shows(page)
     stills = page.locator("#stills li")
-    eventually(lambda: stills.count(), within_s=20, what="a still")
+    eventually(stills.count, within_s=20, what="a still")
     page.locator("#stills").hover()
     seen = stills.count()
     page.evaluate("""() => {

@@ -1,0 +1,133 @@
+"""A checkup: one check after the other, each bounded in time; one that fails keeps no other from its answer."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import shutil
+import socket
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.reporting import say
+
+__all__ = ["Finding", "check_clock", "check_folder", "check_port", "print_findings", "run_checks"]
+
+State = Literal["ok", "unknown", "warning", "wrong"]
+_STYLES: Mapping[State, str] = {"ok": "green", "unknown": "cyan", "warning": "yellow", "wrong": "bold red"}
+
+_PATIENCE_S = 30.0
+_TIME_ERROR = 5
+"""adjtimex(2): the clock is not synchronised."""
+_TIMEX_BYTES = 512
+"""More than ``struct timex`` has anywhere; with ``modes`` 0 the call changes nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What a check found, for people; ``todo`` is one line where something is to be done."""
+
+    state: State
+    found: str
+    todo: str = ""
+
+
+def run_checks(
+    checks: Mapping[str, Callable[[], Finding]], *, patience_s: float = _PATIENCE_S
+) -> dict[str, Finding]:
+    """Each in turn, by name. A `UserError` is what is wrong; a check without an end is left behind."""
+    return {name: _bounded(check, patience_s) for name, check in checks.items()}
+
+
+def print_findings(title: str, findings: Mapping[str, Finding], *, as_json: bool) -> int:
+    """Show them, and at the end what to do. Returns the exit code: 2 where something is wrong."""
+    if as_json:
+        say(json.dumps([{"check": name, **asdict(one)} for name, one in findings.items()]))
+    else:
+        table = Table.grid(padding=(0, 2))
+        for name, one in findings.items():
+            table.add_row(Text(one.state, _STYLES[one.state]), Text(name), Text(one.found))
+        console = Console(highlight=False)
+        console.print(Text(title, "bold"), table, sep="\n")
+        todo = Table.grid(padding=(0, 2))
+        for name, one in findings.items():
+            if one.todo:
+                todo.add_row(Text(name, _STYLES[one.state]), Text(one.todo))
+        if todo.row_count:
+            console.print("", Text("What to do:", "bold"), todo, sep="\n")
+    return 2 if any(one.state == "wrong" for one in findings.values()) else 0
+
+
+def check_clock() -> Finding:
+    """Whether the system keeps its clock by others: delays are differences of two clocks."""
+    try:
+        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
+    except (OSError, AttributeError):
+        state = -1
+    if state < 0:
+        return Finding("unknown", "this system does not say whether its clock is synchronised")
+    if state == _TIME_ERROR:
+        return Finding(
+            "warning",
+            "the clock is not synchronised",
+            "start a time service such as systemd-timesyncd or chrony: certificates and recordings depend on it",
+        )
+    return Finding("ok", "the clock is synchronised")
+
+
+def check_port(address: str, *, name: str) -> None:
+    """Raise `UserError` where HOST:PORT cannot be listened on now."""
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdecimal() and 0 < int(port) < 2**16):
+        raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT")
+    try:
+        family, *_, where = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(where)
+    except OSError as error:
+        raise UserError(f"{name} {address} cannot be listened on ({error.strerror}): give another") from None
+
+
+def check_folder(path: Path, *, name: str) -> int:
+    """Bytes that are free where it is, or will be made; `UserError` where nothing can be written."""
+    there = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(
+            f"{name} {path} cannot be used, because {there} is no folder that can be written: name another"
+        )
+    return shutil.disk_usage(there).free
+
+
+def _bounded(check: Callable[[], Finding], patience_s: float) -> Finding:
+    found: list[Finding] = []
+
+    def run() -> None:
+        try:
+            found.append(check())
+        except UserError as error:
+            said, _, todo = str(error).rpartition(": ")
+            found.append(Finding("wrong", said or todo, todo))
+        except Exception as error:  # noqa: BLE001 - the others are checked all the same
+            found.append(
+                Finding("wrong", f"{type(error).__name__}: {error}", "report it: this should not happen")
+            )
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(patience_s)
+    with contextlib.suppress(IndexError):
+        return found[0]
+    return Finding(
+        "wrong", f"no answer within {patience_s:g} s", "see whether the device or the disk works at all"
+    )

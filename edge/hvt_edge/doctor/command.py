@@ -1,0 +1,213 @@
+"""``hvt-edge doctor``: checks what a flight with these settings needs; sends nothing and changes nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+
+import zenoh
+
+from hvt_common.config import load
+from hvt_common.inference.detect import Detector, detect_every
+from hvt_common.protocol.channels import Channel, EdgeKeys
+from hvt_common.runtime.checkup import (
+    Finding,
+    check_clock,
+    check_folder,
+    check_port,
+    print_findings,
+    run_checks,
+)
+from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
+from hvt_common.transport.reach import check_link
+from hvt_common.transport.session import declare_publisher
+from hvt_common.values import Frame
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.loop.cpu import CpuMeter
+from hvt_edge.source.contract import Source
+from hvt_edge.video.x265 import BaseEncoder
+from hvt_edge.wiring import (
+    check_codecs,
+    check_files,
+    check_store,
+    make_encoder,
+    make_link_settings,
+    store_folder,
+)
+from hvt_edge.world import World
+
+__all__ = ["run"]
+
+_DESCRIPTION = (
+    "Check what a flight with these settings needs; takes the settings of hvt-edge. --json is for programs."
+)
+_SAMPLE_S = 2.0
+_MOST_FRAMES = 20
+_SLOW = 0.9
+"""A camera that gives less than this share of the rate is told of."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """0 where a flight could start, 2 where something is wrong."""
+    words = [one for one in argv if one != "--json"]
+    config, given = load(EdgeConfig, words, program="hvt-edge doctor", description=_DESCRIPTION)
+    config = check(with_profile(config, given=given.values))
+    with ExitStack() as stack:
+        findings = run_checks(_Checks(config, stack).by_name)
+    return print_findings(f"hvt-edge doctor: {config.edge_id}", findings, as_json=len(words) < len(argv))
+
+
+class _Checks:
+    """In the order of the flight; the later ones use what the earlier have opened."""
+
+    def __init__(self, config: EdgeConfig, stack: ExitStack) -> None:
+        self._config = config
+        self._stack = stack
+        self._world = World()
+        self._source: Source | None = None
+        self._detector: Detector | None = None
+        self._frames: list[Frame] = []
+        self._pixels_s = 0.0
+        """Processor time of one detection."""
+
+    @property
+    def by_name(self) -> dict[str, Callable[[], Finding]]:
+        """All of them."""
+        return {
+            "source": self.source,
+            "detector": self.detector,
+            "codecs": self.codecs,
+            "processor": self.processor,
+            "files": self.files,
+            "ports": self.ports,
+            "clock": check_clock,
+            "link": self.link,
+        }
+
+    def source(self) -> Finding:
+        """Opens it, and looks for two seconds how many pictures it gives."""
+        config = self._config
+        source = self._source = self._stack.enter_context(self._world.open_source(config))
+        frames = source.frames(start_ns=self._world.clock())
+        self._frames.append(next(frames))
+        began_s, count = time.monotonic(), 0
+        while time.monotonic() - began_s < _SAMPLE_S and (source.live or count < _MOST_FRAMES):
+            frame = next(frames, None)
+            if frame is None:
+                break
+            count += 1
+            if len(self._frames) < _MOST_FRAMES:
+                self._frames.append(frame)
+        size, base = source.view.source_size, source.view.base_size
+        found = f"{config.source}: {size[0]}x{size[1]}, sent as {base[0]}x{base[1]} at {source.fps:g} fps"
+        rate = count / (time.monotonic() - began_s)
+        if source.live and rate < _SLOW * source.fps:
+            return Finding(
+                "warning",
+                f"{found}, but it gives {rate:.1f}",
+                "set --fps to what it gives, or mend its light",
+            )
+        return Finding("ok", found)
+
+    def detector(self) -> Finding:
+        """Opens it, and runs it on a picture as the flight would."""
+        if self._source is None:
+            return Finding("unknown", "not tried without a source")
+        detector = self._detector = self._world.open_detector(self._config)
+        self._world.warm_up(self._config, detector, self._source)
+        frame = self._frames[0]
+        picture = frame.source_bgr if self._config.candidates == "source" else frame.base_bgr
+        began_s, cpu_s = time.monotonic(), time.process_time()
+        found = detector.detect(picture)
+        self._pixels_s = time.process_time() - cpu_s
+        took_ms = 1000 * (time.monotonic() - began_s)
+        return Finding(
+            "ok", f"{self._config.detector}: {took_ms:.0f} ms a picture, {len(found.class_ids)} found in one"
+        )
+
+    def codecs(self) -> Finding:
+        """A still and a picture, there and back."""
+        config = self._config
+        check_codecs(config)
+        if not self._frames or self._source is None:
+            return Finding(
+                "unknown", f"stills work ({config.still_codec}); no picture to code without a source"
+            )
+        size = self._source.view.base_size
+        encoder = self._encoder(size)
+        picture = BaseDecoder(size=size).decode_yuv(encoder.encode(self._frames[0], keyframe=True).data)
+        if picture is None:
+            return Finding("wrong", "x265's picture could not be decoded", "install the package av anew")
+        return Finding("ok", f"x265 and {config.still_codec} code and decode")
+
+    def processor(self) -> Finding:
+        """What every frame would take, against what others leave."""
+        if self._source is None or not self._frames:
+            return Finding("unknown", "not tried without a source")
+        config, meter = self._config, CpuMeter()
+        encoder = self._encoder(self._source.view.base_size)
+        began_s, cpu_s = time.monotonic(), time.process_time()
+        count = 0
+        while time.monotonic() - began_s < _SAMPLE_S / 2:
+            encoder.encode(self._frames[count % len(self._frames)])
+            count += 1
+        encode_s = (time.process_time() - cpu_s) / count
+        meter.measure(scale=1.0, short=False)
+        fps = self._source.fps
+        every = detect_every(config.detect_every, fps=fps)
+        networks = 2 if config.measures else 1  # it looks at the source and at what the base shows of it
+        needed = fps * (encode_s + networks * self._pixels_s / every)
+        free = meter.now.free
+        found = (
+            f"about {needed:.1f} cores of {free:.1f} that are free: {1000 * encode_s:.0f} ms to code a frame"
+        )
+        if free and needed > free:
+            todo = "lower --fps or --size, give --preset ultrafast or --method M0; else frames are left out"
+            return Finding("warning", found, todo)
+        return Finding("ok", found)
+
+    def files(self) -> Finding:
+        """What is written, and whether there is room."""
+        config = self._config
+        check_files(config)
+        live = self._source is not None and self._source.live
+        check_store(config, live=live)
+        limit = config.store_bytes(live=live)
+        if not limit:
+            return Finding("ok", "nothing is stored while the link is down")
+        folder = store_folder(config)
+        free = check_folder(folder, name="--store-folder")
+        hours = 8 * limit / config.budget_bps / 3600
+        found = f"{folder}: {limit / 1e6:.0f} MB for outages, {hours:.1f} hours; {free / 1e9:.1f} GB are free"
+        if free < limit:
+            return Finding("warning", found, "make room, or give --store less")
+        return Finding("ok", found)
+
+    def ports(self) -> Finding:
+        """Those of the probes; the link's own are tried with it."""
+        if self._config.metrics is None:
+            return Finding("ok", "no --metrics")
+        check_port(self._config.metrics, name="--metrics")
+        return Finding("ok", f"{self._config.metrics} is free for --metrics")
+
+    def link(self) -> Finding:
+        """Keys, endpoints, another edge of this name, and a ground that listens."""
+        settings, keys = make_link_settings(self._config), EdgeKeys(self._config.edge_id)
+        refuse_duplicate_edge(settings, keys)
+        publishers: list[zenoh.Publisher] = []
+
+        def find_peer(session: zenoh.Session) -> str:
+            if not publishers:
+                publishers.append(declare_publisher(session, Channel.BASE, keys=keys))
+            listened_to = bool(publishers[0].matching_status.matching)  # type: ignore[attr-defined]
+            return "a ground listens" if listened_to else ""
+
+        return check_link(settings, find_peer, other="ground")
+
+    def _encoder(self, size: tuple[int, int]) -> BaseEncoder:
+        config = self._config
+        return make_encoder(
+            config, size=size, total_bps=config.budget_bps, base_bps=config.base_bps, decimation=1
+        )

@@ -1,0 +1,104 @@
+"""``hvt-ground doctor``: checks what a ground with these settings needs; asks edges for nothing, changes nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from hvt_common.config import load
+from hvt_common.errors import UserError
+from hvt_common.inference.detect import detect_every
+from hvt_common.protocol.channels import Channel, parse_key, selector
+from hvt_common.runtime.checkup import (
+    Finding,
+    check_clock,
+    check_folder,
+    check_port,
+    print_findings,
+    run_checks,
+)
+from hvt_common.runtime.reporting import check_writable
+from hvt_common.transport.reach import check_link
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.perception.models import Models
+from hvt_ground.wiring import make_link_settings
+
+__all__ = ["run"]
+
+_DESCRIPTION = (
+    "Check what a ground with these settings needs; takes the settings of hvt-ground. --json is for programs."
+)
+_USUAL_FPS, _USUAL_SIZE = 15.0, (1280, 720)
+_USUAL_BPS = 1e6
+_LITTLE_H = 1.0
+
+
+def run(argv: Sequence[str]) -> int:
+    """0 where a ground could start, 2 where something is wrong."""
+    words = [one for one in argv if one != "--json"]
+    config, _ = load(GroundConfig, words, program="hvt-ground doctor", description=_DESCRIPTION)
+    config = check(config)
+    checks: dict[str, Callable[[], Finding]] = {
+        "models": lambda: _models(config),
+        "recordings": lambda: _recordings(config),
+        "ports": lambda: _ports(config),
+        "clock": check_clock,
+        "link": lambda: check_link(make_link_settings(config), _edges, other="edge"),
+    }
+    return print_findings("hvt-ground doctor", run_checks(checks), as_json=len(words) < len(argv))
+
+
+def _models(config: GroundConfig) -> Finding:
+    """Open them, and look how many edges the detector could serve."""
+    detector, classifier = Models(config).take()
+    picture = np.full((_USUAL_SIZE[1], _USUAL_SIZE[0], 3), 128, np.uint8)
+    began_s = time.monotonic()
+    detector.detect(picture)
+    took_s = time.monotonic() - began_s
+    a_second = _USUAL_FPS / detect_every(config.detect_every, fps=_USUAL_FPS)
+    edges = int(1 / (took_s * a_second))
+    names = config.detector if classifier is None else f"{config.detector}, {config.classifier}"
+    found = f"{names}: {1000 * took_s:.0f} ms a picture of 1280x720"
+    if not edges:
+        return Finding(
+            "warning", f"{found}: too slow for one edge", "give --detect-every more, or a lighter --detector"
+        )
+    return Finding("ok", f"{found}, enough for about {edges} edge{'s' * (edges > 1)} of 15 fps")
+
+
+def _recordings(config: GroundConfig) -> Finding:
+    for path, name in ((config.summary, "--summary"), (config.timing, "--timing")):
+        check_writable(path, name=name)
+    if config.record is None:
+        return Finding("ok", "written into this folder")
+    folder = config.record.parent if config.record.suffix == ".rrd" else config.record
+    free = check_folder(folder, name="--record")
+    hours = 8 * free / _USUAL_BPS / 3600
+    found = f"{Path(folder)}: {free / 1e9:.1f} GB are free, {hours:.0f} hours of an edge at 1 Mbps"
+    if hours < _LITTLE_H:
+        return Finding("warning", found, "make room, or give --keep a size")
+    return Finding("ok", found)
+
+
+def _ports(config: GroundConfig) -> Finding:
+    named = {"--web": (config.web, "starlette"), "--metrics": (config.metrics, "prometheus_client")}
+    for name, (address, package) in named.items():
+        if address is None:
+            continue
+        if find_spec(package) is None:
+            raise UserError(f"{name} needs a package that is missing: pip install 'hvt[{name.strip('-')}]'")
+        check_port(address, name=name)
+    free = [f"{address} for {name}" for name, (address, _) in named.items() if address is not None]
+    return Finding("ok", f"free: {', '.join(free)}" if free else "no --web, no --metrics")
+
+
+def _edges(session: zenoh.Session) -> str:
+    replies = session.liveliness().get(selector(Channel.ALIVE), timeout=1.0)
+    keys = [parse_key(str(one.ok.key_expr)) for one in replies if one.ok is not None]
+    names = sorted({key[0] for key in keys if key is not None})
+    return f"edges: {', '.join(names)}" if names else ""

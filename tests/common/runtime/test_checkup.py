@@ -1,0 +1,74 @@
+"""Checks before a flight."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.checkup import (
+    Finding,
+    check_clock,
+    check_folder,
+    check_port,
+    print_findings,
+    run_checks,
+)
+
+
+def refused() -> Finding:
+    raise UserError("camera /dev/video9 is not there: name one that is")
+
+
+def broken() -> Finding:
+    raise ZeroDivisionError("division by zero")
+
+
+def test_one_that_fails_or_hangs_keeps_no_other_from_its_answer():
+    """A camera that hangs would hide that the disk is full."""
+    never = threading.Event()
+    checks = {
+        "camera": refused,
+        "bug": broken,
+        "hangs": lambda: Finding("ok", str(never.wait())),
+        "last": lambda: Finding("ok", "it was checked"),
+    }
+    found = run_checks(checks, patience_s=0.3)
+    assert found["camera"] == Finding("wrong", "camera /dev/video9 is not there", "name one that is")
+    assert (found["bug"].state, found["bug"].found) == ("wrong", "ZeroDivisionError: division by zero")
+    assert (found["hangs"].state, found["hangs"].found) == ("wrong", "no answer within 0.3 s")
+    assert found["last"] == Finding("ok", "it was checked")
+
+
+def test_only_what_is_wrong_fails_and_each_says_what_to_do(capsys):
+    """A script would fly without a camera, or not fly for want of a time service."""
+    warned = {"clock": Finding("warning", "not synchronised", "start chrony")}
+    assert print_findings("doctor", warned, as_json=False) == 0
+    said = capsys.readouterr().out
+    assert said.index("not synchronised") < said.index("What to do:") < said.index("start chrony")
+    wrong = {**warned, "camera": Finding("wrong", "gone [really]", "plug it in")}
+    assert print_findings("doctor", wrong, as_json=True) == 2
+    rows = json.loads(capsys.readouterr().out)
+    assert [(row["check"], row["state"]) for row in rows] == [("clock", "warning"), ("camera", "wrong")]
+    assert print_findings("doctor", wrong, as_json=False) == 2
+    assert "gone [really]" in capsys.readouterr().out
+
+
+def test_ports_folders_and_the_clock(tmp_path):
+    """They would be found out in the field."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(UserError, match="Address already in use"):
+            check_port(f"127.0.0.1:{taken.getsockname()[1]}", name="--metrics")
+    for nonsense in ("nowhere", "127.0.0.1:http", "127.0.0.1:70000000"):
+        with pytest.raises(UserError, match="give HOST:PORT"):
+            check_port(nonsense, name="--metrics")
+    assert check_folder(tmp_path / "not" / "yet", name="--record") > 0
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(UserError, match="is no folder that can be written"):
+        check_folder(tmp_path / "file" / "below", name="--record")
+    assert check_clock().state in ("ok", "warning", "unknown")

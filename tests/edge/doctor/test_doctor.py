@@ -1,0 +1,92 @@
+"""``hvt-edge doctor``: before the flight, not in it."""
+
+from __future__ import annotations
+
+import json
+import socket
+
+import pytest
+
+from hvt_edge.cli import main
+from programs.fleet_keys import Fleet
+from programs.processes import Link, free_ports
+
+CHEAP = ("--size", "640x360", "--detector", "motion", "--preset", "ultrafast")
+
+
+def examined(capsys, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
+    """Exit code, and the findings by name."""
+    code = main(["doctor", "--json", *words])
+    return code, {row["check"]: row for row in json.loads(capsys.readouterr().out)}
+
+
+def test_all_is_well_where_a_ground_listens(tmp_path, capsys):
+    """The engineer would look for a fault that is not there."""
+    with Link(tmp_path) as link:
+        link.ground("--detector", "motion", "--classifier", "none")
+        code, found = examined(capsys, "--source", "demo", *CHEAP, "--connect", link.ground_endpoint)
+    assert code == 0
+    assert found["link"]["found"] == "a ground listens"
+    assert {one["state"] for name, one in found.items() if name not in ("clock", "processor")} == {"ok"}
+    assert "1920x1080, sent as 640x360" in found["source"]["found"]
+    assert "cores" in found["processor"]["found"]
+
+
+def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
+    """One fault after the other would take an afternoon in a field."""
+    (tmp_path / "file").write_bytes(b"")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        code, found = examined(
+            capsys,
+            *("--source", str(tmp_path / "gone.mp4"), *CHEAP, "--detector", str(tmp_path / "gone.onnx")),
+            *(
+                "--metrics",
+                f"127.0.0.1:{taken.getsockname()[1]}",
+                "--record-base",
+                str(tmp_path / "no" / "base.mp4"),
+            ),
+            *("--connect", f"tcp/127.0.0.1:{free_ports(1)[0]}"),
+        )
+    assert code == 2
+    for name in ("source", "files", "ports"):
+        assert found[name]["state"] == "wrong", name
+        assert found[name]["todo"], name
+    assert found["detector"]["state"] == found["processor"]["state"] == "unknown"
+    assert found["link"]["state"] == "warning", "the ground may come later"
+    assert "nobody listens" in found["link"]["found"] or "refused" in found["link"]["found"], found["link"]
+
+
+def test_keys_of_another_edge_are_found_out(tmp_path, capsys):
+    """Its ground would drop all that it sends, and say nothing."""
+    fleet = Fleet(tmp_path / "own")
+    fleet.keys("add-ground", "base")
+    fleet.keys("add-edge", "uav-1")
+    words = (
+        "--zenoh-config",
+        str(fleet.file("uav-1")),
+        "--edge-id",
+        "uav-2",
+        "--connect",
+        "tls/127.0.0.1:7447",
+    )
+    capsys.readouterr()  # what making the keys said
+    code, found = examined(capsys, "--source", "demo", *CHEAP, *words)
+    assert code == 2
+    assert "the certificate of 'uav-1'" in found["link"]["found"] + found["link"]["todo"]
+
+
+def test_settings_that_contradict_are_a_sentence(capsys):
+    """As in a flight."""
+    assert main(["doctor", "--source", "demo", "--budget", "none"]) == 2
+    assert "--budget" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [("--help",)])
+def test_it_explains_itself(capsys, words):
+    """Nobody would find its settings."""
+    with pytest.raises(SystemExit) as ended:
+        main(["doctor", *words])
+    assert ended.value.code == 0
+    assert "hvt-edge doctor" in capsys.readouterr().out

@@ -1,0 +1,58 @@
+"""``hvt-ground doctor``: before the first edge comes."""
+
+from __future__ import annotations
+
+import json
+import socket
+
+from hvt_ground.cli import main
+from programs.processes import Link, free_ports
+
+
+def examined(capsys, *words: str) -> tuple[int, dict[str, dict[str, str]]]:
+    """Exit code, and the findings by name."""
+    code = main(["doctor", "--json", *words])
+    return code, {row["check"]: row for row in json.loads(capsys.readouterr().out)}
+
+
+def test_it_names_the_edges_that_are_there(tmp_path, capsys):
+    """A ground that hears nobody would be searched for a fault of its own."""
+    with Link(tmp_path) as link:
+        cheap = ("--source", "demo", "--size", "640x360", "--fps", "5", "--detector", "motion")
+        link.edge(*cheap, "--edge-id", "uav-7", listens=True).until("ground")
+        words = (
+            "--connect",
+            link.edge_endpoint,
+            "--record",
+            str(tmp_path / "flights"),
+            "--classifier",
+            "none",
+        )
+        code, found = examined(capsys, *words, "--detector", "motion", "--web", "127.0.0.1:1")
+    assert found["link"] == {"check": "link", "state": "ok", "found": "edges: uav-7", "todo": ""}
+    assert "GB are free" in found["recordings"]["found"]
+    assert not (tmp_path / "flights").exists(), "it changes nothing"
+    assert (code, found["ports"]["state"]) in ((0, "ok"), (2, "wrong")), "who is not root may not have port 1"
+
+
+def test_each_fault_is_told_with_what_to_do(tmp_path, capsys):
+    """One after the other, each after a start of its own."""
+    (tmp_path / "file").write_bytes(b"")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        code, found = examined(
+            capsys,
+            *("--detector", str(tmp_path / "gone.onnx"), "--record", str(tmp_path / "file" / "flights")),
+            *(
+                "--web",
+                f"127.0.0.1:{taken.getsockname()[1]}",
+                "--listen",
+                f"tcp/127.0.0.1:{free_ports(1)[0]}",
+            ),
+        )
+    assert code == 2
+    for name in ("models", "recordings", "ports"):
+        assert found[name]["state"] == "wrong", found[name]
+        assert found[name]["todo"], found[name]
+    assert found["link"]["state"] == "warning", "edges may come later"
