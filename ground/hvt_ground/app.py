@@ -25,6 +25,7 @@ from hvt_ground.backlog.recordings import BacklogRecordings
 from hvt_ground.config import GroundConfig
 from hvt_ground.control import EdgeClient
 from hvt_ground.events import Event
+from hvt_ground.link.group import GroundGroup
 from hvt_ground.perception.models import stills_calibrated
 from hvt_ground.recordings.folder import RecordingsFolder
 from hvt_ground.recordings.retention import Retention
@@ -61,6 +62,10 @@ class Ground:
         self._on_started = on_started
         self._clock = SteadyClock()
         self._edges: dict[str, EdgeThread] = {}
+        self._leaving: list[EdgeThread] = []
+        """Of edges that are served no more: they finish."""
+        self._moved: dict[str, EdgeSessions] = {}
+        """What was received of edges that another member of the group serves now."""
         self._ended: defaultdict[str, deque[tuple[dict[str, Any], Sequence[Sink[Event]]]]] = defaultdict(
             partial(deque, maxlen=_MOST_SUMMARIES)
         )
@@ -104,7 +109,13 @@ class Ground:
                 config, models, clock=self._clock, outputs=outputs, view=view, page=page, index=index
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
-            link = stack.enter_context(GroundLink(session, edges=config.edges, clock=self._clock))
+            group = None
+            if config.group is not None:
+                address = "" if page is None or page.is_local else page.address
+                group = stack.enter_context(GroundGroup(session, config.group, page=address))
+            link = stack.enter_context(
+                GroundLink(session, edges=config.edges, clock=self._clock, group=group)
+            )
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()
             notify_systemd("READY=1")
@@ -112,15 +123,17 @@ class Ground:
                 line, pages=(*(() if view is None else (view.page,)), *(page.links if page else ()))
             )
             try:
-                self._serve(link, factory, line, watch, models.failures, page)
+                self._serve(link, factory, line, watch, models.failures, page, group)
                 self._close_edges()
             except Exception as error:
                 raise FlightError(f"the ground cannot go on: {reason_of(error)}") from error
             finally:
                 self._stop_edges()
         return [
-            completed(content, one.sessions, sinks=sinks, failures=models.failures)
-            for edge, one in sorted(self._edges.items())
+            completed(content, sessions, sinks=sinks, failures=models.failures)
+            for edge, sessions in sorted(
+                (self._moved | {edge: one.sessions for edge, one in self._edges.items()}).items()
+            )
             for content, sinks in self._ended[edge]
         ]
 
@@ -184,6 +197,7 @@ class Ground:
         watch: LinkWatch,
         failures: Failures,
         page: WebPage | None,
+        group: GroundGroup | None,
     ) -> None:
         config, polls = self._config, 0
         maker = StateMaker(
@@ -192,12 +206,13 @@ class Ground:
             classifier=Path(config.classifier or "none").name,
             calibrated=stills_calibrated(config),
             failures=failures,
+            group=group,
         )
         while not self._stop.wait(_POLL_S):
             if polls % _STATUS_EVERY_POLLS == 0:
                 notify_systemd("WATCHDOG=1")
             ports = link.ports()
-            self._leave_edges(ports)
+            self._leave_edges(ports, link)
             for port in ports:
                 if port.edge not in self._edges:
                     self._edges[port.edge] = self._serve_edge(port, factory)
@@ -228,11 +243,17 @@ class Ground:
         """In the thread of its edge: a session is not remembered, its numbers are, of the last ones."""
         self._ended[session.info.edge].append((summary(session), session.sinks))
 
-    def _leave_edges(self, ports: list[EdgePort]) -> None:
-        """The link has left those that never were more than a name, for others."""
+    def _leave_edges(self, ports: list[EdgePort], link: GroundLink) -> None:
+        """The link has left those that never were more than a name, for others, and those that moved."""
         for one in [one for one in self._edges.values() if one.sessions.port not in ports]:
             del self._edges[one.sessions.port.edge]
-            one.close()
+            one.stop()
+            self._leaving.append(one)
+        for one in [one for one in self._leaving if one.ended]:
+            self._leaving.remove(one)
+            if one.sessions.ended:
+                self._moved[one.sessions.port.edge] = one.sessions
+            link.closed(one.sessions.port)
 
     def _say_rights(self, port: EdgePort, line: StatusLine, watch: LinkWatch) -> None:
         if not watch.may_command(port.edge):
@@ -251,7 +272,7 @@ class Ground:
 
     def _close_edges(self) -> None:
         self._stop_edges()
-        for one in self._edges.values():
+        for one in (*self._edges.values(), *self._leaving):
             one.close()
         self._raise_error()
 
@@ -260,6 +281,6 @@ class Ground:
             one.stop()
 
     def _raise_error(self) -> None:
-        for one in self._edges.values():
+        for one in (*self._edges.values(), *self._leaving):
             if one.error is not None:
                 raise one.error

@@ -10,6 +10,7 @@ from hvt_common.config import DURATION, PATH, TEXT, Group, SettingType, choice, 
 from hvt_common.errors import UserError
 from hvt_common.inference.runtimes.providers import PROVIDERS
 from hvt_common.inference.store import EMBEDDED_CLASSIFIER, EMBEDDED_DETECTOR
+from hvt_common.protocol.channels import GroupKeys
 from hvt_common.runtime.log import LOG_FORMATS
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT
 from hvt_common.units import Limit, parse_limit
@@ -52,6 +53,9 @@ class GroundConfig:
     )
     insecure: bool = _LINK.switch("allow listening beyond this machine without keys")
     edges: str = _LINK.option(TEXT, "*", "which edges to serve, for example 'uav-*'")
+    group: str | None = _LINK_RARE.option(
+        TEXT, None, "share the edges with all grounds of this group: each edge is served by one of them"
+    )
     once: bool = _LINK.switch("end when the edges have ended")
     wait: float = _LINK.option(
         DURATION, 0.0, "with --once: give up when no edge came for so long; 0 waits for ever"
@@ -174,6 +178,8 @@ def check(config: GroundConfig) -> GroundConfig:
     _check_retention(config)
     if config.web_proxy is not None and config.web is None:
         raise UserError(f"--web-proxy {config.web_proxy} is given without --web: give --web too")
+    if config.group is not None:
+        GroupKeys(config.group)
     if config.view and config.serve:
         raise UserError("--view and --serve are both given: choose the viewer here or the one in a browser")
     if config.labels is not None and config.classifier in (None, DETECTOR, NONE):

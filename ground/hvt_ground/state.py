@@ -15,6 +15,7 @@ from hvt_common.protocol.messages import WIRE_VERSION, Status
 from hvt_common.runtime.failures import FailedPart, Failures
 from hvt_common.units import SECOND_NS
 from hvt_ground.events import Traffic
+from hvt_ground.link.group import Elsewhere, GroundGroup
 from hvt_ground.session.edge_sessions import EdgeSessions
 from hvt_ground.session.session import GroundSession
 
@@ -129,6 +130,10 @@ class GroundState:
     calibrated: bool
     """Whether a still's probability of a class is one: it was fitted to how often it is right."""
     edges: tuple[EdgeState, ...]
+    member: str | None
+    """This ground in its ``--group``; None without."""
+    elsewhere: Mapping[str, Elsewhere]
+    """By edge, the other member of the group that serves it."""
     failed: tuple[FailedPart, ...]
     """Models, recordings and other sinks."""
 
@@ -148,8 +153,10 @@ class StateMaker:
         classifier: str = "",
         calibrated: bool = False,
         failures: Failures | None = None,
+        group: GroundGroup | None = None,
     ) -> None:
         self._clock = clock
+        self._group = group
         self._detector, self._classifier, self._calibrated = detector, classifier, calibrated
         self._failures = failures
         self._links: dict[str, tuple[LinkState, int]] = {}
@@ -172,6 +179,8 @@ class StateMaker:
             classifier=self._classifier,
             calibrated=self._calibrated,
             edges=made,
+            member=None if self._group is None else self._group.member,
+            elsewhere={} if self._group is None else self._group.elsewhere,
             failed=() if self._failures is None else self._failures.now,
         )
 

@@ -19,7 +19,8 @@ __all__ = ["completed", "status_text", "summary", "table"]
 
 def status_text(state: GroundState) -> str:
     """The status line: what comes of each edge now, and what does not work; empty without any."""
-    return " | ".join([*map(_edge_text, state.edges), *map(failed_text, state.failed)])
+    elsewhere = [f"{edge}: at {one.member}" for edge, one in state.elsewhere.items()]
+    return " | ".join([*map(_edge_text, state.edges), *elsewhere, *map(failed_text, state.failed)])
 
 
 def _edge_text(one: EdgeState) -> str:

@@ -1,6 +1,7 @@
 """The key table: every stream of HVT, its direction and how Zenoh is to deliver it. Nothing else knows a key.
 
-Keys are ``hvt/<edge>/<channel>``. This file knows strings only; `session` turns the names into Zenoh's own values.
+Keys are ``hvt/<edge>/<channel>``; those of a group of grounds are ``hvt-group/<group>/<member>[/<edge>]``. This file
+knows strings only; `session` turns the names into Zenoh's own values.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from hvt_common.errors import UserError
 
 __all__ = [
     "DELIVERIES",
+    "GROUP_ROOT",
     "MSGPACK_ENCODING",
     "ROOT",
     "Channel",
     "Delivery",
     "Direction",
     "EdgeKeys",
+    "GroupKeys",
     "check_edge_pattern",
     "matches",
     "parse_key",
@@ -28,6 +31,7 @@ __all__ = [
 ]
 
 ROOT = "hvt"
+GROUP_ROOT = "hvt-group"
 
 MSGPACK_ENCODING = "application/octet-stream"
 """Zenoh has no short code for MessagePack; spelling it out would cost 22 bytes in each message."""
@@ -125,6 +129,41 @@ class EdgeKeys:
     def key(self, channel: Channel) -> str:
         """The full key, such as ``hvt/uav-1/base``."""
         return f"{ROOT}/{self.edge}/{channel}"
+
+
+@dataclass(frozen=True, slots=True)
+class GroupKeys:
+    """Liveliness tokens of grounds that share a fleet. Raises UserError for a name outside ``[a-z0-9-]{1,32}``."""
+
+    group: str
+
+    def __post_init__(self) -> None:
+        if _EDGE_ID.fullmatch(self.group) is None:
+            raise UserError(
+                f"group {self.group!r} is not usable: 1 to 32 characters of a-z, 0-9 and '-' are accepted"
+            )
+
+    @property
+    def everything(self) -> str:
+        """The key expression of all its tokens."""
+        return f"{GROUP_ROOT}/{self.group}/**"
+
+    def member(self, member: str) -> str:
+        """A ground takes part."""
+        return f"{GROUP_ROOT}/{self.group}/{member}"
+
+    def claim(self, member: str, edge: str) -> str:
+        """A ground serves an edge, or is about to."""
+        return f"{GROUP_ROOT}/{self.group}/{member}/{edge}"
+
+    def parse(self, key: str) -> tuple[str, str | None] | None:
+        """The member, and the edge that it claims; None for a key that is none of the group's."""
+        root, group, *names = key.split("/")
+        if (root, group) != (GROUP_ROOT, self.group) or len(names) not in (1, 2):
+            return None
+        if any(_EDGE_ID.fullmatch(one) is None for one in names):
+            return None
+        return names[0], names[1] if len(names) == 2 else None
 
 
 def check_edge_pattern(pattern: str) -> str:

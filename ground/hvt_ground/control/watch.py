@@ -29,6 +29,8 @@ def _table(state: dict[str, Any]) -> Table:
         table.add_row(
             one["edge"], link, *_session_cells(one["session"]), "; ".join(f["part"] for f in failed)
         )
+    for edge, one in state["elsewhere"].items():
+        table.add_row(edge, f"at {one['member']}", *("",) * 6)
     table.caption = "; ".join(f"{one['part']}: {one['reason']}" for one in state["failed"]) or None
     return table
 

@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from hvt_common.protocol.channels import DELIVERIES, ROOT, Channel, Direction, EdgeKeys
+from hvt_common.protocol.channels import DELIVERIES, GROUP_ROOT, ROOT, Channel, Direction, EdgeKeys
 from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
 from hvt_ground.pki.roster import GroundMember, Roster, RouterMember
 
@@ -22,6 +22,7 @@ KEYS_FOLDER = "/etc/hvt/tls"
 """Where the files lie on the machines, unless said otherwise."""
 
 _EVERYBODY = f"{ROOT}/**"
+_GROUPS = f"{GROUP_ROOT}/**"
 
 _Rule = dict[str, Any]
 
@@ -62,14 +63,15 @@ def ground_file(ground: GroundMember, roster: Roster, *, folder: str = KEYS_FOLD
     edges = [edge for edge in roster.edges if ground.may_watch(edge)]
     grants = {edge: _toward_edge(edge, command=ground.command) for edge in edges}
     through = [rule for edge in edges for rule in _toward_edge(edge, command=ground.command)]
-    grants |= {router.name: through for router in roster.routers if edges}
+    grants |= {router.name: [*through, *_AMONG_GROUNDS] for router in roster.routers if edges}
     # A second program of this ground, or another ground, may ask by way of this one: it gets what is its own.
     for other in roster.grounds:
         shared = [edge for edge in edges if other.may_watch(edge)]
         if shared:
             command = ground.command and other.command
             theirs = [rule for edge in shared for rule in _toward_edge(edge, command=ground.command)]
-            grants[other.name] = [*theirs, *_toward_ground(shared, command=command, label=other.name)]
+            theirs += _toward_ground(shared, command=command, label=other.name)
+            grants[other.name] = [*theirs, *_AMONG_GROUNDS]
     head = f"hvt-ground --listen tls/0.0.0.0:7447 --zenoh-config {ground.name}.json5"
     return _text(head, {}, name=ground.name, grants=grants, folder=folder)
 
@@ -80,11 +82,13 @@ def router_file(router: RouterMember, roster: Roster, *, folder: str = KEYS_FOLD
     for ground in roster.grounds:
         edges = [edge for edge in roster.edges if ground.may_watch(edge)]
         if edges:
-            grants[ground.name] = _toward_ground(edges, command=ground.command, label=ground.name)
+            rules = _toward_ground(edges, command=ground.command, label=ground.name)
+            grants[ground.name] = [*rules, *_AMONG_GROUNDS]
     others = [one.name for one in roster.routers if one.name != router.name]
     everything = [
         *(rule for edge in roster.edges for rule in _toward_edge(edge, command=True)),
         *_toward_ground(list(roster.edges), command=True, label="all"),
+        *_AMONG_GROUNDS,
     ]
     grants |= {name: everything for name in others if roster.edges}
     head = f"python deploy/router.py --zenoh-config {router.name}.json5"
@@ -145,6 +149,26 @@ def _rule(name: str, flow: str, messages: Sequence[str], key_exprs: Sequence[str
         "messages": list(messages),
         "key_exprs": list(key_exprs),
     }
+
+
+_GROUP_MESSAGES = (
+    "liveliness_token",
+    "declare_liveliness_subscriber",
+    "liveliness_query",
+    "declare_queryable",
+    "query",
+    "reply",
+)
+_AMONG_GROUNDS: list[_Rule] = [
+    _rule(
+        f"groups-{flow}",
+        flow,
+        _GROUP_MESSAGES,
+        [_GROUPS],
+    )
+    for flow in ("ingress", "egress")
+]
+"""What grounds of a group tell each other, by way of routers too; no edge hears of it, or takes part."""
 
 
 def _access(grants: dict[str, list[_Rule]]) -> dict[str, Any]:

@@ -355,6 +355,11 @@ class EdgeThread:
             self._stop.set()
             self._inbox.close()
 
+    @property
+    def ended(self) -> bool:
+        """Whether it has finished."""
+        return not self._thread.is_alive()
+
     def close(self, *, timeout_s: float = 4.0) -> bool:
         """Finish what has arrived, close the session, join the thread; False where that took too long."""
         self.stop()

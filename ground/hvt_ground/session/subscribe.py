@@ -20,6 +20,7 @@ from hvt_common.transport.doctor.diagnose import control_unanswered
 from hvt_common.transport.flood import FloodWatch
 from hvt_common.transport.inbox import Inbox, Received
 from hvt_common.transport.session import declare_publisher, query_later, subscribe
+from hvt_ground.link.group import GroundGroup
 
 __all__ = ["MAX_EDGES", "EdgePort", "GroundLink"]
 
@@ -28,6 +29,8 @@ _log = logging.getLogger(__name__)
 MAX_EDGES = 64
 """More edge ids than this are not served: each costs a thread, and ids cost a sender nothing. One that shows its
 token takes the place of one that has neither a token nor a session."""
+_MOST_SHARED = 16384
+"""Edges of all members of a group together."""
 _INBOX_MESSAGES = 1024
 _INBOX_SHARE = 0.75
 """Of the inbox for one row: reports by the thousand do not keep pictures out."""
@@ -177,10 +180,27 @@ class EdgePort:
 
 
 class GroundLink:
-    """Sorts what comes by edge. `ports` grows as edges appear that ``edges``, the pattern, accepts."""
+    """Sorts what comes by edge. `ports` grows as edges appear that ``edges``, the pattern, accepts.
 
-    def __init__(self, session: zenoh.Session, *, edges: str, clock: Callable[[], int] | None = None) -> None:
+    With a ``group`` only the edges that are this member's are subscribed to, and a port goes when its edge moves.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        *,
+        edges: str,
+        clock: Callable[[], int] | None = None,
+        group: GroundGroup | None = None,
+    ) -> None:
         self._session = session
+        self._group = group
+        self._alive: set[str] = set()
+        """Edges that show their token, also those that others serve; with a group."""
+        self._subscribers: dict[str, list[zenoh.Subscriber[None]]] = {}
+        """By edge, with a group."""
+        self._leaving: set[str] = set()
+        """Edges whose last session here is being closed; with a group."""
         self._clock = clock or SteadyClock()
         self._edges = edges
         self._lock = threading.Lock()
@@ -188,7 +208,7 @@ class GroundLink:
         self.foreign = 0
         """Messages under keys that are none of ours, or of more edges than are served."""
         self._refused = False
-        for row in _SUBSCRIBED:
+        for row in () if group else _SUBSCRIBED:
             key_expr = selector(row, edges=edges)
             subscribe(session, key_expr, inbox=self, clock=self._clock, on_error=self._fail)
         self._presence = session.liveliness().declare_subscriber(
@@ -196,14 +216,22 @@ class GroundLink:
         )
 
     def ports(self) -> list[EdgePort]:
-        """All edges that are served; one that never had a session may leave again."""
+        """All edges that are served; one that never had a session may leave again, and one that moved."""
+        if self._group is not None:
+            self._share(self._group)
         with self._lock:
             return list(self._ports.values())
+
+    def closed(self, port: EdgePort) -> None:
+        """The last session of a port that had left is closed: with a group another member may serve the edge."""
+        if self._group is not None:
+            self._leaving.discard(port.edge)
+            self._group.release(port.edge)
 
     def is_known(self, edge: str) -> bool:
         """Whether this edge has shown itself, by its token or a message."""
         with self._lock:
-            return edge in self._ports
+            return edge in self._ports or edge in self._alive
 
     def put(self, item: Received) -> None:
         """Take a message from Zenoh's callback."""
@@ -222,6 +250,44 @@ class GroundLink:
             port.inbox.close()
         if self.foreign:
             _log.warning("%d messages under keys that are not ours were skipped", self.foreign)
+
+    def _share(self, group: GroundGroup) -> None:
+        """Begin with the edges that are this member's now, and leave those that are another's."""
+        with self._lock:
+            known = self._alive | self._ports.keys()
+        for edge in sorted(known - self._leaving):
+            served, serves = edge in self._subscribers, group.serves(edge)
+            if serves and not served:
+                self._begin(edge)
+            elif served and not serves:
+                self._leave(edge)
+            elif not served:
+                group.release(edge)
+        group.forget(except_for=known | self._leaving)
+
+    def _begin(self, edge: str) -> None:
+        port = self._port(EdgeKeys(edge).key(Channel.ALIVE), alive=True)
+        if port is None:
+            return
+        if edge in self._alive:
+            port.present.set()
+        self._subscribers[edge] = [
+            subscribe(
+                self._session,
+                EdgeKeys(edge).key(row),
+                inbox=self,
+                clock=self._clock,
+                on_error=self._fail,
+            )
+            for row in _SUBSCRIBED
+        ]
+
+    def _leave(self, edge: str) -> None:
+        self._leaving.add(edge)
+        for one in self._subscribers.pop(edge):
+            one.undeclare()  # type: ignore[no-untyped-call]
+        with self._lock:
+            self._ports.pop(edge).close()
 
     def _port(self, key: str, *, alive: bool = False) -> EdgePort | None:
         parsed = parse_key(key)
@@ -260,11 +326,30 @@ class GroundLink:
 
     def _on_presence(self, sample: zenoh.Sample) -> None:
         key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT  # these enums fail `is`
+        if self._group is not None:
+            self._note_shared(key, there=there)
+            return
         try:
             port = self._port(key, alive=there)
         except Exception as error:  # noqa: BLE001 - for the edge's thread
             self._fail(key, error)
             return
+        if port is not None:
+            (port.present.set if there else port.present.clear)()
+
+    def _note_shared(self, key: str, *, there: bool) -> None:
+        """It may be another's: there is a port for it only if it is served here."""
+        parsed = parse_key(key)
+        if parsed is None or not matches(parsed[0], edges=self._edges):
+            self.foreign += 1
+            return
+        edge = parsed[0]
+        with self._lock:
+            if not there:
+                self._alive.discard(edge)
+            elif len(self._alive) < _MOST_SHARED:
+                self._alive.add(edge)
+            port = self._ports.get(edge)
         if port is not None:
             (port.present.set if there else port.present.clear)()
 

@@ -171,7 +171,9 @@ def state_message(state: GroundState) -> str:
         }
         for one in state.edges
     }
-    return text("state", at=state.at_ns // _MILLION, edges=edges, failed=[*map(_failure, state.failed)])
+    elsewhere = {edge: {"member": one.member, "page": one.page} for edge, one in state.elsewhere.items()}
+    failed = [*map(_failure, state.failed)]
+    return text("state", at=state.at_ns // _MILLION, edges=edges, elsewhere=elsewhere, failed=failed)
 
 
 def state_loads(state: GroundState) -> dict[str, tuple[float, float, float, float]]:

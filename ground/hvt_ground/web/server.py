@@ -59,8 +59,12 @@ class WebPage:
         self._socket = _bound(host, port)
         shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
         start = f"{'http' if keys is None else 'https'}://{shown}:{port}/"
+        self.address = start if proxy is None else f"https://{proxy}/"
+        """Without a token."""
+        self.is_local = proxy is None and not tokens
+        """Whether only this machine reaches it."""
         by_token = tuple(f"{start}?token={token} ({role})" for role, token in tokens.items())
-        self.links = by_token or (start if proxy is None else f"https://{proxy}/",)
+        self.links = by_token or (self.address,)
         """What to open, one for each role."""
         self._client: EdgeClient | None = None
         self._loop = asyncio.new_event_loop()

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -77,13 +77,18 @@ def eventually(true: Callable[[], object], *, within_s: float, what: str) -> Non
 
 
 class Running:
-    """One process; its output goes to files, so that it never waits for a reader."""
+    """One process; its output goes to files, so that it never waits for a reader.
 
-    def __init__(self, module: str, arguments: list[str], *, folder: Path, name: str) -> None:
+    ``within`` goes before its command, such as ``ip netns exec NAME``.
+    """
+
+    def __init__(
+        self, module: str, arguments: list[str], *, folder: Path, name: str, within: Sequence[str] = ()
+    ) -> None:
         self.name = name
         self._summary = folder / f"{name}.json"
         self._out, self._err = folder / f"{name}.out", folder / f"{name}.err"
-        command = [sys.executable, "-m", module, "--summary", str(self._summary), *arguments]
+        command = [*within, sys.executable, "-m", module, "--summary", str(self._summary), *arguments]
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
                 command,

@@ -311,6 +311,7 @@ by("method").addEventListener("change", () => {
 
 /** @param {Message} message */
 function onGroundState(message) {
+  wall.elsewhere(message.elsewhere);
   for (const [edge, state] of Object.entries(message.edges)) {
     wall.state(edge, state, message.at);
     links.set(edge, state.link);

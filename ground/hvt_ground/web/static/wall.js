@@ -8,6 +8,7 @@ export class Wall {
     this.root = root;
     this.nobody = nobody;
     this.onChoose = onChoose;
+    this.others = "{}";
     /** @type {Map<string, Record<string, any>>} */
     this.cards = new Map();
   }
@@ -64,6 +65,28 @@ export class Wall {
     const known = total !== null && budget !== null;
     card.bar.value = known ? Math.min(1, total / budget) : 0;
     card.bar.title = known ? `${kbps(total)} of ${kbps(budget)}` : "";
+  }
+
+  /**
+   * Edges that other grounds of the group serve, each a way to their page.
+   * @param {Record<string, {member: string, page: string}>} edges
+   */
+  elsewhere(edges) {
+    for (const edge of Object.keys(edges)) {
+      this.cards.get(edge)?.button.remove(); // it was here before
+      this.cards.delete(edge);
+    }
+    const now = JSON.stringify(edges);
+    if (now === this.others) return;
+    this.others = now;
+    for (const old of this.root.querySelectorAll(".elsewhere")) old.remove();
+    for (const [edge, { member, page }] of Object.entries(edges)) {
+      const tile = make(page ? "a" : "span", "elsewhere", this.root);
+      if (page) tile.href = `${page}#${new URLSearchParams({ edge })}`;
+      make("b", "", tile).textContent = edge;
+      make("span", "", tile).textContent = `at ${member}`;
+    }
+    if (this.root.children.length > 1) this.nobody.hidden = true;
   }
 
   /** @param {string} chosen empty for none */

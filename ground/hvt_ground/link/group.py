@@ -1,0 +1,210 @@
+"""Grounds that share a fleet: each edge is served by one of them, and by another once that one is gone.
+
+Who serves an edge follows from the names alone, by rendezvous hashing (Thaler and Ravishankar, 1998): the member with
+the highest hash of edge and member. When a member leaves, only its own edges move. Members, and the edges that each
+claims, are liveliness tokens: Zenoh takes them away with the member's link. A member says where its page is to others
+that ask.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import secrets
+import socket
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from hvt_common.protocol.channels import GroupKeys
+
+__all__ = ["Elsewhere", "GroundGroup", "member_name", "owner_of"]
+
+_log = logging.getLogger(__name__)
+
+_JOIN_S = 1.5
+"""So long after its start a member claims nothing: it learns who is there."""
+_SETTLE_S = 0.3
+"""Between a claim and serving: another claim of the same moment is seen by then."""
+_MOST_PAGE_BYTES = 512
+_ANSWER_S = 5.0
+_MOST_MEMBERS, _MOST_CLAIMS = 1024, 16384
+
+
+def owner_of(edge: str, members: Iterable[str]) -> str:
+    """The member that serves the edge, whoever asks."""
+    return max(members, key=lambda member: (_weight(edge, member), member))
+
+
+def member_name() -> str:
+    """Of this machine and process, such as ``base-3fa2``."""
+    host = re.sub(r"[^a-z0-9-]+", "-", socket.gethostname().lower()).strip("-")[:24]
+    return f"{host or 'ground'}-{secrets.token_hex(2)}"
+
+
+def _weight(edge: str, member: str) -> bytes:
+    return hashlib.blake2b(f"{edge}/{member}".encode(), digest_size=16).digest()
+
+
+@dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """Where an edge is served by another member."""
+
+    member: str
+    page: str
+    """The address of its page for browsers; empty where it has none, or has not said."""
+
+
+class GroundGroup:
+    """This ground as a ``member`` of a group, with a ``page`` or none; a context manager.
+
+    For one thread, beside Zenoh's callbacks.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        name: str,
+        *,
+        member: str | None = None,
+        page: str = "",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.name, self.member = name, member or member_name()
+        self._keys = GroupKeys(name)
+        self._session = session
+        self._clock = clock
+        self._began_s = clock()
+        self._lock = threading.Lock()
+        self._members: set[str] = {self.member}
+        self._claims: defaultdict[str, set[str]] = defaultdict(set)
+        """By edge, the other members that claim it."""
+        self._mine: dict[str, bool] = {}
+        """By edge, whether it is this member's; until members or claims change."""
+        self._own: dict[str, tuple[float, zenoh.LivelinessToken]] = {}
+        """By edge, since when it is claimed here."""
+        self._pages: dict[str, str] = {}
+        """By member; empty while it is asked."""
+        key, data = self._keys.member(self.member), page.encode()
+        self._answers = session.declare_queryable(key, lambda query: query.reply(key, data))
+        self._token = session.liveliness().declare_token(self._keys.member(self.member))
+        self._watch = session.liveliness().declare_subscriber(
+            self._keys.everything, self._on_token, history=True
+        )
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """All that are there, this one among them."""
+        with self._lock:
+            return tuple(sorted(self._members))
+
+    @property
+    def elsewhere(self) -> Mapping[str, Elsewhere]:
+        """By edge, the other member that serves it."""
+        with self._lock:
+            found = {edge: min(members) for edge, members in sorted(self._claims.items()) if members}
+            pages = dict(self._pages)
+        for member in set(found.values()) - pages.keys():
+            self._request_page(member)
+        return {edge: Elsewhere(member, pages.get(member, "")) for edge, member in found.items()}
+
+    def serves(self, edge: str) -> bool:
+        """Whether the edge is to be served here now; claims it where it is this member's."""
+        with self._lock:
+            mine, claimed_elsewhere = self._is_mine(edge), edge in self._claims
+        now_s = self._clock()
+        if not mine or now_s - self._began_s < _JOIN_S:
+            return False
+        if edge not in self._own:
+            self._own[edge] = (
+                now_s,
+                self._session.liveliness().declare_token(self._keys.claim(self.member, edge)),
+            )
+        return not claimed_elsewhere and now_s - self._own[edge][0] >= _SETTLE_S
+
+    def release(self, edge: str) -> None:
+        """It is not served here any more, and may be elsewhere; unless it is this member's again."""
+        with self._lock:
+            mine = self._is_mine(edge)
+        if not mine:
+            self._withdraw(edge)
+
+    def forget(self, *, except_for: Iterable[str]) -> None:
+        """Withdraw claims of edges that are gone."""
+        known = set(except_for)
+        for edge in self._own.keys() - known:
+            self._withdraw(edge)
+        with self._lock:
+            for edge in self._mine.keys() - known:
+                del self._mine[edge]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for declared in (self._watch, self._answers):
+            declared.undeclare()  # type: ignore[no-untyped-call]
+        for edge in list(self._own):
+            self._withdraw(edge)
+        self._token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _is_mine(self, edge: str) -> bool:
+        """Under the lock. Who claims takes part, also where its own token has not come yet."""
+        if edge not in self._mine:
+            members = self._members | self._claims.get(edge, set())
+            self._mine[edge] = owner_of(edge, members) == self.member
+        return self._mine[edge]
+
+    def _request_page(self, member: str) -> None:
+        """Once; the answer comes in a callback."""
+
+        def note(reply: zenoh.Reply) -> None:
+            if reply.ok is None or len(reply.ok.payload) > _MOST_PAGE_BYTES:
+                return
+            page = reply.ok.payload.to_bytes().decode(errors="replace")
+            with self._lock:
+                if page.startswith(("http://", "https://")) and len(self._pages) <= _MOST_MEMBERS:
+                    self._pages[member] = page
+
+        with self._lock:
+            self._pages[member] = ""
+        self._session.get(
+            self._keys.member(member), zenoh.handlers.Callback(note, lambda: None), timeout=_ANSWER_S
+        )
+
+    def _withdraw(self, edge: str) -> None:
+        claim = self._own.pop(edge, None)
+        if claim is not None:
+            claim[1].undeclare()  # type: ignore[no-untyped-call]
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        """Tokens may be anybody's where there are no keys: their number is bounded."""
+        parsed = self._keys.parse(str(sample.key_expr))
+        if parsed is None or parsed[0] == self.member:
+            return
+        member, edge = parsed
+        there = sample.kind == zenoh.SampleKind.PUT
+        with self._lock:
+            self._mine.clear()
+            known = self._members if edge is None else self._claims[edge]
+            most = _MOST_MEMBERS if edge is None else _MOST_CLAIMS
+            if not there:
+                known.discard(member)
+                if edge is None:
+                    self._pages.pop(member, None)
+            elif (len(self._members) if edge is None else len(self._claims)) < most:
+                known.add(member)
+            if edge is not None and not known:
+                del self._claims[edge]
+        if edge is None:
+            level = logging.INFO if there else logging.WARNING
+            _log.log(level, "%s: %s %s", self.name, member, "takes part" if there else "is gone")

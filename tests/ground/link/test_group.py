@@ -1,0 +1,137 @@
+"""Who of a group serves which edge."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.channels import Channel, EdgeKeys, GroupKeys
+from hvt_common.transport.session import LinkSettings, open_session
+from hvt_ground.link.group import GroundGroup, member_name, owner_of
+from programs.fleet_keys import Fleet
+from programs.processes import eventually, free_ports
+
+EDGES = [f"uav-{number}" for number in range(1000)]
+MEMBERS = [f"base-{number}" for number in range(40)]
+
+
+def test_edges_are_spread_evenly():
+    """One ground would carry half of the fleet."""
+    load = Counter(owner_of(edge, MEMBERS) for edge in EDGES)
+    assert set(load) == set(MEMBERS)
+    assert max(load.values()) < 2 * len(EDGES) / len(MEMBERS)
+
+
+def test_only_the_edges_of_who_leaves_move():
+    """Each change would interrupt the recordings of the whole fleet."""
+    rest = [one for one in MEMBERS if one != "base-7"]
+    for edge in EDGES:
+        before = owner_of(edge, MEMBERS)
+        if before != "base-7":
+            assert owner_of(edge, rest) == before
+
+
+def test_names_are_usable_as_keys():
+    """A machine whose name has capitals or dots could take no part."""
+    keys = GroupKeys("north")
+    assert keys.parse(keys.claim(member_name(), "uav-1")) is not None
+    assert keys.parse("hvt-group/south/base-1") is None
+    assert keys.parse("hvt-group/north/base-1/uav-1/more") is None
+    assert keys.parse("hvt-group/north/BASE") is None
+    with pytest.raises(UserError, match="group 'N O' is not usable"):
+        GroupKeys("N O")
+
+
+@pytest.fixture
+def sessions() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
+    """Two grounds on one link."""
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    with (
+        open_session(LinkSettings("ground", (endpoint,), ())) as one,
+        open_session(LinkSettings("ground", (), (endpoint,))) as other,
+    ):
+        yield one, other
+
+
+def served(group: GroundGroup, edges: list[str]) -> set[str]:
+    return {edge for edge in edges if group.serves(edge)}
+
+
+def test_each_edge_is_served_once_and_by_another_when_its_member_goes(sessions):
+    """Two recordings of one flight, or none."""
+    edges = EDGES[:12]
+    with GroundGroup(sessions[0], "north", member="base-a") as first:
+        eventually(lambda: served(first, edges) == set(edges), within_s=20, what="it serves all alone")
+        with GroundGroup(sessions[1], "north", member="base-b") as second:
+            eventually(
+                lambda: first.members == second.members == ("base-a", "base-b"), within_s=20, what="both know"
+            )
+            mine = {edge for edge in edges if owner_of(edge, first.members) == "base-a"}
+            assert 0 < len(mine) < len(edges)
+            assert served(first, edges) == mine
+            for _ in range(20):
+                assert served(second, edges) == set(), "the former member has not released them"
+            for edge in edges:
+                first.release(edge)
+            eventually(
+                lambda: served(second, edges) == set(edges) - mine, within_s=20, what="they have moved"
+            )
+            assert served(first, edges) == mine
+            assert set(first.elsewhere) == set(edges) - mine
+        eventually(lambda: served(first, edges) == set(edges), within_s=20, what="they are back")
+        assert not first.elsewhere
+
+
+def test_tokens_of_other_groups_and_nonsense_change_nothing(sessions):
+    """Anybody on an open link could take the fleet away."""
+    with GroundGroup(sessions[0], "north", member="base-a") as group:
+        tokens = [
+            sessions[1].liveliness().declare_token(key)
+            for key in (
+                "hvt-group/south/base-b",
+                "hvt-group/north/BAD",
+                "hvt-group/north/a/b/c",
+                "hvt-group/north/zz",
+            )
+        ]
+        eventually(lambda: "zz" in group.members, within_s=20, what="the last token has come")
+        assert group.members == ("base-a", "zz")
+        for one in tokens:
+            one.undeclare()
+        eventually(lambda: group.members == ("base-a",), within_s=20, what="it is gone")
+
+
+def test_with_keys_grounds_form_a_group_and_edges_take_no_part(tmp_path):
+    """The group would be silent behind TLS, or an edge that was stolen could take the fleet away."""
+    fleet = Fleet(tmp_path / "own")
+    fleet.keys("add-edge", "uav-1")
+    fleet.keys("add-ground", "base", "--host", "127.0.0.1")
+    fleet.keys("add-ground", "other")
+    endpoint = f"tls/127.0.0.1:{free_ports(1)[0]}"
+    with (
+        open_session(fleet.settings("base", "ground", listen=(endpoint,))) as base,
+        open_session(fleet.settings("other", "ground", connect=(endpoint,))) as other,
+        open_session(fleet.settings("uav-1", "edge", connect=(endpoint,))) as edge,
+    ):
+        alive = edge.liveliness().declare_token(EdgeKeys("uav-1").key(Channel.ALIVE))
+        stolen = edge.liveliness().declare_token(GroupKeys("north").member("zz-stolen"))
+        with (
+            GroundGroup(base, "north", member="base-a") as first,
+            GroundGroup(other, "north", member="base-b") as second,
+        ):
+            eventually(
+                lambda: first.members == second.members == ("base-a", "base-b"), within_s=20, what="both know"
+            )
+            token = EdgeKeys("uav-1").key(Channel.ALIVE)
+            eventually(
+                lambda: [one.ok for one in base.liveliness().get(token, timeout=2)],
+                within_s=20,
+                what="the edge is there",
+            )
+            assert "zz-stolen" not in first.members
+        alive.undeclare()
+        stolen.undeclare()
