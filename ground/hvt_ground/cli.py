@@ -49,7 +49,9 @@ def program() -> NoReturn:
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     if words and words[0] in _COMMANDS:
-        code: int = import_module(_COMMANDS[words[0]]).run(words[1:])
+        with needs_extra("'hvt[ground]'"):
+            command = import_module(_COMMANDS[words[0]])
+        code: int = command.run(words[1:])
         return code
     if words and not words[0].startswith("-"):
         from hvt_ground.control import command as control  # noqa: PLC0415

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import json
+import logging
 import os
 import shutil
 import socket
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -45,7 +46,10 @@ class Finding:
 def run_checks(
     checks: Mapping[str, Callable[[], Finding]], *, patience_s: float = _PATIENCE_S
 ) -> dict[str, Finding]:
-    """Each in turn, by name. A `UserError` is what is wrong; a check without an end is left behind."""
+    """Each in turn, by name. A `UserError` is what is wrong; a check without an end is left behind.
+
+    What a check logs belongs to its finding: a warning makes of ``ok`` a ``warning``.
+    """
     return {name: _bounded(check, patience_s) for name, check in checks.items()}
 
 
@@ -85,8 +89,11 @@ def check_clock() -> Finding:
     return Finding("ok", "the clock is synchronised")
 
 
-def check_port(address: str, *, name: str) -> None:
-    """Raise `UserError` where HOST:PORT cannot be listened on now."""
+def check_port(address: str, *, name: str, packages: Sequence[str] = ()) -> None:
+    """Raise `UserError` where HOST:PORT cannot be listened on now, or a package is missing that serves there."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise UserError(f"{name} needs the package {package!r}: pip install 'hvt[{name.strip('-')}]'")
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and 0 < int(port) < 2**16):
         raise UserError(f"{name} {address!r} is not accepted: give HOST:PORT")
@@ -113,21 +120,49 @@ def _bounded(check: Callable[[], Finding], patience_s: float) -> Finding:
     found: list[Finding] = []
 
     def run() -> None:
+        said = _Said(threading.get_ident())
+        logger = logging.getLogger()
+        logger.addHandler(said)
         try:
-            found.append(check())
+            found.append(said.within(check()))
         except UserError as error:
-            said, _, todo = str(error).rpartition(": ")
-            found.append(Finding("wrong", said or todo, todo))
+            what, _, todo = str(error).rpartition(": ")
+            named_only = " " not in what  # the sentence tells what is wrong behind the colon
+            found.append(Finding("wrong", str(error) if named_only else what, todo))
         except Exception as error:  # noqa: BLE001 - the others are checked all the same
             found.append(
                 Finding("wrong", f"{type(error).__name__}: {error}", "report it: this should not happen")
             )
+        finally:
+            logger.removeHandler(said)
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     thread.join(patience_s)
-    with contextlib.suppress(IndexError):
+    if found:
         return found[0]
     return Finding(
         "wrong", f"no answer within {patience_s:g} s", "see whether the device or the disk works at all"
     )
+
+
+class _Said(logging.Handler):
+    """What is logged in one thread."""
+
+    def __init__(self, thread: int) -> None:
+        super().__init__(logging.INFO)
+        self._thread = thread
+        self._warnings: list[str] = []
+        self._facts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self._thread:
+            which = self._facts if record.levelno < logging.WARNING else self._warnings
+            which.append(record.getMessage())
+
+    def within(self, finding: Finding) -> Finding:
+        """The finding with it."""
+        finding = replace(finding, found="; ".join([finding.found, *self._facts]))
+        if not self._warnings or finding.state not in ("ok", "unknown"):
+            return finding
+        return replace(finding, state="warning", todo="; ".join(self._warnings))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 
 import zenoh
 
 from hvt_common.config import load
+from hvt_common.errors import UserError
 from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.channels import Channel, EdgeKeys
 from hvt_common.runtime.checkup import (
@@ -25,13 +27,14 @@ from hvt_common.transport.session import declare_publisher
 from hvt_common.values import Frame
 from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check, with_profile
-from hvt_edge.loop.cpu import CpuMeter
+from hvt_edge.loop.cpu import Cores, CpuMeter
 from hvt_edge.source.contract import Source
 from hvt_edge.video.x265 import BaseEncoder
 from hvt_edge.wiring import (
     check_codecs,
     check_files,
     check_store,
+    first_decimation,
     make_encoder,
     make_link_settings,
     store_folder,
@@ -54,22 +57,23 @@ def run(argv: Sequence[str]) -> int:
     words = [one for one in argv if one != "--json"]
     config, given = load(EdgeConfig, words, program="hvt-edge doctor", description=_DESCRIPTION)
     config = check(with_profile(config, given=given.values))
-    with ExitStack() as stack:
-        findings = run_checks(_Checks(config, stack).by_name)
+    logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # what a network runs on
+    checks = _Checks(config)
+    findings = run_checks(checks.by_name)
+    checks.close()
     return print_findings(f"hvt-edge doctor: {config.edge_id}", findings, as_json=len(words) < len(argv))
 
 
 class _Checks:
     """In the order of the flight; the later ones use what the earlier have opened."""
 
-    def __init__(self, config: EdgeConfig, stack: ExitStack) -> None:
+    def __init__(self, config: EdgeConfig) -> None:
         self._config = config
-        self._stack = stack
         self._world = World()
         self._source: Source | None = None
         self._detector: Detector | None = None
         self._frames: list[Frame] = []
-        self._pixels_s = 0.0
+        self._detect_s = 0.0
         """Processor time of one detection."""
 
     @property
@@ -86,12 +90,21 @@ class _Checks:
             "link": self.link,
         }
 
+    def close(self) -> None:
+        """Let go of the source, unless its check still waits for it."""
+        if self._source is not None:
+            self._source.close()
+
     def source(self) -> Finding:
         """Opens it, and looks for two seconds how many pictures it gives."""
         config = self._config
-        source = self._source = self._stack.enter_context(self._world.open_source(config))
+        source = self._world.open_source(config)
         frames = source.frames(start_ns=self._world.clock())
-        self._frames.append(next(frames))
+        first = next(frames, None)
+        if first is None:
+            source.close()
+            raise UserError(f"--source {config.source} gives no picture: name another")
+        self._frames.append(first)
         began_s, count = time.monotonic(), 0
         while time.monotonic() - began_s < _SAMPLE_S and (source.live or count < _MOST_FRAMES):
             frame = next(frames, None)
@@ -100,6 +113,7 @@ class _Checks:
             count += 1
             if len(self._frames) < _MOST_FRAMES:
                 self._frames.append(frame)
+        self._source = source
         size, base = source.view.source_size, source.view.base_size
         found = f"{config.source}: {size[0]}x{size[1]}, sent as {base[0]}x{base[1]} at {source.fps:g} fps"
         rate = count / (time.monotonic() - began_s)
@@ -121,7 +135,7 @@ class _Checks:
         picture = frame.source_bgr if self._config.candidates == "source" else frame.base_bgr
         began_s, cpu_s = time.monotonic(), time.process_time()
         found = detector.detect(picture)
-        self._pixels_s = time.process_time() - cpu_s
+        self._detect_s = time.process_time() - cpu_s
         took_ms = 1000 * (time.monotonic() - began_s)
         return Finding(
             "ok", f"{self._config.detector}: {took_ms:.0f} ms a picture, {len(found.class_ids)} found in one"
@@ -147,23 +161,24 @@ class _Checks:
         if self._source is None or not self._frames:
             return Finding("unknown", "not tried without a source")
         config, meter = self._config, CpuMeter()
-        encoder = self._encoder(self._source.view.base_size)
+        size = self._source.view.base_size
+        encoder, fps = self._encoder(size), self._source.fps / first_decimation(config, size)
         began_s, cpu_s = time.monotonic(), time.process_time()
         count = 0
         while time.monotonic() - began_s < _SAMPLE_S / 2:
             encoder.encode(self._frames[count % len(self._frames)])
             count += 1
         encode_s = (time.process_time() - cpu_s) / count
+        most_fps = count / (time.monotonic() - began_s)
         meter.measure(scale=1.0, short=False)
-        fps = self._source.fps
-        every = detect_every(config.detect_every, fps=fps)
+        every = detect_every(config.detect_every, fps=self._source.fps)
         networks = 2 if config.measures else 1  # it looks at the source and at what the base shows of it
-        needed = fps * (encode_s + networks * self._pixels_s / every)
+        needed = fps * encode_s + self._source.fps * networks * self._detect_s / every
         free = meter.now.free
-        found = (
-            f"about {needed:.1f} cores of {free:.1f} that are free: {1000 * encode_s:.0f} ms to code a frame"
-        )
-        if free and needed > free:
+        if meter.now == Cores():  # this system does not say
+            free = float(os.cpu_count() or 1)
+        found = f"about {needed:.1f} cores of {free:.1f} that are free; x265 codes {most_fps:.0f} fps of {fps:g} here"
+        if needed > free or most_fps < fps:
             todo = "lower --fps or --size, give --preset ultrafast or --method M0; else frames are left out"
             return Finding("warning", found, todo)
         return Finding("ok", found)
@@ -189,7 +204,7 @@ class _Checks:
         """Those of the probes; the link's own are tried with it."""
         if self._config.metrics is None:
             return Finding("ok", "no --metrics")
-        check_port(self._config.metrics, name="--metrics")
+        check_port(self._config.metrics, name="--metrics", packages=["prometheus_client"])
         return Finding("ok", f"{self._config.metrics} is free for --metrics")
 
     def link(self) -> Finding:
@@ -209,5 +224,9 @@ class _Checks:
     def _encoder(self, size: tuple[int, int]) -> BaseEncoder:
         config = self._config
         return make_encoder(
-            config, size=size, total_bps=config.budget_bps, base_bps=config.base_bps, decimation=1
+            config,
+            size=size,
+            total_bps=config.budget_bps,
+            base_bps=config.base_bps,
+            decimation=first_decimation(config, size),
         )

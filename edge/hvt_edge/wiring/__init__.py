@@ -5,7 +5,7 @@ from hvt_edge.wiring.perception import make_detector, track_confidence, warm_up_
 from hvt_edge.wiring.stages import Stages, build_stages
 from hvt_edge.wiring.stills import check_codecs
 from hvt_edge.wiring.storing import check_files, check_store, store_folder
-from hvt_edge.wiring.video import base_size, default_size, make_encoder
+from hvt_edge.wiring.video import base_size, default_size, first_decimation, make_encoder
 
 __all__ = [
     "Stages",
@@ -15,6 +15,7 @@ __all__ = [
     "check_files",
     "check_store",
     "default_size",
+    "first_decimation",
     "make_detector",
     "make_encoder",
     "make_link_settings",

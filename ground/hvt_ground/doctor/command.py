@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import zenoh
 
 from hvt_common.config import load
-from hvt_common.errors import UserError
 from hvt_common.inference.detect import detect_every
 from hvt_common.protocol.channels import Channel, parse_key, selector
 from hvt_common.runtime.checkup import (
@@ -43,6 +42,7 @@ def run(argv: Sequence[str]) -> int:
     words = [one for one in argv if one != "--json"]
     config, _ = load(GroundConfig, words, program="hvt-ground doctor", description=_DESCRIPTION)
     config = check(config)
+    logging.getLogger("hvt_common.inference.runtimes.model").setLevel(logging.INFO)  # what a network runs on
     checks: dict[str, Callable[[], Finding]] = {
         "models": lambda: _models(config),
         "recordings": lambda: _recordings(config),
@@ -72,28 +72,33 @@ def _models(config: GroundConfig) -> Finding:
 
 
 def _recordings(config: GroundConfig) -> Finding:
-    for path, name in ((config.summary, "--summary"), (config.timing, "--timing")):
+    """What is written, and whether there is room."""
+    named = {"--summary": config.summary, "--timing": config.timing}
+    if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
+        named["--tracks"] = config.tracks
+    folder = config.record_folder or Path()
+    if config.record is not None and config.record_folder is None:
+        named["--record"], folder = config.record, config.record.absolute().parent
+    for name, path in named.items():
         check_writable(path, name=name)
-    if config.record is None:
-        return Finding("ok", "written into this folder")
-    folder = config.record.parent if config.record.suffix == ".rrd" else config.record
     free = check_folder(folder, name="--record")
     hours = 8 * free / _USUAL_BPS / 3600
-    found = f"{Path(folder)}: {free / 1e9:.1f} GB are free, {hours:.0f} hours of an edge at 1 Mbps"
+    found = f"{folder.absolute()}: {free / 1e9:.1f} GB are free, {hours:.0f} hours of an edge at 1 Mbps"
     if hours < _LITTLE_H:
         return Finding("warning", found, "make room, or give --keep a size")
     return Finding("ok", found)
 
 
 def _ports(config: GroundConfig) -> Finding:
-    named = {"--web": (config.web, "starlette"), "--metrics": (config.metrics, "prometheus_client")}
-    for name, (address, package) in named.items():
-        if address is None:
-            continue
-        if find_spec(package) is None:
-            raise UserError(f"{name} needs a package that is missing: pip install 'hvt[{name.strip('-')}]'")
-        check_port(address, name=name)
-    free = [f"{address} for {name}" for name, (address, _) in named.items() if address is not None]
+    named = {
+        "--web": (config.web, ("starlette", "uvicorn", "websockets")),
+        "--metrics": (config.metrics, ("prometheus_client",)),
+    }
+    free = []
+    for name, (address, packages) in named.items():
+        if address is not None:
+            check_port(address, name=name, packages=packages)
+            free.append(f"{address} for {name}")
     return Finding("ok", f"free: {', '.join(free)}" if free else "no --web, no --metrics")
 
 

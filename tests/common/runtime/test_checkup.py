@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import socket
 import threading
 
@@ -23,6 +24,11 @@ def refused() -> Finding:
     raise UserError("camera /dev/video9 is not there: name one that is")
 
 
+def logged(text: str) -> Finding:
+    logging.getLogger("hvt_common.some.part").warning("%s", text)
+    return Finding("ok", "the keys are there")
+
+
 def broken() -> Finding:
     raise ZeroDivisionError("division by zero")
 
@@ -40,6 +46,8 @@ def test_one_that_fails_or_hangs_keeps_no_other_from_its_answer():
     assert found["camera"] == Finding("wrong", "camera /dev/video9 is not there", "name one that is")
     assert (found["bug"].state, found["bug"].found) == ("wrong", "ZeroDivisionError: division by zero")
     assert (found["hangs"].state, found["hangs"].found) == ("wrong", "no answer within 0.3 s")
+    warned = run_checks({"keys": lambda: logged("this key can be read by all")})["keys"]
+    assert (warned.state, warned.todo) == ("warning", "this key can be read by all")
     assert found["last"] == Finding("ok", "it was checked")
 
 

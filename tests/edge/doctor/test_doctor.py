@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import socket
 
@@ -75,6 +76,28 @@ def test_keys_of_another_edge_are_found_out(tmp_path, capsys):
     code, found = examined(capsys, "--source", "demo", *CHEAP, *words)
     assert code == 2
     assert "the certificate of 'uav-1'" in found["link"]["found"] + found["link"]["todo"]
+
+
+def test_a_certificate_that_ends_is_found_out(tmp_path, capsys):
+    """The drone would stand on the ground on some morning."""
+    fleet = Fleet(tmp_path / "own")
+    fleet.keys("add-ground", "base")
+    fleet.keys("add-edge", "uav-1")
+    words = (
+        "--zenoh-config",
+        str(fleet.file("uav-1")),
+        "--edge-id",
+        "uav-1",
+        "--connect",
+        "tls/127.0.0.1:7447",
+    )
+    now = dt.datetime.now(dt.UTC)
+    for made, state, said in ((now - dt.timedelta(days=4000), "wrong", "expired on"), (now, "warning", "")):
+        fleet.reissue("uav-1", now=made)
+        capsys.readouterr()
+        code, found = examined(capsys, "--source", "demo", *CHEAP, *words)
+        assert (code, found["link"]["state"]) == (2 if state == "wrong" else 0, state)
+        assert said in found["link"]["found"]
 
 
 def test_settings_that_contradict_are_a_sentence(capsys):
