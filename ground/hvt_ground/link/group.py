@@ -35,7 +35,8 @@ _SETTLE_S = 0.3
 """Between a claim and serving: another claim of the same moment is seen by then."""
 _MOST_PAGE_BYTES = 512
 _ANSWER_S = 5.0
-_MOST_MEMBERS, _MOST_CLAIMS = 1024, 16384
+_MOST_MEMBERS, _MOST_EDGES, _MOST_CLAIMS = 1024, 16384, 64
+"""The last of one edge: tokens may be anybody's where there are no keys."""
 
 
 def owner_of(edge: str, members: Iterable[str]) -> str:
@@ -187,7 +188,7 @@ class GroundGroup:
             claim[1].undeclare()  # type: ignore[no-untyped-call]
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        """Tokens may be anybody's where there are no keys: their number is bounded."""
+        """In Zenoh's thread."""
         parsed = self._keys.parse(str(sample.key_expr))
         if parsed is None or parsed[0] == self.member:
             return
@@ -196,12 +197,14 @@ class GroundGroup:
         with self._lock:
             self._mine.clear()
             known = self._members if edge is None else self._claims[edge]
-            most = _MOST_MEMBERS if edge is None else _MOST_CLAIMS
             if not there:
                 known.discard(member)
                 if edge is None:
                     self._pages.pop(member, None)
-            elif (len(self._members) if edge is None else len(self._claims)) < most:
+            elif (
+                len(known) < (_MOST_MEMBERS if edge is None else _MOST_CLAIMS)
+                and len(self._claims) <= _MOST_EDGES
+            ):
                 known.add(member)
             if edge is not None and not known:
                 del self._claims[edge]

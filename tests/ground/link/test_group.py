@@ -100,6 +100,15 @@ def test_tokens_of_other_groups_and_nonsense_change_nothing(sessions):
         ]
         eventually(lambda: "zz" in group.members, within_s=20, what="the last token has come")
         assert group.members == ("base-a", "zz")
+        tokens += [
+            sessions[1].liveliness().declare_token(f"hvt-group/north/m-{number}/uav-1")
+            for number in range(200)
+        ]
+        tokens += [
+            sessions[1].liveliness().declare_token(f"hvt-group/north/n-{number}") for number in range(1200)
+        ]
+        eventually(lambda: len(group.members) >= 1024, within_s=20, what="more than are taken")
+        assert len(group.members) == 1024
         for one in tokens:
             one.undeclare()
         eventually(lambda: group.members == ("base-a",), within_s=20, what="it is gone")
