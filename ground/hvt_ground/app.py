@@ -250,6 +250,8 @@ class Ground:
             one.stop()
             self._leaving.append(one)
         for one in [one for one in self._leaving if one.ended]:
+            if one.error is not None:
+                raise one.error
             self._leaving.remove(one)
             if one.sessions.ended:
                 self._moved[one.sessions.port.edge] = one.sessions

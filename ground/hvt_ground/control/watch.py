@@ -19,7 +19,8 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _table(state: dict[str, Any]) -> Table:
-    table = Table(title=f"hvt-ground {state['version']}, {state['detector']}", title_justify="left")
+    title = f"hvt-ground {state['version']}, {', '.join(filter(None, (state['member'], state['detector'])))}"
+    table = Table(title=title, title_justify="left")
     for name in ("edge", "link", "of budget", "delay p95", "picture", "stills", "tracks", "does not work"):
         table.add_column(name)
     for one in state["edges"]:

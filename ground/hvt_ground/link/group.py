@@ -91,8 +91,11 @@ class GroundGroup:
         """By edge, whether it is this member's; until members or claims change."""
         self._own: dict[str, tuple[float, zenoh.LivelinessToken]] = {}
         """By edge, since when it is claimed here."""
+        self._serving: set[str] = set()
         self._pages: dict[str, str] = {}
-        """By member; empty while it is asked."""
+        """By member that has answered; empty where it has none."""
+        self._requested: set[str] = set()
+        """Members that are asked for theirs."""
         key, data = self._keys.member(self.member), page.encode()
         self._answers = session.declare_queryable(key, lambda query: query.reply(key, data))
         self._token = session.liveliness().declare_token(self._keys.member(self.member))
@@ -112,7 +115,9 @@ class GroundGroup:
         with self._lock:
             found = {edge: min(members) for edge, members in sorted(self._claims.items()) if members}
             pages = dict(self._pages)
-        for member in set(found.values()) - pages.keys():
+            unknown = set(found.values()) - pages.keys() - self._requested
+            self._requested |= unknown
+        for member in unknown:
             self._request_page(member)
         return {edge: Elsewhere(member, pages.get(member, "")) for edge, member in found.items()}
 
@@ -122,13 +127,17 @@ class GroundGroup:
             mine, claimed_elsewhere = self._is_mine(edge), edge in self._claims
         now_s = self._clock()
         if not mine or now_s - self._began_s < _JOIN_S:
+            self._serving.discard(edge)
             return False
         if edge not in self._own:
             self._own[edge] = (
                 now_s,
                 self._session.liveliness().declare_token(self._keys.claim(self.member, edge)),
             )
-        return not claimed_elsewhere and now_s - self._own[edge][0] >= _SETTLE_S
+        if not claimed_elsewhere and now_s - self._own[edge][0] >= _SETTLE_S:
+            self._serving.add(edge)
+        # Once it is served, the claim of a member that is about to give way interrupts nothing.
+        return edge in self._serving
 
     def release(self, edge: str) -> None:
         """It is not served here any more, and may be elsewhere; unless it is this member's again."""
@@ -166,23 +175,24 @@ class GroundGroup:
         return self._mine[edge]
 
     def _request_page(self, member: str) -> None:
-        """Once; the answer comes in a callback."""
+        """The answer comes in a callback; where none does it is asked again."""
 
         def note(reply: zenoh.Reply) -> None:
             if reply.ok is None or len(reply.ok.payload) > _MOST_PAGE_BYTES:
                 return
             page = reply.ok.payload.to_bytes().decode(errors="replace")
             with self._lock:
-                if page.startswith(("http://", "https://")) and len(self._pages) <= _MOST_MEMBERS:
+                if member in self._members and (not page or page.startswith(("http://", "https://"))):
                     self._pages[member] = page
 
-        with self._lock:
-            self._pages[member] = ""
-        self._session.get(
-            self._keys.member(member), zenoh.handlers.Callback(note, lambda: None), timeout=_ANSWER_S
-        )
+        def end() -> None:
+            with self._lock:
+                self._requested.discard(member)
+
+        self._session.get(self._keys.member(member), zenoh.handlers.Callback(note, end), timeout=_ANSWER_S)
 
     def _withdraw(self, edge: str) -> None:
+        self._serving.discard(edge)
         claim = self._own.pop(edge, None)
         if claim is not None:
             claim[1].undeclare()  # type: ignore[no-untyped-call]

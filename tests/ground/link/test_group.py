@@ -86,6 +86,37 @@ def test_each_edge_is_served_once_and_by_another_when_its_member_goes(sessions):
         assert not first.elsewhere
 
 
+def test_a_claim_that_has_to_give_way_interrupts_nothing(sessions):
+    """A recording would be split each time a link comes back and tokens arrive out of order."""
+    edge = next(one for one in EDGES if owner_of(one, ("base-a", "base-b")) == "base-a")
+    with GroundGroup(sessions[0], "north", member="base-a") as group:
+        eventually(lambda: group.serves(edge), within_s=20, what="it is served")
+        claim = sessions[1].liveliness().declare_token(GroupKeys("north").claim("base-b", edge))
+        eventually(lambda: edge in group.elsewhere, within_s=20, what="the other claim is known")
+        assert group.serves(edge)
+        claim.undeclare()
+
+
+def test_a_page_is_asked_for_until_it_is_known(sessions):
+    """Its tile would lead nowhere for as long as both run."""
+    keys = GroupKeys("north")
+    with GroundGroup(sessions[0], "north", member="base-a") as group:
+        tokens = [
+            sessions[1].liveliness().declare_token(key)
+            for key in (keys.member("zz"), keys.claim("zz", "uav-1"))
+        ]
+        eventually(lambda: group.elsewhere, within_s=20, what="the other is known")
+        assert group.elsewhere["uav-1"].page == ""
+        answers = sessions[1].declare_queryable(
+            keys.member("zz"), lambda query: query.reply(keys.member("zz"), b"https://z/")
+        )
+        eventually(
+            lambda: group.elsewhere["uav-1"].page == "https://z/", within_s=30, what="its page is known"
+        )
+        for one in (*tokens, answers):
+            one.undeclare()
+
+
 def test_tokens_of_other_groups_and_nonsense_change_nothing(sessions):
     """Anybody on an open link could take the fleet away."""
     with GroundGroup(sessions[0], "north", member="base-a") as group:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_ground.events import Event, Notice, VideoSample
 from hvt_ground.sinks import Outputs, QueuedSink
@@ -138,6 +140,24 @@ def test_a_viewer_that_is_killed_is_told_of_and_started_again(samples, tmp_path,
     assert recording.missing == 0
     assert len(Recording(tmp_path / "a.rrd").video()) == len(samples)
     assert [one.split(":")[0] for one in caplog.messages] == ["live view", "live view"], "once each way"
+
+
+def test_a_recording_does_not_mind_that_a_viewer_is_gone(samples, tmp_path):
+    """The SDK tells whoever ends a recording that another one's viewer is gone: that recording broke off."""
+    port, web_port = free_ports(2)
+    with LiveView("serve", port=port, web_port=web_port) as view:
+        live = Recorder(settings(None, live_url=view.url))
+        live.log(samples[0])
+        os.kill(view.pid, signal.SIGKILL)
+        eventually(lambda: not listening(port), within_s=20, what="the viewer is dead")
+        for number in range(30):  # while the SDK finds out that nobody takes what it sends
+            with suppress(UserError):
+                live.log(samples[number + 1])
+            with Recorder(settings(tmp_path / f"{number}.rrd")) as recorder:
+                recorder.log(samples[0])
+            assert len(Recording(tmp_path / f"{number}.rrd").video()) == 1
+        with suppress(UserError):
+            live.close(None)
 
 
 def feed(events: list[Event], *sinks: QueuedSink[Event]) -> None:

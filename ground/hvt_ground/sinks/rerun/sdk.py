@@ -16,7 +16,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.abc import MetaPathFinder
 from pathlib import Path
@@ -110,7 +110,10 @@ def releasing_recordings() -> Iterator[None]:
     """In it, disconnect recordings and ``del`` the last that refers to them: they are freed at its end."""
     with _list_of_recordings:
         yield
-        bindings.flush_and_cleanup_orphaned_recordings()
+        # It flushes all recordings first, and raises where the viewer of any is gone: that is not this one's fault.
+        # What is not freed then is with the next.
+        with suppress(RuntimeError):
+            bindings.flush_and_cleanup_orphaned_recordings()
 
 
 def viewer_program() -> Path:
