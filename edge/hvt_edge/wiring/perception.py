@@ -28,7 +28,8 @@ def make_detector(config: EdgeConfig) -> Detector:
         confidence=weak_confidence(track_confidence(config)),
         nms_iou=config.nms_iou,
         threads=config.threads,
-        provider=config.provider,
+        # By its speed auto may choose one this time and another the next, and their answers differ a little.
+        provider="cpu" if config.pace == "lockstep" and config.provider == "auto" else config.provider,
     )
     return tiled(detector, config.tiles) if config.candidates == "source" else detector
 

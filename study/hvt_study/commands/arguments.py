@@ -148,7 +148,11 @@ def add_plan_arguments(parser: argparse.ArgumentParser, *, methods: bool = True,
     parser.add_argument(
         "--only", action="append", default=[], metavar="NAME", help="sequences, or patterns of them"
     )
-    parser.add_argument("--provider", default="auto", help="what runs the networks, as of hvt-edge")
+    parser.add_argument(
+        "--provider",
+        default="cpu",
+        help="what runs the networks, as of hvt-edge; auto may choose another each time",
+    )
     parser.add_argument(
         "--out",
         type=Path,

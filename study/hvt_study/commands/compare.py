@@ -88,7 +88,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KIND,…",
         help="kinds that the labels know, such as vehicle; others count neither way (default: all they name)",
     )
-    parser.add_argument("--provider", default="auto", help="what runs the networks, as of hvt-edge")
+    parser.add_argument(
+        "--provider",
+        default="cpu",
+        help="what runs the networks, as of hvt-edge; auto may choose another each time",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vehicles-as-one", action="store_true", help="car, van, truck and bus are one class"
     )
-    parser.add_argument("--provider", default="auto", help="what runs the network, as of hvt-edge")
+    parser.add_argument("--provider", default="cpu", help="what runs the network, as of hvt-edge")
     parser.add_argument("--threads", type=int, default=2, help="of the network")
 
 

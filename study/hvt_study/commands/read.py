@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="read.json, read.png, and cache, where finished flights lie",
     )
-    parser.add_argument("--provider", default="auto", help="what runs the detector, as of hvt-edge")
+    parser.add_argument("--provider", default="cpu", help="what runs the detector, as of hvt-edge")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -278,7 +278,7 @@ def _rows(labels: FrameLabels, classes: Sequence[str]) -> tuple[Boxes, npt.NDArr
 
 
 def _frames(path: Path, held_out: Sequence[_Own], size: _Size) -> list[LabelledFrame]:
-    detector = open_detector(str(path), confidence=_CURVE, provider="auto")
+    detector = open_detector(str(path), confidence=_CURVE, provider="cpu")
     frames = []
     for own in held_out:
         image = read_image(own.path)

@@ -25,7 +25,7 @@ class ModelChoice:
     classifier: str = "detector"
     """``detector`` (it looks at the still again), ``none``, or a classifier."""
     refine: str = "fuse"
-    provider: str = "auto"
+    provider: str = "cpu"
 
 
 @dataclass(frozen=True, slots=True)
