@@ -49,8 +49,6 @@ def summary(session: GroundSession) -> dict[str, Any]:
     worst = account.worst_window_bps
     unread = pipeline.outcomes.get("unread", 0)
     backlog = session.backlog.totals
-    came = session.stills_received + backlog.stills
-    deferred = came - sum(pipeline.outcomes.values()) - sum(session.stills_dropped.values())
     return {
         "edge": info.edge,
         "session": f"{info.session_id:016x}",
@@ -73,7 +71,6 @@ def summary(session: GroundSession) -> dict[str, Any]:
         "worst_window_bps": {"base": worst.base, "roi": worst.roi, "total": worst.total},
         "stills": {
             "received": session.stills_received,
-            "deferred": deferred,
             "dropped": sum(session.stills_dropped.values()),
             "unread": unread,
             "reasons": {

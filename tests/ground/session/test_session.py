@@ -534,7 +534,7 @@ def test_the_summary_can_be_written_and_read(flight):
     assert content["stills"]["received"] == 2
     assert content["stills"]["unread"] == 1
     assert content["stills"]["dropped"] == 1
-    assert content["stills"]["deferred"] == 0
+    assert content["stills"]["reasons"]["outcomes"] == {"unread": 1}
     assert content["latency_ms"]["p50"] is not None
     assert (content["edge"], content["method"], content["recording"]) == ("uav-1", "M5", None)
     content = completed(content, rig.receiver)
