@@ -136,7 +136,9 @@ def test_a_network_of_photographs_makes_no_car_anything_else(flight):
     assert {after for _, after in vehicles if group_of(after) != "vehicle"} == set()
     stills = flight.ground["stills"]
     assert stills["dropped"] == 0
-    assert sum(stills["reasons"]["outcomes"].values()) >= stills["received"], "one of each object that it shows"
+    assert sum(stills["reasons"]["outcomes"].values()) >= stills["received"], (
+        "one of each object that it shows"
+    )
     notes = [
         text for _, _, text in flight.recording.events() if re.match(r"still #.*: \w+ \(.+ \.\d\d\)  ", text)
     ]
