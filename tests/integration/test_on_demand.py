@@ -105,7 +105,7 @@ def flight(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Flight:
         edge = link.edge(
             *("--source", str(scene), "--source-fps", "10", "--fps", "10", "--size", "640x360"),
             *("--preset", "ultrafast", "--budget", "500kbps", "--video-share", "0.6", "--edge-id", "uav-1"),
-            *("--detector", "motion", "--still-codec", "residual", "--cooldown", "0s"),
+            *("--method", "M5", "--detector", "motion", "--still-codec", "residual", "--cooldown", "0s"),
         )
         eventually(lambda: "stills" in ground.said, within_s=40, what="the ground sees stills")
         with EdgeClient.connect(link.ground_endpoint) as edges:

@@ -143,14 +143,26 @@ def test_a_store_that_fails_in_an_outage_costs_what_it_would_have_stored(link, t
 def test_a_model_that_fails_leaves_the_video(link, tmp_path):
     """The flight would end in the first bright minute of a model that cannot bear light."""
     model = failing_in_the_light(tmp_path / "model.onnx")
-    scene = pictures(tmp_path / "clip", [30] * 40 + [200] * 150 + [30] * 500)
+    dark, light = (str(one) for one in sorted(pictures(tmp_path / "seen", [30, 200]).iterdir()))
+    scene, now, later = tmp_path / "clip", tmp_path / "now.png", tmp_path / "later.png"
+    scene.mkdir()
+    for index in range(2000):
+        (scene / f"{index:04d}.png").symlink_to(now)
+
+    def comes(picture: str) -> None:
+        shutil.copy(picture, later)
+        later.replace(now)
+
+    comes(dark)
     with watched(link, "--source", str(scene), "--detector", str(model), "--provider", "cpu") as (
         edge,
         watcher,
     ):
+        comes(light)
         eventually(lambda: watcher.failed("detector"), within_s=SOON_S, what="status says so")
         assert not watcher.failed("detector").working
         watcher.goes_on()
+        comes(dark)
         eventually(lambda: watcher.failed("detector").working, within_s=SOON_S, what="it is opened again")
         watcher.goes_on()
         edge.stop()

@@ -161,7 +161,7 @@ def attack(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Attack:
         edge = link.edge(
             *("--source", str(scene), "--source-fps", "10", "--fps", "10", "--size", "640x360"),
             *("--preset", "ultrafast", "--budget", "300kbps", "--edge-id", "uav-1", "--max-frames", "240"),
-            *("--video-share", "0.6"),  # stills have their share, whatever the video would take
+            *("--method", "M5", "--video-share", "0.6"),  # stills have their share, whatever they give
             *("--detector", "motion"),  # these are no objects that a network knows
             listens=True,
         )

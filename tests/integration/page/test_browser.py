@@ -71,7 +71,7 @@ def flight(long_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         edge = link.edge(
             *("--source", str(long_scene), "--source-fps", "10", "--fps", "10", "--size", "640x360"),
             *("--preset", "ultrafast", "--budget", "500kbps", "--video-share", "0.6", "--edge-id", "uav-1"),
-            *("--detector", "motion", "--cooldown", "0s"),
+            *("--method", "M5", "--detector", "motion", "--cooldown", "0s"),
         )
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield Flight(f"http://127.0.0.1:{port}/", edge, browser)

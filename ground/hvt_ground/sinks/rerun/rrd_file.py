@@ -18,6 +18,7 @@ import os
 import shutil
 import struct
 import threading
+import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -40,6 +41,7 @@ _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
 _END = 0
 _SPARE_BYTES = 2 * 2**20
 _FLUSH_S = 10.0
+_LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
 _filters = threading.Lock()
 """Warning filters are the process's."""
 
@@ -181,10 +183,25 @@ def _created(path: Path) -> int:
         )
     if not path.parent.is_dir():
         raise UserError(f"recording {path} cannot be created: its folder {path.parent} does not exist")
+    for _ in range(_LOCK_TRIES):
+        try:
+            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise UserError(f"recording {path} cannot be created: {error.strerror}") from error
+        # Whoever looks through the folder removes empty files that nobody has locked: this one perhaps, just now.
+        if _locked(file) and os.fstat(file).st_nlink:
+            return file
+        os.close(file)
+        time.sleep(_LOCK_PAUSE_S)
+    raise UserError(f"recording {path} cannot be created: another program is at work on it")
+
+
+def _locked(file: int) -> bool:
+    """Lock it; False where somebody else has claimed it."""
     try:
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise UserError(f"recording {path} cannot be created: {error.strerror}") from error
-    with suppress(OSError):  # a file system without locks
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    return file
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks: nobody can claim it either
+        return True
+    return True
