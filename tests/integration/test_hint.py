@@ -34,7 +34,7 @@ def test_both_sides_name_another_model_once(link, tmp_path):
     """A first user would see an empty picture, and take HVT for broken."""
     edge, ground = fly(link, tmp_path / "sky", "aerial-nano")
     for side in (edge, ground):
-        side.until(SAYS)
+        side.until(SAYS, within_s=85)
     edge.stop()
     ground.finish(within_s=30)
     for side in (edge, ground):
