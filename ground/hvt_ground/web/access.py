@@ -9,7 +9,9 @@ import hmac
 import json
 import os
 import secrets
+import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
@@ -104,9 +106,12 @@ def own_tokens(folder: Path | None = None) -> Mapping[Role, str]:
         folder.mkdir(parents=True, exist_ok=True)
         if not file.exists():
             made = {"operator": secrets.token_urlsafe(24), "viewer": secrets.token_urlsafe(24)}
-            number = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(number, "w", encoding="utf-8") as out:
+            # Whole or not at all, and never in place of those that another ground has just made.
+            with tempfile.NamedTemporaryFile("w", dir=folder, encoding="utf-8") as out:
                 json.dump(made, out)
+                out.flush()
+                with suppress(FileExistsError):
+                    os.link(out.name, file)
         if file.stat().st_mode & 0o077:
             raise UserError(f"{file} can be read by others: chmod 600 it, or remove it for new tokens")
         known = json.loads(file.read_text(encoding="utf-8"))

@@ -94,7 +94,9 @@ class Fleet:
         return {}
 
     def served(self, *grounds: str) -> dict[str, str]:
-        """By edge, the ground that shows its picture now; fails where two do."""
+        """By edge, the ground that shows its picture now; fails where two do, or where a ground is no more."""
+        for ground in grounds:
+            assert self.grounds[ground].alive, self.grounds[ground].said
         found = [
             (one["edge"], ground)
             for ground in grounds
