@@ -42,6 +42,7 @@ __all__ = [
     "load",
     "number",
     "or_auto",
+    "settings_words",
     "to_toml",
 ]
 
@@ -220,6 +221,19 @@ def load(
         if field.name in given:
             values[field.name] = _value(field, given[field.name], name=_flag(field))
     return config_class(**values), Loaded(values=values, print_config=print_config)
+
+
+def settings_words(settings: Mapping[str, object]) -> list[str]:
+    """Settings as a command line says them: ``{"edge_id": "a", "quiet": True}`` is ``--edge-id=a --quiet``."""
+    words = []
+    for name, value in settings.items():
+        flag = f"--{name.replace('_', '-')}"
+        for one in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(one, bool):
+                words.append(flag if one else flag.replace("--", "--no-", 1))
+            else:
+                words.append(f"{flag}={one}")
+    return words
 
 
 def with_joined_values(argv: Sequence[str]) -> list[str]:

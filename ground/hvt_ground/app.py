@@ -36,7 +36,7 @@ from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.state import GroundState, StateMaker
 from hvt_ground.status import completed, status_text, summary
-from hvt_ground.wiring import Models, SessionFactory, make_link_settings
+from hvt_ground.wiring import Models, OpenSink, SessionFactory, make_link_settings
 
 if TYPE_CHECKING:
     from hvt_ground.web import WebPage
@@ -52,12 +52,22 @@ _MOST_SUMMARIES = 256
 
 
 class Ground:
-    """One run of a ground: build it, `run` it once. ``on_started()`` is called once nothing is refused any more."""
+    """One run of a ground: build it, `run` it once. ``on_started()`` is called once nothing is refused any more.
+
+    ``program(info)`` opens a sink for each session: another program's, which takes the place of a recording that
+    nobody asked for.
+    """
 
     def __init__(
-        self, config: GroundConfig, *, stop: threading.Event, on_started: Callable[[], None] = lambda: None
+        self,
+        config: GroundConfig,
+        *,
+        stop: threading.Event,
+        on_started: Callable[[], None] = lambda: None,
+        program: OpenSink | None = None,
     ) -> None:
         self._config = config
+        self._program = program
         self._stop = stop
         self._on_started = on_started
         self._clock = SteadyClock()
@@ -83,8 +93,9 @@ class Ground:
         check_edge_pattern(config.edges)
         check_writable(config.summary, name="--summary")
         check_writable(config.timing, name="--timing")
-        if config.tracks is not None and config.tracks.suffix == ".csv" and not config.tracks.is_dir():
-            check_writable(config.tracks, name="--tracks")
+        for path, suffix, name in ((config.tracks, ".csv", "--tracks"), (config.mcap, ".mcap", "--mcap")):
+            if path is not None and path.suffix == suffix and not path.is_dir():
+                check_writable(path, name=name)
         self._check_record()
         models = Models(config)
         with ExitStack() as stack:
@@ -106,7 +117,14 @@ class Ground:
             self._make_record_folder()
             index.open()
             factory = SessionFactory(
-                config, models, clock=self._clock, outputs=outputs, view=view, page=page, index=index
+                config,
+                models,
+                clock=self._clock,
+                outputs=outputs,
+                view=view,
+                page=page,
+                index=index,
+                program=self._program,
             )
             line = stack.enter_context(StatusLine(quiet=config.quiet, as_json=config.log_format == "json"))
             group = None

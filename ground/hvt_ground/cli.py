@@ -23,12 +23,14 @@ Other commands, each with --help:
   hvt-ground doctor [SETTINGS]           what a ground with them needs, and lacks
   hvt-ground status                      how a ground that runs is
   hvt-ground recordings                  what a folder of recordings holds
+  hvt-ground export FILE.rrd --to KIND   a recording as video, tables, pictures or MCAP
   hvt-ground still | tracks | keyframe   ask an edge, in flight
   hvt-ground set-budget | set-method     command it
   hvt-ground edges                       which edges are there
   hvt-ground keys                        make keys, and say who may do what"""
 _COMMANDS = {
     "doctor": "hvt_ground.doctor.command",
+    "export": "hvt_ground.exports.command",
     "keys": "hvt_ground.pki.command",
     "recordings": "hvt_ground.recordings.command",
     "status": "hvt_ground.control.watch",

@@ -127,6 +127,9 @@ class GroundConfig:
     tracks: Path | None = _FILES.option(
         PATH, None, "also write the tracks as a table: FILE.csv, or a folder for one file a session"
     )
+    mcap: Path | None = _FILES.option(
+        PATH, None, "also write MCAP for Foxglove: FILE.mcap, or a folder for one file a session"
+    )
     stills: Path | None = _FILES.option(
         PATH, None, "also write each still as a picture, with a table of them: a folder that is there"
     )
@@ -219,6 +222,7 @@ def _check_files(config: GroundConfig) -> None:
     for name, path, suffix in (
         ("--record", config.record, ".rrd"),
         ("--tracks", config.tracks, ".csv"),
+        ("--mcap", config.mcap, ".mcap"),
         ("--timing", config.timing, None),
         ("--summary", config.summary, None),
     ):

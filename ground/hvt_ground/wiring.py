@@ -13,6 +13,7 @@ from itertools import count as count_from
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
+from hvt_common.errors import needs_extra
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.messages import Info
@@ -41,11 +42,13 @@ from hvt_ground.sinks.still_files import StillFiles
 from hvt_ground.sinks.timing import SessionTiming, timing_table
 from hvt_ground.sinks.tracks_table import TrackTable
 
-if TYPE_CHECKING:  # who serves no page needs no web server
+if TYPE_CHECKING:  # who serves no page needs no web server, nor protobuf who writes no MCAP
+    from hvt_ground.sinks.mcap_file import McapFile
     from hvt_ground.web import WebPage
 
 __all__ = [
     "Models",
+    "OpenSink",
     "SessionFactory",
     "make_backlog_perception",
     "make_link_settings",
@@ -55,6 +58,9 @@ __all__ = [
 
 S = TypeVar("S", bound=SinkWriter[Any])
 
+OpenSink = Callable[[Info], Callable[[], SinkWriter[Event]]]
+"""What opens a sink for a session."""
+
 _LOCKSTEP_WAIT_S = 10.0
 
 
@@ -62,7 +68,7 @@ class SessionFactory:
     """Makes sessions, and recordings of former ones; each file gets a name of its own. For any thread.
 
     All that they write to is of ``outputs``; ``view`` is a viewer and ``page`` the page for browsers, None shows
-    nothing live; ``index`` learns of the recordings.
+    nothing live; ``index`` learns of the recordings, and ``program`` opens a sink of another program.
     """
 
     def __init__(
@@ -75,6 +81,7 @@ class SessionFactory:
         view: LiveView | None,
         page: WebPage | None = None,
         index: Sink[RecordingRow] | None = None,
+        program: OpenSink | None = None,
     ) -> None:
         self._config = config
         self._models = models
@@ -83,9 +90,12 @@ class SessionFactory:
         self._view = view
         self._page = page
         self._index = index
+        self._program = program
         self._paths: set[Path] = set()
         """Taken by this process."""
         self._naming = threading.Lock()
+        if config.mcap is not None:
+            _mcap_file()  # that it is there
         self._timing: QueuedSink[str] | None = None
         if config.timing is not None:
             names = partial(_take, [config.timing], number=2, may_exist=config.timing)
@@ -98,24 +108,30 @@ class SessionFactory:
         settings = self._recorder_settings(info)
         # In lockstep the edge waits, so that nothing need be lost to a slow disk.
         wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
-        names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
-        open_recording = partial(self._opened, self._files(settings, split=config.split), names)
-        sinks: list[Sink[Event]] = [
-            self._outputs.open(f"recording of {edge}", open_recording, wait_s=wait_s, for_backlog=True)
-        ]
+        sinks: list[Sink[Event]] = []
+        recorded = self._program is None or config.record is not None
+        if recorded:
+            names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
+            open_recording = partial(self._opened, self._files(settings, split=config.split), names)
+            part = f"recording of {edge}"
+            sinks.append(self._outputs.open(part, open_recording, wait_s=wait_s, for_backlog=True))
+        if self._program is not None:
+            part, opens = f"program of {edge}", self._program(info)
+            sinks.append(self._outputs.open(part, opens, wait_s=wait_s, for_backlog=not recorded))
         if self._view is not None:
             open_live = partial(_live_recorder, settings, self._view)
             sinks.append(self._outputs.open(f"live view of {edge}", open_live))
         if self._page is not None:
             sinks.append(self._outputs.open(f"web page of {edge}", self._page.feed(info)))
-        if config.tracks is not None:
-            names = partial(output_path, config.tracks, suffix=".csv", edge=edge, stamp=stamp)
-            open_table = partial(self._opened, TrackTable, names)
-            sinks.append(self._outputs.open(f"tracks table of {edge}", open_table, wait_s=wait_s))
-        if config.stills is not None:
-            names = partial(output_path, config.stills, suffix=".csv", edge=edge, stamp=stamp)
-            open_stills = partial(self._opened, StillFiles, names)
-            sinks.append(self._outputs.open(f"stills of {edge}", open_stills, wait_s=wait_s))
+        for target, what, suffix, make in (
+            (config.tracks, "tracks table", ".csv", TrackTable),
+            (config.mcap, "MCAP file", ".mcap", lambda path: _mcap_file()(path, edge=edge)),
+            (config.stills, "stills", ".csv", StillFiles),
+        ):
+            if target is not None:
+                names = partial(output_path, target, suffix=suffix, edge=edge, stamp=stamp)
+                open_file = partial(self._opened, make, names)
+                sinks.append(self._outputs.open(f"{what} of {edge}", open_file, wait_s=wait_s))
         if self._timing is not None:
             sinks.append(SessionTiming(self._timing, edge=edge, session_id=info.session_id))
         return GroundSession(
@@ -172,6 +188,12 @@ class SessionFactory:
             },
             clocked=info.pace == "realtime",
         )
+
+
+def _mcap_file() -> type[McapFile]:
+    with needs_extra("'hvt[mcap]'"):
+        from hvt_ground.sinks.mcap_file import McapFile  # noqa: PLC0415 - who writes none needs no protobuf
+    return McapFile
 
 
 def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:

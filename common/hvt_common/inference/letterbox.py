@@ -74,6 +74,9 @@ class Letterboxer:
         self._dtype = dtype
         self._input_size = (0, 0)
         self._letterbox: Letterbox | None = None
+        self._canvas: Image
+        self._plane: npt.NDArray[np.uint8]
+        self._tensor: npt.NDArray[Any]
 
     def fill(self, image_bgr: Image, input_size: tuple[int, int]) -> tuple[npt.NDArray[Any], Letterbox]:
         """Return the (1, 3, height, width) input, valid until the next call, and how the image lies on it."""
@@ -100,7 +103,10 @@ class Letterboxer:
         width, height = input_size
         self._letterbox = Letterbox.fitted(image_size, input_size, anchor=self._anchor)
         self._input_size = input_size
-        self._canvas: Image = np.full((height, width, 3), _FILL, np.uint8)
+        # The former input goes before the new one comes: 33 MB for a 1080p source.
+        self._canvas = self._plane = self._tensor = np.empty(0, np.uint8)
+        self._targets: list[npt.NDArray[Any]] = []
+        self._canvas = np.full((height, width, 3), _FILL, np.uint8)
         self._plane = np.empty((height, width), np.uint8)
         self._tensor = np.empty((1, 3, height, width), self._dtype)
         self._targets = list(self._tensor.view(self._table.dtype)[0])

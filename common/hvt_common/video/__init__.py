@@ -1,1 +1,4 @@
-"""Pixels and their codings: `hevc` (decoder), `still_codecs`, `base_crop` (what the base shows of a crop)."""
+"""Pixels and their codings.
+
+`hevc` decodes, `annex_b` takes a stream apart, `still_codecs` codes stills, `base_crop` is what the base has there.
+"""

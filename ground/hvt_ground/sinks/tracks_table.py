@@ -13,7 +13,7 @@ from hvt_common.units import SECOND_NS
 from hvt_ground.events import Event, Overlay
 from hvt_ground.sinks.line_file import LineFile
 
-__all__ = ["COLUMNS", "TrackTable"]
+__all__ = ["COLUMNS", "TrackTable", "track_rows", "utc_text"]
 
 COLUMNS = (
     *("frame", "capture_utc", "id", "x", "y", "w", "h", "confidence"),
@@ -39,7 +39,7 @@ class TrackTable:
         if not isinstance(item, Overlay) or not len(item.track_ids):
             return
         text = io.StringIO(newline="")
-        csv.writer(text, lineterminator="\n").writerows(_rows(item))
+        csv.writer(text, lineterminator="\n").writerows(track_rows(item))
         self._file.log(text.getvalue())
 
     def skipped(self, count: int) -> None:
@@ -50,13 +50,14 @@ class TrackTable:
         self._file.close(hurry)
 
 
-def _rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
+def track_rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
+    """One row of `COLUMNS` a track."""
     origins = overlay.origins or ("base",) * len(overlay.track_ids)
     for row, track_id in enumerate(overlay.track_ids.tolist()):
         x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
         yield (
             overlay.frame_index + 1,
-            _utc_text(overlay.capture_ns),
+            utc_text(overlay.capture_ns),
             track_id,
             *(f"{value:.1f}" for value in (x1, y1, x2 - x1, y2 - y1)),
             f"{overlay.confidences[row]:.3f}",
@@ -69,7 +70,7 @@ def _rows(overlay: Overlay) -> Iterator[tuple[object, ...]]:
         )
 
 
-def _utc_text(unix_ns: int) -> str:
+def utc_text(unix_ns: int) -> str:
     """``2026-11-22T13:01:02.345Z``; empty where no calendar has the time, which comes from the wire."""
     try:
         time = datetime.fromtimestamp(unix_ns // SECOND_NS, UTC)

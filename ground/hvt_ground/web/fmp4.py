@@ -10,19 +10,19 @@ Boxes: ISO/IEC 14496-12; ``avcC`` and ``hvcC``: ISO/IEC 14496-15, 5.3.3.1 and 8.
 
 from __future__ import annotations
 
-import re
 import struct
 from collections import deque
 from dataclasses import dataclass
 from statistics import median
 from typing import Literal
 
-__all__ = ["Codec", "Fragment", "Muxer", "Start", "units"]
+from hvt_common.video.annex_b import nal_units
+
+__all__ = ["Codec", "Fragment", "Muxer", "Start"]
 
 Codec = Literal["h264", "hevc"]
 
 _TIMESCALE = 90_000
-_START_CODE = re.compile(rb"\x00\x00\x01")
 _MATRIX = struct.pack(">9I", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
 _KEYFRAME_FLAGS, _OTHER_FLAGS = 0x02000000, 0x01010000
 """sample_depends_on 2; sample_depends_on 1 with sample_is_non_sync_sample."""
@@ -101,7 +101,7 @@ class Muxer:
         """Parameter sets, the last of each kind in order, and all else with lengths for start codes."""
         sets: dict[int, bytes] = {}
         sample = bytearray()
-        for unit in units(data):
+        for unit in nal_units(data):
             kind = unit[0] & 0x1F if self._codec == "h264" else unit[0] >> 1 & 0x3F
             if kind in _PARAMETER_SETS[self._codec]:
                 sets[kind] = unit
@@ -149,14 +149,6 @@ class Muxer:
         extends = _box(b"mvex", _full(b"trex", struct.pack(">IIIII", 1, 1, 0, 0, 0)))
         file_type = _box(b"ftyp", b"iso5", struct.pack(">I", 512), b"iso5iso6mp41")
         return file_type + _box(b"moov", movie_header, _box(b"trak", track_header, media), extends)
-
-
-def units(data: bytes) -> list[bytes]:
-    """The NAL units of an Annex B access unit, without start codes."""
-    starts = [match.start() for match in _START_CODE.finditer(data)]
-    ends = [*starts, len(data)][1:]
-    found = (data[begin + 3 : end].rstrip(b"\0") for begin, end in zip(starts, ends, strict=True))
-    return [unit for unit in found if unit]
 
 
 def codec_string(codec: Codec, sets: tuple[bytes, ...]) -> str:

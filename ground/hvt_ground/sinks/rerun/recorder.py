@@ -18,7 +18,9 @@ import numpy as np
 from rerun.chunk import Chunk
 
 from hvt_common.units import bitrate_text
+from hvt_common.video.annex_b import parameter_sets
 from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.sinks.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun import blueprint as names
 from hvt_ground.sinks.rerun.live_view import LiveRecording
 from hvt_ground.sinks.rerun.overlays import (
@@ -30,7 +32,6 @@ from hvt_ground.sinks.rerun.overlays import (
     LayerUpdate,
     OverlayEncoder,
 )
-from hvt_ground.sinks.rerun.palette import AMBER, GREY, VERMILLION, Rgb
 from hvt_ground.sinks.rerun.recording_file import RecordingFile
 from hvt_ground.sinks.rerun.rrd_file import RrdFile
 from hvt_ground.sinks.rerun.sdk import RecordingId
@@ -169,7 +170,7 @@ class Recorder:
             and item.keyframe
             and not item.stored
             and self._decodable(item)
-            and _has_parameter_sets(item.data)
+            and bool(parameter_sets(item.data))
         )
 
     def go_on_in(self, file: RecordingFile, *, at: tuple[int, int]) -> None:
@@ -273,7 +274,7 @@ class Recorder:
     def _decodable(self, sample: VideoSample) -> bool:
         """Rerun shows garbage for what its decoder cannot use, so begin at a keyframe and never go back."""
         if self._last_sample is None:
-            return sample.keyframe and _has_parameter_sets(sample.data)
+            return sample.keyframe and bool(parameter_sets(sample.data))
         return sample.frame_index > self._last_sample and bool(sample.data)
 
     def _overlay(self, overlay: Overlay) -> list[TableRow | Chunk]:
@@ -364,9 +365,3 @@ def _facts(settings: RecorderSettings, frames: str) -> dict[str, str]:
         "budget": bitrate_text(settings.budget_bps),
         **settings.facts,
     }
-
-
-def _has_parameter_sets(access_unit: bytes) -> bool:
-    """Whether VPS, SPS and PPS (NAL types 32, 33, 34 of H.265 table 7-1) precede the picture in an Annex B unit."""
-    kinds = {(unit[0] >> 1) & 0x3F for unit in access_unit.split(b"\x00\x00\x01")[1:] if unit}
-    return {32, 33, 34} <= kinds

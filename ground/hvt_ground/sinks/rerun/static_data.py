@@ -7,10 +7,7 @@ from collections.abc import Mapping, Sequence
 import rerun as rr
 from rerun.chunk import Chunk
 
-from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.labels import place_legend
-from hvt_ground.sinks.rerun.overlays import BRIGHTNESS, REPORTED_MARK
-from hvt_ground.sinks.rerun.palette import (
+from hvt_ground.sinks.palette import (
     BASE_LINE,
     BUDGET_LINE,
     GREY,
@@ -19,6 +16,9 @@ from hvt_ground.sinks.rerun.palette import (
     class_colour,
     dimmed,
 )
+from hvt_ground.sinks.rerun import blueprint as names
+from hvt_ground.sinks.rerun.labels import place_legend
+from hvt_ground.sinks.rerun.overlays import BRIGHTNESS, REPORTED_MARK
 from hvt_ground.sinks.rerun.stills.gallery import SLOTS
 from hvt_ground.sinks.rerun.tables import static_chunk
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from hvt_ground.sinks.rerun.palette import Rgb
+from hvt_ground.sinks.palette import Rgb
 from hvt_ground.sinks.rerun.stills.gallery import Placement
 
 __all__ = [

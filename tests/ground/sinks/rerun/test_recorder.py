@@ -17,9 +17,9 @@ import pytest
 
 from hvt_common.errors import UserError
 from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+from hvt_ground.sinks.palette import class_colour
 from hvt_ground.sinks.rerun.live_view import LiveView, free_port, viewer_program
 from hvt_ground.sinks.rerun.overlays import CENTRE_STEP_PX, HALF_SIZE_STEP_PX, OverlayEncoder
-from hvt_ground.sinks.rerun.palette import class_colour
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.rerun.stills.gallery import CANVAS, SLOTS, Gallery, frame_of, placed
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, moving_boxes, session

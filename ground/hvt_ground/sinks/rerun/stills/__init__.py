@@ -1,1 +1,4 @@
-"""What a recording shows of stills: pairs in a gallery, patches on the picture; others use `rows` and `gallery`."""
+"""What a recording shows of stills: pairs in a gallery, patches on the picture.
+
+Others use `rows`, `gallery`, and the words and pictures of one still, `pairs`.
+"""

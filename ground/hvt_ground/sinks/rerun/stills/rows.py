@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from hvt_ground.events import Overlay, Refinement
+from hvt_ground.sinks.palette import AMBER, GREY, class_colour
 from hvt_ground.sinks.rerun import blueprint as names
-from hvt_ground.sinks.rerun.palette import AMBER, GREY, class_colour
 from hvt_ground.sinks.rerun.stills.gallery import Gallery, frame_of, placed
 from hvt_ground.sinks.rerun.stills.pairs import BLANK, Coded, base_picture, caption, event_text, still_picture
 from hvt_ground.sinks.rerun.stills.patches import Patches

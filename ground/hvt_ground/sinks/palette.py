@@ -1,4 +1,4 @@
-"""The colours of a recording: one for each kind of object, one for each line of a plot.
+"""Colours: one for each kind of object, one for each line of a plot.
 
 The base is the palette of Okabe and Ito ("Color Universal Design", 2008), which stays distinct for the common
 forms of colour blindness; its black and its dark blue are left out or lightened, because the screen is dark.

@@ -1,0 +1,181 @@
+"""An edge whose frames come from the program that it is a part of: `hvt_edge.open`.
+
+It is the edge of ``hvt-edge``, with another source. As with a camera, a frame that comes before the one before was
+taken replaces it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any, Self, cast
+
+import numpy as np
+
+from hvt_common.config import load, settings_words
+from hvt_common.errors import UserError
+from hvt_common.values import Fit, Image
+from hvt_edge.app import Edge
+from hvt_edge.config import EdgeConfig, check, with_profile
+from hvt_edge.source.contract import Source
+from hvt_edge.source.live import LiveSource, Shot, SignalLost
+from hvt_edge.wiring import base_size
+from hvt_edge.world import World
+
+__all__ = ["PushedEdge", "open_edge"]
+
+_NAME = "pushed frames"
+_PATIENCE_S = 5.0
+"""A program that pushes nothing for so long is said to be away, as a camera is."""
+
+
+def open_edge(**settings: object) -> PushedEdge:
+    """An edge with the settings of ``hvt-edge`` (docs/options.md), such as ``connect="tcp/10.0.0.1:7447"``.
+
+    Names have underscores for dashes; what may be given several times takes a list, and a switch True or False.
+    Raises `UserError` where a setting is unknown or wrong.
+    """
+    if "source" in settings:
+        raise UserError(f"source {settings['source']!r} is not accepted: frames are pushed")
+    words = settings_words({"quiet": True, **settings, "source": _NAME})
+    config, given = load(EdgeConfig, words, program="hvt_edge.open", description="")
+    if config.pace != "realtime":
+        raise UserError(f"pace {config.pace!r} is not accepted: pushed frames come in real time")
+    return PushedEdge(check(with_profile(config, given=given.values)))
+
+
+class PushedEdge:
+    """Sends what is pushed, until it is closed; use it with ``with``. For any thread.
+
+    Attributes:
+        summary: What ``--summary`` writes; empty before the end.
+    """
+
+    def __init__(self, config: EdgeConfig) -> None:
+        self.summary: dict[str, Any] = {}
+        self._grabber = _PushGrabber()
+        self._stop = threading.Event()
+        self._error: BaseException | None = None
+        self._edge = Edge(config, stop=self._stop, world=_PushedWorld(self._grabber))
+        self._thread = threading.Thread(target=self._run, name="hvt-edge", daemon=True)
+        self._thread.start()
+
+    def push(self, frame_bgr: Image, *, capture_ns: int | None = None) -> None:
+        """Hand over a frame: (height, width, 3) uint8 BGR, copied. The first one says how large the source is.
+
+        ``capture_ns`` is when it was taken, Unix nanoseconds; None is now. Raises `ValueError` for another array,
+        and `UserError` or `FlightError` once the edge has ended for that.
+        """
+        if (
+            frame_bgr.dtype != np.uint8
+            or frame_bgr.ndim != 3
+            or frame_bgr.shape[2] != 3
+            or not frame_bgr.size
+        ):
+            raise ValueError(
+                f"a frame of {frame_bgr.dtype} {frame_bgr.shape} is not accepted: (height, width, 3) uint8 is"
+            )
+        if self._error is not None:
+            raise self._error
+        self._grabber.put(frame_bgr.copy(), time.time_ns() if capture_ns is None else capture_ns)
+
+    def close(self) -> None:
+        """Send what is left, say goodbye, and wait for the end; raises what ended the edge before."""
+        self._grabber.end()
+        self._stop.set()
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
+        try:
+            self.close()
+        except Exception:
+            if kind is None:  # else what the program raised goes first
+                raise
+
+    def _run(self) -> None:
+        try:
+            self.summary = self._edge.run()
+        except _NothingPushed:
+            pass
+        except BaseException as error:  # noqa: BLE001 - handed to the program
+            self._error = error
+
+
+class _NothingPushed(Exception):  # noqa: N818 - an event
+    """It was closed before the first frame."""
+
+
+class _PushGrabber:
+    """The newest frame that was pushed and not yet taken."""
+
+    name = _NAME
+
+    def __init__(self) -> None:
+        self._news = threading.Condition()
+        self._newest: tuple[Image, int] | None = None
+        self._ended = False
+
+    def put(self, frame_bgr: Image, capture_ns: int) -> None:
+        with self._news:
+            self._newest = frame_bgr, capture_ns
+            self._news.notify_all()
+
+    def end(self) -> None:
+        with self._news:
+            self._ended = True
+            self._news.notify_all()
+
+    def open(self) -> None:
+        """Wait for the first frame."""
+        with self._news:
+            self._news.wait_for(lambda: self._newest or self._ended)
+            if self._newest is None:
+                raise _NothingPushed
+
+    def restart(self) -> None:
+        with self._news:
+            if self._newest is None:
+                raise SignalLost("no frame is pushed")
+
+    def grab(self) -> Shot:
+        with self._news:
+            self._news.wait_for(lambda: self._newest or self._ended, _PATIENCE_S)
+            if self._newest is None:
+                raise SignalLost(f"no frame was pushed for {_PATIENCE_S:g} s")
+            (frame_bgr, capture_ns), self._newest = self._newest, None
+        return Shot(lambda: frame_bgr, camera_ns=capture_ns)
+
+    def close(self) -> None:
+        """There is no device."""
+
+
+class _PushedSource(LiveSource):
+    def __init__(self, grabber: _PushGrabber, config: EdgeConfig, world: World) -> None:
+        super().__init__(
+            grabber,
+            size=base_size(config),
+            fps=config.nominal_fps,
+            fit=cast("Fit", config.fit),
+            max_frames=config.max_frames,
+            clock=world.clock,
+            failures=world.failures,
+        )
+        self._pushed = grabber
+
+    def close(self) -> None:
+        self._pushed.end()
+        super().close()
+
+
+class _PushedWorld(World):
+    def __init__(self, grabber: _PushGrabber) -> None:
+        super().__init__()
+        self._grabber = grabber
+
+    def open_source(self, config: EdgeConfig) -> Source:
+        return _PushedSource(self._grabber, config, self)

@@ -1,0 +1,1 @@
+"""What leaves a recording for other programs: `command`, `recorded` (reads it), and one file a kind."""

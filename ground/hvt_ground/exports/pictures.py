@@ -1,0 +1,96 @@
+"""Pictures with what is on them: base pictures as a COCO data set, and the stills as files with a table."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from hvt_common.errors import UserError
+from hvt_ground.events import Overlay
+from hvt_ground.exports.recorded import Recorded
+from hvt_ground.exports.video import decoded
+from hvt_ground.sinks.tracks_table import utc_text
+
+__all__ = ["STILL_COLUMNS", "write_coco", "write_stills"]
+
+STILL_COLUMNS = ("file", "base_file", "frame", "capture_utc", "caption")
+"""``base_file`` shows what the base stream had there, empty where the recording does not say; ``frame`` is the one,
+from 1, at which the still was known; ``caption`` what it did, as under the pair on the screen."""
+_JPEG_QUALITY_PCT = 95
+
+
+def write_coco(recorded: Recorded, folder: Path) -> None:
+    """``annotations.json`` (COCO, instances) and the base pictures that it names, in ``images``.
+
+    An annotation has the ``track_id`` and ``score`` beside COCO's own fields; tracks that stills doubt are left out.
+    """
+    images: list[dict[str, Any]] = []
+    boxes: list[dict[str, Any]] = []
+    numbers: dict[str, int] = {}
+    drawn_at = {one.frame_index: one for one in recorded.overlays()}
+    (folder / "images").mkdir()
+    for sample, picture in decoded(recorded):
+        name = f"images/{sample.frame_index + 1:06d}.jpg"
+        _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY_PCT])
+        (folder / name).write_bytes(data.tobytes())
+        image = {
+            "id": sample.frame_index + 1,
+            "file_name": name,
+            "width": picture.shape[1],
+            "height": picture.shape[0],
+            "date_captured": utc_text(sample.capture_ns),
+        }
+        images.append(image)
+        boxes += _annotations(drawn_at[sample.frame_index], image["id"], numbers, first=len(boxes) + 1)
+    content = {
+        "info": {"description": f"hvt: edge {recorded.edge}, session {recorded.session}"},
+        "images": images,
+        "annotations": boxes,
+        "categories": [{"id": number, "name": name} for name, number in numbers.items()],
+    }
+    (folder / "annotations.json").write_text(json.dumps(content), encoding="utf-8")
+
+
+def _annotations(
+    overlay: Overlay, image: int, numbers: dict[str, int], *, first: int
+) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = []
+    for row, track_id in enumerate(overlay.track_ids.tolist()):
+        if overlay.doubted is not None and overlay.doubted[row]:
+            continue
+        x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
+        found.append(
+            {
+                "id": first + len(found),
+                "image_id": image,
+                "category_id": numbers.setdefault(overlay.classes[row], len(numbers) + 1),
+                "bbox": [x1, y1, x2 - x1, y2 - y1],
+                "area": (x2 - x1) * (y2 - y1),
+                "iscrowd": 0,
+                "track_id": track_id,
+                "score": round(float(overlay.confidences[row]), 2),
+            }
+        )
+    return found
+
+
+def write_stills(recorded: Recorded, folder: Path) -> None:
+    """Each still as the recording shows it, what the base had there, and ``stills.csv`` (`STILL_COLUMNS`).
+
+    Raises `UserError` where the recording has none.
+    """
+    if not recorded.stills:
+        raise UserError(f"the recording of {recorded.edge} has no stills")
+    with (folder / "stills.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(STILL_COLUMNS)
+        for number, still in enumerate(recorded.stills, 1):
+            names = [f"{number:06d}-still.jpg", f"{number:06d}-base.jpg" if still.base_jpeg else ""]
+            for name, data in zip(names, (still.jpeg, still.base_jpeg), strict=True):
+                if name:
+                    (folder / name).write_bytes(data)
+            writer.writerow((*names, still.frame_index + 1, utc_text(still.capture_ns), still.caption))

@@ -1,0 +1,129 @@
+"""The base stream as a video file: its units copied, or decoded with the overlays drawn in and coded again."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.container import OutputContainer
+
+from hvt_common.errors import UserError
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Image
+from hvt_common.video.annex_b import parameter_sets
+from hvt_common.video.hevc import BaseDecoder
+from hvt_ground.events import Overlay, VideoSample
+from hvt_ground.exports.recorded import Recorded
+from hvt_ground.sinks.palette import class_colour
+
+__all__ = ["CONTAINERS", "decoded", "write_video"]
+
+CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
+"""By name, libavformat's."""
+_TIME_BASE = Fraction(1, 90_000)
+_CRF = "20"
+
+
+def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool) -> None:
+    """Write the pictures with their capture times, from 0 on; ``creation_time`` is when the first was taken.
+
+    ``burn_in`` draws boxes, ids and classes into them, which codes them again (H.264). Raises `UserError` where the
+    recording has no video.
+    """
+    samples = _from_keyframe(recorded)
+    taken = datetime.fromtimestamp(samples[0].capture_ns / SECOND_NS, UTC).isoformat()
+    with av.open(str(path), "w", format=CONTAINERS[container]) as output:
+        output.metadata["creation_time"] = taken
+        output.metadata["title"] = f"{recorded.edge}, session {recorded.session}"
+        if burn_in:
+            _draw(recorded, output)
+        else:
+            _copy(samples, output)
+
+
+def decoded(recorded: Recorded) -> Iterator[tuple[VideoSample, Image]]:
+    """Each sample that can be decoded, with its picture: uint8 (H, W, 3) BGR, base pixels."""
+    decoder = BaseDecoder()
+    for sample in _from_keyframe(recorded):
+        if sample.keyframe:
+            decoder.reset()
+        picture = decoder.decode(sample.data)
+        if picture is not None:
+            yield sample, picture
+
+
+def _from_keyframe(recorded: Recorded) -> list[VideoSample]:
+    first = next(
+        (number for number, one in enumerate(recorded.video) if one.keyframe and parameter_sets(one.data)),
+        None,
+    )
+    if first is None:
+        raise UserError(f"the recording of {recorded.edge} has no video: it was removed, or none came")
+    return list(recorded.video[first:])
+
+
+def _copy(samples: list[VideoSample], output: OutputContainer) -> None:
+    with av.open(io.BytesIO(samples[0].data), format="hevc") as probe:
+        stream = output.add_stream_from_template(probe.streams.video[0])
+    stream.time_base = _TIME_BASE
+    for sample, at in _timed(samples):
+        packet = av.Packet(sample.data)
+        packet.stream, packet.time_base = stream, _TIME_BASE
+        packet.pts = packet.dts = at
+        packet.is_keyframe = sample.keyframe
+        output.mux(packet)
+
+
+def _draw(recorded: Recorded, output: OutputContainer) -> None:
+    drawn_at = {one.frame_index: one for one in recorded.overlays()}
+    stream = None
+    first_ns, last = 0, -1
+    for sample, picture in decoded(recorded):
+        if stream is None:
+            first_ns = sample.capture_ns
+            stream = output.add_stream("libx264", options={"crf": _CRF, "preset": "veryfast"})
+            stream.height, stream.width = (side - side % 2 for side in picture.shape[:2])
+            stream.pix_fmt = "yuv420p"
+            stream.time_base = stream.codec_context.time_base = _TIME_BASE
+        drawn = _with_boxes(picture, drawn_at[sample.frame_index])
+        frame = av.VideoFrame.from_ndarray(
+            np.ascontiguousarray(drawn[: stream.height, : stream.width]), "bgr24"
+        )
+        last = max(last + 1, _since(sample.capture_ns, first_ns))
+        frame.pts, frame.time_base = last, _TIME_BASE
+        output.mux(stream.encode(frame))
+    if stream is not None:
+        output.mux(stream.encode())
+
+
+def _with_boxes(picture: Image, overlay: Overlay) -> Image:
+    """A copy with a frame, id and class for each track; thick where a still has spoken."""
+    drawn = picture.copy()
+    for row, track_id in enumerate(overlay.track_ids.tolist()):
+        x1, y1, x2, y2 = (round(value) for value in overlay.boxes_base_px[row].tolist())
+        name = overlay.classes[row]
+        colour = class_colour(name)[::-1]
+        cv2.rectangle(drawn, (x1, y1), (x2, y2), colour, 2 if overlay.refined[row] else 1)
+        text = f"{track_id} {name}"
+        place = x1, y1 - 4 if y1 > 14 else y2 + 12
+        for thickness, ink in ((3, (0, 0, 0)), (1, colour)):
+            cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, ink, thickness, cv2.LINE_AA)
+    return drawn
+
+
+def _timed(samples: list[VideoSample]) -> Iterator[tuple[VideoSample, int]]:
+    """With the time of each in `_TIME_BASE`, which grows."""
+    last = -1
+    for sample in samples:
+        last = max(last + 1, _since(sample.capture_ns, samples[0].capture_ns))
+        yield sample, last
+
+
+def _since(capture_ns: int, first_ns: int) -> int:
+    return round(Fraction(capture_ns - first_ns, SECOND_NS) / _TIME_BASE)

@@ -1,0 +1,1 @@
+"""The ground as a part of another program: `received` gives it what comes."""

@@ -1,0 +1,152 @@
+"""A ground whose events another program takes: `hvt_ground.listen`.
+
+It is the ground of ``hvt-ground``, with one sink more. Who takes too little loses events, the oldest that wait, and
+nobody else does; pictures go on at the next keyframe.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from hvt_common.config import load, settings_words
+from hvt_common.protocol.messages import Info
+from hvt_common.values import Image
+from hvt_common.video.hevc import BaseDecoder
+from hvt_ground.app import Ground
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.events import Event, Notice, Overlay, Refinement, Traffic, VideoSample
+
+__all__ = ["Listening", "Picture", "Received", "listen"]
+
+_MOST_QUEUED = 32
+"""Events, of which each may be a picture."""
+_POLL_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A decoded picture of the base stream."""
+
+    frame_index: int
+    capture_ns: int
+    image_bgr: Image
+    """(height, width, 3) uint8, base pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """Something that an edge sent, or that the ground made of it."""
+
+    edge: str
+    session_id: int
+    event: Picture | Overlay | Refinement | Traffic | Notice
+
+
+def listen(**settings: object) -> Listening:
+    """A ground with the settings of ``hvt-ground`` (docs/options.md), such as ``listen="tcp/0.0.0.0:7447"``.
+
+    Names have underscores for dashes; what may be given several times takes a list, and a switch True or False.
+    Nothing is recorded unless ``record`` says so. Raises `UserError` where a setting is unknown or wrong.
+    """
+    words = settings_words({"quiet": True, **settings})
+    config, _ = load(GroundConfig, words, program="hvt_ground.listen", description="")
+    return Listening(check(config))
+
+
+class Listening:
+    """Iterate over it: it ends when the ground does, with ``once`` after the edges, or when it is closed.
+
+    Attributes:
+        summaries: One a session, as ``--summary`` writes them; empty before the end.
+    """
+
+    def __init__(self, config: GroundConfig) -> None:
+        self.summaries: list[dict[str, Any]] = []
+        self._queue: queue.Queue[Received] = queue.Queue(_MOST_QUEUED)
+        self._stop = threading.Event()
+        self._error: BaseException | None = None
+        self._ground = Ground(config, stop=self._stop, program=self._sink_of)
+        self._thread = threading.Thread(target=self._run, name="hvt-ground", daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[Received]:
+        return self
+
+    def __next__(self) -> Received:
+        """The next event; raises what ended the ground, `UserError` or `FlightError`."""
+        while True:
+            running = self._thread.is_alive()
+            try:
+                return self._queue.get(timeout=_POLL_S if running else 0.0)
+            except queue.Empty:
+                if running:
+                    continue
+            if self._error is not None:
+                raise self._error
+            raise StopIteration
+
+    def close(self) -> None:
+        """End the ground; what it has given out by then can still be taken."""
+        self._stop.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    def _sink_of(self, info: Info) -> Callable[[], _Queue]:
+        return lambda: _Queue(self._queue, self._stop, info)
+
+    def _run(self) -> None:
+        try:
+            self.summaries = self._ground.run()
+        except BaseException as error:  # noqa: BLE001 - handed to the program
+            self._error = error
+
+
+class _Queue:
+    """The events of one session, decoded, for the program's queue; waits while that is full."""
+
+    path: Path | None = None
+
+    def __init__(self, events: queue.Queue[Received], stop: threading.Event, info: Info) -> None:
+        self._events = events
+        self._stop = stop
+        self._info = info
+        self._decoder = BaseDecoder(size=info.base_size)
+        self._awaits_keyframe = True
+
+    def log(self, item: Event) -> None:
+        event: Picture | Overlay | Refinement | Traffic | Notice | None = None
+        match item:
+            case VideoSample() if not item.stored:
+                event = self._decoded(item)
+            case Overlay() | Refinement() | Traffic() | Notice():
+                event = item
+        while event is not None and not self._stop.is_set():
+            try:
+                self._events.put(Received(self._info.edge, self._info.session_id, event), timeout=_POLL_S)
+            except queue.Full:
+                continue
+            return
+
+    def skipped(self, count: int) -> None:
+        del count
+        self._awaits_keyframe = True
+
+    def close(self, hurry: threading.Event | None = None) -> None:
+        """There is nothing to close."""
+
+    def _decoded(self, sample: VideoSample) -> Picture | None:
+        if sample.keyframe:
+            self._decoder.reset()
+            self._awaits_keyframe = False
+        image = None if self._awaits_keyframe else self._decoder.decode(sample.data)
+        return None if image is None else Picture(sample.frame_index, sample.capture_ns, image)

@@ -1,0 +1,176 @@
+"""Writes a session as MCAP with Foxglove's schemas: video, boxes, stills and events, for Foxglove and ROS tools.
+
+Times are capture times. Topics begin with the edge's id, so that files of several edges can be opened together.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.Point2_pb2 import Point2
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from foxglove_schemas_protobuf.TextAnnotation_pb2 import TextAnnotation
+from google.protobuf.timestamp_pb2 import Timestamp
+from mcap_protobuf.writer import Writer
+
+from hvt_common.errors import UserError
+from hvt_common.units import SECOND_NS
+from hvt_common.video.annex_b import parameter_sets
+from hvt_ground.events import Event, FrameEvent, Notice, Overlay, Refinement, VideoSample
+from hvt_ground.sinks.line_file import check_there
+from hvt_ground.sinks.palette import Rgb, class_colour
+from hvt_ground.sinks.rerun.stills.pairs import event_text, still_picture
+
+__all__ = ["McapFile"]
+
+_CHUNK_BYTES = 256 * 1024
+"""What a kill loses at the most: a chunk is written once it is full."""
+_LATEST_NS = (1 << 63) - 1
+_THIN_PX, _THICK_PX = 1.0, 3.0
+_FONT_PX = 12.0
+_Message = CompressedVideo | CompressedImage | ImageAnnotations | Log
+_LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
+
+
+@dataclass(frozen=True, slots=True)
+class _At:
+    frame_index: int
+    capture_ns: int
+
+
+class McapFile:
+    """An MCAP file; takes the place of one of that name. `UserError` where it cannot be written."""
+
+    def __init__(self, path: Path, *, edge: str) -> None:
+        self.path = path
+        self._edge = edge
+        self._sets = b""
+        """The newest parameter sets."""
+        self._awaits_keyframe = True
+        try:
+            self._file: BinaryIO = path.open("wb")
+            self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
+        except OSError as error:
+            raise UserError(f"MCAP file {path} cannot be created: {error.strerror}") from None
+
+    def log(self, item: Event) -> None:
+        """Write what there is a schema for; the rest passes by."""
+        match item:
+            case VideoSample():
+                data = self._sample(item)
+                if data:
+                    self._write("video", CompressedVideo(data=data, format="h265"), item)
+            case Overlay():
+                self._write("tracks", _annotations(item), item)
+            case Refinement():
+                picture = still_picture(item)
+                if picture is not None:
+                    self.still(picture[0], frame_index=item.frame_index, capture_ns=item.capture_ns)
+                self._write("events", Log(level=Log.INFO, message=event_text(item)), item)
+            case Notice():
+                self._write("events", Log(level=_LEVELS[item.level], message=item.text), item)
+
+    def still(self, jpeg: bytes, *, frame_index: int, capture_ns: int) -> None:
+        """Write a still, a JPEG."""
+        at = _At(frame_index, capture_ns)
+        self._write("stills", CompressedImage(data=jpeg, format="jpeg"), at)
+
+    def skipped(self, count: int) -> None:
+        """So many events are missing: video goes on at its next keyframe."""
+        del count
+        self._awaits_keyframe = True
+
+    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
+        """Write index and footer, and close; a second call does nothing."""
+        if self._file.closed:
+            return
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+        except OSError as error:
+            raise UserError(f"MCAP file {self.path} cannot be finished: {error.strerror}") from error
+        finally:
+            self._file.close()
+
+    def _write(self, topic: str, message: _Message, at: _At | FrameEvent) -> None:
+        # What no timestamp can hold is held at its end: times come from the wire.
+        capture_ns = min(max(at.capture_ns, 0), _LATEST_NS)
+        message.timestamp.CopyFrom(Timestamp(seconds=capture_ns // SECOND_NS, nanos=capture_ns % SECOND_NS))
+        if isinstance(message, CompressedVideo | CompressedImage):
+            message.frame_id = self._edge
+        elif isinstance(message, Log):
+            message.name = self._edge
+        try:
+            check_there(self._file.fileno(), self.path)
+            self._writer.write_message(
+                f"/{self._edge}/{topic}",
+                message,
+                log_time=capture_ns,
+                publish_time=capture_ns,
+                sequence=max(0, at.frame_index) & 0xFFFFFFFF,
+            )
+        except OSError as error:
+            raise UserError(
+                f"MCAP file {self.path} cannot be written any further: {error.strerror}"
+            ) from error
+
+    def _sample(self, sample: VideoSample) -> bytes:
+        """The access unit; a keyframe always with its parameter sets, which a reader that joins there needs."""
+        if sample.keyframe:
+            sets = parameter_sets(sample.data)
+            self._sets = sets or self._sets
+            self._awaits_keyframe = not self._sets
+            return sample.data if sets else self._sets + sample.data
+        return b"" if self._awaits_keyframe else sample.data
+
+
+def _annotations(overlay: Overlay) -> ImageAnnotations:
+    """A frame around each track, with its id and class, and the rest as metadata of the frame."""
+    origins = overlay.origins or ("base",) * len(overlay.track_ids)
+    result = ImageAnnotations()
+    for row, track_id in enumerate(overlay.track_ids.tolist()):
+        x1, y1, x2, y2 = overlay.boxes_base_px[row].tolist()
+        name, refined = overlay.classes[row], bool(overlay.refined[row])
+        colour = _colour(class_colour(name))
+        facts = {
+            "id": track_id,
+            "class": name,
+            "base_class": overlay.base_classes[row],
+            "confidence": f"{overlay.confidences[row]:.2f}",
+            "refined": int(refined),
+            "origin": origins[row],
+        }
+        corners = _points(((x1, y1), (x2, y1), (x2, y2), (x1, y2)))
+        result.points.append(
+            PointsAnnotation(
+                type=PointsAnnotation.LINE_LOOP,
+                points=corners,
+                outline_color=colour,
+                thickness=_THICK_PX if refined else _THIN_PX,
+                metadata=[KeyValuePair(key=key, value=str(value)) for key, value in facts.items()],
+            )
+        )
+        result.texts.append(
+            TextAnnotation(
+                position=corners[0], text=f"{track_id} {name}", font_size=_FONT_PX, text_color=colour
+            )
+        )
+    return result
+
+
+def _points(corners: Iterable[tuple[float, float]]) -> list[Point2]:
+    return [Point2(x=x, y=y) for x, y in corners]
+
+
+def _colour(rgb: Rgb) -> Color:
+    red, green, blue = (channel / 255 for channel in rgb)
+    return Color(r=red, g=green, b=blue, a=1.0)

@@ -1,0 +1,247 @@
+"""``hvt-ground export``: each kind opens in the program that it is for, and says what the ground knew."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from faster_coco_eval import COCO
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from mcap.reader import make_reader
+from motmetrics.io import loadtxt
+
+import hvt_ground.cli
+from hvt_common.units import Limit
+from hvt_common.video.hevc import BaseDecoder
+from hvt_ground.events import Event, Overlay, Refinement, VideoSample
+from hvt_ground.recordings.session_files import SessionFiles
+from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
+from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
+from programs.small_disk import small_disk
+
+FRAMES, SIZE, TRACKS = 60, (320, 192), 6
+
+
+@pytest.fixture(scope="module")
+def events() -> list[Event]:
+    """Four seconds."""
+    drawn = drawn_frames(FRAMES, SIZE)
+    return [
+        one for one, _ in session(drawn, coded(drawn, kbps=300, keyint=20), tracks=TRACKS, total_kbps=500)
+    ]
+
+
+@pytest.fixture(scope="module")
+def recording(events: list[Event], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As the ground writes it."""
+    path = tmp_path_factory.mktemp("flight") / "flight.rrd"
+    with Recorder(RecorderSettings(path, "uav-1", "00ff", SIZE, 15.0, 500_000.0)) as recorder:
+        for event in events:
+            recorder.log(event)
+    return path
+
+
+def export(recording: Path, out: Path, *words: str) -> Path:
+    """Run the command; it must be content."""
+    assert hvt_ground.cli.main(["export", str(recording), "--out", str(out), *words]) == 0
+    assert [one.name for one in out.parent.iterdir() if one.name.endswith(".part")] == []
+    return out
+
+
+def lines(table: Path) -> list[dict[str, str]]:
+    """Of a CSV file."""
+    return list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """The one sentence."""
+    assert hvt_ground.cli.main(["export", *map(str, words)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("hvt-ground: "), said
+    assert len(said.splitlines()) == 1
+    return said
+
+
+def pictures(events: list[Event]) -> list[np.ndarray]:
+    """What the ground decoded."""
+    decoder = BaseDecoder()
+    return [decoder.decode(one.data) for one in events if isinstance(one, VideoSample)]
+
+
+@pytest.mark.parametrize("kind", ["mp4", "mkv", "ts"])
+def test_video_is_copied_with_its_capture_times(recording, events, tmp_path, kind):
+    """A player would show other pictures, or at other times, than the camera took."""
+    with av.open(str(export(recording, tmp_path / f"flight.{kind}"))) as video:
+        assert video.streams.video[0].codec_context.name == "hevc"
+        frames = [(one.time, one.to_ndarray(format="gray")) for one in video.decode(video=0)]
+    times = np.array([time for time, _ in frames])
+    assert np.allclose(times - times[0], np.arange(FRAMES) * STEP_NS / 1e9, atol=0.002)
+    sent = [cv2.cvtColor(one, cv2.COLOR_BGR2GRAY).astype(float) for one in pictures(events)]
+    apart = [np.abs(one.astype(float) - other).mean() for (_, one), other in zip(frames, sent, strict=True)]
+    assert max(apart) < 20, "it shows something else"  # full and limited range
+    assert np.corrcoef(frames[7][1].ravel(), sent[7].ravel())[0, 1] > 0.99
+
+
+def test_the_mp4_says_when_the_first_picture_was_taken(recording, tmp_path):
+    """Nobody could lay it beside another camera's."""
+    with av.open(str(export(recording, tmp_path / "flight.mp4"))) as video:
+        assert video.metadata["creation_time"].startswith("2026-09-21T14:13:20")
+
+
+def test_boxes_are_drawn_in_on_request(recording, events, tmp_path):
+    """Whoever gets the file has no viewer that lays boxes over it."""
+    out = export(recording, tmp_path / "flight.mp4", "--burn-in")
+    with av.open(str(out)) as video:
+        assert video.streams.video[0].codec_context.name == "h264"
+        drawn = [one.to_ndarray(format="bgr24") for one in video.decode(video=0)]
+    plain = pictures(events)[30].astype(float)
+    changed = np.abs(drawn[30].astype(float) - plain).max(axis=2) > 60
+    (overlay,) = [one for one in events if isinstance(one, Overlay) and one.frame_index == 30]
+    x1, y1, x2, _ = overlay.boxes_base_px[0].round().astype(int)
+    assert changed[max(0, y1 - 2) : y1 + 3, x1:x2].any(), "no edge above the first object"
+    assert changed.mean() < 0.25
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")  # of what motmetrics uses
+def test_the_tracks_are_those_that_the_ground_had(recording, events, tmp_path):
+    """A table that another program reads would be wrong, by more than the recording is coarse."""
+    rows = lines(export(recording, tmp_path / "t.csv"))
+    table = pq.read_table(export(recording, tmp_path / "t.parquet")).to_pylist()
+    mot = loadtxt(export(recording, tmp_path / "t.txt", "--to", "mot"))
+    overlays = {one.frame_index: one for one in events if isinstance(one, Overlay)}
+    assert len(rows) == len(table) == len(mot) == FRAMES * TRACKS
+    off = []
+    for row, typed in zip(rows, table, strict=True):
+        frame, track = int(row["frame"]), int(row["id"])
+        overlay = overlays[frame - 1]
+        at = int(np.flatnonzero(overlay.track_ids == track)[0])
+        assert (row["class"], row["base_class"]) == (overlay.classes[at], overlay.base_classes[at])
+        assert row["refined"] == str(int(overlay.refined[at]))
+        assert (typed["frame"], typed["id"], typed["class"]) == (frame, track, row["class"])
+        x1, y1, x2, y2 = overlay.boxes_base_px[at].tolist()
+        off.append(np.subtract([float(row[one]) for one in "xywh"], [x1, y1, x2 - x1, y2 - y1]))
+        assert mot.loc[(frame, track), "Width"] == pytest.approx(float(row["w"]), abs=0.06)
+    # Boxes are held while they move by less than a pixel, and written less often where bytes are scarce.
+    assert np.percentile(np.abs(off), 90) < 3
+    assert rows[0]["capture_utc"] == "2026-09-21T14:13:20.000Z"
+
+
+def test_the_data_set_opens_in_coco_tools(recording, events, tmp_path):
+    """One would have to write the labels again to train on what was flown."""
+    out = export(recording, tmp_path / "set", "--to", "coco")
+    coco = COCO(str(out / "annotations.json"))
+    assert len(coco.getImgIds()) == FRAMES
+    names = {one["name"] for one in coco.loadCats(coco.getCatIds())}
+    assert {"car", "van", "truck"} <= names
+    image = coco.loadImgs([31])[0]
+    picture = cv2.imread(str(out / image["file_name"]))
+    assert (picture.shape[1], picture.shape[0]) == (image["width"], image["height"]) == SIZE
+    assert np.abs(picture.astype(float) - pictures(events)[30]).mean() < 4
+    assert len(coco.getAnnIds(imgIds=[31])) == TRACKS
+
+
+def test_the_stills_come_with_what_the_base_showed(recording, events, tmp_path):
+    """The pictures that one looks for would stay inside the recording."""
+    sent = {one.still for one in events if isinstance(one, Refinement)}
+    out = export(recording, tmp_path / "pairs", "--to", "stills")
+    rows = lines(out / "stills.csv")
+    assert {(out / row["file"]).read_bytes() for row in rows} <= sent
+    assert len(rows) >= 0.9 * len(sent)
+    assert sum(bool(row["base_file"]) for row in rows) >= 20
+    assert all(cv2.imread(str(out / row["base_file"])) is not None for row in rows if row["base_file"])
+    assert any("→" in row["caption"] for row in rows)
+
+
+def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
+    """Foxglove would open an empty file, or show boxes of another moment."""
+    found: dict[str, list] = {}
+    with export(recording, tmp_path / "flight.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            found.setdefault(channel.topic, []).append((schema.name, message))
+    assert set(found) == {f"/uav-1/{one}" for one in ("video", "tracks", "stills", "events")}
+    samples = [one for one in events if isinstance(one, VideoSample)]
+    video = [CompressedVideo.FromString(message.data) for _, message in found["/uav-1/video"]]
+    assert [one.data for one in video] == [one.data for one in samples]
+    assert {one.format for one in video} == {"h265"}
+    assert found["/uav-1/video"][0][0] == "foxglove.CompressedVideo"
+    tenth = found["/uav-1/video"][10][1]
+    assert tenth.log_time == START_NS + 10 * STEP_NS
+    boxes = ImageAnnotations.FromString(found["/uav-1/tracks"][30][1].data)
+    facts = [{one.key: one.value for one in points.metadata} for points in boxes.points]
+    assert sorted(int(one["id"]) for one in facts) == list(range(1, TRACKS + 1))
+    assert all(text.text.split()[0] == one["id"] for text, one in zip(boxes.texts, facts, strict=True))
+
+
+def test_a_split_session_is_exported_as_one(events, tmp_path):
+    """A video would end where a file did."""
+    settings = RecorderSettings(tmp_path / "part.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
+    sink = SessionFiles(settings, split=Limit(seconds=1.2), index=None)
+    for event in events:
+        sink.log(event)
+    sink.close()
+    parts = sorted(tmp_path.glob("*.rrd"))
+    assert len(parts) > 1
+    out = tmp_path / "all.mp4"
+    assert hvt_ground.cli.main(["export", *map(str, reversed(parts)), "--out", str(out)]) == 0
+    with av.open(str(out)) as video:
+        assert sum(1 for _ in video.decode(video=0)) == FRAMES
+        assert video.duration / av.time_base == pytest.approx(float(Fraction(FRAMES, 15)), abs=0.1)
+
+
+def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
+    """A traceback, or a file that is no export."""
+    wrong = tmp_path / "wrong.rrd"
+    wrong.write_bytes(b"RRF2" + bytes(100))
+    assert "wrong.rrd is no recording" in refused(capsys, wrong, "--to", "mp4")
+    assert "absent.rrd is no recording" in refused(capsys, tmp_path / "absent.rrd", "--to", "mp4")
+    assert "--to is missing: give one of mp4, mkv, ts" in refused(capsys, recording)
+    assert "'avi'" in refused(capsys, recording, "--to", "avi")
+    assert "--burn-in draws into video, and --to is csv" in refused(
+        capsys, recording, "--to", "csv", "--burn-in"
+    )
+    other = tmp_path / "other.rrd"
+    with Recorder(RecorderSettings(other, "uav-2", "0aaa", SIZE, 15.0, 500_000.0)):
+        pass
+    assert "are of 2 sessions" in refused(capsys, recording, other, "--to", "mp4")
+    assert "recording of uav-2 has no video" in refused(capsys, other, "--to", "mp4")
+    assert "has no stills" in refused(capsys, other, "--to", "stills")
+    assert not list(tmp_path.glob("*.mp4")), "half a file"
+    taken = tmp_path / "full"
+    taken.mkdir()
+    (taken / "mine.txt").write_text("mine", encoding="utf-8")
+    assert "is there and not an empty folder" in refused(capsys, recording, "--to", "coco", "--out", taken)
+    assert (taken / "mine.txt").exists()
+
+
+def test_an_export_that_nobody_named_overwrites_nothing(recording, tmp_path, capsys):
+    """A file that was edited since would be gone."""
+    mine = shutil.copy(recording, tmp_path / "flight.rrd")
+    assert hvt_ground.cli.main(["export", str(mine), "--to", "csv"]) == 0
+    assert "flight.csv is there already" in refused(capsys, mine, "--to", "csv")
+
+
+@pytest.mark.parametrize("kind", ["mp4", "csv", "coco", "mcap"])
+def test_a_full_disk_leaves_no_half_file(recording, tmp_path, capsys, kind):
+    """It would be taken for a whole one."""
+    with small_disk(tmp_path / "small", size="8k") as disk:
+        out = disk / "flight" if kind == "coco" else disk / f"flight.{kind}"
+        assert "No space left on device" in refused(capsys, recording, "--to", kind, "--out", out)
+        assert list(disk.iterdir()) == []
+
+
+def test_json_of_coco_is_plain(recording, tmp_path):
+    """NumPy's numbers would not be written at all."""
+    out = export(recording, tmp_path / "set", "--to", "coco")
+    content = json.loads((out / "annotations.json").read_text(encoding="utf-8"))
+    assert {"id", "image_id", "category_id", "bbox", "area", "iscrowd", "track_id", "score"} == set(
+        content["annotations"][0]
+    )

@@ -1,0 +1,118 @@
+"""HVT as a part of another program: frames are pushed in at one end, pictures and tracks come out at the other."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+import hvt_edge
+import hvt_ground
+from hvt_common.errors import FlightError, UserError
+from hvt_edge.library.pushed import PushedEdge
+from hvt_ground.events import Overlay
+from hvt_ground.library.received import Picture
+from media.recorded_feed import drawn_frames
+from programs.processes import free_ports
+
+pytestmark = pytest.mark.integration
+
+FPS = 15
+
+
+def push_all(edge: PushedEdge, frames: list[np.ndarray], *, rounds: int = 1) -> list[int]:
+    """At the rate of a camera; the capture times."""
+    times = []
+    for frame in frames * rounds:
+        times.append(time.time_ns())
+        edge.push(frame, capture_ns=times[-1])
+        time.sleep(1 / FPS)
+    return times
+
+
+def test_what_is_pushed_arrives_as_pictures_and_tracks(tmp_path, monkeypatch):
+    """A robot's own program would have to write clips for hvt-edge, and read recordings of hvt-ground."""
+    monkeypatch.chdir(tmp_path)
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    frames = drawn_frames(90, (320, 192))
+    received, times = [], []
+    with hvt_ground.listen(listen=endpoint, detector="motion", classifier="none", once=True) as ground:
+        with hvt_edge.open(
+            edge_id="rover-1", connect=[endpoint], detector="motion", budget="400kbps", method="M0"
+        ) as edge:
+            pushing = threading.Thread(target=lambda: times.extend(push_all(edge, frames)))
+            pushing.start()
+            for one in ground:
+                received.append(one)
+                if len(received) > 60:
+                    break
+            pushing.join()
+        received += list(ground)
+    pictures = [one.event for one in received if isinstance(one.event, Picture)]
+    assert {one.edge for one in received} == {"rover-1"}
+    assert len(pictures) > 40
+    sent = dict(zip(times, frames, strict=True))
+    nearest = [min(times, key=lambda at: abs(at - one.capture_ns)) for one in pictures]
+    assert max(abs(a - b.capture_ns) for a, b in zip(nearest, pictures, strict=True)) < 50_000_000
+    alike = [
+        np.corrcoef(
+            cv2.cvtColor(one.image_bgr, cv2.COLOR_BGR2GRAY).ravel(),
+            cv2.cvtColor(sent[at], cv2.COLOR_BGR2GRAY).ravel(),
+        )[0, 1]
+        for at, one in zip(nearest, pictures, strict=True)
+    ]
+    assert np.median(alike) > 0.95
+    assert any(len(one.event.track_ids) for one in received if isinstance(one.event, Overlay)), (
+        "three rectangles move"
+    )
+    assert edge.summary["frames"] >= len(pictures)
+    assert len(ground.summaries) == 1
+    assert list(tmp_path.glob("*.rrd")) == [], "nobody asked for a recording"
+
+
+def test_a_program_that_takes_nothing_holds_nobody(tmp_path, monkeypatch):
+    """The ground's recording, or another edge, would wait for it."""
+    monkeypatch.chdir(tmp_path)
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    frames = drawn_frames(60, (320, 192))
+    with (
+        hvt_ground.listen(
+            listen=endpoint, detector="motion", classifier="none", record=tmp_path / "flight.rrd"
+        ) as ground,
+        hvt_edge.open(edge_id="rover-1", connect=endpoint, detector="motion", method="M0") as edge,
+    ):
+        push_all(edge, frames, rounds=2)
+    assert ground.summaries[0]["frames"] > 60
+    assert (tmp_path / "flight.rrd").stat().st_size > 50_000
+    assert len(list(ground)) <= 40, "what waits is bounded"
+
+
+def test_what_is_wrong_is_raised_where_the_program_can_see_it(tmp_path, monkeypatch):
+    """A robot would fly on blind and not know."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="budget"):
+        hvt_edge.open(budget="none at all")
+    with pytest.raises(UserError, match=r"source 'clip\.mp4' is not accepted: frames are pushed"):
+        hvt_edge.open(source="clip.mp4")
+    with pytest.raises(UserError, match="colour"):
+        hvt_ground.listen(colour="blue")
+    edge = hvt_edge.open(connect="tcp/127.0.0.1:9", detector=tmp_path / "absent.onnx")
+    with pytest.raises(ValueError, match=r"float64 \(4, 4\) is not accepted"):
+        edge.push(np.zeros((4, 4)))
+    with pytest.raises((UserError, FlightError), match=r"absent\.onnx"):
+        push_all(edge, drawn_frames(60, (320, 192)))
+    with pytest.raises((UserError, FlightError), match=r"absent\.onnx"):
+        edge.close()
+    ground = hvt_ground.listen(listen="tcp/127.0.0.1:0nonsense")
+    with pytest.raises(UserError, match="0nonsense"):
+        next(ground)
+
+
+def test_an_edge_that_never_got_a_frame_ends_quietly():
+    """A program that could not open its camera would hang at its end."""
+    with hvt_edge.open(connect="tcp/127.0.0.1:9", detector="motion") as edge:
+        pass
+    assert edge.summary == {}
