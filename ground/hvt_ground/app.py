@@ -93,6 +93,7 @@ class Ground:
         check_edge_pattern(config.edges)
         check_writable(config.summary, name="--summary")
         check_writable(config.timing, name="--timing")
+        check_writable(config.log, name="--log")
         for path, suffix, name in ((config.tracks, ".csv", "--tracks"), (config.mcap, ".mcap", "--mcap")):
             if path is not None and path.suffix == suffix and not path.is_dir():
                 check_writable(path, name=name)
@@ -132,7 +133,9 @@ class Ground:
                 address = "" if page is None or page.is_local else page.address
                 group = stack.enter_context(GroundGroup(session, config.group, page=address))
             link = stack.enter_context(
-                GroundLink(session, edges=config.edges, clock=self._clock, group=group)
+                GroundLink(
+                    session, edges=config.edges, clock=self._clock, group=group, log=factory.message_log
+                )
             )
             watch = stack.enter_context(LinkWatch(session, settings, served=link.is_known))
             self._on_started()

@@ -24,6 +24,7 @@ Other commands, each with --help:
   hvt-ground status                      how a ground that runs is
   hvt-ground recordings                  what a folder of recordings holds
   hvt-ground export FILE.rrd --to KIND   a recording as video, tables, pictures or MCAP
+  hvt-ground replay FILE.hvtlog          receive again what --log kept, with other models
   hvt-ground still | tracks | keyframe   ask an edge, in flight
   hvt-ground set-budget | set-method     command it
   hvt-ground edges                       which edges are there
@@ -33,6 +34,7 @@ _COMMANDS = {
     "export": "hvt_ground.exports.command",
     "keys": "hvt_ground.pki.command",
     "recordings": "hvt_ground.recordings.command",
+    "replay": "hvt_ground.replay.command",
     "status": "hvt_ground.control.watch",
 }
 """By name, the module whose ``run`` takes the words that follow; imported for none but its own."""

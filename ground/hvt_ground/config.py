@@ -133,6 +133,9 @@ class GroundConfig:
     stills: Path | None = _FILES.option(
         PATH, None, "also write each still as a picture, with a table of them: a folder that is there"
     )
+    log: Path | None = _FILES.option(
+        PATH, None, "also keep every message as it came, for hvt-ground replay: FILE.hvtlog"
+    )
     timing: Path | None = _FILES_RARE.option(
         PATH, None, "also write when each message was captured, sent, received and shown: FILE.csv"
     )
@@ -224,6 +227,7 @@ def _check_files(config: GroundConfig) -> None:
         ("--tracks", config.tracks, ".csv"),
         ("--mcap", config.mcap, ".mcap"),
         ("--timing", config.timing, None),
+        ("--log", config.log, None),
         ("--summary", config.summary, None),
     ):
         if path is None or (suffix is not None and path.suffix != suffix):

@@ -18,6 +18,7 @@ from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.messages import Info
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
+from hvt_common.transport.inbox import Received
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import Limit, bitrate_text
 from hvt_ground.backlog.perception import BacklogPerception
@@ -36,6 +37,7 @@ from hvt_ground.recordings.session_files import SessionFiles
 from hvt_ground.session.receiver_report import ReceiverReports
 from hvt_ground.session.session import GroundSession
 from hvt_ground.sinks import Outputs, QueuedSink, Sink, SinkWriter
+from hvt_ground.sinks.message_log import MessageLog
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from hvt_ground.sinks.still_files import StillFiles
@@ -100,6 +102,11 @@ class SessionFactory:
         if config.timing is not None:
             names = partial(_take, [config.timing], number=2, may_exist=config.timing)
             self._timing = outputs.open("timing table", partial(self._opened, timing_table, names))
+        self.message_log: Callable[[Received], None] | None = None
+        """Takes all that comes from edges."""
+        if config.log is not None:
+            names = partial(_take, [config.log], number=2, may_exist=config.log)
+            self.message_log = outputs.open("message log", partial(self._opened, MessageLog, names)).log
 
     def open_session(self, info: Info, reports: ReceiverReports) -> GroundSession:
         """A session with its perception and its sinks."""

@@ -111,9 +111,9 @@ def _with_boxes(picture: Image, overlay: Overlay) -> Image:
         colour = class_colour(name)[::-1]
         cv2.rectangle(drawn, (x1, y1), (x2, y2), colour, 2 if overlay.refined[row] else 1)
         text = f"{track_id} {name}"
-        place = x1, y1 - 4 if y1 > 14 else y2 + 12
-        for thickness, ink in ((3, (0, 0, 0)), (1, colour)):
-            cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, ink, thickness, cv2.LINE_AA)
+        x, y = x1, y1 - 4 if y1 > 14 else y2 + 12
+        for at, ink in (((x + 1, y + 1), (0, 0, 0)), ((x, y), colour)):
+            cv2.putText(drawn, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, ink, 1, cv2.LINE_AA)
     return drawn
 
 

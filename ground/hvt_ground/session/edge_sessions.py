@@ -205,6 +205,8 @@ class EdgeSessions:
                 self._take(session, header, item)
             elif isinstance(header, Status) or (isinstance(header, RoiHeader) and session is None):
                 self._pre_session.hold(packet)
+            elif isinstance(header, TrackStep) and session is None:
+                pass  # who joins between two keyframes gets some; the next ones say all of it again
             else:
                 self._receiver.skip_stranger(row, header.session_id)
         except WireError as error:

@@ -53,9 +53,17 @@ class EdgePort:
     ``put`` is for Zenoh's callbacks, all else for the edge's thread, which gets their errors by `raise_error`.
     """
 
-    def __init__(self, session: zenoh.Session, edge: str, *, clock: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        edge: str,
+        *,
+        clock: Callable[[], int],
+        log: Callable[[Received], None] | None = None,
+    ) -> None:
         self.edge = edge
         self._clock = clock
+        self._log = log
         self.inbox = Inbox(capacity=_INBOX_MESSAGES, overflow="newest", share=_INBOX_SHARE)
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self.present = threading.Event()
@@ -90,6 +98,8 @@ class EdgePort:
 
         def note(data: bytes) -> None:
             answered_ns = self._clock()
+            if self._log is not None:
+                self._log(Received(self._keys.key(Channel.INFO), data, b"", "", answered_ns))
             try:
                 info = Info.parse(data)
             except WireError as error:
@@ -112,6 +122,8 @@ class EdgePort:
 
     def put(self, item: Received, row: Channel) -> None:
         """Take a message in; what finds no room is dropped."""
+        if self._log is not None:
+            self._log(item)
         self.inbox.put(item)
         if self._flood.note(row, now_ns=item.received_ns) is not None:
             _log.warning(
@@ -183,6 +195,7 @@ class GroundLink:
     """Sorts what comes by edge. `ports` grows as edges appear that ``edges``, the pattern, accepts.
 
     With a ``group`` only the edges that are this member's are subscribed to, and a port goes when its edge moves.
+    ``log`` gets all that comes from an edge, in Zenoh's callbacks.
     """
 
     def __init__(
@@ -192,9 +205,11 @@ class GroundLink:
         edges: str,
         clock: Callable[[], int] | None = None,
         group: GroundGroup | None = None,
+        log: Callable[[Received], None] | None = None,
     ) -> None:
         self._session = session
         self._group = group
+        self._log = log
         self._alive: set[str] = set()
         """Edges that show their token, also those that others serve; with a group."""
         self._subscribers: dict[str, list[zenoh.Subscriber[None]]] = {}
@@ -302,7 +317,7 @@ class GroundLink:
                     self.foreign += 1
                     self._say_refused(edge)
                     return None
-                port = self._ports[edge] = EdgePort(self._session, edge, clock=self._clock)
+                port = self._ports[edge] = EdgePort(self._session, edge, clock=self._clock, log=self._log)
             return port
 
     def _make_space(self) -> bool:

@@ -1,7 +1,7 @@
 """Where events go: recordings, live views, tables; each behind a queue, so that its failure is its own.
 
-Beside what is listed here there are `mcap_file`, `still_files`, `timing`, `tracks_table`, `palette` (colours) and the
-room `rerun`.
+Beside what is listed here there are `mcap_file`, `message_log`, `still_files`, `timing`, `tracks_table`, `palette`
+(colours) and the room `rerun`.
 """
 
 from __future__ import annotations

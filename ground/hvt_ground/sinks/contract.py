@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from hvt_common.transport.inbox import Received
 from hvt_ground.events import Refinement, VideoSample
 
 __all__ = ["Sink", "SinkWriter", "size_bytes"]
@@ -39,6 +40,8 @@ class SinkWriter(Sink[T_contra], Protocol[T_contra]):
 def size_bytes(item: object) -> int:
     """About what an item takes in memory."""
     match item:
+        case Received():
+            return item.size_bytes + _SMALL_BYTES
         case VideoSample():
             return len(item.data) + _SMALL_BYTES
         case Refinement():

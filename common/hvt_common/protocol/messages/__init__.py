@@ -1,4 +1,7 @@
-"""Every message of HVT as bytes, and back. docs/wire.md is the same for people of other languages."""
+"""Every message of HVT as bytes, and back. docs/wire.md is the same for people of other languages.
+
+Who makes vectors of them reaches into `envelope`, `fields` and `track_boxes`.
+"""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class TrackStep(Message):
     reference: int = wire_field(Int(-1, U32))
     """Sequence of the step that the boxes are coded against; -1 where they stand by themselves."""
     boxes: bytes = wire_field(Blob(_MOST_BOX_BYTES))
-    """Range-coded; see docs/wire.md, *Coded tracks*."""
+    """Range-coded; see docs/wire-tracks.md."""
 
     @property
     def send_ns(self) -> int:

@@ -1,0 +1,191 @@
+"""``hvt-ground replay FILE.hvtlog [SETTINGS]``: receive again what was received, with other models or rules.
+
+It is the ground of the flight without its link: nothing is skipped for lack of time, so that the same file and the
+same settings give the same recording, tables and summary.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress
+
+from hvt_common.config import load
+from hvt_common.errors import Parser, UserError
+from hvt_common.protocol.channels import Channel, parse_key
+from hvt_common.protocol.messages import Feedback, Info, WireError
+from hvt_common.runtime.process import stop_on_signals
+from hvt_common.runtime.reporting import print_table, say, write_json
+from hvt_common.transport.inbox import Received
+from hvt_common.units import SECOND_NS
+from hvt_ground.backlog.recordings import BacklogRecordings
+from hvt_ground.config import GroundConfig, check
+from hvt_ground.perception.models import Models
+from hvt_ground.session.edge_sessions import EdgeSessions
+from hvt_ground.session.session import GroundSession
+from hvt_ground.session.subscribe import InfoAnswer
+from hvt_ground.sinks import Outputs
+from hvt_ground.sinks.message_log import read_log
+from hvt_ground.sinks.rerun.live_view import LiveView
+from hvt_ground.status import completed, summary, table
+from hvt_ground.wiring import SessionFactory
+
+__all__ = ["run"]
+
+_OF_A_LINK = (
+    "listen",
+    "connect",
+    "zenoh_config",
+    "insecure",
+    "group",
+    "once",
+    "wait",
+    "web",
+    "metrics",
+    "log",
+)
+"""Settings that mean nothing without a link."""
+_MOST_PAUSE_S = 5.0
+"""With ``--speed``: what stood still for longer is shown shorter."""
+
+
+def run(argv: Sequence[str]) -> int:
+    """Replay a file; `UserError` where it is none, or for a setting of the link."""
+    parser = Parser(prog="hvt-ground replay", description=__doc__, add_help=False)
+    parser.add_argument("--speed", type=float, default=math.inf)
+    parser.add_argument("--help", "-h", action="store_true")
+    given, words = parser.parse_known_args(list(argv))
+    if given.help or not words or words[0].startswith("-"):
+        raise UserError(
+            "give the file first: hvt-ground replay FILE.hvtlog [--speed 1] [settings of hvt-ground]"
+        )
+    if not given.speed > 0:
+        raise UserError(f"--speed {given.speed:g} is not accepted: give more than 0; 1 is as it came")
+    path = Path(words[0])
+    config, loaded = load(GroundConfig, words[1:], program="hvt-ground replay", description=str(__doc__))
+    for name in _OF_A_LINK:
+        if name in loaded.values:
+            raise UserError(f"--{name.replace('_', '-')} is not accepted: a replay has no link")
+    if config.provider == "auto":  # by its speed it may choose one this time and another the next
+        config = replace(config, provider="cpu")
+    sessions = _Replay(check(config), path, speed=given.speed).run()
+    for content in sessions:
+        print_table(f"{content['edge']}: received", table(content))
+    if not sessions:
+        say(f"hvt-ground: {path} has no session that can be shown")
+    if config.summary is not None:
+        write_json(config.summary, sessions[0] if len(sessions) == 1 else sessions)
+    return 0
+
+
+class _ReplayPort:
+    """An edge as its messages say it was: it knows its sessions, and answers nothing else."""
+
+    def __init__(self, edge: str, infos: dict[int, Info]) -> None:
+        self.edge = edge
+        self.present, self.used = threading.Event(), threading.Event()
+        self.present.set()
+        self._infos = infos
+
+    def query_info(self, session_id: int) -> InfoAnswer | None:
+        info = self._infos.get(session_id)
+        return None if info is None else (info, info.received_ns, info.answered_ns)
+
+    def request_info(self, session_id: int) -> None:
+        """There is nobody to answer."""
+
+    def take_info(self) -> InfoAnswer | None:
+        return None
+
+    def request_keyframe(self) -> None:
+        """What came has come."""
+
+    def report(self, feedback: Feedback) -> None:
+        """Nobody listens."""
+
+    def raise_error(self) -> None:
+        """There are no callbacks."""
+
+
+class _Replay:
+    def __init__(self, config: GroundConfig, path: Path, *, speed: float) -> None:
+        self._config = config
+        self._path = path
+        self._speed = speed
+        self._now_ns = 0
+        self._stop = stop_on_signals()
+
+    def run(self) -> list[dict[str, Any]]:
+        """Play all of it; a summary a session."""
+        infos = _infos(self._path)
+        models = Models(self._config)
+        ended: list[tuple[dict[str, Any], GroundSession]] = []
+        edges: dict[str, EdgeSessions] = {}
+        with ExitStack() as stack:
+            outputs = Outputs(models.failures)
+            stack.callback(outputs.close)
+            view = None
+            if self._config.view or self._config.serve:
+                view = stack.enter_context(LiveView("spawn" if self._config.view else "serve"))
+            factory = SessionFactory(self._config, models, clock=self._clock, outputs=outputs, view=view)
+            for item in self._paced():
+                edge = (parse_key(item.key) or ("", None))[0]
+                if edge not in infos:
+                    continue
+                if edge not in edges:
+                    edges[edge] = EdgeSessions(
+                        _ReplayPort(edge, infos[edge]),  # type: ignore[arg-type]
+                        open_session=factory.open_session,
+                        on_ended=lambda one: ended.append((summary(one), one)),
+                        recordings=BacklogRecordings(factory.open_backlog),
+                        clock=self._clock,
+                    )
+                edges[edge].work(item, pending=False)
+            for one in edges.values():
+                one.close()
+        return [
+            completed(content, edges[session.info.edge], sinks=session.sinks, failures=models.failures)
+            for content, session in ended
+        ]
+
+    def _clock(self) -> int:
+        return self._now_ns
+
+    def _paced(self) -> Iterator[Received]:
+        """The messages, each at its time."""
+        size = self._path.stat().st_size
+        with Progress(transient=True, disable=self._config.quiet) as progress:
+            task = progress.add_task(self._path.name, total=size)
+            for item in read_log(self._path):
+                if self._stop.is_set():
+                    return
+                if parse_key(item.key) is None or item.key.endswith(f"/{Channel.INFO}"):
+                    continue
+                pause_s = (item.received_ns - self._now_ns) / SECOND_NS / self._speed if self._now_ns else 0.0
+                if pause_s > 0:
+                    time.sleep(min(pause_s, _MOST_PAUSE_S))
+                self._now_ns = max(self._now_ns, item.received_ns)
+                progress.advance(task, item.size_bytes + len(item.key))
+                yield item
+
+
+def _infos(path: Path) -> dict[str, dict[int, Info]]:
+    """What each edge said of its sessions, by session; all are played in lockstep."""
+    found: dict[str, dict[int, Info]] = {}
+    for item in read_log(path):
+        parsed = parse_key(item.key)
+        if parsed is None or parsed[1] is not Channel.INFO:
+            continue
+        try:
+            info = Info.parse(item.payload)
+        except WireError:
+            continue
+        found.setdefault(parsed[0], {})[info.session_id] = replace(info, pace="lockstep")
+    return found

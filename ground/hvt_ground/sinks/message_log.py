@@ -1,0 +1,103 @@
+"""A file of every message that a ground has received, each with its time: readable after ``kill -9``.
+
+``HVTLOG`` and two bytes for the version of the form; then records: length (4 bytes, little-endian) and CRC-32 (4
+bytes, of zlib) of a MessagePack array ``[received_ns, key, encoding, attachment, payload]``. Answers to ``info`` are
+among them, because nothing can be read without them.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import msgpack
+
+from hvt_common.errors import UserError
+from hvt_common.protocol.messages import MAX_PAYLOAD_BYTES
+from hvt_common.transport.inbox import Received
+from hvt_ground.sinks.line_file import check_there
+
+__all__ = ["MessageLog", "read_log"]
+
+_MAGIC = b"HVTLOG\x00\x01"
+_HEAD = struct.Struct("<II")
+_MOST_BYTES = MAX_PAYLOAD_BYTES + 2**17
+"""Of a record: the largest payload, the largest message beside it, and the names."""
+_TYPES = [int, str, str, bytes, bytes]
+
+
+class MessageLog:
+    """Appends messages to a new file; takes the place of one of that name. `UserError` where it cannot be written."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._written = 0
+        try:
+            self._file: BinaryIO = path.open("wb", buffering=0)
+            self._file.write(_MAGIC)
+        except OSError as error:
+            raise UserError(f"message log {path} cannot be created: {error.strerror}") from None
+
+    def log(self, item: Received) -> None:
+        """Append a message; it is in the file when this returns, whole or not at all."""
+        body: bytes = msgpack.packb(
+            [item.received_ns, item.key, item.encoding, item.attachment, item.payload]
+        )
+        record = _HEAD.pack(len(body), zlib.crc32(body)) + body
+        at = self._file.tell()
+        try:
+            check_there(self._file.fileno(), self.path)
+            view = memoryview(record)
+            while view:
+                view = view[self._file.write(view) or 0 :]
+        except OSError as error:
+            self._file.seek(at)
+            self._file.truncate()
+            raise UserError(
+                f"message log {self.path} cannot be written any further: {error.strerror}"
+            ) from error
+
+    def skipped(self, count: int) -> None:
+        """They are missing, as if they had been lost on the link."""
+
+    def close(self, hurry: threading.Event | None = None) -> None:  # noqa: ARG002 - it is always quick
+        """Close the file; a second call does nothing."""
+        self._file.close()
+
+
+def read_log(path: Path) -> Iterator[Received]:
+    """The messages of a file, in the order in which they came, up to the first record that is not whole.
+
+    Raises:
+        UserError: it cannot be read, or is no message log.
+    """
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise UserError(f"{path} is no message log of hvt-ground --log")
+            while (item := _read(file)) is not None:
+                yield item
+    except OSError as error:
+        raise UserError(f"message log {path} cannot be read: {error.strerror}") from None
+
+
+def _read(file: BinaryIO) -> Received | None:
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        return None
+    length, checksum = _HEAD.unpack(head)
+    body = file.read(length) if length <= _MOST_BYTES else b""
+    if not body or len(body) < length or zlib.crc32(body) != checksum:
+        return None
+    try:
+        values = msgpack.unpackb(body, max_ext_len=0)
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException):
+        return None
+    if type(values) is not list or [type(one) for one in values] != _TYPES:
+        return None
+    received_ns, key, encoding, attachment, payload = values
+    return Received(key, payload, attachment, encoding, received_ns)

@@ -1,0 +1,1 @@
+"""Vectors by which a reader of the wire in any language can be tried; `vectors` makes them."""

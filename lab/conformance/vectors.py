@@ -1,0 +1,328 @@
+"""``PYTHONPATH=.:tests/support python -m lab.conformance.vectors``: write docs/conformance/ from the code.
+
+Nothing is drawn by chance: the same code gives the same files, and a test compares them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from hvt_common.protocol.messages import (
+    BacklogStill,
+    BacklogUnit,
+    BaseHeader,
+    Flags,
+    Message,
+    RoiHeader,
+    TrackStep,
+    TrackStepEncoder,
+    WireError,
+    kinds,
+    pack_backlog_still,
+    pack_backlog_units,
+    parse_backlog_still,
+    parse_backlog_units,
+)
+from hvt_common.protocol.messages.envelope import WIRE_VERSION
+from hvt_common.protocol.messages.fields import Int
+from hvt_common.protocol.messages.track_boxes import CodedTrack, read_tracks
+from hvt_common.values import Tracks
+from rigs.messages import EXAMPLES, ROI
+
+__all__ = ["FOLDER", "files", "main"]
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "conformance"
+_PAYLOADS: Mapping[type[Message], bytes] = {BaseHeader: b"an access unit", RoiHeader: b"a still"}
+_EXACT = 2**53 - 1
+"""Beyond it a number of JSON is not exact everywhere, and stands as text."""
+_TRACK = (
+    "id",
+    "class",
+    "confidence",
+    "x",
+    "y",
+    "width",
+    "height",
+    "vx",
+    "vy",
+    "scale_x",
+    "scale_y",
+    "missed",
+)
+
+
+def files() -> dict[str, str]:
+    """The text of each file, by name."""
+    content = {
+        "messages.json": list(_messages()),
+        "refused.json": list(_refused()),
+        "objects.json": list(_objects()),
+        "track-steps.json": list(_track_steps()),
+    }
+    # A vector a line: a change shows which.
+    return {
+        name: "[\n" + ",\n".join(json.dumps(one, ensure_ascii=True) for one in vectors) + "\n]\n"
+        for name, vectors in content.items()
+    }
+
+
+def main() -> int:
+    """Write all of them."""
+    FOLDER.mkdir(exist_ok=True)
+    for name, text in files().items():
+        (FOLDER / name).write_text(text, encoding="utf-8")
+        print(f"{FOLDER / name}: {text.count(chr(10)) - 2} vectors")
+    return 0
+
+
+# Messages that are to be read
+
+
+def _messages() -> Iterator[dict[str, Any]]:
+    for message in EXAMPLES:
+        yield _vector(message, "an example")
+        for name, kind in kinds(type(message)):
+            if isinstance(kind, Int):
+                for bound in (kind.low, kind.high):
+                    yield _vector(replace(message, **{name: bound}), f"{name} at its bound")
+
+
+def _vector(message: Message, what: str) -> dict[str, Any]:
+    payload = _PAYLOADS.get(type(message), b"")
+    data = message.pack(payload)
+    return {
+        "message": type(message).__name__,
+        "what": what,
+        "hex": data.hex(),
+        "payload": payload.hex(),
+        "fields": _plain(msgpack.unpackb(data)[1:-1]),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """As JSON can hold it: bytes as ``{"hex": …}``, whole numbers beyond 2^53 as text."""
+    match value:
+        case bool() | str() | float() | None:
+            return value
+        case int():
+            return value if abs(value) <= _EXACT else str(value)
+        case bytes():
+            return {"hex": value.hex()}
+        case dict():
+            return {key: _plain(one) for key, one in value.items()}
+    return [_plain(one) for one in value]
+
+
+# Messages that are not
+
+
+def _refused() -> Iterator[dict[str, Any]]:
+    """What is damaged, of another version, or out of bounds, each with a checksum that fits unless that is it."""
+    for message in EXAMPLES:
+        payload = _PAYLOADS.get(type(message), b"")
+        good = message.pack(payload)
+        values = msgpack.unpackb(good)[:-1]
+        yield _bad(message, "a bit is flipped", bytes((*good[:-7], good[-7] ^ 1, *good[-6:])), payload)
+        yield _bad(message, "its end is missing", good[:-1], payload)
+        yield _bad(message, "a byte follows", good + b"\0", payload)
+        yield _bad(message, "the checksum is of another payload", good, payload + b"!")
+        yield _bad(
+            message,
+            "an older version",
+            _packed([WIRE_VERSION - 1, *values[1:]], payload),
+            payload,
+            version=True,
+        )
+        yield _bad(
+            message,
+            "a newer version",
+            _packed([WIRE_VERSION + 1, *values[1:]], payload),
+            payload,
+            version=True,
+        )
+        yield _bad(message, "a field too many", _packed([*values, 0], payload), payload)
+        yield _bad(message, "a field too few", _packed(values[:-1], payload), payload)
+        for place, (name, kind) in enumerate(kinds(type(message)), 1):
+            for wrong, what in _wrong(kind):
+                changed = [*values[:place], wrong, *values[place + 1 :]]
+                yield _bad(message, f"{name} {what}", _packed(changed, payload), payload)
+
+
+def _wrong(kind: Any) -> Iterator[tuple[Any, str]]:
+    """Values that a kind of field refuses, as far as MessagePack can hold them."""
+    for value, what in (
+        (None, "is nothing"),
+        (1.5, "is a fraction"),
+        ("\x07", "is a text with a control character"),
+        ([], "is an empty array"),
+        (2**64 - 1, "is far above all"),
+    ):
+        try:
+            kind.decode(value)
+        except WireError:
+            yield value, what
+    if isinstance(kind, Int):
+        for value, what in (
+            (kind.low - 1, "is just below its bound"),
+            (kind.high + 1, "is just above its bound"),
+        ):
+            if -(2**63) <= value < 2**64:
+                yield value, what
+
+
+def _bad(
+    message: Message, what: str, data: bytes, payload: bytes, *, version: bool = False
+) -> dict[str, Any]:
+    try:
+        type(message).parse(data, payload)
+    except WireError:
+        return {
+            "message": type(message).__name__,
+            "what": what,
+            "hex": data.hex(),
+            "payload": payload.hex(),
+            "version": version,
+        }
+    raise AssertionError(f"{type(message).__name__} is read although {what}")
+
+
+def _packed(values: list[Any], payload: bytes) -> bytes:
+    """The array with a checksum that fits."""
+    body = msgpack.Packer().pack_array_header(len(values) + 1) + b"".join(map(msgpack.packb, values))
+    return bytes(body) + b"\xce" + zlib.crc32(body, zlib.crc32(payload)).to_bytes(4, "big")
+
+
+# Objects of the backlog
+
+
+def _objects() -> Iterator[dict[str, Any]]:
+    header = replace(ROI, flags=int(Flags.STORED))
+    still = BacklogStill(header.pack(b"a still"), "image/jpeg", b"a still")
+    units = [
+        BacklogUnit(7, 1_000, keyframe=True, data=b"first"),
+        BacklogUnit(9, 1_200, keyframe=False, data=b"second"),
+    ]
+    for kind, data in (("still", pack_backlog_still(still)), ("base", pack_backlog_units(units))):
+        yield {"kind": kind, "what": "an example", "hex": data.hex(), "values": _plain(msgpack.unpackb(data))}
+        for what, wrong in (
+            ("its end is missing", data[:-1]),
+            ("a byte follows", data + b"\0"),
+            ("is empty", b""),
+        ):
+            yield _bad_object(kind, what, wrong)
+    rows = [[7, 1_000, True, b"first"], [9, 1_200, False, b"second"]]
+    for what, changed in (
+        ("no frame at all", []),
+        ("frames are not in order", rows[::-1]),
+        ("times are not in order", [rows[0], [9, 1_000, False, b"second"]]),
+        ("a frame is empty", [[7, 1_000, True, b""]]),
+        ("a flag is a number", [[7, 1_000, 1, b"first"]]),
+        ("an index is below zero", [[-1, 1_000, True, b"first"]]),
+    ):
+        yield _bad_object("base", what, msgpack.packb(changed))
+    yield _bad_object("still", "there is no still", msgpack.packb([still.attachment, "image/jpeg", b""]))
+    yield _bad_object(
+        "still", "the encoding is bytes", msgpack.packb([still.attachment, b"jpeg", b"a still"])
+    )
+
+
+def _bad_object(kind: str, what: str, data: bytes) -> dict[str, Any]:
+    try:
+        (parse_backlog_still if kind == "still" else parse_backlog_units)(data)
+    except WireError:
+        return {"kind": kind, "what": what, "hex": data.hex()}
+    raise AssertionError(f"the object {kind} is read although {what}")
+
+
+# Tracks
+
+
+def _track_steps() -> Iterator[dict[str, Any]]:
+    """Sessions of steps, each with the list that it leaves; damaged ones leave that of the step before."""
+    for name, count, steps in (("three cars", 3, 8), ("a crowd", 60, 6), ("nobody", 0, 3)):
+        yield {"session": name, "steps": list(_session(count, steps))}
+    yield {"session": "damaged steps", "steps": list(_damaged())}
+
+
+def _session(count: int, steps: int) -> Iterator[dict[str, Any]]:
+    encoder = TrackStepEncoder(session_id=2**63 + 5, refresh_ns=1_500_000_000)
+    state: list[CodedTrack] = []
+    frame = -1
+    for number in range(steps):
+        step = encoder.encode(_tracks(count, number), capture_ns=10**18 + number * 333_333_333)
+        state = _read(step, state, before=frame)
+        frame = step.frame_index
+        yield {"hex": step.pack().hex(), "tracks": _rows(state)}
+
+
+def _tracks(count: int, number: int) -> Tracks:
+    """Objects that move, turn up, are missed for some steps, change their class and leave."""
+    ids = [one for one in range(1, count + 1) if (one + number) % 4 or one % 3]
+    ids += [10_000 + number] if count else []
+    rng = np.random.default_rng(number)
+    rows = np.array(ids, np.float64).reshape(-1, 1)
+    corner = np.hstack([rows * 37 % 1200, rows * 23 % 680]) + number * np.hstack([rows % 5 - 2, rows % 3])
+    corner += rng.normal(0, 0.5, corner.shape)
+    side = np.hstack([8 + rows % 40, 6 + rows % 25])
+    return Tracks(
+        frame_index=number * 5,
+        ids=np.array(ids, np.int64),
+        boxes_xyxy_px=np.hstack([corner, corner + side]).astype(np.float32),
+        confidences=(0.3 + rows[:, 0] * 7 % 10 / 15).astype(np.float32),
+        class_ids=((rows[:, 0] + (number > 3)) % 4).astype(np.int32),
+        born_frames=np.zeros(len(ids), np.int64),
+        seen_frames=np.full(len(ids), number * 5, np.int64),
+        started=np.zeros(len(ids), np.bool_),
+    )
+
+
+def _damaged() -> Iterator[dict[str, Any]]:
+    encoder = TrackStepEncoder(session_id=1)
+    first = encoder.encode(_tracks(5, 0), capture_ns=10**18)
+    second = encoder.encode(_tracks(5, 1), capture_ns=10**18 + 333_333_333)
+    state = _read(first, [], before=-1)
+    yield {"hex": first.pack().hex(), "tracks": _rows(state)}
+    for boxes in (second.boxes[:-6], second.boxes + b"\0\0", bytes(40), b"\xff" * 40):
+        step = replace(second, boxes=boxes)
+        try:
+            _read(step, state, before=first.frame_index)
+        except WireError:
+            yield {"hex": step.pack().hex(), "damaged": True}
+    yield {"hex": replace(second, frame_index=0).pack().hex(), "damaged": True}
+    yield {"hex": replace(second, sequence=9, reference=8).pack().hex(), "skipped": True}
+    yield {"hex": first.pack().hex(), "skipped": True}
+    yield {"hex": second.pack().hex(), "tracks": _rows(_read(second, state, before=first.frame_index))}
+
+
+def _read(step: TrackStep, state: list[CodedTrack], *, before: int) -> list[CodedTrack]:
+    reference = None if step.reference < 0 else state
+    return read_tracks(step.boxes, reference=reference, frames=step.frame_index - before)
+
+
+def _rows(state: list[CodedTrack]) -> list[dict[str, int]]:
+    return [
+        dict(
+            zip(
+                _TRACK,
+                (
+                    *(one.track_id, one.class_id, one.confidence, one.x, one.y, one.width, one.height),
+                    *(one.velocity_x, one.velocity_y, one.scale_x, one.scale_y, one.missed),
+                ),
+                strict=True,
+            )
+        )
+        for one in state
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

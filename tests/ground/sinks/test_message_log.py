@@ -1,0 +1,103 @@
+"""The log of messages: what was written is read back, whatever happened to the file."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hvt_common.errors import UserError
+from hvt_common.transport.inbox import Received
+from hvt_ground.sinks.message_log import MessageLog, read_log
+from programs.small_disk import small_disk
+
+MESSAGES = [
+    Received(
+        f"hvt/uav-1/{row}",
+        bytes([number]) * number * 40,
+        b"head" * (number % 3),
+        "video/h265",
+        10**18 + number,
+    )
+    for number, row in enumerate(("base", "roi", "status", "tracks", "info") * 4)
+]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with all of them."""
+    path = tmp_path_factory.mktemp("log") / "flight.hvtlog"
+    sink = MessageLog(path)
+    for one in MESSAGES:
+        sink.log(one)
+    sink.close()
+    return path
+
+
+def test_messages_come_back_as_they_came(log):
+    """A replay would show another flight."""
+    assert list(read_log(log)) == MESSAGES
+    assert log.stat().st_size < 1.3 * sum(
+        one.size_bytes + len(one.key) + len(one.encoding) for one in MESSAGES
+    )
+
+
+@pytest.mark.parametrize("lost", [1, 3, 8, 200, 5000])
+def test_a_killed_ground_leaves_all_but_the_last_record(log, tmp_path, lost):
+    """A power cut would take the whole flight."""
+    cut_off = tmp_path / "cut.hvtlog"
+    cut_off.write_bytes(log.read_bytes()[:-lost])
+    found = list(read_log(cut_off))
+    assert found == MESSAGES[: len(found)]
+    assert len(found) >= len(MESSAGES) - 1 - lost // 600
+
+
+@given(place=st.integers(8, 15_000), flipped=st.integers(1, 255))
+def test_a_damaged_byte_ends_it_and_invents_nothing(log, place, flipped):
+    """A message that nobody sent would be taken for one."""
+    data = bytearray(log.read_bytes())
+    data[place % (len(data) - 8) + 8] ^= flipped
+    damaged = log.with_name("damaged.hvtlog")
+    damaged.write_bytes(data)
+    found = list(read_log(damaged))
+    assert found == MESSAGES[: len(found)]
+
+
+def test_a_record_that_claims_gigabytes_takes_no_memory(tmp_path):
+    """A file from outside would end the process."""
+    path = tmp_path / "large.hvtlog"
+    path.write_bytes(b"HVTLOG\x00\x01" + struct.pack("<II", 2**32 - 1, 0) + bytes(100))
+    assert list(read_log(path)) == []
+
+
+def test_what_is_no_log_is_said(tmp_path):
+    """A recording given by mistake would look like an empty flight."""
+    wrong = tmp_path / "flight.rrd"
+    wrong.write_bytes(b"RRF2" + bytes(20))
+    with pytest.raises(UserError, match="is no message log"):
+        list(read_log(wrong))
+    with pytest.raises(UserError, match="No such file"):
+        list(read_log(tmp_path / "absent.hvtlog"))
+
+
+def test_a_full_disk_leaves_whole_records(tmp_path):
+    """What was kept so far would be lost with what found no room."""
+    with small_disk(tmp_path / "small", size="8k") as disk:
+        sink = MessageLog(disk / "flight.hvtlog")
+        endless = itertools.cycle(MESSAGES)
+        with pytest.raises(UserError, match="cannot be written any further: No space left on device"):
+            _write_all(sink, endless)
+        sink.close()
+        found = list(read_log(disk / "flight.hvtlog"))
+        assert found == MESSAGES[: len(found)]
+        assert len(found) > 5
+
+
+def _write_all(sink: MessageLog, messages: Iterator[Received]) -> None:
+    for one in messages:
+        sink.log(one)
