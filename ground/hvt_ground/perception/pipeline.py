@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from hvt_common.inference.detect import Detector
 from hvt_common.protocol.messages import StillResult
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Image, Tracks, View
+from hvt_common.values import Boxes, Image, Tracks, View
 from hvt_common.video.hevc import YuvPicture
 from hvt_ground.events import Event, Overlay
 from hvt_ground.perception.fusion.camera_path import CameraPath
@@ -42,6 +44,11 @@ _HISTORY_S = 3.0
 """Of pictures that residual stills may build on."""
 _MOST_HISTORY_FRAMES = 45
 _MOST_HISTORY_BYTES = 128 * 2**20
+
+_LEAST_INSIDE = 0.5
+"""Tracks are carried on for a while. A box of which more than half has left the picture is of what nobody can see."""
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,19 +300,30 @@ def _overlay(
 ) -> Overlay:
     tracks = fused.tracks
     limits = np.array([*base_size, *base_size], np.float32)  # the tracker lets boxes leave the picture
+    boxes = np.clip(tracks.boxes_xyxy_px, 0, limits)
+    rows = np.flatnonzero(_areas(boxes) > _LEAST_INSIDE * _areas(tracks.boxes_xyxy_px))
     return Overlay(
         frame_index=tracks.frame_index,
         capture_ns=capture_ns,
-        track_ids=tracks.ids,
-        boxes_base_px=np.clip(tracks.boxes_xyxy_px, 0, limits),
-        base_classes=shown.base_classes,
-        classes=shown.classes,
-        confidences=shown.confidences,
-        refined=shown.refined,
-        origins=fused.origins,
-        doubted=shown.doubted,
-        sure=shown.sure,
+        track_ids=tracks.ids[rows],
+        boxes_base_px=boxes[rows],
+        base_classes=_of(shown.base_classes, rows),
+        classes=_of(shown.classes, rows),
+        confidences=shown.confidences[rows],
+        refined=shown.refined[rows],
+        origins=_of(fused.origins, rows),
+        doubted=shown.doubted[rows],
+        sure=shown.sure[rows],
     )
+
+
+def _areas(boxes: Boxes) -> npt.NDArray[np.float32]:
+    wide, high = (boxes[:, 2:] - boxes[:, :2]).T
+    return np.asarray(wide * high)
+
+
+def _of(words: tuple[T, ...], rows: npt.NDArray[np.intp]) -> tuple[T, ...]:
+    return tuple(words[row] for row in rows.tolist())
 
 
 def _nothing(frame_index: int) -> Tracks:

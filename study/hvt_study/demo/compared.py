@@ -110,7 +110,8 @@ def _truth(scene: Scene, index: int, *, scale: float) -> Labelled:
     truth = scene.truth(index / NOMINAL_FPS)
     judged = truth.visible >= _LEAST_VISIBLE
     names = tuple(scene.class_names[kind] for kind in truth.class_ids[judged].tolist())
-    return Labelled(truth.boxes_source_px[judged].astype(np.float64) * scale, names)
+    boxes = truth.boxes_source_px.astype(np.float64) * scale
+    return Labelled(boxes[judged], names, beside_xyxy_px=boxes[~judged])
 
 
 def _newest(one: Flown, frame: int) -> Image:

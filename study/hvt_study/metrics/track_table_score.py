@@ -6,7 +6,7 @@ import csv
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,8 @@ class Labelled:
     boxes_xyxy_px: npt.NDArray[np.float64]
     """(N, 4), base pixels."""
     classes: tuple[str, ...]
+    beside_xyxy_px: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))
+    """(P, 4), of the truth: objects that are hidden; who lists one is neither right nor wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,19 +71,23 @@ def read_tracks(path: Path, *, column: str = "class") -> dict[int, Labelled]:
 
 
 def read_truth(path: Path, *, class_names: Sequence[str]) -> dict[int, Labelled]:
-    """Read MOTChallenge ground truth (``frame,id,x,y,w,h,1,class,visibility``) by frame; hidden objects left out."""
+    """Read MOTChallenge ground truth (``frame,id,x,y,w,h,1,class,visibility``) by frame; hidden ones stand beside."""
     rows: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
+    beside: dict[int, list[tuple[list[float], str]]] = defaultdict(list)
     try:
         with path.open(encoding="utf-8") as file:
             for fields in csv.reader(file):
                 x, y, w, h = (float(value) for value in fields[2:6])
-                if float(fields[8]) >= _LEAST_VISIBLE:
-                    rows[int(fields[0])].append(([x, y, x + w, y + h], class_names[int(fields[7]) - 1]))
+                judged = rows if float(fields[8]) >= _LEAST_VISIBLE else beside
+                judged[int(fields[0])].append(([x, y, x + w, y + h], class_names[int(fields[7]) - 1]))
     except (OSError, IndexError, ValueError) as error:
         raise UserError(
             f"{path} is not MOTChallenge ground truth of {len(class_names)} classes ({error})"
         ) from None
-    return {frame: _labelled(found) for frame, found in rows.items()}
+    return {
+        frame: replace(_labelled(rows[frame]), beside_xyxy_px=_labelled(beside[frame]).boxes_xyxy_px)
+        for frame in sorted(rows.keys() | beside.keys())
+    }
 
 
 def score(
@@ -115,6 +121,7 @@ def _frame(wanted: Labelled, found: Labelled) -> LabelledFrame:
         wanted.boxes_xyxy_px.astype(np.float32),
         np.full(len(wanted.classes), NO_ID, np.int64),
         wanted.classes,
+        beside_xyxy_px=wanted.beside_xyxy_px.astype(np.float32),
     )
     boxes, sure = found.boxes_xyxy_px.astype(np.float32), np.ones(len(ids), np.float32)
     return labels, FrameView(boxes, ids, found.classes, sure, found.classes)

@@ -350,6 +350,22 @@ def test_the_edges_tracks_and_ours_are_one_list(pictures):
     assert rig.pipeline.steps_used == 1
 
 
+def test_what_has_left_the_picture_is_listed_no_more(pictures):
+    """The edge's last word on an object that drives out of view would stand at the border, and count as an object."""
+    rig = Rig()
+    for picture in pictures[:14]:
+        rig.pipeline.analyze(picture, hurry=False)
+        if picture.frame_index in (3, 5):  # eight pixels a frame to the right, the border is at 320
+            left = 270.0 + 8 * picture.frame_index
+            rig.pipeline.edge_step(
+                tracks_at(picture.frame_index, {32: (left, 20.0, min(left + 30, 320.0), 40.0)})
+            )
+    leaving = {one.frame_index: one.boxes_base_px[one.boxes_base_px[:, 1] < 50] for one in rig.of(Overlay)}
+    assert len(leaving[4]) == len(leaving[6]) == 1
+    assert [frame for frame, boxes in leaving.items() if len(boxes) and frame > 8] == []
+    assert all((boxes[:, 2] > boxes[:, 0]).all() for boxes in leaving.values())
+
+
 def test_a_still_of_a_track_that_only_the_edge_sees_refines_it(flight, pictures):
     """On a bad base nothing would ever be refined: the ground has no track there."""
     far = (220.0, 20.0, 250.0, 50.0)

@@ -35,6 +35,21 @@ def test_known_answer() -> None:
     assert result.macro_f1 == pytest.approx((2 * 1 / (2 + 2) + 0) / 2)
 
 
+def test_who_lists_a_hidden_object_is_neither_right_nor_wrong(tmp_path: Path) -> None:
+    """A ground that sees more than was judged would be scored worse for it."""
+    lines = ["1,1,0,0,10,10,1,1,1.0", "1,2,50,0,20,20,1,1,0.2"]
+    (tmp_path / "gt.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    truth = read_truth(tmp_path / "gt.txt", class_names=("car",))
+    seen = (0.0, 0.0, 10.0, 10.0, "car")
+    results = [
+        score({1: labelled(seen, *more)}, truth, frame_area_px=AREA_PX)
+        for more in ((), ((50.0, 0.0, 70.0, 20.0, "car"),), ((200.0, 0.0, 220.0, 20.0, "car"),))
+    ]
+    assert [one.objects for one in results] == [1, 1, 1]
+    assert [one.false_per_frame for one in results] == [0, 0, 1]
+    assert results[0].named_f1 == results[1].named_f1 == 1
+
+
 def test_a_track_counts_for_one_object_only() -> None:
     """One large box over two neighbours must not find both."""
     truth = {1: labelled((0, 0, 10, 10, "car"), (0, 1, 10, 11, "car"))}
