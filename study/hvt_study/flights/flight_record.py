@@ -172,15 +172,16 @@ class FlightRecord:
     # What is listed
 
     def listed(self, overlay: Overlay, tracks: Tracks) -> ObservedFrame:
-        """A list, with the same tracks before refinement."""
-        assert np.array_equal(overlay.track_ids, tracks.ids), "both are of the same list"
+        """A list, with the same tracks before refinement; what has left the picture is in ``tracks`` alone."""
+        rows = np.flatnonzero(np.isin(tracks.ids, overlay.track_ids))
+        assert np.array_equal(overlay.track_ids, tracks.ids[rows]), "both are of the same list"
         return ObservedFrame(
             self._inside(overlay.boxes_base_px),
             overlay.classes,
             ids=overlay.track_ids,
             confidences=overlay.confidences,
             classes_before=overlay.base_classes,
-            confidences_before=tracks.confidences.astype(np.float32),
+            confidences_before=tracks.confidences[rows].astype(np.float32),
             origins=overlay.origins or ("base",) * len(overlay.classes),
         )
 
