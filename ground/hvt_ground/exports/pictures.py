@@ -12,7 +12,7 @@ import cv2
 from hvt_common.errors import UserError
 from hvt_ground.events import Overlay
 from hvt_ground.exports.recorded import Recorded
-from hvt_ground.exports.video import decoded
+from hvt_ground.exports.video import pictures
 from hvt_ground.sinks.tracks_table import utc_text
 
 __all__ = ["STILL_COLUMNS", "write_coco", "write_stills"]
@@ -31,9 +31,8 @@ def write_coco(recorded: Recorded, folder: Path) -> None:
     images: list[dict[str, Any]] = []
     boxes: list[dict[str, Any]] = []
     numbers: dict[str, int] = {}
-    drawn_at = {one.frame_index: one for one in recorded.overlays()}
     (folder / "images").mkdir()
-    for sample, picture in decoded(recorded):
+    for sample, picture, overlay in pictures(recorded):
         name = f"images/{sample.frame_index + 1:06d}.jpg"
         _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY_PCT])
         (folder / name).write_bytes(data.tobytes())
@@ -45,7 +44,7 @@ def write_coco(recorded: Recorded, folder: Path) -> None:
             "date_captured": utc_text(sample.capture_ns),
         }
         images.append(image)
-        boxes += _annotations(drawn_at[sample.frame_index], image["id"], numbers, first=len(boxes) + 1)
+        boxes += _annotations(overlay, image["id"], numbers, first=len(boxes) + 1)
     content = {
         "info": {"description": f"hvt: edge {recorded.edge}, session {recorded.session}"},
         "images": images,

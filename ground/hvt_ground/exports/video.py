@@ -22,7 +22,7 @@ from hvt_ground.events import Overlay, VideoSample
 from hvt_ground.exports.recorded import Recorded
 from hvt_ground.sinks.palette import class_colour
 
-__all__ = ["CONTAINERS", "decoded", "write_video"]
+__all__ = ["CONTAINERS", "pictures", "write_video"]
 
 CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
 """By name, libavformat's."""
@@ -47,15 +47,17 @@ def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool
             _copy(samples, output)
 
 
-def decoded(recorded: Recorded) -> Iterator[tuple[VideoSample, Image]]:
-    """Each sample that can be decoded, with its picture: uint8 (H, W, 3) BGR, base pixels."""
+def pictures(recorded: Recorded) -> Iterator[tuple[VideoSample, Image, Overlay]]:
+    """Each sample that can be decoded, with its picture (uint8 (H, W, 3) BGR, base pixels) and what was drawn on it."""
     decoder = BaseDecoder()
+    overlays = recorded.overlays()  # at every sample, and at some frames between
     for sample in _from_keyframe(recorded):
+        overlay = next(one for one in overlays if one.frame_index == sample.frame_index)
         if sample.keyframe:
             decoder.reset()
         picture = decoder.decode(sample.data)
         if picture is not None:
-            yield sample, picture
+            yield sample, picture, overlay
 
 
 def _from_keyframe(recorded: Recorded) -> list[VideoSample]:
@@ -81,17 +83,16 @@ def _copy(samples: list[VideoSample], output: OutputContainer) -> None:
 
 
 def _draw(recorded: Recorded, output: OutputContainer) -> None:
-    drawn_at = {one.frame_index: one for one in recorded.overlays()}
     stream = None
     first_ns, last = 0, -1
-    for sample, picture in decoded(recorded):
+    for sample, picture, overlay in pictures(recorded):
         if stream is None:
             first_ns = sample.capture_ns
             stream = output.add_stream("libx264", options={"crf": _CRF, "preset": "veryfast"})
             stream.height, stream.width = (side - side % 2 for side in picture.shape[:2])
             stream.pix_fmt = "yuv420p"
             stream.time_base = stream.codec_context.time_base = _TIME_BASE
-        drawn = _with_boxes(picture, drawn_at[sample.frame_index])
+        drawn = _with_boxes(picture, overlay)
         frame = av.VideoFrame.from_ndarray(
             np.ascontiguousarray(drawn[: stream.height, : stream.width]), "bgr24"
         )

@@ -102,6 +102,8 @@ class McapFile:
             self._file.close()
 
     def _write(self, topic: str, message: _Message, at: _At | FrameEvent) -> None:
+        if self._file.closed:
+            return
         # What no timestamp can hold is held at its end: times come from the wire.
         capture_ns = min(max(at.capture_ns, 0), _LATEST_NS)
         message.timestamp.CopyFrom(Timestamp(seconds=capture_ns // SECOND_NS, nanos=capture_ns % SECOND_NS))

@@ -1,0 +1,589 @@
+// A reader of the wire that knows docs/wire.md, docs/wire-messages.md and docs/wire-tracks.md and no line of the Python:
+// it shows that they are enough, and that the code holds to them. It checks every vector of docs/conformance.
+//
+//   tsc --target es2020 --module commonjs --strict --outDir OUT lab/conformance/reader.ts && node OUT/reader.js docs/conformance
+
+declare function require(name: string): any;
+declare const process: any;
+const fs = require("fs");
+
+// What cannot be read. Another version is no damage: it is counted apart.
+class Refused extends Error {
+  constructor(reason: string, readonly version = false) {
+    super(reason);
+  }
+}
+
+// ---- Bytes ------------------------------------------------------------------------------------------------------
+
+const CRC_TABLE = Array.from({ length: 256 }, (_, start) => {
+  let value = start;
+  for (let bit = 0; bit < 8; bit++) value = value & 1 ? 0xedb88320 ^ (value >>> 1) : value >>> 1;
+  return value >>> 0;
+});
+
+function crc32(...parts: Uint8Array[]): number {
+  let crc = 0xffffffff;
+  for (const part of parts) for (const byte of part) crc = CRC_TABLE[(crc ^ byte) & 0xff] ^ (crc >>> 8);
+  return (crc ^ 0xffffffff) >>> 0;
+}
+
+const unhex = (text: string): Uint8Array => Uint8Array.from(text.match(/../g) ?? [], (pair) => parseInt(pair, 16));
+const hex = (bytes: Uint8Array): string => Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
+
+// ---- MessagePack ------------------------------------------------------------------------------------------------
+
+// Whole numbers are bigint and fractions number, so that the two cannot be taken for one another.
+type Value = null | boolean | bigint | number | string | Uint8Array | Value[] | Map<string, Value>;
+const DEEPEST = 16;
+
+function unpack(data: Uint8Array): Value {
+  const view = new DataView(data.buffer, data.byteOffset, data.byteLength);
+  let at = 0;
+  const take = (length: number): number => {
+    if (at + length > data.length) throw new Refused("it is cut short");
+    at += length;
+    return at - length;
+  };
+  const size = (bytes: 1 | 2 | 4): number => {
+    const place = take(bytes);
+    return bytes === 1 ? view.getUint8(place) : bytes === 2 ? view.getUint16(place) : view.getUint32(place);
+  };
+  const bytes = (length: number): Uint8Array => data.subarray(take(length), at);
+  const text = (length: number): string => {
+    try {
+      return new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(bytes(length));
+    } catch (error) {
+      throw error instanceof Refused ? error : new Refused("a text is not UTF-8");
+    }
+  };
+  const array = (length: number, depth: number): Value[] => {
+    if (length > data.length) throw new Refused("an array is longer than the message");
+    return Array.from({ length }, () => next(depth));
+  };
+  const map = (length: number, depth: number): Map<string, Value> => {
+    const found = new Map<string, Value>();
+    for (let entry = 0; entry < length; entry++) {
+      const key = next(depth);
+      if (typeof key !== "string") throw new Refused("a key is no text");
+      found.set(key, next(depth));
+    }
+    return found;
+  };
+  const next = (depth: number): Value => {
+    if (depth > DEEPEST) throw new Refused("it is nested too deep");
+    const tag = size(1);
+    if (tag < 0x80) return BigInt(tag);
+    if (tag < 0x90) return map(tag & 15, depth + 1);
+    if (tag < 0xa0) return array(tag & 15, depth + 1);
+    if (tag < 0xc0) return text(tag & 31);
+    if (tag >= 0xe0) return BigInt(tag - 256);
+    switch (tag) {
+      case 0xc0: return null;
+      case 0xc2: return false;
+      case 0xc3: return true;
+      case 0xc4: return bytes(size(1));
+      case 0xc5: return bytes(size(2));
+      case 0xc6: return bytes(size(4));
+      case 0xca: return view.getFloat32(take(4));
+      case 0xcb: return view.getFloat64(take(8));
+      case 0xcc: return BigInt(size(1));
+      case 0xcd: return BigInt(size(2));
+      case 0xce: return BigInt(size(4));
+      case 0xcf: return view.getBigUint64(take(8));
+      case 0xd0: return BigInt(view.getInt8(take(1)));
+      case 0xd1: return BigInt(view.getInt16(take(2)));
+      case 0xd2: return BigInt(view.getInt32(take(4)));
+      case 0xd3: return view.getBigInt64(take(8));
+      case 0xd9: return text(size(1));
+      case 0xda: return text(size(2));
+      case 0xdb: return text(size(4));
+      case 0xdc: return array(size(2), depth + 1);
+      case 0xdd: return array(size(4), depth + 1);
+      case 0xde: return map(size(2), depth + 1);
+      case 0xdf: return map(size(4), depth + 1);
+      default: throw new Refused("a type that no message has");
+    }
+  };
+  const value = next(0);
+  if (at < data.length) throw new Refused("bytes follow");
+  return value;
+}
+
+// ---- The tables of wire-messages.md -----------------------------------------------------------------------------
+
+type Kind = (value: Value) => void; // throws Refused
+type Fields = [string, Kind][];
+
+const [U32, U53, U64, I63] = [2n ** 32n - 1n, 2n ** 53n - 1n, 2n ** 64n - 1n, 2n ** 63n - 1n];
+const utf8 = (text: string): number => new TextEncoder().encode(text).length;
+
+function need(holds: boolean, reason: string): asserts holds {
+  if (!holds) throw new Refused(reason);
+}
+const int = (low: bigint | number, high: bigint | number): Kind => (value) =>
+  need(typeof value === "bigint" && value >= BigInt(low) && value <= BigInt(high), `no whole number ${low}…${high}`);
+const float = (low: number, high: number): Kind => (value) =>
+  need(typeof value === "number" && value >= low && value <= high, `no fraction ${low}…${high}`);
+const text = (most: number): Kind => (value) =>
+  need(typeof value === "string" && utf8(value) <= most && printable(value), `no printable text of ${most} bytes`);
+const bin = (most: number): Kind => (value) =>
+  need(value instanceof Uint8Array && value.length <= most, `no ${most} bytes`);
+const bool: Kind = (value) => need(typeof value === "boolean", "neither true nor false");
+const list = (most: number, of: Kind, least = 0): Kind => (value) => {
+  need(Array.isArray(value) && value.length >= least && value.length <= most, `no array of ${least} to ${most}`);
+  value.forEach(of);
+};
+const exactly = (count: number, of: Kind): Kind => list(count, of, count);
+const map = (most: number, keys: number, of: Kind): Kind => (value) => {
+  need(value instanceof Map && value.size <= most, `no map of ${most}`);
+  for (const [key, one] of value) {
+    text(keys)(key);
+    of(one);
+  }
+};
+// An int, a finite float or a text of at most 64 bytes.
+const scalar: Kind = (value) => {
+  if (typeof value === "number") need(Number.isFinite(value), "no finite number");
+  else if (typeof value === "string") text(64)(value);
+  else int(-(2n ** 63n), U64)(value);
+};
+const nested = (fields: Fields, more: Kind = () => undefined): Kind => (value) => {
+  need(Array.isArray(value), "no nested array");
+  checkFields(fields, value);
+  more(value);
+};
+// Printable as docs/wire.md asks: no control, format, surrogate, private or unassigned character, no separator but the space.
+const printable = (value: string): boolean => !/[\p{C}\p{Zl}\p{Zp}]|(?! )\p{Zs}/u.test(value);
+
+function checkFields(fields: Fields, values: Value[]): void {
+  need(values.length === fields.length, `${values.length} fields in place of ${fields.length}`);
+  fields.forEach(([name, kind], place) => {
+    try {
+      kind(values[place]);
+    } catch (error) {
+      throw new Refused(`${name}: ${(error as Error).message}`);
+    }
+  });
+}
+
+const far = 8 * 32767;
+const boxKind: Kind = (value) => {
+  exactly(4, int(-far, far))(value);
+  const [x1, y1, x2, y2] = value as bigint[];
+  need(x1 <= x2 && y1 <= y2, "a box that is inside out");
+};
+const cropKind: Kind = (value) => {
+  exactly(4, int(0, 32767))(value);
+  const [x1, y1, x2, y2] = value as bigint[];
+  need(x1 < x2 && y1 < y2, "an empty crop");
+};
+const session: [string, Kind] = ["session_id", int(0, U64)];
+const sequence: [string, Kind] = ["sequence", int(0, U32)];
+const frame: [string, Kind] = ["frame_index", int(0, U32)];
+const capture: [string, Kind] = ["capture_ns", int(0, I63)];
+const delay: [string, Kind] = ["send_delay_ns", int(-I63, I63)];
+const numbers = (names: string, kind: Kind): Fields => names.split(" ").map((name) => [name, kind]);
+
+const alsoShown: Fields = [["track_id", int(0, U32)], ["box_source_px", boxKind]];
+const trackNow: Fields = [
+  ["track_id", int(0, U32)], ["class_id", int(0, 2047)], ["confidence", int(0, 1000)], ["box_source_px", boxKind],
+];
+const health: Fields = [
+  ...numbers("frames_captured frames_encoded frames_dropped keyframes tracks", int(0, U53)),
+  ...numbers("base_queue still_queue", int(0, U32)),
+  ...numbers("encode_ms detect_ms", int(0, 600000)),
+  ["feedback_age_ms", int(-1, U32)],
+  ...numbers("frames_dropped_cpu frames_unanalyzed", int(0, U53)),
+  ...numbers("cores_needed cores_free", int(0, 409600)),
+];
+const failedPart: Fields = [
+  ["part", text(24)], ["reason", text(160)], ["failures", int(1, U32)], ["failed_ns", int(0, I63)], ["working", bool],
+];
+const stillResult: Fields = [
+  ["still_sequence", int(0, U32)], ["track_id", int(-1, U32)], ["class_name", text(64)], ["confidence", int(0, 1000)],
+  ["entropy_nats", int(0, 20000)], ["ground_track_id", int(-1, U32)], ["again", bool],
+];
+const acknowledged: Fields = [
+  session, ["kind", int(0, 2)], ["number", int(0, U32)], ["acknowledged_bytes", int(0, 4194304)],
+];
+const reasons = map(24, 32, int(0, U32));
+
+const STILL_BYTES = 2 ** 20;
+const PAYLOAD_BYTES = 4 * 2 ** 20;
+const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields }> = {
+  BaseHeader: { most: 80, fields: [session, sequence, frame, capture, delay, ["flags", int(0, 255)]] },
+  RoiHeader: {
+    most: 1024,
+    payload: STILL_BYTES,
+    fields: [
+      session, sequence, frame, capture, delay, ["flags", int(0, 255)], ["track_id", int(-1, U32)],
+      ["box_source_px", boxKind], ["crop_source_px", cropKind], ["class_name", text(64)], ["confidence", int(0, 1000)],
+      ["reason", text(48)], ["codec", text(24)], ["quality_pct", int(0, 100)], ["parameters", map(8, 16, scalar)],
+      ["also", list(15, nested(alsoShown))],
+    ],
+  },
+  BacklogHeader: {
+    most: 80,
+    fields: [
+      session, ["kind", int(0, 2)], ["number", int(0, U32)], ["offset", int(0, 4194304)],
+      ["total_bytes", int(1, 4194304)], ["send_ns", int(0, I63)],
+    ],
+  },
+  Info: {
+    most: 65536,
+    fields: [
+      session, ["edge", text(32)], ["software", text(32)], ["started_ns", int(0, I63)],
+      ["source_size", exactly(2, int(1, 32767))], ["base_size", exactly(2, int(1, 32767))],
+      ["view_scale", float(0.0001, 10000)], ["view_offset_px", exactly(2, float(-32767, 32767))],
+      ["fps", float(0.01, 1000)], ["codec", text(24)], ["pace", int(0, 1)], ["method", text(48)],
+      ["budget_bps", int(0, U53)], ["base_bps", int(0, U53)], ["window_ns", int(1, 3600000000000)],
+      ["class_names", list(2048, text(64))], ["received_ns", int(0, I63)], ["answered_ns", int(0, I63)],
+    ],
+  },
+  TrackStep: {
+    most: 16384,
+    fields: [session, sequence, frame, capture, delay, ["reference", int(-1, U32)], ["boxes", bin(16000)]],
+  },
+  Status: {
+    most: 6144,
+    fields: [
+      session, sequence, ["state", int(0, 1)], ["send_ns", int(0, I63)], ["media_ns", int(0, I63)],
+      ...numbers("last_base_sequence last_still_sequence", int(-1, U32)),
+      ...numbers("base_bytes roi_bytes backlog_bytes meta_bytes overhead_bytes", int(0, U53)),
+      ...numbers("base_messages roi_messages backlog_messages meta_messages", int(0, U53)),
+      ["worst_window_bps", exactly(3, int(0, U53))], ["sent", reasons], ["deferred", reasons], ["dropped", reasons],
+      ["health", nested(health)], ["failed", list(8, nested(failedPart))], ["levers", text(120)],
+    ],
+  },
+  ControlRequest: {
+    most: 1024,
+    fields: [session, ["command", text(24)], ["arguments", map(8, 16, scalar)]],
+  },
+  ControlAnswer: {
+    most: 4096,
+    fields: [
+      session, ["accepted", bool], ["reason", text(200)], ["still_request", int(-1, U32)],
+      ["frame_index", int(-1, U32)], ["tracks", list(64, nested(trackNow))],
+    ],
+  },
+  Feedback: {
+    most: 6144,
+    fields: [
+      session, ["receiver_id", int(0, U64)], sequence, ["send_ns", int(0, I63)], ["last_frame_index", int(-1, U32)],
+      ...numbers("base_messages base_bytes roi_messages roi_bytes lost corrupt", int(0, U53)),
+      ["base_sequence", int(-1, U32)], ["base_held_us", int(0, U32)], ["still_sequence", int(-1, U32)],
+      ["missing_stills", list(32, int(0, U32))], ["delay_p50_ms", int(-10, 36000000)],
+      ["clock_offset_ns", int(-I63, I63)], ["clock_error_ns", int(-1, I63)],
+      ["stills", list(32, nested(stillResult))], ["backlog", list(16, nested(acknowledged))],
+    ],
+  },
+};
+
+const VERSION = 3n;
+
+function read(name: string, data: Uint8Array, payload: Uint8Array): Value[] {
+  const { most, payload: mostPayload, fields } = MESSAGES[name];
+  need(data.length <= most, "it is too long");
+  need(payload.length <= (mostPayload ?? PAYLOAD_BYTES), "its payload is too long");
+  const values = unpack(data);
+  need(Array.isArray(values) && typeof values[0] === "bigint", "no array that begins with a version");
+  if (values[0] !== VERSION) throw new Refused(`version ${values[0]}`, true);
+  need(data[data.length - 5] === 0xce, "no checksum at its end");
+  need(values[values.length - 1] === BigInt(crc32(payload, data.subarray(0, -5))), "another checksum");
+  checkFields(fields, values.slice(1, -1));
+  return values.slice(1, -1);
+}
+
+// ---- Objects of the backlog -------------------------------------------------------------------------------------
+
+function readObject(kind: string, data: Uint8Array): Value {
+  need(data.length <= 4194304, "it is too long");
+  const values = unpack(data);
+  if (kind === "still") {
+    need(Array.isArray(values) && values.length === 3, "no array of three");
+    bin(1024)(values[0]);
+    text(64)(values[1]);
+    need(values[2] instanceof Uint8Array && values[2].length > 0, "no still");
+    return values;
+  }
+  list(2400, nested([["frame", int(0, U32)], ["capture_ns", int(0, I63)], ["keyframe", bool], ["unit", bin(4194304)]]), 1)(values);
+  let before: Value[] | undefined;
+  for (const row of values as Value[][]) {
+    need((row[3] as Uint8Array).length > 0, "a frame is empty");
+    need(!before || (row[0]! > before[0]! && row[1]! > before[1]!), "frames are not in order");
+    before = row;
+  }
+  return values;
+}
+
+// ---- Coded tracks, wire-tracks.md -------------------------------------------------------------------------------
+
+type Context = { zero: number; n: number };
+const fresh = (): Context => ({ zero: 32768, n: 0 });
+type Numbers = { nonzero: Context; sign: Context; length: Context[]; high: Context[] };
+const freshNumbers = (): Numbers => ({
+  nonzero: fresh(), sign: fresh(),
+  length: Array.from({ length: 33 }, fresh), high: Array.from({ length: 33 }, fresh),
+});
+
+class RangeDecoder {
+  private code = 0;
+  private range = 0xffffffff;
+  private next = 4;
+
+  constructor(private readonly data: Uint8Array) {
+    for (let place = 0; place < 4; place++) this.code = this.code * 256 + (data[place] ?? 0);
+  }
+
+  bit(context: Context): number {
+    const bound = Math.floor(this.range / 65536) * context.zero;
+    const one = this.code >= bound ? 1 : 0;
+    if (one) {
+      this.code -= bound;
+      this.range -= bound;
+      context.zero -= Math.floor(context.zero / (context.n + 2));
+    } else {
+      this.range = bound;
+      context.zero += Math.floor((65536 - context.zero) / (context.n + 2));
+    }
+    context.n = Math.min(30, context.n + 1);
+    this.normalise();
+    return one;
+  }
+
+  plain(): number {
+    this.range = Math.floor(this.range / 2);
+    const one = this.code >= this.range ? 1 : 0;
+    if (one) this.code -= this.range;
+    this.normalise();
+    return one;
+  }
+
+  unsigned(numbers: Numbers): number {
+    let length = 0;
+    while (this.bit(numbers.length[length])) {
+      length += 1;
+      need(length < 33, "a number that is too long");
+    }
+    if (length === 0) return 0;
+    let value = 2 + this.bit(numbers.high[length]);
+    for (let rest = length - 1; rest > 0; rest--) value = value * 2 + this.plain();
+    return value - 1;
+  }
+
+  signed(numbers: Numbers): number {
+    if (!this.bit(numbers.nonzero)) return 0;
+    const negative = this.bit(numbers.sign);
+    const size = this.unsigned(numbers) + 1;
+    return negative ? -size : size;
+  }
+
+  finish(): void {
+    need(this.next >= this.data.length, "bytes are left over");
+  }
+
+  private normalise(): void {
+    while (this.range < 2 ** 24) {
+      need(this.next - this.data.length < 4, "the step is cut short");
+      this.code = (this.code * 256 + (this.data[this.next] ?? 0)) % 2 ** 32;
+      this.range *= 256;
+      this.next += 1;
+    }
+  }
+}
+
+type Track = {
+  id: number; class: number; confidence: number; x: number; y: number; width: number; height: number;
+  vx: number; vy: number; scale_x: number; scale_y: number; missed: number;
+};
+
+const held = (low: number, high: number) => (value: number): number => Math.min(Math.max(value, low), high);
+const [near, sized, fast, sure] = [held(-524272, 524272), held(1, 524272), held(-(2 ** 24), 2 ** 24), held(0, 15)];
+// Shifts on numbers that 32 bits may not hold.
+const left = (value: number, places: number): number => value * 2 ** places;
+const right = (value: number, places: number): number => Math.floor(value / 2 ** places);
+const median = (values: number[]): number =>
+  values.length ? [...values].sort((a, b) => a - b)[(values.length - 1) >> 1] : 0;
+
+function readTracks(data: Uint8Array, before: Track[], frames: number, alone: boolean): Track[] {
+  const coder = new RangeDecoder(data);
+  const pair = () => ({ x: freshNumbers(), y: freshNumbers() });
+  const [shared, move, grow, scale, side, place, drift] = [pair(), pair(), pair(), pair(), pair(), pair(), pair()];
+  const [present, changed, classDiffers] = [[fresh(), fresh()], fresh(), fresh()];
+  const [classes, confidences, count, ids] = [freshNumbers(), freshNumbers(), freshNumbers(), freshNumbers()];
+  const readClass = (was: number): number => {
+    if (!coder.bit(classDiffers)) return was;
+    const found = coder.unsigned(classes);
+    need(found < 2048, "a class that cannot be");
+    return found;
+  };
+  const found: Track[] = [];
+  const listed = before.map((track) => coder.bit(present[track.missed > 0 ? 1 : 0]));
+  const any = listed.some((there) => there);
+  const sx = any ? coder.signed(shared.x) * 4 : 0;
+  const sy = any ? coder.signed(shared.y) * 4 : 0;
+  before.forEach((old, index) => {
+    const track = { ...old };
+    const x = old.x + right(old.vx * frames + 128, 8) + sx;
+    const y = old.y + right(old.vy * frames + 128, 8) + sy;
+    if (!listed[index]) {
+      if (old.missed < 6) found.push({ ...track, x: near(x), y: near(y), missed: old.missed + 1 });
+      return;
+    }
+    const dx = left(coder.signed(move.x), old.scale_x);
+    const dy = left(coder.signed(move.y), old.scale_y);
+    track.width = sized(old.width + left(coder.signed(grow.x), old.scale_x));
+    track.height = sized(old.height + left(coder.signed(grow.y), old.scale_y));
+    if (coder.bit(changed)) {
+      track.class = readClass(old.class);
+      track.confidence = sure(old.confidence + coder.signed(confidences));
+    }
+    track.x = near(x + dx);
+    track.y = near(y + dy);
+    track.vx = fast(old.vx + Math.floor(left(dx + sx, 7) / frames));
+    track.vy = fast(old.vy + Math.floor(left(dy + sy, 7) / frames));
+    track.missed = 0;
+    found.push(track);
+  });
+  const seen = found.filter((track) => track.missed === 0);
+  const cx = alone ? fast(coder.signed(shared.x) * 64) : median(seen.map((track) => track.vx));
+  const cy = alone ? fast(coder.signed(shared.y) * 64) : median(seen.map((track) => track.vy));
+  const known = new Set(found.map((track) => track.id));
+  const births = coder.unsigned(count);
+  need(seen.length + births <= 1024, "too many tracks");
+  let p: Track = {
+    id: 0, class: 0, confidence: 8, x: 0, y: 0, width: 640, height: 640, vx: 0, vy: 0, scale_x: 5, scale_y: 5, missed: 0,
+  };
+  const measure = (axis: "x" | "y", was: number, length: number): [number, number] => {
+    const step = was + coder.signed(scale[axis]);
+    need(step >= 0 && step <= 11, "a step that cannot be");
+    return [step, sized(left(right(length, step) + coder.signed(side[axis]), step))];
+  };
+  for (let birth = 0; birth < births; birth++) {
+    const id = p.id + 1 + coder.unsigned(ids);
+    need(id <= 2 ** 32 - 1 && !known.has(id), "an id that cannot be");
+    const kind = readClass(p.class);
+    const confidence = sure(p.confidence + coder.signed(confidences));
+    const [scale_x, width] = measure("x", p.scale_x, p.width);
+    const [scale_y, height] = measure("y", p.scale_y, p.height);
+    const x = near(left(coder.signed(place.x), scale_x));
+    const y = near(left(coder.signed(place.y), scale_y));
+    const vx = fast(cx + (alone ? left(coder.signed(drift.x), scale_x + 7) : 0));
+    const vy = fast(cy + (alone ? left(coder.signed(drift.y), scale_y + 7) : 0));
+    p = { id, class: kind, confidence, x, y, width, height, vx, vy, scale_x, scale_y, missed: 0 };
+    found.push(p);
+  }
+  coder.finish();
+  return found.sort((a, b) => a.id - b.id);
+}
+
+class TrackReader {
+  tracks: Track[] = [];
+  private sequence = -1;
+  private frame = -1;
+
+  // "read", "skipped" where it builds on a step that never came or is not newer, "damaged".
+  take(data: Uint8Array): string {
+    const values = read("TrackStep", data, new Uint8Array());
+    const [sequence, frame, reference] = [Number(values[1]), Number(values[2]), Number(values[5])];
+    if (sequence <= this.sequence || (reference !== -1 && reference !== this.sequence)) return "skipped";
+    try {
+      need(frame > this.frame, "it does not lie ahead");
+      const before = reference === -1 ? [] : this.tracks;
+      this.tracks = readTracks(values[6] as Uint8Array, before, frame - this.frame, reference === -1);
+    } catch (error) {
+      if (error instanceof Refused) return "damaged";
+      throw error;
+    }
+    [this.sequence, this.frame] = [sequence, frame];
+    return "read";
+  }
+}
+
+// ---- The vectors ------------------------------------------------------------------------------------------------
+
+// As the vectors write it: whole numbers beyond 2^53 as text, bytes as {"hex": …}.
+function plain(value: Value): unknown {
+  if (typeof value === "bigint") return value <= U53 && value >= -U53 ? Number(value) : String(value);
+  if (value instanceof Uint8Array) return { hex: hex(value) };
+  if (value instanceof Map) return Object.fromEntries([...value].map(([key, one]) => [key, plain(one)]));
+  return Array.isArray(value) ? value.map(plain) : value;
+}
+
+// Keys in one order, so that two objects compare as texts.
+const canonical = (value: any): string =>
+  JSON.stringify(value, (_key, one) =>
+    one && typeof one === "object" && !Array.isArray(one) ? Object.fromEntries(Object.entries(one).sort()) : one,
+  );
+
+function refusal(attempt: () => unknown): Refused | undefined {
+  try {
+    attempt();
+  } catch (error) {
+    if (error instanceof Refused) return error;
+    throw error;
+  }
+  return undefined;
+}
+
+// Each gives what is wrong with a vector, nothing where it holds.
+const CHECKS: Record<string, (vector: any) => string | undefined> = {
+  "messages.json": (vector) => {
+    const values = read(vector.message, unhex(vector.hex), unhex(vector.payload));
+    return canonical(values.map(plain)) === canonical(vector.fields) ? undefined : canonical(values.map(plain));
+  },
+  "refused.json": (vector) => {
+    const refused = refusal(() => read(vector.message, unhex(vector.hex), unhex(vector.payload)));
+    if (!refused) return "it was read";
+    return refused.version === vector.version ? undefined : `it was refused for: ${refused.message}`;
+  },
+  "objects.json": (vector) => {
+    const refused = refusal(() => readObject(vector.kind, unhex(vector.hex)));
+    if (refused) return vector.values ? refused.message : undefined;
+    const values = canonical(plain(readObject(vector.kind, unhex(vector.hex))));
+    return values === canonical(vector.values) ? undefined : values;
+  },
+  "track-steps.json": (vector) => {
+    const reader = new TrackReader();
+    for (const [number, step] of vector.steps.entries()) {
+      const became = reader.take(unhex(step.hex));
+      const expected = step.damaged ? "damaged" : step.skipped ? "skipped" : "read";
+      if (became !== expected) return `step ${number} is ${became}, not ${expected}`;
+      if (step.tracks && canonical(reader.tracks) !== canonical(step.tracks)) return `step ${number}: another list`;
+    }
+    return undefined;
+  },
+};
+
+function main(folder: string): number {
+  let failed = 0;
+  for (const [file, check] of Object.entries(CHECKS)) {
+    const vectors: any[] = JSON.parse(fs.readFileSync(`${folder}/${file}`, "utf-8"));
+    let good = 0;
+    vectors.forEach((vector, index) => {
+      let wrong: string | undefined;
+      try {
+        wrong = check(vector);
+      } catch (error) {
+        wrong = String(error);
+      }
+      if (wrong === undefined) good += 1;
+      else console.log(`${file} ${index}: ${vector.message ?? vector.kind ?? vector.session}, ${vector.what ?? ""}: ${wrong}`);
+    });
+    console.log(`${file}: ${good} of ${vectors.length}`);
+    failed += vectors.length - good;
+  }
+  return failed ? 1 : 0;
+}
+
+declare const console: any;
+declare class TextDecoder {
+  constructor(name: string, options: object);
+  decode(bytes: Uint8Array): string;
+}
+declare class TextEncoder {
+  encode(text: string): Uint8Array;
+}
+
+process.exit(main(process.argv[2]));
