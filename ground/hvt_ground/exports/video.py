@@ -48,7 +48,7 @@ def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool
 
 
 def pictures(recorded: Recorded) -> Iterator[tuple[VideoSample, Image, Overlay]]:
-    """Each sample that can be decoded, with its picture (uint8 (H, W, 3) BGR, base pixels) and what was drawn on it."""
+    """Each sample that can be decoded, its picture (uint8 (H, W, 3) BGR, base pixels) and what was drawn on it."""
     decoder = BaseDecoder()
     overlays = recorded.overlays()  # at every sample, and at some frames between
     for sample in _from_keyframe(recorded):
