@@ -11,13 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hvt_common.errors import FlightError, UserError, needs_extra
+from hvt_common.errors import FlightError, needs_extra
 from hvt_common.protocol.channels import check_edge_pattern
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures, reason_of
 from hvt_common.runtime.health_server import HealthServer, state_answers
 from hvt_common.runtime.process import notify_systemd
-from hvt_common.runtime.reporting import StatusLine, check_writable
+from hvt_common.runtime.reporting import StatusLine
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.session import open_session
 from hvt_common.transport.zenoh_config import DEFAULT_ENDPOINT, LinkSettings, key_pair
@@ -36,7 +36,14 @@ from hvt_ground.sinks import Outputs, Sink
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.state import GroundState, StateMaker
 from hvt_ground.status import completed, status_text, summary
-from hvt_ground.wiring import Models, OpenSink, SessionFactory, make_link_settings
+from hvt_ground.wiring import (
+    Models,
+    OpenSink,
+    SessionFactory,
+    check_outputs,
+    make_link_settings,
+    make_record_folder,
+)
 
 if TYPE_CHECKING:
     from hvt_ground.web import WebPage
@@ -91,13 +98,7 @@ class Ground:
         """
         config = self._config
         check_edge_pattern(config.edges)
-        check_writable(config.summary, name="--summary")
-        check_writable(config.timing, name="--timing")
-        check_writable(config.log, name="--log")
-        for path, suffix, name in ((config.tracks, ".csv", "--tracks"), (config.mcap, ".mcap", "--mcap")):
-            if path is not None and path.suffix == suffix and not path.is_dir():
-                check_writable(path, name=name)
-        self._check_record()
+        check_outputs(config)
         models = Models(config)
         with ExitStack() as stack:
             view: LiveView | None = None
@@ -115,7 +116,7 @@ class Ground:
             session = stack.enter_context(open_session(settings))
             if page is not None:
                 page.use(EdgeClient.of_session(session, settings))
-            self._make_record_folder()
+            make_record_folder(config)
             index.open()
             factory = SessionFactory(
                 config,
@@ -159,29 +160,6 @@ class Ground:
         ]
 
     # Before anything is received
-
-    def _check_record(self) -> None:
-        record = self._config.record
-        if record is None or record.is_dir():
-            return
-        if record.suffix == ".rrd":
-            check_writable(record, name="--record")
-        elif record.exists():
-            raise UserError(
-                f"--record {record} is neither a folder nor named .rrd: give FILE.rrd or a folder"
-            )
-
-    def _make_record_folder(self) -> None:
-        """Comes after all that may be refused: a failed start leaves nothing behind."""
-        record = self._config.record
-        if record is None or record.suffix == ".rrd":
-            return
-        try:
-            record.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(
-                f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
-            ) from None
 
     def _open_page(self, address: str, settings: LinkSettings) -> WebPage:
         with needs_extra("'hvt[web]'"):  # only now: who serves none starts faster
@@ -254,7 +232,7 @@ class Ground:
                 port,
                 open_session=factory.open_session,
                 on_ended=self._note_ended,
-                recordings=BacklogRecordings(factory.open_backlog),
+                recordings=BacklogRecordings(factory.open_backlog) if factory.records else None,
                 clock=self._clock,
                 patience_s=self._config.patience_s,
             )

@@ -13,10 +13,11 @@ from itertools import count as count_from
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
-from hvt_common.errors import needs_extra
+from hvt_common.errors import UserError, needs_extra
 from hvt_common.inference.classify import Classifier
 from hvt_common.inference.detect import Detector, detect_every
 from hvt_common.protocol.messages import Info
+from hvt_common.runtime.reporting import check_writable
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.transport.inbox import Received
 from hvt_common.transport.zenoh_config import LinkSettings
@@ -52,9 +53,11 @@ __all__ = [
     "Models",
     "OpenSink",
     "SessionFactory",
+    "check_outputs",
     "make_backlog_perception",
     "make_link_settings",
     "make_pipeline",
+    "make_record_folder",
     "output_path",
 ]
 
@@ -93,6 +96,8 @@ class SessionFactory:
         self._page = page
         self._index = index
         self._program = program
+        self.records = program is None or config.record is not None
+        """Whether there are recordings: a program takes their place unless they are asked for."""
         self._paths: set[Path] = set()
         """Taken by this process."""
         self._naming = threading.Lock()
@@ -116,15 +121,14 @@ class SessionFactory:
         # In lockstep the edge waits, so that nothing need be lost to a slow disk.
         wait_s = _LOCKSTEP_WAIT_S if info.pace == "lockstep" else 0.0
         sinks: list[Sink[Event]] = []
-        recorded = self._program is None or config.record is not None
-        if recorded:
+        if self.records:
             names = partial(output_path, config.record, suffix=".rrd", edge=edge, stamp=stamp)
             open_recording = partial(self._opened, self._files(settings, split=config.split), names)
             part = f"recording of {edge}"
             sinks.append(self._outputs.open(part, open_recording, wait_s=wait_s, for_backlog=True))
         if self._program is not None:
             part, opens = f"program of {edge}", self._program(info)
-            sinks.append(self._outputs.open(part, opens, wait_s=wait_s, for_backlog=not recorded))
+            sinks.append(self._outputs.open(part, opens, wait_s=wait_s, for_backlog=not self.records))
         if self._view is not None:
             open_live = partial(_live_recorder, settings, self._view)
             sinks.append(self._outputs.open(f"live view of {edge}", open_live))
@@ -206,6 +210,36 @@ def _mcap_file() -> type[McapFile]:
 def _live_recorder(settings: RecorderSettings, view: LiveView) -> Recorder:
     view.start_again()
     return Recorder(replace(settings, live_url=view.url))
+
+
+def check_outputs(config: GroundConfig) -> None:
+    """Refuse files that cannot be written, before anything is received; `UserError`."""
+    check_writable(config.summary, name="--summary")
+    check_writable(config.timing, name="--timing")
+    check_writable(config.log, name="--log")
+    for path, suffix, name in (
+        (config.tracks, ".csv", "--tracks"),
+        (config.mcap, ".mcap", "--mcap"),
+        (config.record, ".rrd", "--record"),
+    ):
+        if path is not None and path.suffix == suffix and not path.is_dir():
+            check_writable(path, name=name)
+    record = config.record
+    if record is not None and record.suffix != ".rrd" and record.exists() and not record.is_dir():
+        raise UserError(f"--record {record} is neither a folder nor named .rrd: give FILE.rrd or a folder")
+
+
+def make_record_folder(config: GroundConfig) -> None:
+    """Comes after all that may be refused: a failed start leaves nothing behind."""
+    record = config.record
+    if record is None or record.suffix == ".rrd":
+        return
+    try:
+        record.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"--record {record} cannot be made ({error.strerror}): give FILE.rrd or a folder"
+        ) from None
 
 
 def make_link_settings(config: GroundConfig) -> LinkSettings:

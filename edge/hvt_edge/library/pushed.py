@@ -6,6 +6,7 @@ taken replaces it.
 
 from __future__ import annotations
 
+import operator
 import threading
 import time
 from typing import Any, Self, cast
@@ -63,9 +64,10 @@ class PushedEdge:
     def push(self, frame_bgr: Image, *, capture_ns: int | None = None) -> None:
         """Hand over a frame: (height, width, 3) uint8 BGR, copied. The first one says how large the source is.
 
-        ``capture_ns`` is when it was taken, Unix nanoseconds; None is now. Raises `ValueError` for another array,
-        and `UserError` or `FlightError` once the edge has ended for that.
+        ``capture_ns`` is when it was taken, Unix nanoseconds, a whole number; None is now. Raises `ValueError` for
+        another array or time, and `UserError` or `FlightError` once the edge has ended for that.
         """
+        taken_ns = time.time_ns() if capture_ns is None else _nanoseconds(capture_ns)
         if (
             frame_bgr.dtype != np.uint8
             or frame_bgr.ndim != 3
@@ -77,12 +79,12 @@ class PushedEdge:
             )
         if self._error is not None:
             raise self._error
-        self._grabber.put(frame_bgr.copy(), time.time_ns() if capture_ns is None else capture_ns)
+        self._grabber.put(frame_bgr.copy(), taken_ns)
 
     def close(self) -> None:
         """Send what is left, say goodbye, and wait for the end; raises what ended the edge before."""
-        self._grabber.end()
         self._stop.set()
+        self._grabber.cancel_opening()
         self._thread.join()
         if self._error is not None:
             raise self._error
@@ -106,6 +108,16 @@ class PushedEdge:
             self._error = error
 
 
+def _nanoseconds(capture_ns: int) -> int:
+    try:
+        taken_ns = operator.index(capture_ns)
+    except TypeError:
+        taken_ns = -1
+    if not 0 <= taken_ns < 1 << 63:
+        raise ValueError(f"capture_ns {capture_ns!r} is not accepted: whole nanoseconds of Unix time are")
+    return taken_ns
+
+
 class _NothingPushed(Exception):  # noqa: N818 - an event
     """It was closed before the first frame."""
 
@@ -118,7 +130,7 @@ class _PushGrabber:
     def __init__(self) -> None:
         self._news = threading.Condition()
         self._newest: tuple[Image, int] | None = None
-        self._ended = False
+        self._opened = self._ended = False
 
     def put(self, frame_bgr: Image, capture_ns: int) -> None:
         with self._news:
@@ -130,12 +142,18 @@ class _PushGrabber:
             self._ended = True
             self._news.notify_all()
 
+    def cancel_opening(self) -> None:
+        with self._news:
+            self._ended |= not self._opened
+            self._news.notify_all()
+
     def open(self) -> None:
         """Wait for the first frame."""
         with self._news:
             self._news.wait_for(lambda: self._newest or self._ended)
             if self._newest is None:
                 raise _NothingPushed
+            self._opened = True
 
     def restart(self) -> None:
         with self._news:
@@ -168,6 +186,7 @@ class _PushedSource(LiveSource):
         self._pushed = grabber
 
     def close(self) -> None:
+        self._end()
         self._pushed.end()
         super().close()
 

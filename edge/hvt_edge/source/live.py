@@ -162,7 +162,7 @@ class LiveSource(Source):
 
     def _recover(self, error: SignalLost) -> None:
         """Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop."""
-        while True:
+        while not self._stop.is_set():  # what stops because it is closed has not failed
             self._pause.failed(self._clock())
             self._failures.failed(_PART, f"{self._grabber.name} stopped ({error})")
             if self._stop.wait(self._pause.pause_ns / SECOND_NS):

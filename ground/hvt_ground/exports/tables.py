@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import pyarrow as pa
@@ -14,6 +15,7 @@ from hvt_ground.sinks.tracks_table import COLUMNS, track_rows
 
 __all__ = ["write_csv", "write_mot", "write_parquet"]
 
+_BATCH_ROWS = 100_000
 _TYPES = {
     "frame": pa.int64(),
     "capture_utc": pa.string(),
@@ -34,18 +36,22 @@ def write_csv(recorded: Recorded, path: Path) -> None:
 
 def write_parquet(recorded: Recorded, path: Path) -> None:
     """The same as a Parquet file."""
-    columns = list(zip(*_rows(recorded), strict=True)) or [()] * len(COLUMNS)
-    table = {}
-    for name, column in zip(COLUMNS, columns, strict=True):
-        kind = _TYPES[name]
+    schema = pa.schema([(name, _TYPES[name]) for name in COLUMNS])
+    rows = _rows(recorded)
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        while batch := list(islice(rows, _BATCH_ROWS)):
+            writer.write_table(_table(batch, schema))
+
+
+def _table(rows: Sequence[tuple[object, ...]], schema: pa.Schema) -> pa.Table:
+    columns = []
+    for field, column in zip(schema, zip(*rows, strict=True), strict=True):
+        kind = field.type
         number = float if pa.types.is_floating(kind) else bool if pa.types.is_boolean(kind) else None
         values = column if number is None else [number(one) for one in column]
-        table[name] = (
-            pa.array(values, pa.string()).cast(kind)
-            if pa.types.is_dictionary(kind)
-            else pa.array(values, kind)
-        )
-    pq.write_table(pa.table(table), path, compression="zstd")
+        text = pa.types.is_dictionary(kind)
+        columns.append(pa.array(values, pa.string()).cast(kind) if text else pa.array(values, kind))
+    return pa.table(columns, schema=schema)
 
 
 def write_mot(recorded: Recorded, path: Path) -> None:

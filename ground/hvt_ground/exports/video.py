@@ -26,7 +26,8 @@ __all__ = ["CONTAINERS", "pictures", "write_video"]
 
 CONTAINERS = {"mp4": "mp4", "mkv": "matroska", "ts": "mpegts"}
 """By name, libavformat's."""
-_TIME_BASE = Fraction(1, 90_000)
+_TIME_BASE = Fraction(1, 1000)
+"""MP4 has 32 bits for the time between two pictures: 24 days."""
 _CRF = "20"
 
 
@@ -38,7 +39,7 @@ def write_video(recorded: Recorded, path: Path, *, container: str, burn_in: bool
     """
     samples = _from_keyframe(recorded)
     taken = datetime.fromtimestamp(samples[0].capture_ns / SECOND_NS, UTC).isoformat()
-    with av.open(str(path), "w", format=CONTAINERS[container]) as output:
+    with av.open(str(path.absolute()), "w", format=CONTAINERS[container]) as output:
         output.metadata["creation_time"] = taken
         output.metadata["title"] = f"{recorded.edge}, session {recorded.session}"
         if burn_in:

@@ -21,7 +21,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         UserError: it cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
+    part = _part_of(path)
     try:
         yield part
         part.replace(path)
@@ -38,7 +38,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     Raises:
         UserError: it is not empty, or cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
+    part = _part_of(path)
     try:
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
             raise UserError(f"{path} is there and not an empty folder: name one that is new")
@@ -52,3 +52,9 @@ def whole_folder(path: Path) -> Iterator[Path]:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _part_of(path: Path) -> Path:
+    if not path.name:
+        raise UserError(f"--out {path} has no name: name a file, or a folder that is new")
+    return path.with_name(f".{path.name}.part")

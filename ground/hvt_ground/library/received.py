@@ -1,7 +1,7 @@
 """A ground whose events another program takes: `hvt_ground.listen`.
 
 It is the ground of ``hvt-ground``, with one sink more. Who takes too little loses events, the oldest that wait, and
-nobody else does; pictures go on at the next keyframe.
+holds nobody else; in lockstep the edge waits for it.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -36,6 +37,8 @@ class Picture:
     capture_ns: int
     image_bgr: Image
     """(height, width, 3) uint8, base pixels."""
+    stored: bool = False
+    """It was stored at the edge while the link was down: it lies before others that came already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,33 +123,43 @@ class _Queue:
         self._events = events
         self._stop = stop
         self._info = info
-        self._decoder = BaseDecoder(size=info.base_size)
-        self._awaits_keyframe = True
+        # What was stored is another stretch of the stream than what is live.
+        self._decoders = {stored: BaseDecoder(size=info.base_size) for stored in (False, True)}
+        self._awaits_keyframe = {False: True, True: True}
 
     def log(self, item: Event) -> None:
         event: Picture | Overlay | Refinement | Traffic | Notice | None = None
         match item:
-            case VideoSample() if not item.stored:
+            case VideoSample():
                 event = self._decoded(item)
             case Overlay() | Refinement() | Traffic() | Notice():
                 event = item
-        while event is not None and not self._stop.is_set():
-            try:
-                self._events.put(Received(self._info.edge, self._info.session_id, event), timeout=_POLL_S)
-            except queue.Full:
-                continue
-            return
+        if event is not None:
+            self._put(Received(self._info.edge, self._info.session_id, event))
 
     def skipped(self, count: int) -> None:
         del count
-        self._awaits_keyframe = True
+        self._awaits_keyframe = {False: True, True: True}
 
     def close(self, hurry: threading.Event | None = None) -> None:
         """There is nothing to close."""
 
+    def _put(self, received: Received) -> None:
+        waits = self._info.pace == "lockstep"
+        while not self._stop.is_set():
+            try:
+                self._events.put(received, block=waits, timeout=_POLL_S)
+            except queue.Full:
+                if not waits:
+                    with suppress(queue.Empty):
+                        self._events.get_nowait()
+                continue
+            return
+
     def _decoded(self, sample: VideoSample) -> Picture | None:
+        decoder = self._decoders[sample.stored]
         if sample.keyframe:
-            self._decoder.reset()
-            self._awaits_keyframe = False
-        image = None if self._awaits_keyframe else self._decoder.decode(sample.data)
-        return None if image is None else Picture(sample.frame_index, sample.capture_ns, image)
+            decoder.reset()
+            self._awaits_keyframe[sample.stored] = False
+        image = None if self._awaits_keyframe[sample.stored] else decoder.decode(sample.data)
+        return None if image is None else Picture(sample.frame_index, sample.capture_ns, image, sample.stored)

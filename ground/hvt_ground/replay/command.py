@@ -19,7 +19,7 @@ from rich.progress import Progress
 
 from hvt_common.config import load
 from hvt_common.errors import Parser, UserError
-from hvt_common.protocol.channels import Channel, parse_key
+from hvt_common.protocol.channels import Channel, check_edge_pattern, matches, parse_key
 from hvt_common.protocol.messages import Feedback, Info, WireError
 from hvt_common.runtime.process import stop_on_signals
 from hvt_common.runtime.reporting import print_table, say, write_json
@@ -35,7 +35,7 @@ from hvt_ground.sinks import Outputs
 from hvt_ground.sinks.message_log import read_log
 from hvt_ground.sinks.rerun.live_view import LiveView
 from hvt_ground.status import completed, summary, table
-from hvt_ground.wiring import SessionFactory
+from hvt_ground.wiring import SessionFactory, check_outputs, make_record_folder
 
 __all__ = ["run"]
 
@@ -50,6 +50,7 @@ _OF_A_LINK = (
     "web",
     "metrics",
     "log",
+    "patience",
 )
 """Settings that mean nothing without a link."""
 _MOST_PAUSE_S = 5.0
@@ -124,7 +125,10 @@ class _Replay:
 
     def run(self) -> list[dict[str, Any]]:
         """Play all of it; a summary a session."""
+        check_edge_pattern(self._config.edges)
+        check_outputs(self._config)
         infos = _infos(self._path)
+        make_record_folder(self._config)
         models = Models(self._config)
         ended: list[tuple[dict[str, Any], GroundSession]] = []
         edges: dict[str, EdgeSessions] = {}
@@ -137,7 +141,7 @@ class _Replay:
             factory = SessionFactory(self._config, models, clock=self._clock, outputs=outputs, view=view)
             for item in self._paced():
                 edge = (parse_key(item.key) or ("", None))[0]
-                if edge not in infos:
+                if edge not in infos or not matches(edge, edges=self._config.edges):
                     continue
                 if edge not in edges:
                     edges[edge] = EdgeSessions(

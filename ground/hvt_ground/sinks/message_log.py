@@ -43,10 +43,12 @@ class MessageLog:
             raise UserError(f"message log {path} cannot be created: {error.strerror}") from None
 
     def log(self, item: Received) -> None:
-        """Append a message; it is in the file when this returns, whole or not at all."""
+        """Append a message, whole or not at all; one that is larger than any of ours is left out."""
         body: bytes = msgpack.packb(
             [item.received_ns, item.key, item.encoding, item.attachment, item.payload]
         )
+        if len(body) > _MOST_BYTES:  # no message of ours is so large, and a reader would stop at it
+            return
         record = _HEAD.pack(len(body), zlib.crc32(body)) + body
         at = self._file.tell()
         try:

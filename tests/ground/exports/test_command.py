@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from hvt_common.units import Limit
 from hvt_common.video.hevc import BaseDecoder
 from hvt_ground.events import Event, Overlay, Refinement, VideoSample
 from hvt_ground.recordings.session_files import SessionFiles
+from hvt_ground.sinks.rerun.joined import join_recordings
 from hvt_ground.sinks.rerun.recorder import Recorder, RecorderSettings
 from media.recorded_feed import START_NS, STEP_NS, coded, drawn_frames, session
 from programs.small_disk import small_disk
@@ -181,7 +183,43 @@ def test_mcap_has_video_boxes_stills_and_events(recording, events, tmp_path):
     assert all(text.text.split()[0] == one["id"] for text, one in zip(boxes.texts, facts, strict=True))
 
 
-def test_a_split_session_is_exported_as_one(events, tmp_path):
+def test_a_ground_that_was_started_again_leaves_no_ghosts(events, tmp_path):
+    """Boxes of the first recording would stand in the second, beside their own."""
+    halves = (0, 30), (30, 60)
+    for number, (begin, end) in enumerate(halves):
+        settings = RecorderSettings(tmp_path / f"{number}.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
+        with Recorder(settings) as recorder:
+            for event in events:
+                if begin <= event.frame_index < end and not isinstance(event, Refinement):
+                    shift = (
+                        replace(event, track_ids=event.track_ids + 50)
+                        if number and isinstance(event, Overlay)
+                        else event
+                    )
+                    recorder.log(shift)
+    out = tmp_path / "both.csv"
+    assert (
+        hvt_ground.cli.main(["export", str(tmp_path / "1.rrd"), str(tmp_path / "0.rrd"), "--out", str(out)])
+        == 0
+    )
+    by_frame: dict[int, list[int]] = {}
+    for row in lines(out):
+        by_frame.setdefault(int(row["frame"]), []).append(int(row["id"]))
+    assert {len(ids) for ids in by_frame.values()} == {TRACKS}
+    # The second begins at its first keyframe.
+    assert min(by_frame[60]) > 50 >= max(by_frame[30])
+
+
+@pytest.mark.parametrize("lost", [50, 3000])
+def test_a_recording_that_breaks_off_is_exported_so_far(recording, tmp_path, lost):
+    """A power cut would take the whole flight."""
+    cut = tmp_path / "cut.rrd"
+    cut.write_bytes(recording.read_bytes()[:-lost])
+    with av.open(str(export(cut, tmp_path / "cut.mp4"))) as video:
+        assert sum(1 for _ in video.decode(video=0)) > FRAMES / 2
+
+
+def test_a_split_session_is_exported_as_one(recording, events, tmp_path):
     """A video would end where a file did."""
     settings = RecorderSettings(tmp_path / "part.rrd", "uav-1", "00ff", SIZE, 15.0, 500_000.0)
     sink = SessionFiles(settings, split=Limit(seconds=1.2), index=None)
@@ -195,6 +233,20 @@ def test_a_split_session_is_exported_as_one(events, tmp_path):
     with av.open(str(out)) as video:
         assert sum(1 for _ in video.decode(video=0)) == FRAMES
         assert video.duration / av.time_base == pytest.approx(float(Fraction(FRAMES, 15)), abs=0.1)
+    stills = export(recording, tmp_path / "whole", "--to", "stills")
+    words = ["export", *map(str, parts), "--to", "stills", "--out", str(tmp_path / "parts")]
+    assert hvt_ground.cli.main(words) == 0
+    shown = [
+        [
+            (row["frame"], row["caption"], (folder / row["file"]).read_bytes())
+            for row in lines(folder / "stills.csv")
+        ]
+        for folder in (stills, tmp_path / "parts")
+    ]
+    assert [one for one in shown[1] if one not in shown[0]] == [], (
+        "a still of another file's end, at its beginning"
+    )
+    assert len({data for _, _, data in shown[1]}) >= 0.9 * len(shown[0])
 
 
 def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
@@ -214,6 +266,10 @@ def test_what_cannot_be_is_said_in_one_sentence(recording, tmp_path, capsys):
     assert "are of 2 sessions" in refused(capsys, recording, other, "--to", "mp4")
     assert "recording of uav-2 has no video" in refused(capsys, other, "--to", "mp4")
     assert "has no stills" in refused(capsys, other, "--to", "stills")
+    joined = tmp_path / "joined.rrd"
+    join_recordings([recording, other], joined, base_size=SIZE, fps=15.0)
+    assert "no recording of one edge" in refused(capsys, joined, "--to", "mp4")
+    assert "has no name" in refused(capsys, recording, "--to", "mp4", "--out", "/")
     assert not list(tmp_path.glob("*.mp4")), "half a file"
     taken = tmp_path / "full"
     taken.mkdir()

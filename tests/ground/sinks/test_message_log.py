@@ -75,6 +75,15 @@ def test_a_record_that_claims_gigabytes_takes_no_memory(tmp_path):
     assert list(read_log(path)) == []
 
 
+def test_what_no_edge_sends_ends_no_replay(tmp_path):
+    """Anybody on the link could end what is read of a log with one large message."""
+    sink = MessageLog(tmp_path / "flight.hvtlog")
+    for one in (MESSAGES[1], Received("hvt/intruder/base", bytes(5 * 2**20), b"", "", 1), MESSAGES[2]):
+        sink.log(one)
+    sink.close()
+    assert list(read_log(tmp_path / "flight.hvtlog")) == MESSAGES[1:3]
+
+
 def test_what_is_no_log_is_said(tmp_path):
     """A recording given by mistake would look like an empty flight."""
     wrong = tmp_path / "flight.rrd"

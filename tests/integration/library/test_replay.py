@@ -71,6 +71,17 @@ def test_another_detector_sees_something_else(flight, tmp_path, capsys):
     assert {row[6] for row in base} == {"moving"}
 
 
+def test_edges_and_folders_are_as_in_flight(flight, tmp_path, capsys):
+    """A new folder would stay empty, and an edge that nobody wants would be shown."""
+    folder, _ = flight
+    words = ("--detector", "motion", "--classifier", "none", *SETTINGS)
+    assert "no session" in replay(
+        capsys, folder / "flight.hvtlog", "--edges", "other", *words, "--record", tmp_path
+    )
+    replay(capsys, folder / "flight.hvtlog", *words, "--record", tmp_path / "new")
+    assert len(list((tmp_path / "new").glob("*.rrd"))) == 1
+
+
 def test_its_speed_can_be_that_of_the_flight(flight, tmp_path, capsys):
     """A viewer would see minutes in a moment."""
     folder, _ = flight
@@ -93,6 +104,8 @@ def test_what_cannot_be_is_said_in_one_sentence(flight, tmp_path, capsys):
         (["replay", log, "--listen", "tcp/127.0.0.1:1"], "--listen is not accepted: a replay has no link"),
         (["replay", log, "--speed", "0"], "--speed 0 is not accepted"),
         (["replay", log, "--detector", str(tmp_path / "absent.onnx")], "absent.onnx"),
+        (["replay", log, "--edges", "UAV"], "edge pattern 'UAV' is not usable"),
+        (["replay", log, "--tracks", str(tmp_path / "absent" / "t.csv")], "--tracks"),
     ):
         assert hvt_ground.cli.main(words) == 2, words
         error = capsys.readouterr().err

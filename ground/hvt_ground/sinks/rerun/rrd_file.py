@@ -32,7 +32,7 @@ from hvt_common.errors import UserError
 from hvt_ground.sinks.line_file import check_there
 from hvt_ground.sinks.rerun.sdk import RecordingId, new_recording, releasing_recordings, send_blueprint
 
-__all__ = ["RrdFile"]
+__all__ = ["RrdFile", "copy_whole_messages"]
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +40,7 @@ _STREAM_HEADER_BYTES = 12  # "RRF2", version, compression and serialisation
 _MESSAGE_HEADER = struct.Struct("<QQ")  # kind, length of what follows
 _END = 0
 _SPARE_BYTES = 2 * 2**20
+_COPY_BYTES = 2**20
 _FLUSH_S = 10.0
 _LOCK_TRIES, _LOCK_PAUSE_S = 50, 0.02
 _filters = threading.Lock()
@@ -173,6 +174,28 @@ def _messages(stream: bytes) -> bytes:
         at += _MESSAGE_HEADER.size + length
         end = at
     return stream[_STREAM_HEADER_BYTES:end]
+
+
+def copy_whole_messages(path: Path, out: Path) -> bool:
+    """Copy a recording up to its last whole message: the SDK refuses a file that breaks off in one.
+
+    False where nothing would be left out, or nothing be left.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        at = _STREAM_HEADER_BYTES
+        while len(head := os.pread(file.fileno(), _MESSAGE_HEADER.size, at)) == _MESSAGE_HEADER.size:
+            _, length = _MESSAGE_HEADER.unpack(head)
+            if at + _MESSAGE_HEADER.size + length > size:
+                break
+            at += _MESSAGE_HEADER.size + length
+        if not _STREAM_HEADER_BYTES < at < size:
+            return False
+        with out.open("wb") as copy:
+            while at > 0 and (data := file.read(min(at, _COPY_BYTES))):
+                copy.write(data)
+                at -= len(data)
+    return True
 
 
 def _created(path: Path) -> int:
