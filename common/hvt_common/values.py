@@ -19,10 +19,13 @@ import numpy.typing as npt
 __all__ = [
     "AccessUnit",
     "Boxes",
+    "CameraUnit",
     "Detections",
     "Fit",
     "Frame",
     "Image",
+    "Orientation",
+    "Pose",
     "Posterior",
     "Still",
     "Tracks",
@@ -95,6 +98,18 @@ class Frame:
     """The untouched frame; stills are cropped from it."""
     base_bgr: Image
     """The same moment resampled to the base size; the encoder's input."""
+    camera_unit: CameraUnit | None = None
+    """The same frame as the camera has coded it, where that is to be the base stream (``--encoder passthrough``)."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraUnit:
+    """One frame as the camera itself has coded it, in place of x265."""
+
+    data: bytes = field(repr=False)
+    """An HEVC access unit, Annex B. It builds on the one before it, that of the frame with the index before."""
+    keyframe: bool
+    """A decoder can begin with it: VPS, SPS and PPS are before the picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +120,46 @@ class AccessUnit:
     capture_ns: int
     data: bytes
     keyframe: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """Where something points, in degrees: aircraft angles (yaw, then pitch, then roll), as in MISB ST 0601."""
+
+    yaw_deg: float
+    """Clockwise from true north, 0 up to 360."""
+    pitch_deg: float
+    """Up from the horizon, -90 to 90; a camera that points straight down has -90, and its yaw is where the upper
+    edge of the picture points."""
+    roll_deg: float
+    """To the right (clockwise, seen along the direction), -180 up to 180."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a camera was, what it pointed at, and how sure that is. WGS 84."""
+
+    capture_ns: int
+    """By the clock of the frames."""
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float | None = None
+    """Above the ground; where that is not flat, above the place that the height counts from, as a rule the
+    take-off."""
+    altitude_m: float | None = None
+    """Above mean sea level."""
+    camera: Orientation | None = None
+    """Of the optical axis."""
+    platform: Orientation | None = None
+    """Of the aircraft or vehicle."""
+    hfov_deg: float | None = None
+    """Horizontal field of view of the source frame, above 0 and below 180."""
+    position_error_m: float = 3.0
+    """Standard deviation along each horizontal axis."""
+    height_error_m: float = 3.0
+    """Standard deviation of ``height_m``."""
+    angle_error_deg: float = 2.0
+    """Standard deviation of each of the camera's angles."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-// A reader of the wire that knows docs/wire.md, docs/wire-messages.md and docs/wire-tracks.md and no line of the Python:
+// A reader of the wire that knows docs/wire.md, wire-messages.md, wire-tracks.md and wire-stills.md and no line of the Python:
 // it shows that they are enough, and that the code holds to them. It checks every vector of docs/conformance.
 //
 //   tsc --target es2020 --module commonjs --strict --outDir OUT lab/conformance/reader.ts && node OUT/reader.js docs/conformance
@@ -112,8 +112,9 @@ function unpack(data: Uint8Array): Value {
 
 // ---- The tables of wire-messages.md -----------------------------------------------------------------------------
 
-type Kind = (value: Value) => void; // throws Refused
-type Fields = [string, Kind][];
+// Throws Refused; gives the value without what is skipped in it, or nothing where it is as it came.
+type Kind = (value: Value) => Value | void;
+type Fields = [string, Kind, Value?][];  // name, kind, and the value where an earlier sender has none
 
 const [U32, U53, U64, I63] = [2n ** 32n - 1n, 2n ** 53n - 1n, 2n ** 64n - 1n, 2n ** 63n - 1n];
 const utf8 = (text: string): number => new TextEncoder().encode(text).length;
@@ -132,7 +133,7 @@ const bin = (most: number): Kind => (value) =>
 const bool: Kind = (value) => need(typeof value === "boolean", "neither true nor false");
 const list = (most: number, of: Kind, least = 0): Kind => (value) => {
   need(Array.isArray(value) && value.length >= least && value.length <= most, `no array of ${least} to ${most}`);
-  value.forEach(of);
+  return value.map((one) => of(one) ?? one);
 };
 const exactly = (count: number, of: Kind): Kind => list(count, of, count);
 const map = (most: number, keys: number, of: Kind): Kind => (value) => {
@@ -148,19 +149,29 @@ const scalar: Kind = (value) => {
   else if (typeof value === "string") text(64)(value);
   else int(-(2n ** 63n), U64)(value);
 };
-const nested = (fields: Fields, more: Kind = () => undefined): Kind => (value) => {
+const nested = (fields: Fields): Kind => (value) => {
   need(Array.isArray(value), "no nested array");
+  return checkFields(fields, value);
+};
+// An array of an object of the backlog: these have no fields that came later.
+const row = (fields: Fields): Kind => (value) => {
+  need(Array.isArray(value) && value.length === fields.length, `no array of ${fields.length}`);
   checkFields(fields, value);
-  more(value);
 };
 // Printable as docs/wire.md asks: no control, format, surrogate, private or unassigned character, no separator but the space.
 const printable = (value: string): boolean => !/[\p{C}\p{Zl}\p{Zp}]|(?! )\p{Zs}/u.test(value);
 
-function checkFields(fields: Fields, values: Value[]): void {
-  need(values.length === fields.length, `${values.length} fields in place of ${fields.length}`);
-  fields.forEach(([name, kind], place) => {
+const UNKNOWN_FIELDS = 16;
+
+// Skips what a later sender put behind the fields of the tables; the fields that an earlier one lacks have defaults.
+function checkFields(fields: Fields, values: Value[]): Value[] {
+  const least = fields.filter((one) => one[2] === undefined).length;
+  need(values.length >= least, `${values.length} fields, at least ${least} are needed`);
+  need(values.length <= fields.length + UNKNOWN_FIELDS, `${values.length} fields, more than are skipped`);
+  return fields.map(([name, kind, missing], place) => {
+    if (place >= values.length) return missing!;
     try {
-      kind(values[place]);
+      return kind(values[place]) ?? values[place];
     } catch (error) {
       throw new Refused(`${name}: ${(error as Error).message}`);
     }
@@ -239,6 +250,7 @@ const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields 
       ["fps", float(0.01, 1000)], ["codec", text(24)], ["pace", int(0, 1)], ["method", text(48)],
       ["budget_bps", int(0, U53)], ["base_bps", int(0, U53)], ["window_ns", int(1, 3600000000000)],
       ["class_names", list(2048, text(64))], ["received_ns", int(0, I63)], ["answered_ns", int(0, I63)],
+      ["still_codecs", list(8, text(24)), []], ["channels", list(16, text(16)), []],
     ],
   },
   TrackStep: {
@@ -256,6 +268,7 @@ const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields 
       ["health", nested(health)], ["failed", list(8, nested(failedPart))], ["levers", text(120)],
     ],
   },
+  InfoRequest: { most: 1024, fields: [["requester_id", int(0, U64)], ["still_codecs", list(24, text(24))]] },
   ControlRequest: {
     most: 1024,
     fields: [session, ["command", text(24)], ["arguments", map(8, 16, scalar)]],
@@ -280,7 +293,7 @@ const MESSAGES: Record<string, { most: number; payload?: number; fields: Fields 
   },
 };
 
-const VERSION = 3n;
+const VERSIONS = [3n, 4n];
 
 function read(name: string, data: Uint8Array, payload: Uint8Array): Value[] {
   const { most, payload: mostPayload, fields } = MESSAGES[name];
@@ -288,11 +301,10 @@ function read(name: string, data: Uint8Array, payload: Uint8Array): Value[] {
   need(payload.length <= (mostPayload ?? PAYLOAD_BYTES), "its payload is too long");
   const values = unpack(data);
   need(Array.isArray(values) && typeof values[0] === "bigint", "no array that begins with a version");
-  if (values[0] !== VERSION) throw new Refused(`version ${values[0]}`, true);
+  if (!VERSIONS.includes(values[0])) throw new Refused(`version ${values[0]}`, true);
   need(data[data.length - 5] === 0xce, "no checksum at its end");
   need(values[values.length - 1] === BigInt(crc32(payload, data.subarray(0, -5))), "another checksum");
-  checkFields(fields, values.slice(1, -1));
-  return values.slice(1, -1);
+  return checkFields(fields, values.slice(1, -1));
 }
 
 // ---- Objects of the backlog -------------------------------------------------------------------------------------
@@ -307,7 +319,7 @@ function readObject(kind: string, data: Uint8Array): Value {
     need(values[2] instanceof Uint8Array && values[2].length > 0, "no still");
     return values;
   }
-  list(2400, nested([["frame", int(0, U32)], ["capture_ns", int(0, I63)], ["keyframe", bool], ["unit", bin(4194304)]]), 1)(values);
+  list(2400, row([["frame", int(0, U32)], ["capture_ns", int(0, I63)], ["keyframe", bool], ["unit", bin(4194304)]]), 1)(values);
   let before: Value[] | undefined;
   for (const row of values as Value[][]) {
     need((row[3] as Uint8Array).length > 0, "a frame is empty");
@@ -501,6 +513,205 @@ class TrackReader {
   }
 }
 
+// ---- Stills, wire-stills.md -------------------------------------------------------------------------------------
+
+type Plane = { width: number; height: number; at: ArrayLike<number> };
+const floor = Math.floor;
+const levels = held(0, 255);
+const filled = (side: number): number => 16 * Math.ceil(side / 16);
+
+// Y, Cb and Cr of a picture whose planes follow each other.
+function planesOf(bytes: ArrayLike<number>, width: number, height: number): Plane[] {
+  const all = Array.from(bytes);
+  const [luma, chroma] = [width * height, (width / 2) * (height / 2)];
+  return [
+    { width, height, at: all.slice(0, luma) },
+    { width: width / 2, height: height / 2, at: all.slice(luma, luma + chroma) },
+    { width: width / 2, height: height / 2, at: all.slice(luma + chroma) },
+  ];
+}
+
+// The planes of a crop of BGR pixels, filled up to whole blocks.
+function coded(bgr: Uint8Array, width: number, height: number): Uint8Array {
+  const [wide, high] = [filled(width), filled(height)];
+  const pixel = (x: number, y: number): number[] => {
+    const place = 3 * (Math.min(y, height - 1) * width + Math.min(x, width - 1));
+    return [bgr[place + 2], bgr[place + 1], bgr[place]];
+  };
+  const out: number[] = [];
+  const sample = (value: number): number => out.push(Math.min(Math.max(value, 1), 255));
+  for (let y = 0; y < high; y++)
+    for (let x = 0; x < wide; x++) {
+      const [r, g, b] = pixel(x, y);
+      sample(floor((19595 * r + 38470 * g + 7471 * b + 32768) / 65536));
+    }
+  for (const [cr, cg, cb] of [[-11059, -21709, 32768], [32768, -27439, -5329]])
+    for (let y = 0; y < high; y += 2)
+      for (let x = 0; x < wide; x += 2) {
+        let sum = 0;
+        for (const [dx, dy] of [[0, 0], [1, 0], [0, 1], [1, 1]]) {
+          const [r, g, b] = pixel(x + dx, y + dy);
+          sum += cr * r + cg * g + cb * b;
+        }
+        sample(floor((sum + 131072) / 262144) + 128);
+      }
+  return Uint8Array.from(out);
+}
+
+// 16 times as large, in twice its width and height.
+function enlarged(plane: Plane): Plane {
+  const value = (x: number, y: number): number =>
+    plane.at[Math.min(Math.max(y, 0), plane.height - 1) * plane.width + Math.min(Math.max(x, 0), plane.width - 1)];
+  const [width, height] = [2 * plane.width, 2 * plane.height];
+  const at = Array.from({ length: width * height }, (_, place) => {
+    const [x, y] = [place % width, floor(place / width)];
+    const [cx, cy] = [x >> 1, y >> 1];
+    const [nx, ny] = [x % 2 ? cx + 1 : cx - 1, y % 2 ? cy + 1 : cy - 1];
+    return 9 * value(cx, cy) + 3 * value(nx, cy) + 3 * value(cx, ny) + value(nx, ny);
+  });
+  return { width, height, at };
+}
+
+// B, G and R of planes whose chroma is around zero, cut to a size, and not held.
+function colours([luma, first, second]: Plane[], width: number, height: number): number[] {
+  const [cb, cr] = [enlarged(first), enlarged(second)];
+  const out: number[] = [];
+  for (let y = 0; y < height; y++)
+    for (let x = 0; x < width; x++) {
+      const place = y * luma.width + x;
+      const [l, b, r] = [1048576 * luma.at[place] + 524288, cb.at[place], cr.at[place]];
+      out.push(floor((l + 116130 * b) / 1048576), floor((l - 22554 * b - 46802 * r) / 1048576), floor((l + 91881 * r) / 1048576));
+    }
+  return out;
+}
+
+const shifted = (plane: Plane, by: (place: number) => number): Plane =>
+  ({ ...plane, at: Array.from(plane.at, (value, place) => value - by(place)) });
+
+// What each pixel of an axis takes of which samples, and of how many.
+function axis(origin: number, step: number, count: number, length: number): { taps: [number, number][][]; n: number } {
+  const n = Math.max(1, Math.ceil(step / 65536));
+  const taps = Array.from({ length: count }, (_, i) => {
+    const found: [number, number][] = [];
+    for (let j = i * n; j < (i + 1) * n; j++) {
+      const m = origin + floor(((2 * j + 1) * step) / (2 * n)) - 32768;
+      const q = floor((m + 1024) / 2048);
+      const k = floor(q / 32);
+      const f = q - 32 * k;
+      const weights = [
+        -3 * (f ** 3 - 64 * f ** 2 + 1024 * f), 5 * f ** 3 - 288 * f ** 2 + 131072,
+        -5 * f ** 3 + 192 * f ** 2 + 3072 * f, 3 * f ** 3 - 96 * f ** 2,
+      ];
+      weights.forEach((weight, tap) => found.push([Math.min(Math.max(k - 1 + tap, 0), length - 1), weight]));
+    }
+    return found;
+  });
+  return { taps, n };
+}
+
+function baseCrop(vector: any): Uint8Array {
+  const [[w, h], [x1, y1, x2, y2], scale] = [vector.size, vector.crop_source_px, vector.view_scale];
+  const fixed = (value: number): number => floor(value * 65536 + 0.5);
+  const across = [fixed(x1 * scale + vector.view_offset_px[0]), fixed(((x2 - x1) / w) * scale)];
+  const down = [fixed(y1 * scale + vector.view_offset_px[1]), fixed(((y2 - y1) / h) * scale)];
+  const [y, cb, cr] = vector.base_planes.map((text: string, index: number) => {
+    const [part, at] = [index ? 2 : 1, unhex(text)];
+    const [width, height] = vector.base_size.map((side: number) => Math.ceil(side / part));
+    const rows = axis(floor(down[0] / part), floor(down[1] / part), h, height);
+    const columns = axis(floor(across[0] / part), floor(across[1] / part), w, width);
+    const total = rows.n * columns.n * 2 ** 28;
+    return rows.taps.flatMap((row) =>
+      columns.taps.map((column) => {
+        let sum = 0;
+        for (const [top, weight] of row) for (const [left, other] of column) sum += weight * other * at[top * width + left];
+        return Math.min(Math.max(floor((sum + total / 2) / total), 0), 16320);
+      }),
+    );
+  });
+  return Uint8Array.from(
+    y.flatMap((level: number, place: number) => {
+      const [e, b, r] = [76309 * (level - 1024) + 2097152, cb[place] - 8192, cr[place] - 8192];
+      return [e + 138438 * b, e - 13975 * b - 34925 * r, e + 117489 * r].map((sum) => levels(floor(sum / 4194304)));
+    }),
+  );
+}
+
+// Bits as text, most significant first.
+const ue = (value: number): string => "0".repeat((value + 1).toString(2).length - 1) + (value + 1).toString(2);
+const se = (value: number): string => ue(value > 0 ? 2 * value - 1 : -2 * value);
+const packed = (bits: string, fill: string): number[] =>
+  (bits + fill.repeat((8 - (bits.length % 8)) % 8)).match(/.{8}/g)!.map((byte) => parseInt(byte, 2));
+
+// A NAL unit behind its start code, with emulation prevention bytes.
+function unit(first: number, body: number[]): number[] {
+  const out = [0, 0, 0, 1, first];
+  let zeros = 0;
+  for (const byte of body) {
+    if (zeros >= 2 && byte <= 3) {
+      out.push(3);
+      zeros = 0;
+    }
+    out.push(byte);
+    zeros = byte ? 0 : zeros + 1;
+  }
+  if (zeros) out.push(3);
+  return out;
+}
+
+function stream(payload: Uint8Array, width: number, height: number, reference?: Uint8Array): Uint8Array {
+  const [w, h, qp] = [filled(width) / 16, filled(height) / 16, payload[0]];
+  need(payload.length > 1 && qp <= 51, "no coded slice");
+  const picture = (set: number, cabac: string): number[] =>
+    unit(0x68, packed(`${ue(set)}${ue(0)}${cabac}0${ue(0).repeat(3)}000${se(0)}${se(0)}${se(4)}10010${se(4)}1`, "0"));
+  const sets = unit(0x67, [
+    ...[100, 0, 62],
+    ...packed(`${ue(0)}${ue(1)}${ue(0)}${ue(0)}00${ue(0)}${ue(2)}${ue(1)}0${ue(w - 1)}${ue(h - 1)}11001`, "0"),
+  ]).concat(picture(0, "1"), picture(1, "0"));
+  const deblocking = qp > 15 ? ue(0) + se(0) + se(0) : ue(1);
+  const data = Array.from(payload.subarray(1));
+  if (!reference) {
+    const header = `${ue(0)}${ue(7)}${ue(0)}0000${ue(0)}00${se(qp - 26)}${deblocking}`;
+    return Uint8Array.from(sets.concat(unit(0x65, packed(header, "1").concat(data))));
+  }
+  const planes = planesOf(reference, 16 * w, 16 * h);
+  const blocks: number[] = [];
+  let bits = `${ue(0)}${ue(7)}${ue(1)}0000${ue(0)}00${se(0)}${ue(1)}`;
+  for (let y = 0; y < h; y++)
+    for (let x = 0; x < w; x++) {
+      blocks.push(...packed(bits + ue(25), "0"));
+      bits = "";
+      planes.forEach((plane, index) => {
+        const side = index ? 8 : 16;
+        for (let row = 0; row < side; row++)
+          for (let column = 0; column < side; column++) blocks.push(plane.at[(y * side + row) * plane.width + x * side + column]);
+      });
+    }
+  const header = `${ue(0)}${ue(5)}${ue(0)}000100${ue(0)}${se(qp - 26)}${deblocking}`;
+  return Uint8Array.from(sets.concat(unit(0x65, blocks.concat(0x80)), unit(0x01, packed(header, "1").concat(data))));
+}
+
+// This reader has no decoder of H.264: it takes the decoded picture from the vector, and checks all around it.
+function checkStill(vector: any): string | undefined {
+  const [payload, [width, height]] = [unhex(vector.payload), vector.size];
+  const picture = (bytes: Uint8Array): Plane[] => planesOf(bytes, filled(width), filled(height));
+  const differs = (what: string, found: ArrayLike<number>): string | undefined =>
+    hex(Uint8Array.from(found)) === vector[what] ? undefined : `another ${what}`;
+  if (vector.codec === "h264-intra") {
+    const planes = picture(unhex(vector.decoded)).map((plane, index) => shifted(plane, () => (index ? 128 : 0)));
+    return differs("stream", stream(payload, width, height)) ?? differs("pixels", colours(planes, width, height).map(levels));
+  }
+  if (vector.codec !== "residual") return vector.tolerance && payload.length ? undefined : "no picture file";
+  const base = baseCrop(vector);
+  const reference = coded(base, width, height);
+  if (crc32(reference) !== vector.parameters.b) return "another base";
+  const [before, after] = [picture(reference), picture(unhex(vector.decoded))];
+  const change = colours(after.map((plane, index) => shifted(plane, (place) => before[index].at[place])), width, height);
+  return (
+    differs("base_crop", base) ?? differs("reference", reference) ?? differs("stream", stream(payload, width, height, reference)) ??
+    differs("pixels", Array.from(base, (value, place) => levels(value + change[place])))
+  );
+}
+
 // ---- The vectors ------------------------------------------------------------------------------------------------
 
 // As the vectors write it: whole numbers beyond 2^53 as text, bytes as {"hex": …}.
@@ -554,6 +765,7 @@ const CHECKS: Record<string, (vector: any) => string | undefined> = {
     }
     return undefined;
   },
+  "stills.json": checkStill,
 };
 
 function main(folder: string): number {
@@ -569,7 +781,7 @@ function main(folder: string): number {
         wrong = String(error);
       }
       if (wrong === undefined) good += 1;
-      else console.log(`${file} ${index}: ${vector.message ?? vector.kind ?? vector.session}, ${vector.what ?? ""}: ${wrong}`);
+      else console.log(`${file} ${index}: ${vector.message ?? vector.kind ?? vector.session ?? vector.codec}, ${vector.what ?? ""}: ${wrong}`);
     });
     console.log(`${file}: ${good} of ${vectors.length}`);
     failed += vectors.length - good;

@@ -9,7 +9,7 @@ import json
 import sys
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
-from hvt_common.protocol.messages.envelope import WIRE_VERSION
+from hvt_common.protocol.messages.envelope import MOST_UNKNOWN_FIELDS, READ_VERSIONS, WIRE_VERSION
 from hvt_common.protocol.messages.fields import Int
 from hvt_common.protocol.messages.track_boxes import CodedTrack, read_tracks
 from hvt_common.values import Tracks
@@ -42,6 +42,8 @@ __all__ = ["FOLDER", "files", "main"]
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "conformance"
 _PAYLOADS: Mapping[type[Message], bytes] = {BaseHeader: b"an access unit", RoiHeader: b"a still"}
+_WITH_NESTED = {"RoiHeader": ("also", 16), "ControlAnswer": ("tracks", 6), "Feedback": ("stills", 19)}
+"""A field that holds nested arrays, and its place."""
 _EXACT = 2**53 - 1
 """Beyond it a number of JSON is not exact everywhere, and stands as text."""
 _TRACK = (
@@ -94,17 +96,45 @@ def _messages() -> Iterator[dict[str, Any]]:
             if isinstance(kind, Int):
                 for bound in (kind.low, kind.high):
                     yield _vector(replace(message, **{name: bound}), f"{name} at its bound")
+        yield from _of_other_minors(message)
 
 
-def _vector(message: Message, what: str) -> dict[str, Any]:
+def _of_other_minors(message: Message) -> Iterator[dict[str, Any]]:
+    """From a sender that knows more fields than we do, or fewer."""
     payload = _PAYLOADS.get(type(message), b"")
-    data = message.pack(payload)
+    values = msgpack.unpackb(message.pack(payload))[:-1]
+    left_bytes = type(message).MAX_BYTES - len(message.pack(payload))
+    for what, unknown in (
+        ("one unknown field behind its own", [0]),
+        ("unknown fields of every type", [None, True, -1, 1.5, "new", b"new", [1, [2]], {"new": 1}]),
+        ("as many unknown fields as are skipped", [0] * MOST_UNKNOWN_FIELDS),
+    ):
+        if len(b"".join(map(msgpack.packb, unknown))) + 2 <= left_bytes:
+            yield _vector(message, what, _packed([*values, *unknown], payload))
+    if type(message).__name__ in _WITH_NESTED:
+        name, place = _WITH_NESTED[type(message).__name__]
+        nested = [[*one, 7] for one in values[place]]
+        longer = [*values[:place], nested, *values[place + 1 :]]
+        yield _vector(message, f"an unknown field in each of {name}", _packed(longer, payload))
+    optional = sum(item.default is not MISSING for item in fields(type(message)))
+    for version in READ_VERSIONS if optional else (WIRE_VERSION - 1,):
+        older = [version, *values[1 : len(values) - optional]]
+        what = f"version {version}" + (" without what was added since" if optional else "")
+        defaults = {item.name: item.default for item in fields(type(message)) if item.default is not MISSING}
+        yield _vector(replace(message, **defaults), what, _packed(older, payload))
+
+
+def _vector(message: Message, what: str, data: bytes | None = None) -> dict[str, Any]:
+    """``data`` is the message in another form, of the same fields."""
+    payload = _PAYLOADS.get(type(message), b"")
+    if data is not None:
+        assert type(message).parse(data, payload) == type(message).parse(message.pack(payload), payload), what
     return {
         "message": type(message).__name__,
         "what": what,
-        "hex": data.hex(),
+        "hex": (message.pack(payload) if data is None else data).hex(),
         "payload": payload.hex(),
-        "fields": _plain(msgpack.unpackb(data)[1:-1]),
+        "fields": _plain(msgpack.unpackb(message.pack(payload))[1:-1]),
     }
 
 
@@ -138,7 +168,7 @@ def _refused() -> Iterator[dict[str, Any]]:
         yield _bad(
             message,
             "an older version",
-            _packed([WIRE_VERSION - 1, *values[1:]], payload),
+            _packed([READ_VERSIONS[0] - 1, *values[1:]], payload),
             payload,
             version=True,
         )
@@ -149,8 +179,14 @@ def _refused() -> Iterator[dict[str, Any]]:
             payload,
             version=True,
         )
-        yield _bad(message, "a field too many", _packed([*values, 0], payload), payload)
-        yield _bad(message, "a field too few", _packed(values[:-1], payload), payload)
+        unknown = [0] * (MOST_UNKNOWN_FIELDS + 1)
+        yield _bad(
+            message, "more unknown fields than are skipped", _packed([*values, *unknown], payload), payload
+        )
+        optional = sum(item.default is not MISSING for item in fields(type(message)))
+        yield _bad(
+            message, "a field too few", _packed(values[: len(values) - optional - 1], payload), payload
+        )
         for place, (name, kind) in enumerate(kinds(type(message)), 1):
             for wrong, what in _wrong(kind):
                 changed = [*values[:place], wrong, *values[place + 1 :]]

@@ -21,6 +21,9 @@ from hvt_common.protocol.messages import (
     Flags,
     Info,
     Message,
+    PoseDecoder,
+    PoseEncoder,
+    PoseReport,
     RoiHeader,
     Status,
     TrackStep,
@@ -32,6 +35,7 @@ from hvt_common.protocol.messages import (
     parse_backlog_still,
     parse_backlog_units,
 )
+from hvt_common.values import Orientation, Pose
 from lab.fuzz.contract import Target
 from lab.fuzz.mutate import Bytes, changed_values, each_part, joined, parted, plain, with_checksum
 from rigs import messages
@@ -135,6 +139,32 @@ def _step_seeds() -> list[bytes]:
     return seeds
 
 
+def _pose_reports(data: bytes) -> None:
+    decoder = PoseDecoder()
+    for part in parted(data):
+        with contextlib.suppress(WireError):
+            pose = decoder.decode(PoseReport.parse(part))
+            assert pose is None or (abs(pose.latitude_deg) <= 90 and abs(pose.longitude_deg) <= 180)
+
+
+def _pose_seeds() -> list[bytes]:
+    encoder = PoseEncoder(session_id=5)
+    reports = [
+        encoder.encode(
+            Pose(
+                _NOW + second * 1_000_000_000,
+                latitude_deg=48.1 + second * 1e-4,
+                longitude_deg=179.9999 + second * 1e-4,
+                height_m=120.0,
+                camera=Orientation(90.0, -45.0, 0.0),
+                hfov_deg=60.0,
+            )
+        )(_NOW).pack()
+        for second in range(4)
+    ]
+    return [joined(reports), joined(reports[:1])]
+
+
 def _backlog_still(data: bytes) -> None:
     with contextlib.suppress(WireError):
         still = parse_backlog_still(data)
@@ -201,6 +231,7 @@ TARGETS = (
         short=250,
         most_bytes=6000,
     ),
+    Target("pose-reports", _pose_reports, _pose_seeds, mutate=each_part(changed_values), share=40, short=500),
     Target("backlog-still", _backlog_still, _backlog_still_seeds, share=40),
     Target(
         "backlog-units",

@@ -92,7 +92,7 @@ def _received(data: bytes) -> None:
     except WireError:
         return
     with contextlib.suppress(StillError):
-        image = decode_still(ReceivedStill(header, payload), base_bgr=_base(), view=_VIEW)
+        image = decode_still(ReceivedStill(header, payload), base=_base(), view=_VIEW)
         assert max(image.shape) <= 512
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from hvt_common.protocol.channels import parse_key
 from lab.fuzz import (
+    file_targets,
     ground_target,
     message_targets,
     model_target,
@@ -32,6 +33,7 @@ TARGETS = {
         *stage_targets.TARGETS,
         *picture_targets.TARGETS,
         *text_targets.TARGETS,
+        *file_targets.TARGETS,
         *ground_target.TARGETS,
         *model_target.TARGETS,
         PLANTED,

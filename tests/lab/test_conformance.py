@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import io
+import json
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image as Pillow
 
+from hvt_common.values import View
+from hvt_common.video.exact_crop import exact_base_crop
+from hvt_common.video.still_codecs import BaseMissingError, still_codec, still_codec_names
+from lab.conformance.stills import FILE, vectors
 from lab.conformance.vectors import FOLDER, files
 
 READER = Path(__file__).resolve().parents[2] / "lab" / "conformance" / "reader.ts"
@@ -43,7 +52,7 @@ def run(reader: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
 
 def test_the_vectors_are_those_of_the_code():
     """Somebody else's reader would be tried on a wire that is no more."""
-    written = {path.name: path.read_text(encoding="utf-8") for path in FOLDER.glob("*.json")}
+    written = {path.name: path.read_text(encoding="utf-8") for path in FOLDER.glob("*.json") if path != FILE}
     assert written.keys() == files().keys()
     stale = [name for name, text in files().items() if text != written[name]]
     assert stale == [], "run PYTHONPATH=.:tests/support python -m lab.conformance.vectors"
@@ -54,7 +63,7 @@ def test_an_independent_reader_reads_all_of_them(reader):
     done = run(reader, FOLDER)
     assert done.returncode == 0, done.stdout + done.stderr
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == [
-        *("messages.json", "refused.json", "objects.json", "track-steps.json"),
+        *("messages.json", "refused.json", "objects.json", "track-steps.json", "stills.json"),
     ]
 
 
@@ -65,6 +74,9 @@ def test_an_independent_reader_reads_all_of_them(reader):
         ("refused.json", '"version": true', '"version": false'),
         ("objects.json", '"values": [[7, 1000', '"values": [[8, 1000'),
         ("track-steps.json", '"width": ', '"width": 1'),
+        ("stills.json", '"b": ', '"b": 1'),
+        ("stills.json", '"pixels": "', '"pixels": "0'),
+        ("stills.json", '"payload": "', '"payload": "00'),
     ],
 )
 def test_a_wrong_vector_is_noticed(reader, tmp_path, name, before, after):
@@ -77,3 +89,77 @@ def test_a_wrong_vector_is_noticed(reader, tmp_path, name, before, after):
     done = run(reader, tmp_path / "vectors")
     assert done.returncode == 1
     assert f"{name} " in done.stdout
+
+
+STILLS: list[dict[str, Any]] = [json.loads(line.rstrip(",")) for line in FILE.read_text().splitlines()[1:-1]]
+
+
+def pixels(still: dict[str, Any]) -> np.ndarray:
+    """BGR, as the vector has them."""
+    width, height = still["size"]
+    return np.frombuffer(bytes.fromhex(still["pixels"]), np.uint8).reshape(height, width, 3)
+
+
+def base_crop_of(still: dict[str, Any]) -> np.ndarray | None:
+    """From the base picture, where the codec needs it."""
+    if "base_planes" not in still:
+        return None
+    width, height = still["base_size"]
+    planes = [
+        np.frombuffer(bytes.fromhex(text), np.uint8).reshape(height // part, width // part)
+        for text, part in zip(still["base_planes"], (1, 2, 2), strict=True)
+    ]
+    view = View((1, 1), (width, height), still["view_scale"], tuple(still["view_offset_px"]))
+    return exact_base_crop(
+        tuple(planes), view=view, crop_source_px=tuple(still["crop_source_px"]), size=tuple(still["size"])
+    )
+
+
+def near(found: np.ndarray, still: dict[str, Any]) -> bool:
+    """Whether it is the picture of the vector, as near as the vector asks."""
+    allowed = still.get("tolerance", {"mean": 0, "most": 0})
+    off = np.abs(found.astype(int) - pixels(still))
+    return bool(off.mean() <= allowed["mean"] and off.max() <= allowed["most"])
+
+
+@pytest.mark.parametrize("still", STILLS, ids=lambda still: f"{still['codec']}: {still['what']}")
+def test_the_code_reads_the_stills(still):
+    """Edge and ground of two versions, or machines, would refuse each other's stills."""
+    if still["codec"] not in still_codec_names():
+        pytest.skip(f"{still['codec']} is not installed")
+    base = base_crop_of(still)
+    image = still_codec(still["codec"]).decode(
+        bytes.fromhex(still["payload"]),
+        size=tuple(still["size"]),
+        parameters=still["parameters"],
+        base_bgr=base,
+    )
+    assert near(image, still)
+    if base is not None:
+        with pytest.raises(BaseMissingError):
+            still_codec(still["codec"]).decode(
+                bytes.fromhex(still["payload"]),
+                size=tuple(still["size"]),
+                parameters=still["parameters"],
+                base_bgr=base ^ 2,
+            )
+
+
+@pytest.mark.parametrize("name", ["jpeg", "webp"])
+def test_another_decoder_reads_the_picture_files(name):
+    """The tolerance would be that of one library."""
+    (still,) = [one for one in STILLS if one["codec"] == name]
+    with Pillow.open(io.BytesIO(bytes.fromhex(still["payload"]))) as opened:
+        theirs = np.asarray(opened.convert("RGB"))[..., ::-1]
+    assert near(theirs, still)
+    assert not near(theirs // 2, still)
+
+
+def test_there_is_a_still_of_each_codec():
+    """A reader would be tried on some of what an edge sends."""
+    names = {still["codec"] for still in STILLS}
+    assert names == {"jpeg", "webp", "avif", "jxl", "h264-intra", "residual"}
+    if set(still_codec_names()) >= names:
+        assert [(one["codec"], one["what"]) for one in vectors()] == [
+            (one["codec"], one["what"]) for one in STILLS
+        ]

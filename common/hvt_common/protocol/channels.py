@@ -46,6 +46,7 @@ class Channel(StrEnum):
     BASE = "base"
     ROI = "roi"
     TRACKS = "tracks"
+    POSE = "pose"
     BACKLOG = "backlog"
     STATUS = "status"
     INFO = "info"
@@ -96,6 +97,7 @@ DELIVERIES: Mapping[Channel, Delivery] = MappingProxyType(
             encoding="image/jpeg",
         ),
         Channel.TRACKS: Delivery(Direction.EDGE_TO_GROUND, "TrackStep", "DATA_LOW", "DROP"),
+        Channel.POSE: Delivery(Direction.EDGE_TO_GROUND, "PoseReport", "DATA_LOW", "DROP"),
         Channel.BACKLOG: Delivery(
             Direction.EDGE_TO_GROUND,
             "a chunk of what was stored while the link was down; attachment BacklogHeader",
@@ -103,7 +105,9 @@ DELIVERIES: Mapping[Channel, Delivery] = MappingProxyType(
             "BLOCK",
         ),
         Channel.STATUS: Delivery(Direction.EDGE_TO_GROUND, "Status", "INTERACTIVE_LOW", "DROP"),
-        Channel.INFO: Delivery(Direction.GROUND_QUERIES, "empty question, Info", "INTERACTIVE_HIGH", "BLOCK"),
+        Channel.INFO: Delivery(
+            Direction.GROUND_QUERIES, "InfoRequest or nothing, Info", "INTERACTIVE_HIGH", "BLOCK"
+        ),
         Channel.CONTROL: Delivery(
             Direction.GROUND_QUERIES, "ControlRequest, ControlAnswer", "INTERACTIVE_HIGH", "BLOCK"
         ),

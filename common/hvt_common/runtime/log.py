@@ -16,11 +16,14 @@ from typing import Any
 
 from hvt_common.errors import FlightError, UserError
 
-__all__ = ["LOG_FORMATS", "STATUS_LOGGER", "Log", "log_fields", "start_log"]
+__all__ = ["LOG_FORMATS", "START_LOGGER", "STATUS_LOGGER", "Log", "log_fields", "start_log"]
 
 LOG_FORMATS = ("text", "json")
 STATUS_LOGGER = "hvt.status"
 """Of the lines that are a status line else; in JSON only."""
+
+START_LOGGER = "hvt.start"
+"""Of what was found at the start and is no warning; not with ``quiet``."""
 
 _fields: ContextVar[Mapping[str, str]] = ContextVar("hvt_log_fields", default=MappingProxyType({}))
 
@@ -33,7 +36,8 @@ def log_fields(**fields: str) -> None:
 def start_log(program: str, *, quiet: bool, form: str = "text", **fields: str) -> Log:
     """Buffer the log until `Log.release`, then write it to stderr. So a start that fails says one sentence.
 
-    Unless ``quiet``, the provider of each network is logged, and with ``form="json"`` a line of status now and then.
+    Unless ``quiet``, the provider of each network and what else was found at the start is logged, and with
+    ``form="json"`` a line of status now and then.
     ``fields`` are of every JSON line.
     """
     stream = logging.StreamHandler()
@@ -44,7 +48,7 @@ def start_log(program: str, *, quiet: bool, form: str = "text", **fields: str) -
     held = _HeldLog(stream)
     held.addFilter(_with_fields)
     logging.basicConfig(level=logging.WARNING, handlers=[held], force=True)
-    for name in ("hvt_common.inference.runtimes.model", *((STATUS_LOGGER,) if as_json else ())):
+    for name in ("hvt_common.inference.runtimes.model", START_LOGGER, *((STATUS_LOGGER,) if as_json else ())):
         logging.getLogger(name).setLevel(logging.WARNING if quiet else logging.INFO)
     log = Log(program, held, as_json=as_json)
     if as_json:

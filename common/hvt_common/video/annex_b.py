@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["is_keyframe", "nal_units", "parameter_sets"]
+__all__ = ["LONG_START", "PARAMETER_SETS", "is_keyframe", "nal_kind", "nal_units", "parameter_sets"]
 
 _START_CODE = re.compile(rb"\x00\x00\x01")
-_LONG_START = b"\0\0\0\1"
+LONG_START = b"\0\0\0\1"
+"""What a parameter set, and the first unit of a picture, begins with."""
 _IRAP = frozenset(range(16, 22))
 """BLA, IDR and CRA pictures of H.265, table 7-1."""
-_PARAMETER_SETS = frozenset({32, 33, 34})
+PARAMETER_SETS = frozenset({32, 33, 34})
 """VPS, SPS and PPS, ibid."""
 
 
@@ -24,19 +25,19 @@ def nal_units(stream: bytes) -> list[bytes]:
 
 def parameter_sets(access_unit: bytes) -> bytes:
     """VPS, SPS and PPS of an HEVC access unit, as Annex B; empty unless all three are in it."""
-    found = {kind: unit for unit in nal_units(access_unit) if (kind := _kind(unit)) in _PARAMETER_SETS}
+    found = {kind: unit for unit in nal_units(access_unit) if (kind := nal_kind(unit)) in PARAMETER_SETS}
     return (
-        b"".join(_LONG_START + found[kind] for kind in sorted(found))
-        if len(found) == len(_PARAMETER_SETS)
+        b"".join(LONG_START + found[kind] for kind in sorted(found))
+        if len(found) == len(PARAMETER_SETS)
         else b""
     )
 
 
 def is_keyframe(access_unit: bytes) -> bool:
     """Whether an HEVC access unit is an IRAP picture, at which a decoder that has its parameter sets can start."""
-    return any(_kind(unit) in _IRAP for unit in nal_units(access_unit))
+    return any(nal_kind(unit) in _IRAP for unit in nal_units(access_unit))
 
 
-def _kind(unit: bytes) -> int:
+def nal_kind(unit: bytes) -> int:
     """The NAL unit type, H.265 clause 7.3.1.2."""
     return unit[0] >> 1 & 0x3F

@@ -1,7 +1,8 @@
 """What the base frame shows of a crop of the source, at the size at which the crop is coded.
 
-Edge and ground compute it from the same decoded pixels with the same arithmetic: a residual still is the difference
-to it, and a still has to be closer to the source than it.
+Edge and ground compute it from the same decoded picture with the same arithmetic: a residual still is the difference
+to it, and a still has to be closer to the source than it. Of a picture as it was decoded it is exact (`exact_crop`);
+of one that is already BGR it is as near, by OpenCV, for gates and for people.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import cv2
 import numpy as np
 
 from hvt_common.values import Image, View
+from hvt_common.video.exact_crop import exact_base_crop
+from hvt_common.video.hevc import YuvPicture
 
 __all__ = ["MAX_SIDE_PX", "base_crop", "coded_size", "resampled"]
 
@@ -29,17 +32,26 @@ def coded_size(
 
 
 def base_crop(
-    base_bgr: Image, *, view: View, crop_source_px: tuple[int, int, int, int], size: tuple[int, int]
+    picture: Image | YuvPicture,
+    *,
+    view: View,
+    crop_source_px: tuple[int, int, int, int],
+    size: tuple[int, int],
 ) -> Image:
     """What the base frame shows of a crop, resampled to ``size``: the picture that a still must beat.
 
     The base gets its best chance: exact sub-pixel alignment, cubic where it is enlarged, area means where it is
     shrunk.
     """
+    if isinstance(picture, YuvPicture):
+        planes = picture.planes
+        if planes is not None:
+            return exact_base_crop(planes, view=view, crop_source_px=crop_source_px, size=size)
+        picture = picture.bgr()
     x1, y1, x2, y2 = crop_source_px
     origin = x1 * view.scale + view.offset_px[0], y1 * view.scale + view.offset_px[1]
     step = (x2 - x1) / size[0] * view.scale, (y2 - y1) / size[1] * view.scale
-    return resampled(base_bgr, origin, step, size)
+    return resampled(picture, origin, step, size)
 
 
 def resampled(

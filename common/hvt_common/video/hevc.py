@@ -7,6 +7,7 @@ from typing import cast
 import av
 import av.error
 import numpy as np
+import numpy.typing as npt
 from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoReformatter
 
@@ -28,6 +29,8 @@ MAX_SIDE_PX = 8192
 MAX_PICTURE_PX = 35_651_584
 """The luma samples of a picture of level 6.2 (ITU-T H.265, table A.8): 8192x4352."""
 _BLOCK_PX = 64
+_YUV420 = ("yuv420p", "yuvj420p")
+Plane = npt.NDArray[np.uint8]
 """A coded picture is filled up to whole blocks, and libavcodec's rows to as much."""
 
 
@@ -48,6 +51,19 @@ class YuvPicture:
     def nbytes(self) -> int:
         """Of its pixels."""
         return sum(plane.buffer_size for plane in self._picture.planes)
+
+    @property
+    def planes(self) -> tuple[Plane, Plane, Plane] | None:
+        """Y (H, W), Cb and Cr (half of it, rounded up), uint8, read-only; None if it is not 4:2:0, 8 bits."""
+        if self._picture.format.name not in _YUV420:
+            return None
+        (width, height), whole = self.size, self._picture.planes
+        half = -(-width // 2), -(-height // 2)
+        luma, first, second = (
+            np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)[: side[1], : side[0]]
+            for plane, side in zip(whole, ((width, height), half, half), strict=True)
+        )
+        return luma, first, second
 
     def bgr(self) -> Image:
         """Uint8 (H, W, 3), the same at every call."""

@@ -21,25 +21,31 @@ from hvt_common.protocol.messages.backlog import (
 )
 from hvt_common.protocol.messages.dialogue import (
     MAX_MISSING_STILLS,
+    MAX_STILL_CODECS,
     MAX_STILL_RESULTS,
     MAX_TRACKS_NOW,
     Command,
     ControlAnswer,
     ControlRequest,
     Feedback,
+    InfoRequest,
     StillResult,
     TrackNow,
 )
 from hvt_common.protocol.messages.envelope import (
     MAX_PAYLOAD_BYTES,
+    MOST_UNKNOWN_FIELDS,
+    READ_VERSIONS,
     WIRE_VERSION,
     CorruptError,
     Message,
     PackedMessage,
     UnknownVersionError,
     kinds,
+    wire_version,
 )
 from hvt_common.protocol.messages.fields import WireError, fitted_text
+from hvt_common.protocol.messages.pose_report import PoseDecoder, PoseEncoder, PoseReport
 from hvt_common.protocol.messages.reports import (
     MOST_FAILED_PARTS,
     FailedPart,
@@ -57,9 +63,12 @@ __all__ = [
     "MAX_BACKLOG_BYTES",
     "MAX_MISSING_STILLS",
     "MAX_PAYLOAD_BYTES",
+    "MAX_STILL_CODECS",
     "MAX_STILL_RESULTS",
     "MAX_TRACKS_NOW",
     "MOST_FAILED_PARTS",
+    "MOST_UNKNOWN_FIELDS",
+    "READ_VERSIONS",
     "WIRE_VERSION",
     "AcknowledgedRange",
     "AlsoShown",
@@ -77,9 +86,13 @@ __all__ = [
     "Flags",
     "Health",
     "Info",
+    "InfoRequest",
     "Message",
     "ObjectKey",
     "PackedMessage",
+    "PoseDecoder",
+    "PoseEncoder",
+    "PoseReport",
     "RoiHeader",
     "Status",
     "StillResult",
@@ -96,4 +109,5 @@ __all__ = [
     "pack_backlog_units",
     "parse_backlog_still",
     "parse_backlog_units",
+    "wire_version",
 ]

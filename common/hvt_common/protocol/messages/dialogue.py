@@ -1,4 +1,4 @@
-"""Messages of the ground: control requests with their answers, and the receiver report."""
+"""Messages of the ground: info and control requests with their answers, and the receiver report."""
 
 from __future__ import annotations
 
@@ -26,12 +26,14 @@ from hvt_common.protocol.messages.fields import (
 
 __all__ = [
     "MAX_MISSING_STILLS",
+    "MAX_STILL_CODECS",
     "MAX_STILL_RESULTS",
     "MAX_TRACKS_NOW",
     "Command",
     "ControlAnswer",
     "ControlRequest",
     "Feedback",
+    "InfoRequest",
     "StillResult",
     "TrackNow",
 ]
@@ -39,6 +41,8 @@ __all__ = [
 MAX_STILL_RESULTS = 32
 MAX_MISSING_STILLS = 32
 """How many one report names; of more, the newest."""
+MAX_STILL_CODECS = 24
+"""How many a ground names."""
 MAX_TRACKS_NOW = 64
 """How many tracks one answer lists: the most confident."""
 _COUNT = Int(0, 2**53 - 1)
@@ -58,6 +62,16 @@ class Command(StrEnum):
     SET_METHOD = "set-method"
     SEND_BACKLOG = "send-backlog"
     """Send the stored base stream too, before the remaining stills."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InfoRequest(Message):
+    """Payload of a question on ``info``. A question without one is answered alike, and says nothing of codecs."""
+
+    requester_id: int = wire_field(Int(0, U64))
+    """Random, new at each start of the ground: a later request of the same number takes the place of this one."""
+    still_codecs: tuple[str, ...] = wire_field(ListOf(Text(24), MAX_STILL_CODECS))
+    """Codecs of stills that the ground reads: the edge sends no other, but for ``jpeg``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,9 @@
 """A message as bytes: a MessagePack array that begins with the schema version and ends with a CRC-32.
 
-``[version, field, field, …, crc]``. The CRC is always the last five bytes (``0xce`` and a big-endian uint32). It is
+``[version, field, field, …, crc]``. Later minor versions add fields behind the last one: a reader skips those that it
+does not know, and takes those that are missing, from an earlier sender, at their defaults.
+
+The CRC is always the last five bytes (``0xce`` and a big-endian uint32). It is
 CRC-32 as zlib, PNG and Ethernet have it (reflected polynomial 0xEDB88320, start and final inversion) over the Zenoh
 payload, if the message is its attachment, followed by the array's bytes up to the CRC's own five. So one flipped
 bit in either is always noticed.
@@ -10,7 +13,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, ClassVar, Self, TypeVar
 
 import msgpack
@@ -19,6 +22,8 @@ from hvt_common.protocol.messages.fields import Kind, WireError
 
 __all__ = [
     "MAX_PAYLOAD_BYTES",
+    "MOST_UNKNOWN_FIELDS",
+    "READ_VERSIONS",
     "WIRE_VERSION",
     "CorruptError",
     "Message",
@@ -26,9 +31,15 @@ __all__ = [
     "PackedMessage",
     "UnknownVersionError",
     "kinds",
+    "wire_version",
 ]
 
-WIRE_VERSION = 3
+WIRE_VERSION = 4
+"""That of every message that is sent."""
+READ_VERSIONS = (3, 4)
+"""A message of version 3 is one of version 4 without the fields that were added since; it had to be exact."""
+MOST_UNKNOWN_FIELDS = 16
+"""So many fields behind the last known one are skipped, in each array; with more it is no message of ours."""
 MAX_PAYLOAD_BYTES = 4 * 2**20
 """No access unit and no still is larger; a larger payload is refused unread."""
 
@@ -40,6 +51,17 @@ _T = TypeVar("_T")
 
 class UnknownVersionError(WireError):
     """The message is of another schema version: count it apart, warn once, skip it."""
+
+    def __init__(self, message: str, version: int) -> None:
+        known = " and ".join(map(str, READ_VERSIONS))
+        super().__init__(f"{message} has schema version {version}, only {known} are known here")
+        self.version = version
+
+    def between(self, sender: str, reader: str) -> str:
+        """What to do about it, as one sentence."""
+        known = " and ".join(map(str, READ_VERSIONS))
+        older = reader if self.version > WIRE_VERSION else sender
+        return f"{sender} speaks wire version {self.version}, {reader} reads {known}: update {older}"
 
 
 class CorruptError(WireError):
@@ -78,6 +100,7 @@ class Message:
         if len(payload) > cls.MAX_PAYLOAD:
             raise WireError(f"payload of {len(payload)} bytes is longer than {cls.MAX_PAYLOAD}")
         array = _unpack(data, name)
+        _check_version(array, name)
         if len(data) <= _CRC_BYTES or data[-_CRC_BYTES] != _CRC_TAG:
             raise WireError(f"{name} does not end with its checksum")
         if array[-1] != _checksum(data[:-_CRC_BYTES], payload):
@@ -150,7 +173,7 @@ def _packed(value: Any) -> bytes:
 
 
 def _unpack(data: bytes, name: str) -> list[Any]:
-    """The array in ``data``, its version checked. Sizes inside are bounded by the length of ``data`` itself."""
+    """The array in ``data``, its version not checked. Sizes inside are bounded by the length of ``data`` itself."""
     try:
         array = msgpack.unpackb(data, raw=False, strict_map_key=True, use_list=True, max_ext_len=0)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
@@ -158,17 +181,27 @@ def _unpack(data: bytes, name: str) -> list[Any]:
         raise WireError(f"{name} is not MessagePack: {reason:.80}") from None
     if type(array) is not list or not array or type(array[0]) is not int:
         raise WireError(f"{name} is not an array that begins with a version")
-    if array[0] != WIRE_VERSION:
-        raise UnknownVersionError(f"{name} has schema version {array[0]}, only {WIRE_VERSION} is known here")
     return array
+
+
+def _check_version(array: list[Any], name: str) -> None:
+    if array[0] not in READ_VERSIONS:
+        raise UnknownVersionError(name, array[0])
+
+
+def wire_version(data: bytes) -> int:
+    """The schema version of a message whose bytes `Message.parse` has accepted."""
+    version: int = _unpack(data, "message")[0]
+    return version
 
 
 def _from_values(message: type[_T], values: list[Any]) -> _T:
     table = kinds(message)
-    if len(values) != len(table):
-        raise WireError(f"{message.__name__} has {len(values)} fields in place of {len(table)}")
+    least, most = _required(message), len(table) + MOST_UNKNOWN_FIELDS
+    if not least <= len(values) <= most:
+        raise WireError(f"{message.__name__} has {len(values)} fields, not {least} to {most}")
     decoded = {}
-    for (name, kind), raw in zip(table, values, strict=True):
+    for (name, kind), raw in zip(table, values, strict=False):
         try:
             decoded[name] = kind.decode(raw)
         except WireError as error:
@@ -177,6 +210,11 @@ def _from_values(message: type[_T], values: list[Any]) -> _T:
         return message(**decoded)
     except ValueError as error:
         raise WireError(f"{message.__name__}: {error}") from None
+
+
+def _required(message: type) -> int:
+    """How many fields the first of these messages had: those without a default."""
+    return sum(item.default is MISSING for item in fields(message))
 
 
 def _checksum(body: bytes, payload: bytes) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sized
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from typing import Any
 
 __all__ = [
@@ -80,9 +80,13 @@ class _Sequence(Kind):
         return tuple(self.inner.decode(item) for item in raw)
 
 
-def wire_field(kind: Kind) -> Any:
-    """A dataclass field that crosses the wire as ``kind``; fields are sent in the order they are declared."""
-    return field(metadata={"wire": kind})
+def wire_field(kind: Kind, *, default: Any = MISSING) -> Any:
+    """A dataclass field that crosses the wire as ``kind``; fields are sent in the order they are declared.
+
+    One that was added later has a ``default``, which it has in the messages of earlier senders; it stands behind all
+    that have none.
+    """
+    return field(metadata={"wire": kind}, default=default)
 
 
 @dataclass(frozen=True, slots=True)

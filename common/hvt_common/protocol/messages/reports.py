@@ -85,6 +85,10 @@ class Info(Message):
     """When the edge received the question, its clock (t1)."""
     answered_ns: int = wire_field(_TIME)
     """When it answered (t2)."""
+    still_codecs: tuple[str, ...] = wire_field(ListOf(Text(24), 8), default=())
+    """Codecs of the stills that it sends now; empty where an earlier edge does not say."""
+    channels: tuple[str, ...] = wire_field(ListOf(Text(16), 16), default=())
+    """On which it sends; empty where an earlier edge does not say."""
 
     @property
     def view(self) -> View:

@@ -1,6 +1,7 @@
 """Still codecs behind one small contract (`contract.py`); docs/stills.md has the table of them.
 
-Those of `plugins` need a library of their own.
+Those of `plugins` need a library of their own. Who makes vectors of stills reaches into `av_still`, `h264_intra`,
+`h264_syntax` and `yuv420`.
 """
 
 from hvt_common.video.still_codecs.contract import (

@@ -6,8 +6,8 @@ ground writes the base crop as a picture of verbatim samples (I_PCM) in front of
 the base as it is (next to nothing), the base plus a difference, the base from a little aside, or the source anew.
 
 What the ground adds to its base crop is the decoded difference alone: where nothing was coded the result is the base,
-to the bit. A difference of one level between the two references (rounding on another processor) stays one level: the
-slice data is parsed without them. Another picture is found out by its checksum before anything is painted.
+to the bit. All of it is arithmetic of whole numbers (docs/wire-stills.md). Another picture is found out by its
+checksum before anything is painted.
 """
 
 from __future__ import annotations
@@ -32,12 +32,18 @@ from hvt_common.video.still_codecs.h264_syntax import (
     parameter_sets,
     verbatim_picture,
 )
-from hvt_common.video.still_codecs.yuv420 import difference_bgr, filled_outside, padded_size, to_planar
+from hvt_common.video.still_codecs.yuv420 import (
+    Planar,
+    difference_bgr,
+    filled_outside,
+    padded_size,
+    to_planar,
+)
 
 __all__ = ["CHECKSUM", "ResidualCodec"]
 
 CHECKSUM = "b"
-"""The parameter with the CRC-32 of the base crop's pixels."""
+"""The parameter with the CRC-32 of the reference picture: the base crop's planes Y, Cb and Cr, whole blocks."""
 
 _REFERENCE_QP = 4
 """The base crop in x264: within 0.3 levels of the base itself."""
@@ -65,7 +71,7 @@ class ResidualCodec:
         options = x264_options(f"qp={qp}:ipratio={ratio:.5f}:keyint=infinite", pixels=width * height)
         units = encoded([base, source], encoder="libx264", options=options)
         cabac = cabac_data(b"".join(units), qp=qp, intra=False)
-        return CodedCrop(bytes([qp]) + cabac, {CHECKSUM: _checksum(base_bgr)})
+        return CodedCrop(bytes([qp]) + cabac, {CHECKSUM: _checksum(base)})
 
     def decode(
         self,
@@ -78,15 +84,16 @@ class ResidualCodec:
         """The crop again, on the base crop that the edge had; `BaseMissingError` on any other."""
         if base_bgr is None or base_bgr.shape != (size[1], size[0], 3):
             raise BaseMissingError(f"a residual still of {size[0]}x{size[1]} has no base crop of that size")
-        if parameters.get(CHECKSUM) != _checksum(base_bgr):
+        base = to_planar(base_bgr)
+        if parameters.get(CHECKSUM) != _checksum(base):
             raise BaseMissingError("a residual still builds on another base picture than the one at hand")
         qp, cabac = split_payload(data)
-        whole, base = padded_size(size), to_planar(base_bgr)
+        whole = padded_size(size)
         units = [parameter_sets(whole) + verbatim_picture(base), coded_slice(cabac, qp=qp, intra=False)]
         picture = decoded(units, decoder="h264", size=whole)
         sharper = base_bgr + difference_bgr(picture, base, size=size)
-        return np.asarray(np.clip(np.rint(sharper), 0, 255), np.uint8)
+        return np.asarray(np.clip(sharper, 0, 255), np.uint8)
 
 
-def _checksum(image_bgr: Image) -> int:
-    return zlib.crc32(image_bgr.tobytes())
+def _checksum(base: Planar) -> int:
+    return zlib.crc32(base.tobytes())

@@ -18,6 +18,7 @@ from hypothesis.strategies import SearchStrategy
 from hvt_common.protocol.messages import (
     MAX_PAYLOAD_BYTES,
     MAX_STILL_RESULTS,
+    MOST_UNKNOWN_FIELDS,
     AcknowledgedRange,
     AlsoShown,
     BacklogHeader,
@@ -31,6 +32,7 @@ from hvt_common.protocol.messages import (
     Feedback,
     Health,
     Info,
+    InfoRequest,
     Message,
     PackedMessage,
     RoiHeader,
@@ -45,6 +47,7 @@ from hvt_common.protocol.messages import (
     pack_backlog_units,
     parse_backlog_still,
     parse_backlog_units,
+    wire_version,
 )
 from hvt_common.protocol.messages.envelope import WIRE_VERSION, Nested
 from hvt_common.protocol.messages.fields import (
@@ -74,6 +77,7 @@ MESSAGES: tuple[type[Message], ...] = (
     TrackStep,
     Info,
     Status,
+    InfoRequest,
     ControlRequest,
     ControlAnswer,
     Feedback,
@@ -256,7 +260,7 @@ def test_the_independent_packing_is_accepted():
         ({"sequence": None}, "BaseHeader.sequence: NoneType in place"),
         ({"sequence": [2]}, "BaseHeader.sequence: list in place"),
         ({"capture_ns": 2**63}, "BaseHeader.capture_ns: 9223372036854775808 is outside"),
-        ({"extra": 1}, "BaseHeader has 7 fields in place of 6"),
+        ({f"extra-{number}": 1 for number in range(17)}, "BaseHeader has 23 fields, not 6 to 22"),
     ],
 )
 def test_a_wrong_field_is_named(changed, said):
@@ -297,10 +301,47 @@ def test_an_empty_crop_or_inverted_box_is_refused(name, bad):
 
 def test_another_version_is_told_apart():
     """A newer edge would be reported as corrupt instead of as newer."""
-    with pytest.raises(UnknownVersionError, match="schema version 4, only 3 is known"):
-        BaseHeader.parse(sealed([4, "anything"]))
+    with pytest.raises(UnknownVersionError, match="schema version 5, only 3 and 4 are known") as newer:
+        BaseHeader.parse(sealed([5, "anything"]))
+    assert newer.value.between("edge uav-1", "this ground") == (
+        "edge uav-1 speaks wire version 5, this ground reads 3 and 4: update this ground"
+    )
+    with pytest.raises(UnknownVersionError) as older:
+        BaseHeader.parse(sealed([2, "anything"]))
+    assert older.value.between("edge uav-1", "this ground").endswith("update edge uav-1")
     with pytest.raises(WireError, match=r"begins with a version"):
         BaseHeader.parse(sealed([True, 1, 2, 3, 4, 5, 6]))
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_fields_of_a_later_minor_version_are_skipped(message):
+    """Every new field would need every ground and every edge to be updated on one day."""
+    values = msgpack.unpackb(message.pack())[:-1]
+    assert type(message).parse(sealed([*values, 0])) == message
+    room = type(message).MAX_BYTES - len(message.pack())
+    if room > 40:
+        assert type(message).parse(sealed([*values, "new", [1, {"a": None}], b"x"])) == message
+    with pytest.raises(WireError, match=f"{type(message).__name__} has"):
+        type(message).parse(sealed([*values, *[0] * (MOST_UNKNOWN_FIELDS + 1)]))
+    with pytest.raises(WireError, match=r"longer than|has|more than"):
+        type(message).parse(sealed([*values, bytes(type(message).MAX_BYTES)]))
+
+
+def test_fields_of_a_later_minor_version_are_skipped_in_nested_arrays_too():
+    """A new field of a track in a still would make the whole still unusable."""
+    values = msgpack.unpackb(ROI.pack())[:-1]
+    values[-1] = [[*one, "new"] for one in values[-1]]
+    assert RoiHeader.parse(sealed(values)) == ROI
+
+
+def test_the_version_before_is_read():
+    """What an edge has stored on its disk would be lost by an update."""
+    for message in EXAMPLES:
+        values = msgpack.unpackb(message.pack())[:-1]
+        since = {"still_codecs": (), "channels": ()} if isinstance(message, Info) else {}
+        older = sealed([3, *values[1 : len(values) - len(since)]])
+        assert type(message).parse(older) == replace(message, **since)
+        assert (wire_version(older), wire_version(message.pack())) == (3, WIRE_VERSION)
 
 
 def test_oversized_messages_are_not_looked_at():

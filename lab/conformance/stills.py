@@ -1,0 +1,139 @@
+"""``PYTHONPATH=. python -m lab.conformance.stills``: write docs/conformance/stills.json, a still of each codec.
+
+Encoders differ from machine to machine, so that these are made once; a test has the code of today read them. A reader
+without a decoder of H.264 takes the decoded picture from the vector, and checks all around it.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hvt_common.values import Image, View
+from hvt_common.video.exact_crop import exact_base_crop
+from hvt_common.video.still_codecs import Parameters, still_codec, still_codec_names
+from hvt_common.video.still_codecs.av_still import decoded
+from hvt_common.video.still_codecs.h264_intra import split_payload
+from hvt_common.video.still_codecs.h264_syntax import coded_slice, parameter_sets, verbatim_picture
+from hvt_common.video.still_codecs.yuv420 import Planar, padded_size, to_planar
+
+__all__ = ["FILE", "main", "vectors"]
+
+FILE = Path(__file__).resolve().parents[2] / "docs" / "conformance" / "stills.json"
+_BASE = (64, 48)
+_PLAIN = {"jpeg": (2, 24), "webp": (2, 24), "avif": (2, 24), "jxl": (2, 24)}
+"""Mean and largest difference in levels of another decoder's picture: each enlarges chroma in its way."""
+_CROPS = (
+    ("enlarged, odd sides", View((160, 120), _BASE, 0.4, (0.0, 0.0)), (37, 21, 78, 50), (41, 29)),
+    ("at a corner, with an offset", View((150, 120), _BASE, 0.4, (2.0, 0.0)), (0, 0, 33, 40), (33, 40)),
+    ("shrunk", View(_BASE, _BASE, 1.0, (0.0, 0.0)), (0, 4, 64, 44), (32, 20)),
+)
+
+
+def vectors() -> Iterator[dict[str, Any]]:
+    """One after the other; raises where a library is missing."""
+    planes = _base_planes()
+    for what, view, crop_px, size in _CROPS:
+        yield _residual(what, planes, view, crop_px, size)
+    crop = _texture(41, 29, seed=3)
+    yield _intra(crop)
+    for name, (mean, most) in _PLAIN.items():
+        if name not in still_codec_names():
+            raise SystemExit(f"{name} is not installed: install hvt[jxl] and an OpenCV with WebP and AVIF")
+        coded = still_codec(name).encode(crop, quality_pct=80)
+        pixels = still_codec(name).decode(coded.data, size=(41, 29))
+        yield _vector("a picture file", name, coded.data, (41, 29), pixels) | {
+            "tolerance": {"mean": mean, "most": most}
+        }
+
+
+def main() -> int:
+    """Write the file."""
+    lines = ",\n".join(json.dumps(one) for one in vectors())
+    FILE.write_text(f"[\n{lines}\n]\n", encoding="utf-8")
+    print(f"{FILE}: {lines.count(chr(10)) + 1} vectors")
+    return 0
+
+
+def _residual(
+    what: str,
+    planes: tuple[Planar, Planar, Planar],
+    view: View,
+    crop_px: tuple[int, int, int, int],
+    size: tuple[int, int],
+) -> dict[str, Any]:
+    base = exact_base_crop(planes, view=view, crop_source_px=crop_px, size=size)
+    detail = _texture(*size, seed=7).astype(np.int16) - 128
+    crop = np.asarray(np.clip(base + detail // 4, 0, 255), np.uint8)
+    codec = still_codec("residual")
+    coded = codec.encode(crop, quality_pct=70, base_bgr=base)
+    pixels = codec.decode(coded.data, size=size, parameters=coded.parameters, base_bgr=base)
+    reference, (qp, cabac) = to_planar(base), split_payload(coded.data)
+    units = [
+        parameter_sets(padded_size(size)) + verbatim_picture(reference),
+        coded_slice(cabac, qp=qp, intra=False),
+    ]
+    return _vector(what, "residual", coded.data, size, pixels, coded.parameters) | {
+        "crop_source_px": crop_px,
+        "view_scale": view.scale,
+        "view_offset_px": view.offset_px,
+        "base_size": _BASE,
+        "base_planes": [plane.tobytes().hex() for plane in planes],
+        "base_crop": base.tobytes().hex(),
+        "reference": reference.tobytes().hex(),
+        "stream": b"".join(units).hex(),
+        "decoded": decoded(units, decoder="h264", size=padded_size(size)).tobytes().hex(),
+    }
+
+
+def _intra(crop: Image) -> dict[str, Any]:
+    codec, size = still_codec("h264-intra"), (crop.shape[1], crop.shape[0])
+    data = codec.encode(crop, quality_pct=70).data
+    qp, cabac = split_payload(data)
+    unit = parameter_sets(padded_size(size)) + coded_slice(cabac, qp=qp, intra=True)
+    return _vector("one slice", "h264-intra", data, size, codec.decode(data, size=size)) | {
+        "stream": unit.hex(),
+        "decoded": decoded([unit], decoder="h264", size=padded_size(size)).tobytes().hex(),
+    }
+
+
+def _vector(
+    what: str,
+    codec: str,
+    data: bytes,
+    size: tuple[int, int],
+    pixels: Image,
+    parameters: Parameters | None = None,
+) -> dict[str, Any]:
+    return {
+        "codec": codec,
+        "what": what,
+        "size": size,
+        "parameters": dict(parameters or {}),
+        "payload": data.hex(),
+        "pixels": pixels.tobytes().hex(),
+    }
+
+
+def _base_planes() -> tuple[Planar, Planar, Planar]:
+    """Of a base picture: limited range, with blacks and whites beyond it, as a decoder may give."""
+    width, height = _BASE
+    luma = _texture(width, height, seed=1)[..., 0]
+    first, second = (_texture(width // 2, height // 2, seed=seed)[..., 0] for seed in (4, 5))
+    return luma, first, second
+
+
+def _texture(width: int, height: int, *, seed: int) -> Image:
+    """Smooth blotches of colour, the same everywhere: a file keeps them, so that no generator has to."""
+    coarse = np.random.default_rng(seed).integers(0, 256, (-(-height // 6), -(-width // 6), 3), np.uint8)
+    return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,51 @@
+"""Metres on the earth, and the pose between two."""
+
+from __future__ import annotations
+
+import pytest
+
+from hvt_common.geodesy import between, metres_per_degree, moved
+from hvt_common.values import Orientation, Pose
+
+
+@pytest.mark.parametrize(
+    ("latitude", "north_m", "east_m"),
+    [(0.0, 110_574, 111_320), (45.0, 111_132, 78_847), (60.0, 111_412, 55_800), (-52.0, 111_267, 68_678)],
+)
+def test_a_degree_is_as_long_as_tables_of_wgs_84_say(latitude, north_m, east_m):
+    """Places would be metres off, and nobody could say where."""
+    assert metres_per_degree(latitude) == pytest.approx((north_m, east_m), abs=1.0)
+
+
+def test_moving_there_and_back_returns_to_the_place():
+    """North and east, or their signs, would be mixed up."""
+    there = moved(52.0, 13.0, north_m=300, east_m=-400)
+    assert there[0] > 52.0
+    assert there[1] < 13.0
+    assert moved(*there, north_m=-300, east_m=400) == pytest.approx((52.0, 13.0), abs=1e-6)
+
+
+def test_longitudes_go_round():
+    """A ship that crosses the date line would jump around the world."""
+    assert moved(0.0, 179.9999, north_m=0, east_m=100)[1] == pytest.approx(-179.9992, abs=1e-4)
+    first, second = Pose(0, 0.0, 179.9998), Pose(10, 0.0, -179.9998)
+    assert abs(between(first, second, 5).longitude_deg) == pytest.approx(180.0, abs=1e-9)
+
+
+def test_angles_turn_the_shorter_way():
+    """A camera that pans through north would sweep over the whole horizon between two poses."""
+    first = Pose(0, 1.0, 2.0, camera=Orientation(350, -80, 170), height_m=10)
+    second = Pose(10, 1.0, 2.0, camera=Orientation(20, -90, -170), height_m=20)
+    middle = between(first, second, 5)
+    assert middle.camera is not None
+    assert middle.camera.yaw_deg == pytest.approx(5)
+    assert middle.camera.pitch_deg == pytest.approx(-85)
+    assert abs(middle.camera.roll_deg) == pytest.approx(180)
+    assert middle.height_m == pytest.approx(15)
+
+
+def test_what_only_one_knows_is_not_known_between():
+    """A pose would be made up of a value that nobody measured there."""
+    middle = between(Pose(0, 1.0, 2.0, height_m=10), Pose(10, 1.0, 2.0, position_error_m=9), 5)
+    assert middle.height_m is None
+    assert middle.position_error_m == 9
