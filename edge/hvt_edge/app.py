@@ -15,7 +15,7 @@ from hvt_common.runtime.health_server import HealthServer, state_answers
 from hvt_common.runtime.process import notify_systemd, with_lower_priority
 from hvt_common.runtime.reporting import StatusLine
 from hvt_common.units import SECOND_NS
-from hvt_common.values import View
+from hvt_common.values import Frame, View
 from hvt_edge.config import EdgeConfig, check_rate
 from hvt_edge.control.link_control import wait_for_ground
 from hvt_edge.health.heartbeat import Heartbeat
@@ -32,7 +32,16 @@ from hvt_edge.source.demo import check_truth
 from hvt_edge.source.live import closing_on
 from hvt_edge.status import StatusReporter, status_text
 from hvt_edge.summary import summary
-from hvt_edge.wiring import Stages, build_stages, check_codecs, check_files, check_store, track_confidence
+from hvt_edge.wiring import (
+    Stages,
+    as_the_camera_is,
+    build_stages,
+    check_codecs,
+    check_files,
+    check_store,
+    qualify_encoder,
+    track_confidence,
+)
 from hvt_edge.world import World
 
 __all__ = ["Edge"]
@@ -86,9 +95,14 @@ class Edge:
             if config.metrics is not None:
                 stack.enter_context(self._health_server(config.metrics))
             source = stack.enter_context(world.open_source(config))
+            config = self._config = as_the_camera_is(config, source)
+            pose_source = world.open_pose(config, source)
+            if pose_source is not None:
+                stack.callback(pose_source.close)
             check_truth(config.truth, source)
             check_store(config, live=source.live)
             check_rate(config, source.view.base_size)
+            headroom = qualify_encoder(config, source, clock=world.clock, stop=self._stop)
             background = (lambda call: call()) if self._lockstep else with_lower_priority
             opened = background(lambda: world.open_detector(config))
             background(lambda: world.warm_up(config, opened, source))
@@ -107,6 +121,7 @@ class Edge:
                 stack,
                 config,
                 source=source,
+                pose_source=pose_source,
                 detector=detector,
                 link=link,
                 session_id=world.session_id,
@@ -116,6 +131,7 @@ class Edge:
                 clock=world.clock,
                 loop_clock=self._loop_clock,
                 wait_until=self._wait_until,
+                headroom=headroom,
             )
             heartbeat = Heartbeat(self._state_maker(stages, link, source.view), clock=world.clock)
             self._heartbeat = heartbeat
@@ -124,6 +140,7 @@ class Edge:
                 info=stages.info.info,
                 control=stages.commands.answer,
                 on_feedback=stages.link_control.on_feedback,
+                on_info_request=stages.still_readers.on_request,
                 reply=stages.transmitter.reply,
             )
             self._on_started()
@@ -174,6 +191,7 @@ class Edge:
                 if frame is not None:
                     self._counts.newest_came_ns = self._world.clock()
                 pace.step(frame, missed=source.missed)
+                self._step_pose(stages, frame)
                 del frame  # 9 MB at 1080p, while the next is read
                 now_ns = self._loop_clock()
                 if now_ns >= next_status_ns:
@@ -190,6 +208,16 @@ class Edge:
             stages.link_control.finish(
                 stop=self._stop, note=line.note, turn=lambda: heartbeat.turn("running")
             )
+
+    def _step_pose(self, stages: Stages, frame: Frame | None) -> None:
+        """A slow machine plays a clip longer, and what it shows comes later."""
+        if stages.pose is None or frame is None:
+            return
+        stages.pose.step(
+            frame.capture_ns - stages.operating.now.started_ns,
+            capture_ns=frame.capture_ns + self._counts.paused_ns,
+            now_ns=self._loop_clock(),
+        )
 
     def _make_pace(self, source: Source, stages: Stages, link: EdgeLink) -> LockstepPace | RealtimePace:
         if self._lockstep:

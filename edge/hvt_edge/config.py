@@ -37,6 +37,7 @@ from hvt_edge.profiles import PROFILES, REGIMES
 from hvt_edge.source.contract import check_shape
 from hvt_edge.stills.policy.registry import METHODS, method, tuning
 from hvt_edge.video.encoder_settings import PRESETS, least_base_bps
+from hvt_edge.video.encoders.registry import PASSTHROUGH, X265, check_encoder
 from hvt_edge.video.share import FIRST_SHARE
 
 __all__ = [
@@ -60,6 +61,8 @@ LEAST_FPS = 2.0
 """To this ``--fps auto`` may fall: two frames in a window of a second."""
 _AUTO_FIRST_SHARE = 0.95
 """With ``--profile auto`` stills begin with the least."""
+POSE_BPS = 1_200
+"""What ``--pose`` takes of the budget: a message a second."""
 TRACKS_BPS = 8_000
 """What ``--send-tracks`` takes of the budget: about that for 45 boxes three times a second."""
 
@@ -106,6 +109,14 @@ class EdgeConfig:
     )
     source_fps: float | None = _SOURCE_RARE.option(
         number(0.1, 1000), None, "frame rate of an image folder, or instead of what a file says"
+    )
+    pose: str | None = _SOURCE.option(
+        TEXT,
+        None,
+        "where the camera is: FILE.csv, .srt (DJI), .gpx, fixed:LAT,LON,HEIGHT,AZIMUTH,TILT or mavlink:…",
+    )
+    fov: float | None = _SOURCE_RARE.option(
+        number(1, 179, unit=" degrees"), None, "horizontal field of view, where --pose does not say it"
     )
     seed: int = _SOURCE_RARE.option(integer(0, 2**31 - 1), 0, "seed of the demo scene")
     max_frames: int | None = _SOURCE_RARE.option(integer(1, 10**9), None, "end after this many base frames")
@@ -199,6 +210,11 @@ class EdgeConfig:
         AUTO,
         "time between keyframes beside those that grounds ask for; 0 for none; auto: 10s, up to 60s on a thin link",
     )
+    encoder: str = _SENT_RARE.option(
+        TEXT,
+        X265,
+        "x265, hevc_nvenc, hevc_qsv, hevc_v4l2m2m, one that a package brings, or passthrough: a camera's own HEVC",
+    )
     preset: str = _SENT_RARE.option(choice(*PRESETS), "veryfast", "x265 preset")
 
     detector: str = _MODELS.option(
@@ -257,7 +273,9 @@ class EdgeConfig:
     store_age: float = _FILES_RARE.option(
         DURATION, 3600.0, "what an earlier run stored longer ago than this is dropped at the start"
     )
-    record_base: Path | None = _FILES.option(PATH, None, "also keep the base stream in this Matroska file")
+    record_base: Path | None = _FILES_RARE.option(
+        PATH, None, "also keep the base stream in this Matroska file"
+    )
     truth: Path | None = _FILES_RARE.option(PATH, None, "write the demo's ground truth, MOTChallenge form")
     metrics: str | None = _FILES_RARE.option(
         TEXT,
@@ -323,9 +341,14 @@ class EdgeConfig:
         return self.profile == "auto"
 
     @property
+    def passes_through(self) -> bool:
+        """Whether the camera's own units are the base stream: its size, rate and keyframes are not the edge's."""
+        return self.encoder == PASSTHROUGH
+
+    @property
     def metadata_bps(self) -> int:
         """What is kept for messages beside base and stills, in bits a second."""
-        return TRACKS_BPS if self.send_tracks else 0
+        return (TRACKS_BPS if self.send_tracks else 0) + (POSE_BPS if self.pose else 0)
 
     @property
     def base_bps(self) -> int:
@@ -354,13 +377,17 @@ def with_profile(config: EdgeConfig, *, given: Collection[str]) -> EdgeConfig:
     Without a profile it is auto, unless the user says which method to fly.
     """
     profile = config.profile
-    if profile is None:
-        if not {"method", "regime"}.isdisjoint(given):
-            return config
+    if profile is None and {"method", "regime"}.isdisjoint(given):
         profile = "auto"
-    settings = {"profile": profile, **PROFILES[profile]}
+    settings = {} if profile is None else {"profile": profile, **PROFILES[profile]}
     if config.regime is not None:  # which sets the share itself
         settings.pop("video_share", None)
+    if config.encoder != X265:  # no other takes regions
+        settings.pop("roi_depth", None)
+    if config.encoder == PASSTHROUGH:  # the camera decides on rate, size and bits
+        settings = {**settings, "fps": AUTO, "size": None}
+        if settings.get("video_share") == AUTO:
+            settings["video_share"] = _AUTO_FIRST_SHARE
     if "candidates" in given and config.candidates != "source":
         settings.pop("tiles", None)
     return replace(config, **{name: value for name, value in settings.items() if name not in given})
@@ -376,7 +403,15 @@ def check(config: EdgeConfig) -> EdgeConfig:
         raise UserError(
             f"--regime {config.regime} already sets --budget and --video-share: leave one or the other out"
         )
+    check_encoder(config.encoder)
     config = _with_rates(config)
+    if config.roi_depth and config.encoder != X265:
+        raise UserError(
+            f"--roi-depth {config.roi_depth:g} needs x265, and --encoder {config.encoder} takes no regions: "
+            "give --roi-depth 0, and not --method R0"
+        )
+    if config.passes_through:
+        _check_passthrough(config)
     if not _LEAST_WINDOW_S <= config.window <= _MOST_WINDOW_S or config.window < 2 / config.nominal_fps:
         raise UserError(
             f"--window {config.window:g}s is not accepted: give {_LEAST_WINDOW_S:g}s to {_MOST_WINDOW_S:g}s, and two "
@@ -399,7 +434,12 @@ def check(config: EdgeConfig) -> EdgeConfig:
 
 
 def check_rate(config: EdgeConfig, size: tuple[int, int]) -> None:
-    """Raise `UserError` where x265 cannot follow what the budget leaves to the base stream at this size."""
+    """Raise `UserError` where x265 cannot follow what the budget leaves to the base stream at this size.
+
+    What a camera takes is measured (`hvt_edge.video.encoders.passthrough`).
+    """
+    if config.passes_through:
+        return
     fps = LEAST_FPS if config.auto_fps else config.nominal_fps
     least_bps = least_base_bps(size, fps, edge_id=config.edge_id)
     if config.base_bps < least_bps:
@@ -420,6 +460,18 @@ def _with_rates(config: EdgeConfig) -> EdgeConfig:
         raise UserError(f"--video-share {share:g} leaves no base stream: give more than 0, at most 1")
     depth = _R0_DEPTH if policy.name == "R0" and not config.roi_depth else config.roi_depth
     return replace(config, budget=config.budget or regime.budget_bps, video_share=share, roi_depth=depth)
+
+
+def _check_passthrough(config: EdgeConfig) -> None:
+    """What the camera decides cannot be set."""
+    if config.size == AUTO:
+        raise UserError(
+            "--size auto is not accepted with --encoder passthrough, which sends the camera's own size: leave it out"
+        )
+    if config.video_share == AUTO:
+        raise UserError(
+            "--video-share auto is not accepted with --encoder passthrough, whose rate is the camera's: give a share"
+        )
 
 
 def _check_stills(config: EdgeConfig) -> None:

@@ -7,6 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
 from hvt_common import __version__
+from hvt_common.protocol.channels import Channel
 from hvt_common.protocol.ledger import Ledger
 from hvt_common.protocol.messages import (
     MOST_FAILED_PARTS,
@@ -41,6 +42,9 @@ class InfoReporter:
     operating: Operating
     view: View
     class_names: tuple[str, ...]
+    channels: tuple[Channel, ...]
+    still_codecs: Callable[[], tuple[str, ...]]
+    """Those of the stills that are sent now."""
     clock: Callable[[], int]
 
     def info(self, received_ns: int | None = None) -> bytes:
@@ -66,6 +70,8 @@ class InfoReporter:
             class_names=self.class_names,
             received_ns=answered_ns if received_ns is None else received_ns,
             answered_ns=answered_ns,
+            still_codecs=self.still_codecs(),
+            channels=self.channels,
         )
         return info.pack()
 

@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from contextlib import ExitStack
 from typing import cast
 
+from hvt_common.errors import UserError
 from hvt_common.inference.detect import Detector
 from hvt_common.runtime.clock import SteadyClock
 from hvt_common.runtime.failures import Failures
@@ -15,6 +16,9 @@ from hvt_common.values import Fit
 from hvt_edge.config import EdgeConfig
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink, ZenohLink
+from hvt_edge.pose.opening import PoseSource, open_pose
+from hvt_edge.pose.table import PoseTable
+from hvt_edge.source.demo import DemoSource
 from hvt_edge.source.opening import Source, open_source
 from hvt_edge.wiring import base_size, make_detector, make_link_settings, warm_up_for
 
@@ -53,9 +57,20 @@ class World:
             seed=config.seed,
             max_frames=config.max_frames,
             source_fps=config.source_fps,
+            coded=config.passes_through,
             clock=self.clock,
             failures=self.failures,
         )
+
+    def open_pose(self, config: EdgeConfig, source: Source) -> PoseSource | None:
+        """Open what ``--pose`` names; None without. Raises `UserError` where nothing usable is there."""
+        if config.pose is None:
+            return None
+        if config.pose == "demo":
+            if not isinstance(source, DemoSource):
+                raise UserError(f"--pose demo is of the drawn scene, and --source is {config.source}")
+            return PoseTable(source.poses())
+        return open_pose(config.pose, hfov_deg=config.fov, clock=self.clock)
 
     def open_link(self, stack: ExitStack, config: EdgeConfig) -> EdgeLink:
         """Open the link until ``stack`` closes. Raises `UserError` for a bad port, endpoint or edge id."""

@@ -145,6 +145,11 @@ class BacklogStage:
         """Whether the next stored frame should be a keyframe that begins a segment."""
         return self._segment_ns is None or now_ns - self._segment_ns >= SEGMENT_NS
 
+    @property
+    def segment_open(self) -> bool:
+        """Whether what is stored goes on from a keyframe without a hole."""
+        return self._segment_ns is not None
+
     def base(self, unit: AccessUnit, *, now_ns: int, sent: bool = False) -> None:
         """Store a frame; ``sent``: it goes out too."""
         if sent:

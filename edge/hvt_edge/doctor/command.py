@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 import time
 from collections.abc import Callable, Sequence
 
@@ -29,14 +30,16 @@ from hvt_common.video.hevc import BaseDecoder
 from hvt_edge.config import EdgeConfig, check, with_profile
 from hvt_edge.loop.cpu import Cores, CpuMeter
 from hvt_edge.source.contract import Source
-from hvt_edge.video.x265 import BaseEncoder
+from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.wiring import (
+    as_the_camera_is,
     check_codecs,
     check_files,
     check_store,
     first_decimation,
     make_encoder,
     make_link_settings,
+    qualify_encoder,
     store_folder,
 )
 from hvt_edge.world import World
@@ -99,6 +102,11 @@ class _Checks:
         """Opens it, and looks for two seconds how many pictures it gives."""
         config = self._config
         source = self._world.open_source(config)
+        try:
+            self._config = as_the_camera_is(config, source)
+        except UserError:
+            source.close()
+            raise
         frames = source.frames(start_ns=self._world.clock())
         first = next(frames, None)
         if first is None:
@@ -150,11 +158,14 @@ class _Checks:
                 "unknown", f"stills work ({config.still_codec}); no picture to code without a source"
             )
         size = self._source.view.base_size
+        qualify_encoder(config, self._source, clock=self._world.clock, stop=threading.Event())
         encoder = self._encoder(size)
         picture = BaseDecoder(size=size).decode_yuv(encoder.encode(self._frames[0], keyframe=True).data)
         if picture is None:
-            return Finding("wrong", "x265's picture could not be decoded", "install the package av anew")
-        return Finding("ok", f"x265 and {config.still_codec} code and decode")
+            return Finding(
+                "wrong", f"{config.encoder}'s picture could not be decoded", "install the package av anew"
+            )
+        return Finding("ok", f"{config.encoder} and {config.still_codec} code and decode")
 
     def processor(self) -> Finding:
         """What every frame would take, against what others leave."""
@@ -177,7 +188,10 @@ class _Checks:
         free = meter.now.free
         if meter.now == Cores():  # this system does not say
             free = float(os.cpu_count() or 1)
-        found = f"about {needed:.1f} cores of {free:.1f} that are free; x265 codes {most_fps:.0f} fps of {fps:g} here"
+        codes = f"{config.encoder} codes {most_fps:.0f} fps of {fps:g} here"
+        if config.passes_through:
+            codes = "the camera codes"
+        found = f"about {needed:.1f} cores of {free:.1f} that are free; {codes}"
         if needed > free or most_fps < fps:
             todo = "lower --fps or --size, give --preset ultrafast or --method M0; else frames are left out"
             return Finding("warning", found, todo)
@@ -221,7 +235,7 @@ class _Checks:
 
         return check_link(settings, find_peer, other="ground")
 
-    def _encoder(self, size: tuple[int, int]) -> BaseEncoder:
+    def _encoder(self, size: tuple[int, int]) -> Encoder:
         config = self._config
         return make_encoder(
             config,

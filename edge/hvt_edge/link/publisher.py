@@ -11,7 +11,14 @@ from typing import Protocol, Self
 import zenoh
 
 from hvt_common.protocol.channels import Channel, EdgeKeys
-from hvt_common.protocol.messages import ControlAnswer, ControlRequest, Feedback, WireError
+from hvt_common.protocol.messages import (
+    ControlAnswer,
+    ControlRequest,
+    Feedback,
+    InfoRequest,
+    UnknownVersionError,
+    WireError,
+)
 from hvt_common.runtime.failures import Failures
 from hvt_common.transport.doctor.diagnose import LinkWatch
 from hvt_common.transport.duplicate_edge import refuse_duplicate_edge
@@ -24,7 +31,7 @@ __all__ = ["EdgeLink", "EdgeListener", "ZenohLink"]
 
 _log = logging.getLogger(__name__)
 
-_PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.BACKLOG, Channel.STATUS)
+_PUBLISHED = (Channel.BASE, Channel.ROI, Channel.TRACKS, Channel.POSE, Channel.BACKLOG, Channel.STATUS)
 _MOST_PER_S = 1000
 """Requests, or reports: a ground sends some ten a second."""
 _NEEDED = (Channel.BASE, Channel.ROI, Channel.STATUS)
@@ -58,6 +65,7 @@ class EdgeLink(Outlet, Protocol):
         info: Callable[[int], bytes],
         control: Callable[[ControlRequest], ControlAnswer],
         on_feedback: Callable[[Feedback], None],
+        on_info_request: Callable[[InfoRequest], None] = lambda _request: None,
         reply: Callable[[Channel, bytes], bytes] = lambda _channel, payload: payload,
     ) -> None:
         """Answer grounds from now on: all that answers them is there."""
@@ -120,6 +128,7 @@ class ZenohLink:
         info: Callable[[int], bytes],
         control: Callable[[ControlRequest], ControlAnswer],
         on_feedback: Callable[[Feedback], None],
+        on_info_request: Callable[[InfoRequest], None] = lambda _request: None,
         reply: Callable[[Channel, bytes], bytes] = lambda _channel, payload: payload,
     ) -> None:
         """Answer grounds from now on; see `EdgeListener`."""
@@ -129,6 +138,7 @@ class ZenohLink:
             info=info,
             control=control,
             on_feedback=on_feedback,
+            on_info_request=on_info_request,
             reply=reply,
             failures=self._failures,
             clock=self._clock,
@@ -146,9 +156,9 @@ class ZenohLink:
 class EdgeListener:
     """Queryables info and control; a subscriber of feedback; last the alive token, by which grounds find the edge.
 
-    ``info(received_ns)``, ``control(request)`` and ``on_feedback(feedback)`` run in Zenoh's callbacks and must be
-    quick; ``reply(channel, payload)`` gives the payload back as it leaves (`Transmitter.reply`); ``clock`` is that of
-    the headers.
+    ``info(received_ns)``, ``on_info_request(request)`` before it, ``control(request)`` and ``on_feedback(feedback)``
+    run in Zenoh's callbacks and must be quick; ``reply(channel, payload)`` gives the payload back as it leaves
+    (`Transmitter.reply`); ``clock`` is that of the headers.
     """
 
     session: zenoh.Session
@@ -157,6 +167,7 @@ class EdgeListener:
     info: Callable[[int], bytes]
     control: Callable[[ControlRequest], ControlAnswer]
     on_feedback: Callable[[Feedback], None]
+    on_info_request: Callable[[InfoRequest], None]
     reply: Callable[[Channel, bytes], bytes]
     failures: Failures
     clock: Callable[[], int]
@@ -165,6 +176,7 @@ class EdgeListener:
         self._flood = FloodWatch(most_per_s=_MOST_PER_S)
         self.unusable = 0
         """Messages from grounds that were skipped: damaged, foreign or of another version."""
+        self._version_said = False
         serve(self.session, Channel.INFO, keys=self.keys, answer=self._on_info)
         serve(self.session, Channel.CONTROL, keys=self.keys, answer=self._on_control)
         self._feedback = self.session.declare_subscriber(self.keys.key(Channel.FEEDBACK), self._on_feedback)
@@ -180,7 +192,12 @@ class EdgeListener:
     def __exit__(self, *_error: object) -> None:
         self.close()
 
-    def _on_info(self, _query: bytes) -> bytes | None:
+    def _on_info(self, query: bytes) -> bytes | None:
+        if query:
+            try:
+                self.on_info_request(InfoRequest.parse(query))
+            except WireError as error:  # who asks so is answered all the same
+                self._skip("info", error)
         return self._answered(Channel.INFO, lambda: self.info(self.clock()))
 
     def _on_control(self, query: bytes) -> bytes | None:
@@ -222,5 +239,10 @@ class EdgeListener:
 
     def _skip(self, channel: str, error: WireError) -> None:
         self.unusable += 1
+        if isinstance(error, UnknownVersionError):
+            if not self._version_said:
+                self._version_said = True
+                _log.warning("%s", error.between("a ground", f"edge {self.keys.edge}"))
+            return
         if self.unusable.bit_count() == 1:  # 1, 2, 4, 8 …: a flood does not fill the log
             _log.warning("%s message skipped (%d so far): %s", channel, self.unusable, error)

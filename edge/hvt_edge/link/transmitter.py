@@ -2,7 +2,7 @@
 
 Base first, then metadata, stills by utility, the backlog. Four threads send:
 
-* the frame loop: `base`, `status`, and what it stores in place of sending;
+* the frame loop: `base`, `status`, `pose`, and what it stores in place of sending;
 * the stills' thread: `tracks` and `still`;
 * the store's thread: `backlog`;
 * the link's callbacks: `reply`, what grounds asked of ``info`` and ``control``.
@@ -87,10 +87,12 @@ class Transmitter:
         self._newest: StillEnvelope | None = None
         self._ended = False
 
-    def base(self, unit: AccessUnit, *, now_ns: int, after_hole: bool = False) -> int:
+    def base(self, unit: AccessUnit, *, now_ns: int, after_hole: bool = False, announced: bool = True) -> int:
         """Send one access unit as soon as the budget's window has room for it; return its line bytes.
 
         ``after_hole``: frames that it builds on were not sent. A number is left out, so that nobody shows it.
+        ``announced``: stills yield to a keyframe beforehand; else the budget keeps room for another that comes by
+        itself.
         """
         line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
         with self._lock:
@@ -106,7 +108,7 @@ class Transmitter:
             )
             attachment = header.pack(unit.data)
             line_bytes = self._count(Channel.BASE, Account.BASE, unit.data, attachment, at_ns=at_ns)
-            self.budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
+            self.budget.record_base(line_bytes, now_ns=at_ns, keyframe=unit.keyframe and announced)
             if self.pacer is not None:
                 self.pacer.sent_base(self.base_sequence, line_bytes, now_ns=at_ns, keyframe=unit.keyframe)
             if self.in_flight is not None:
@@ -246,6 +248,10 @@ class Transmitter:
         """Send the edge's own tracks of one decision step, made for the moment at which they may go."""
         self._metadata(Channel.TRACKS, make, now_ns=now_ns)
 
+    def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
+        """Send where the camera is, made for the moment at which it may go."""
+        self._metadata(Channel.POSE, make, now_ns=now_ns)
+
     def status(self, make: Callable[[int], Status], *, now_ns: int, last: bool = False) -> None:
         """Send the once-a-second report, made for the moment at which it may go.
 
@@ -280,6 +286,13 @@ class Transmitter:
         with self._lock:
             line_bytes = round(self.budget.base_step_bytes)
             return max(0, self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True) - now_ns)
+
+    def base_unit_wait_ns(self, unit: AccessUnit, *, now_ns: int) -> int | None:
+        """How long this unit would wait for the budget's window; None where no window would have room for it."""
+        line_bytes = self._line_bytes(Channel.BASE, unit.data, BASE_ATTACHMENT_BYTES)
+        with self._lock:
+            at_ns = self.budget.earliest_ns(line_bytes, now_ns=now_ns, base=True)
+            return at_ns - now_ns if self.budget.fits(line_bytes, now_ns=at_ns) else None
 
     def takes_ns(self, line_bytes: int) -> int:
         """How long so many line bytes take the whole budget."""

@@ -23,7 +23,7 @@ from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.point import LoopClock
 from hvt_edge.perception.analyzer import AnalyzedFrame
 from hvt_edge.stills.stage import StillStage
-from hvt_edge.video.stage import BaseStage
+from hvt_edge.video.passthrough import VideoStage
 
 __all__ = ["LockstepPace"]
 
@@ -46,7 +46,7 @@ class LockstepPace:
     perception beside the next frame's encoding; it is closed with the pace.
     """
 
-    base: BaseStage
+    base: VideoStage
     stills: StillStage
     _: KW_ONLY
     inbox: FeedbackInbox
@@ -79,7 +79,7 @@ class LockstepPace:
         self.counts.captured += 1
         now_ns = frame.capture_ns
         began_ns = time.perf_counter_ns()
-        decision = self.base.decide(frame.index, now_ns=now_ns)
+        decision = self.base.decide(frame, now_ns=now_ns)
         unit = self.base.encode(frame, decision, now_ns=now_ns, tracks=self.stills.latest_tracks)
         if unit is not None:
             self.counts.note(frame, encode_ns=time.perf_counter_ns() - began_ns)

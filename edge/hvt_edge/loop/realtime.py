@@ -15,7 +15,7 @@ from hvt_edge.loop.counts import FrameCounts
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.stills.worker import StillWorker
 from hvt_edge.video.frame_decision import Action
-from hvt_edge.video.stage import BaseStage
+from hvt_edge.video.passthrough import VideoStage
 
 __all__ = ["RealtimePace"]
 
@@ -41,7 +41,7 @@ class RealtimePace:
     same, and only their analysis is skipped. ``before_frame(now_ns)`` runs first, so that rates can track the link.
     """
 
-    base: BaseStage
+    base: VideoStage
     stills: StillStage
     _: KW_ONLY
     inbox: FeedbackInbox
@@ -80,7 +80,8 @@ class RealtimePace:
         behind = newly_missed > 0
         if not self.live:
             frame = self._by_clip_clock(frame)
-            in_time = self._in_time(frame)
+            # A camera's own unit is never left out: all that follow build on it. The clip is played slower.
+            in_time = self._in_time(frame) or frame.camera_unit is not None
             shown_lately = self.clock() - self._sent_ns < _MOST_GAP_NS
             if not in_time and frame.capture_ns < self._must_code_ns and shown_lately:
                 self._drop(1)
@@ -90,18 +91,19 @@ class RealtimePace:
         now_ns = self.clock()
         self.before_frame(now_ns)
         began_ns = self.clock()
-        decision = self.base.decide(frame.index, now_ns=now_ns)
-        unit = self.base.encode(frame, decision, now_ns=now_ns, tracks=self.stills.latest_tracks)
+        decision = self.base.decide(frame, now_ns=now_ns)
+        decided_ns = self.clock()  # later, where a camera's own unit waited for its room
+        unit = self.base.encode(frame, decision, now_ns=decided_ns, tracks=self.stills.latest_tracks)
         encoded_ns = self.clock()
         if unit is not None:
-            self.counts.note(frame, encode_ns=encoded_ns - began_ns)
+            self.counts.note(frame, encode_ns=encoded_ns - decided_ns)
             self.base.send(unit, decision, now_ns=encoded_ns)
         elif decision.action is Action.HOLD:
             self.counts.dropped_link += 1
         self._sent_ns = self.clock()
-        sending_ns = self._sent_ns - encoded_ns
+        sending_ns = decided_ns - began_ns + self._sent_ns - encoded_ns
         self._link_late_ns = min(_MOST_LINK_LATE_NS, self._link_late_ns + sending_ns)
-        self._link_bound = sending_ns > max(encoded_ns - began_ns, _LINK_BOUND_NS)
+        self._link_bound = sending_ns > max(encoded_ns - decided_ns, _LINK_BOUND_NS)
         # Video goes first: perception gets no frame while the loop is late.
         self.counts.unanalyzed += not self._worker.take(frame, unit, late=behind)
 

@@ -36,6 +36,8 @@ class KeyframeSettings:
     frame in twenty, two seconds would show half of what 0.7 s shows."""
     request_share: float = 0.35
     """Of the budget, for keyframes that nobody needs as far as the edge can tell."""
+    camera_every_s: float | None = None
+    """The camera makes its own keyframes, about so far apart, and none on request; None: the edge makes them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +95,11 @@ class KeyframeRequests:
         What costs no keyframe of its own is always served: one is due already, or the newest one is so fresh that it
         crossed the request on the way.
         """
+        if self.settings.camera_every_s is not None:
+            return (
+                "the camera's own video is sent (--encoder passthrough), and it makes no keyframe on request: the "
+                f"next comes by itself, one each {self.settings.camera_every_s:.1f} s or so"
+            )
         with self._lock:
             state = self._state
             fresh = state.last_ns is not None and now_ns - state.last_ns < self.settings.rest_ns
@@ -107,7 +114,9 @@ class KeyframeRequests:
             return None
 
     def require(self, now_ns: int) -> None:
-        """The edge itself wants one, because something is to change with it."""
+        """The edge itself wants one, because something is to change with it; a camera's next one will do."""
+        if self.settings.camera_every_s is not None:
+            return
         with self._lock:
             self._add(now_ns)
 

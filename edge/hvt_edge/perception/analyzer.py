@@ -12,7 +12,7 @@ import numpy as np
 from hvt_common.runtime.statistics import DistinctIds
 from hvt_common.tracking.bytetrack import ByteTracker
 from hvt_common.values import AccessUnit, Detections, Frame, Image, Tracks, View
-from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.hevc import BaseDecoder, YuvPicture
 
 __all__ = ["AnalyzedFrame", "Analyzer", "AnalyzerSettings", "FailingDetector"]
 
@@ -40,6 +40,8 @@ class AnalyzedFrame:
     tracks: Tracks
     detected: bool
     """A decision step: the detector ran on this frame."""
+    picture: YuvPicture | None = None
+    """The same as `base_bgr`, as it was decoded: what a still may build on."""
 
     @property
     def coded(self) -> bool:
@@ -48,7 +50,7 @@ class AnalyzedFrame:
 
 
 class _Decoder(Protocol):
-    def decode(self, data: bytes) -> Image | None: ...
+    def decode_yuv(self, data: bytes) -> YuvPicture | None: ...
 
 
 class FailingDetector(Protocol):
@@ -128,24 +130,25 @@ class Analyzer:
         return analyzed
 
     def _analyze(self, frame: Frame, unit: AccessUnit | None, *, hurry: bool) -> AnalyzedFrame:
-        base_bgr = None if unit is None else self._decode(frame.index, unit)
+        picture = None if unit is None else self._decode(frame.index, unit)
+        base_bgr = None if picture is None else picture.bgr()
         pixels = frame.base_bgr if self._settings.candidates == "source" else base_bgr
         due = not hurry and self._due(frame.index, coded=unit is not None)
         detections = self._detect(frame, base_bgr) if due else None
         if detections is None:
             tracks = self._tracker.predict(frame_index=frame.index, image_bgr=pixels)
-            return AnalyzedFrame(frame, base_bgr, tracks, detected=False)
+            return AnalyzedFrame(frame, base_bgr, tracks, detected=False, picture=picture)
         self._detected_index = frame.index
         tracks = self._tracker.update(detections, frame_index=frame.index, image_bgr=pixels)
-        return AnalyzedFrame(frame, base_bgr, tracks, detected=True)
+        return AnalyzedFrame(frame, base_bgr, tracks, detected=True, picture=picture)
 
-    def _decode(self, index: int, unit: AccessUnit) -> Image:
-        base_bgr = self._decoder.decode(unit.data)
-        assert base_bgr is not None, "the edge decodes what it has just encoded"
+    def _decode(self, index: int, unit: AccessUnit) -> YuvPicture:
+        picture = self._decoder.decode_yuv(unit.data)
+        assert picture is not None, "the edge decodes what it has just encoded"
         if self._coded_index is not None:
             self._coded_gap = index - self._coded_index
         self._coded_index = index
-        return base_bgr
+        return picture
 
     def _due(self, index: int, *, coded: bool) -> bool:
         """Whether the detector is to run on this frame. By frame counts alone, never by a clock."""

@@ -5,17 +5,48 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Self
 
 from hvt_common.errors import UserError
 from hvt_common.values import Frame, View
 
-__all__ = ["BaseSize", "Source", "check_shape", "size_within"]
+__all__ = ["BaseSize", "CameraStream", "SeenUnit", "Source", "check_shape", "size_within"]
 
 BaseSize = tuple[int, int] | Callable[[tuple[int, int]], tuple[int, int]]
 """(width, height) of the base frames, or how they follow from those of the source."""
 
 _LEAST_SIDE_PX, _MOST_SIDE_PX = 64, 8192
+
+
+@dataclass(frozen=True, slots=True)
+class SeenUnit:
+    """One access unit that was looked at before the flight."""
+
+    at_s: float
+    """By the camera's time stamps, from its first unit on."""
+    size_bytes: int
+    """With the parameter sets that a keyframe is given."""
+    keyframe: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CameraStream:
+    """What was seen of the stream before the flight: of a file its first minutes, of a camera some seconds."""
+
+    units: tuple[SeenUnit, ...]
+    """The first is a keyframe."""
+    fps: float
+    """As its time stamps say."""
+
+    @property
+    def keyframe_s(self) -> float:
+        """From one keyframe to the next at the longest; where there was no second one, how long was looked for it."""
+        times = [unit.at_s for unit in self.units if unit.keyframe]
+        return max(
+            (later - earlier for earlier, later in pairwise([*times, self.units[-1].at_s])), default=0.0
+        )
 
 
 class Source(ABC):
@@ -35,6 +66,11 @@ class Source(ABC):
     """Frames of a live source for which the reader was too slow."""
     restarts: int = 0
     """How often a live source was opened again."""
+    camera_stream: CameraStream | None = None
+    """The camera's own HEVC, where each frame comes with its unit of it (`Frame.camera_unit`). An index that is left
+    out is a unit that was lost."""
+    warning: str = ""
+    """What the camera's own stream does to what is shown, in a sentence; empty for nothing."""
 
     @abstractmethod
     def frames(self, *, start_ns: int) -> Iterator[Frame]:

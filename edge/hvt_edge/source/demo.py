@@ -22,7 +22,7 @@ import numpy as np
 
 from hvt_common.errors import UserError
 from hvt_common.units import exact_rate
-from hvt_common.values import Fit, Frame, Image, View
+from hvt_common.values import Fit, Frame, Image, Pose, View
 from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.resample import Resizer, capture_time_ns
 
@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 _END_S = 5.0
+_POSES_PER_S = 5
 SCENE_WORDS: Mapping[str, tuple[str, Any]] = {"codes": ("codes", True), "4k": ("size", (3840, 2160))}
 """What may follow ``demo:``, and the argument of the scene that it is."""
 
@@ -69,6 +70,10 @@ class DrawnScene(Protocol):
         """The picture at a moment: BGR, uint8, (height, width, 3)."""
         ...
 
+    def pose(self, t_s: float) -> Pose:
+        """Where the camera is at a moment; ``capture_ns`` counts from the scene's beginning."""
+        ...
+
     def write_truth(self, path: Path, *, fps: float, view: View) -> int:
         """Write the ground truth of a flight at that rate as MOTChallenge's gt.txt, in base pixels."""
         ...
@@ -97,6 +102,8 @@ class DemoSource(Source):
         )
         self._end = weakref.finalize(self, _end, self._drawing)
         self._size: tuple[int, int]
+        self._pictures_due = 0
+        """Asked for, and not yet taken."""
         self._size, self.class_names, duration_s = self._answer()
         self.fps = fps
         self._resizer = Resizer(self._size, size, fit=fit)
@@ -107,17 +114,25 @@ class DemoSource(Source):
     def frames(self, *, start_ns: int) -> Iterator[Frame]:
         """The scene from its beginning."""
         rate = exact_rate(self.fps)
+        self._drop_pictures()
         self._request("image", 0.0)
         for index in range(self._count):
             self._request("image", float((index + 1) / rate))  # drawn while this one is coded
             capture_ns = capture_time_ns(index, fps=rate, start_ns=start_ns)
             yield self._resizer.frame(self._picture(), index=index, capture_ns=capture_ns)
-        self._picture()
+        self._drop_pictures()
 
     def write_truth(self, path: Path, *, fps: float) -> None:
         """Write the ground truth of a flight at that rate; before the first frame."""
+        self._drop_pictures()
         self._request("truth", path, fps, self.view)
         self._answer()
+
+    def poses(self) -> list[Pose]:
+        """Where the camera is from the scene's beginning to its end; before the first frame."""
+        self._request("poses")
+        poses: list[Pose] = self._answer()
+        return poses
 
     def close(self) -> None:
         """End the drawing; a source that is forgotten ends it too."""
@@ -127,6 +142,7 @@ class DemoSource(Source):
         assert self._drawing.stdin is not None, "it was opened with a pipe"
         pickle.dump(request, self._drawing.stdin)
         self._drawing.stdin.flush()
+        self._pictures_due += request[0] == "image"
 
     def _answer(self) -> Any:
         assert self._drawing.stdout is not None, "it was opened with a pipe"
@@ -137,7 +153,13 @@ class DemoSource(Source):
         picture = np.empty((self._size[1], self._size[0], 3), np.uint8)
         if self._drawing.stdout.readinto(picture.data) != picture.nbytes:  # type: ignore[attr-defined]
             raise UserError("--source demo: the process that draws the scene has ended")
+        self._pictures_due -= 1
         return picture
+
+    def _drop_pictures(self) -> None:
+        """Take what an earlier reader asked for and left."""
+        while self._pictures_due:
+            self._picture()
 
 
 def _end(drawing: subprocess.Popen[bytes]) -> None:
@@ -159,6 +181,9 @@ def _draw(seed: int, spec: str) -> None:
             return
         if kind == "image":
             answers.write(scene.image(min(rest[0], scene.duration_s)).data)
+        elif kind == "poses":
+            count = math.ceil(scene.duration_s * _POSES_PER_S)
+            pickle.dump([scene.pose(number / _POSES_PER_S) for number in range(count + 1)], answers)
         else:
             path, fps, view = rest
             pickle.dump(scene.write_truth(path, fps=fps, view=view), answers)

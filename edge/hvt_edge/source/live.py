@@ -15,17 +15,29 @@ from hvt_common.runtime.failures import Failures, RetryPause
 from hvt_common.units import SECOND_NS
 from hvt_common.values import Fit, Frame, Image
 from hvt_edge.source.camera_clock import CameraClock
+from hvt_edge.source.camera_stream import CameraDecoder
 from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.resample import Gate, Resizer
 
-__all__ = ["Grabber", "LiveSource", "Shot", "SignalLost", "closing_on"]
+__all__ = ["SOURCE_PART", "CameraPacket", "Grabber", "LiveSource", "Shot", "SignalLost", "closing_on"]
 
 _log = logging.getLogger(__name__)
 
 _FIRST_WAIT_NS, _LONGEST_WAIT_NS = SECOND_NS // 2, 8 * SECOND_NS
 _JOIN_S = 1.5
 _IDLE_S = 1.0
-_PART = "source"
+SOURCE_PART = "source"
+"""What it is called where it fails."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPacket:
+    """A frame as the camera has coded it; packets of one decoder come in order, and it is given each."""
+
+    data: bytes
+    at_s: float | None
+    """By the stream's own time stamps; None where it has none."""
+    decoder: CameraDecoder
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +47,8 @@ class Shot:
     image: Callable[[], Image]
     camera_ns: int | None = None
     """When it was taken by the camera's own clock, Unix nanoseconds; None where it does not say."""
+    packet: CameraPacket | None = None
+    """For ``--encoder passthrough``; ``image`` then decodes it, and is not called beside."""
 
 
 class SignalLost(Exception):  # noqa: N818 - an event, not a fault of the program
@@ -88,15 +102,19 @@ class LiveSource(Source):
         self._grabber = grabber
         grabber.open()
         try:
-            first = grabber.grab().image()
+            first_size = self._first_size(grabber, size)
         except SignalLost as error:
             grabber.close()
             raise UserError(f"source {grabber.name} opens but delivers no picture ({error})") from error
-        self._resizer = Resizer((first.shape[1], first.shape[0]), size, fit=fit)
+        except UserError:
+            grabber.close()
+            raise
+        self._resizer = Resizer(first_size, size, fit=fit)
         self.view = self._resizer.view
         self._pause = RetryPause(_FIRST_WAIT_NS, _LONGEST_WAIT_NS)
         self._news = threading.Condition()
         self._latest: tuple[int, Image] | None = None
+        self._gate = Gate(self.fps)
         self._failure: BaseException | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hvt-source", daemon=True)
@@ -130,21 +148,25 @@ class LiveSource(Source):
         if self._thread.is_alive():
             _log.warning("%s did not answer within %g s and is left behind", self._grabber.name, _JOIN_S)
 
+    def _first_size(self, grabber: Grabber, size: BaseSize) -> tuple[int, int]:
+        """(width, height) of the source, from its first picture."""
+        del size
+        first = grabber.grab().image()
+        return first.shape[1], first.shape[0]
+
     def _end(self) -> None:
         with self._news:
             self._stop.set()
             self._news.notify_all()
 
     def _run(self) -> None:
-        gate, camera_clock = Gate(self.fps), CameraClock()
+        camera_clock = CameraClock()
         try:
             while not self._stop.is_set():
                 try:
                     shot = self._grabber.grab()
                     capture_ns = camera_clock.capture_ns(shot.camera_ns, now_ns=self._clock())
-                    if gate.accept(capture_ns):
-                        self._offer(capture_ns, shot.image())
-                        self._failures.works(_PART)
+                    self._take(shot, capture_ns)
                 except SignalLost as error:
                     self._recover(error)
                     camera_clock = CameraClock()
@@ -154,17 +176,22 @@ class LiveSource(Source):
             self._grabber.close()
             self._end()
 
-    def _offer(self, capture_ns: int, image: Image) -> None:
+    def _take(self, shot: Shot, capture_ns: int) -> None:
+        """A frame has come (the reader's thread)."""
+        if not self._gate.accept(capture_ns):
+            return
+        image = shot.image()
         with self._news:
             self.missed += self._latest is not None
             self._latest = (capture_ns, image)
             self._news.notify_all()
+        self._failures.works(SOURCE_PART)
 
     def _recover(self, error: SignalLost) -> None:
         """Open the grabber again, waiting twice as long after each failure; returns when it is open or we stop."""
         while not self._stop.is_set():  # what stops because it is closed has not failed
             self._pause.failed(self._clock())
-            self._failures.failed(_PART, f"{self._grabber.name} stopped ({error})")
+            self._failures.failed(SOURCE_PART, f"{self._grabber.name} stopped ({error})")
             if self._stop.wait(self._pause.pause_ns / SECOND_NS):
                 return
             try:

@@ -11,14 +11,17 @@ from hvt_common.errors import UserError
 from hvt_common.runtime.failures import Failures
 from hvt_common.values import Fit
 from hvt_edge.source.camera import CameraGrabber
+from hvt_edge.source.camera_stream import REENCODE
+from hvt_edge.source.coded_live import CodedLiveSource, CodedStreamGrabber
+from hvt_edge.source.coded_video import CodedVideoSource
 from hvt_edge.source.contract import BaseSize, Source, check_shape
 from hvt_edge.source.demo import DemoSource, is_demo
 from hvt_edge.source.folder import FolderSource
 from hvt_edge.source.live import LiveSource
 from hvt_edge.source.stream import LIVE_SCHEMES, StreamGrabber
-from hvt_edge.source.video import VideoSource
+from hvt_edge.source.video import VideoSource, without_password
 
-__all__ = ["Source", "check_shape", "open_source"]
+__all__ = ["REENCODE", "Source", "check_shape", "open_source", "without_password"]
 
 _ACCEPTED = (
     "a video file, a folder of images, rtsp://…, http://…, udp://…, /dev/videoN, demo or demo:codes,4k"
@@ -34,6 +37,7 @@ def open_source(
     seed: int = 0,
     max_frames: int | None = None,
     source_fps: float | None = None,
+    coded: bool = False,
     clock: Callable[[], int] | None = None,
     failures: Failures | None = None,
 ) -> Source:
@@ -43,9 +47,12 @@ def open_source(
     ``fps`` is above 0 and at most 240; for ``fit`` see `View.fitted`. ``source_fps`` is the rate at which the
     images of a folder were taken (default: the base rate), or overrides a video file's own time stamps. ``clock``
     is a live source's, Unix nanoseconds without steps, and ``failures`` is told when it is away; None for its own.
+    With ``coded`` each frame comes with the camera's own unit of it, at the camera's rate, whatever ``fps`` is.
     Raises `UserError` if nothing usable is there, or size or rate are impossible.
     """
     check_shape(size=size, fps=fps, source_fps=source_fps)
+    if coded:
+        _check_coded(spec)
     if is_demo(spec):
         return DemoSource(spec, size=size, fps=fps, fit=fit, seed=seed, max_frames=max_frames)
     live = partial(
@@ -53,8 +60,12 @@ def open_source(
     )
     scheme = urlsplit(spec).scheme if "://" in spec else ""
     if scheme in LIVE_SCHEMES:
-        stream = StreamGrabber(spec)
+        stream = CodedStreamGrabber(spec) if coded else StreamGrabber(spec)
         stream.open()
+        if isinstance(stream, CodedStreamGrabber) and not stream.holds_a_clip:
+            return CodedLiveSource(
+                stream, size=size, fit=fit, max_frames=max_frames, clock=clock, failures=failures
+            )
         if not stream.holds_a_clip:
             return live(stream)
         stream.close()
@@ -64,5 +75,22 @@ def open_source(
         return live(CameraGrabber(spec, fps=fps))
     if not scheme and not Path(spec).exists():
         raise UserError(f"source {spec!r} does not exist; accepted is {_ACCEPTED}")
+    if coded:
+        return CodedVideoSource(spec, size=size, fit=fit, max_frames=max_frames, source_fps=source_fps)
     kind = FolderSource if not scheme and Path(spec).is_dir() else VideoSource
     return kind(spec, size=size, fps=fps, fit=fit, max_frames=max_frames, source_fps=source_fps)
+
+
+def _check_coded(spec: str) -> None:
+    """Raise `UserError` for what is no coded video; that it is HEVC is seen when it is open."""
+    kinds = (
+        ("the drawn demo", is_demo(spec)),
+        ("a device", spec.startswith("/dev/")),
+        ("a folder", Path(spec).is_dir()),
+    )
+    for kind, is_it in kinds:
+        if is_it:
+            raise UserError(
+                f"source {spec!r} is {kind}, and --encoder passthrough takes a video file or a stream that is HEVC "
+                f"already: {REENCODE}"
+            )

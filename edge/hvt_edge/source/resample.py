@@ -8,13 +8,14 @@ both axes and centred: whole between black borders (letterbox) or filling the fr
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from fractions import Fraction
 from typing import TypeVar
 
 import cv2
 import numpy as np
 
-from hvt_common.values import Fit, Frame, Image, View
+from hvt_common.values import CameraUnit, Fit, Frame, Image, View
 from hvt_edge.source.contract import BaseSize
 
 __all__ = [
@@ -112,6 +113,10 @@ class Resizer:
         base = self._resized(whole)
         base.flags.writeable = False
         return Frame(index=index, capture_ns=capture_ns, source_bgr=whole, base_bgr=base)
+
+    def coded_frame(self, picture: Image, unit: CameraUnit, *, index: int, capture_ns: int) -> Frame:
+        """The frame of a camera's own unit, of which ``picture`` was decoded: source and base are the same."""
+        return replace(self.frame(picture, index=index, capture_ns=capture_ns), camera_unit=unit)
 
     def _resized(self, source: Image) -> Image:
         if self.view.source_size == self.view.base_size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import av
@@ -12,7 +13,7 @@ from hvt_common.errors import UserError
 from hvt_edge.source.live import Shot, SignalLost
 from hvt_edge.source.video import upright_bgr, without_password
 
-__all__ = ["LIVE_SCHEMES", "StreamGrabber"]
+__all__ = ["LIVE_SCHEMES", "StreamGrabber", "camera_time_ns"]
 
 LIVE_SCHEMES = frozenset({"rtsp", "rtsps", "http", "https", "udp", "rtp", "tcp", "srt"})
 
@@ -39,7 +40,7 @@ class StreamGrabber:
         self.name = without_password(url)
         self._url, self._open_s = url, open_s
         self._container: Any = None
-        self._frames: Iterator[tuple[av.VideoFrame, int | None]] = iter(())
+        self._shots: Iterator[Shot] = iter(())
 
     def open(self) -> None:
         """Open, where it is not open yet. Raises `UserError` if there is no video within ``open_s``."""
@@ -62,17 +63,16 @@ class StreamGrabber:
     def grab(self) -> Shot:
         """The next frame, at most the read timeout from now."""
         try:
-            taken = next(self._frames, None)
+            shot = next(self._shots, None)
         except (av.error.FFmpegError, OSError) as error:
             raise SignalLost(_cause(error)) from error
-        if taken is None:
+        if shot is None:
             raise SignalLost("it ended")
-        frame, camera_ns = taken
-        return Shot(lambda: upright_bgr(frame), camera_ns)
+        return shot
 
     def close(self) -> None:
         """Close the connection."""
-        self._frames = iter(())
+        self._shots = iter(())
         if self._container is not None:
             self._container.close()
             self._container = None
@@ -83,20 +83,37 @@ class StreamGrabber:
         if stream is None:
             container.close()
             raise UserError(f"source {self.name} holds no video stream")
+        try:
+            shots = self._read(container, stream)
+        except UserError:
+            container.close()
+            raise
+        self._container, self._shots = container, shots
+
+    def _read(self, container: Any, stream: Any) -> Iterator[Shot]:
+        """What comes from now on; raises UserError where the stream is not taken."""
         stream.thread_type = "SLICE"
-        self._container, self._frames = container, _decoded(container, stream)
+        return _decoded(container, stream)
 
 
-def _decoded(container: Any, stream: Any) -> Iterator[tuple[av.VideoFrame, int | None]]:
-    """Frames, each with its time by the camera's clock where RTCP sender reports tell it (RFC 3550, 6.4.1)."""
+def _decoded(container: Any, stream: Any) -> Iterator[Shot]:
+    """Frames, each with its time by the camera's clock."""
     times: dict[int, int] = {}
     for packet in container.demux(stream):
-        if packet.pts is not None and packet.has_sidedata("prft"):
-            times[packet.pts] = 1000 * int.from_bytes(bytes(packet.get_sidedata("prft"))[:8], "little")
+        camera_ns = camera_time_ns(packet)
+        if packet.pts is not None and camera_ns is not None:
+            times[packet.pts] = camera_ns
         for frame in packet.decode():
-            yield frame, times.pop(frame.pts, None)
+            yield Shot(partial(upright_bgr, frame), times.pop(frame.pts, None))
         if len(times) > _MOST_TIMES:
             times.clear()
+
+
+def camera_time_ns(packet: av.Packet[Any]) -> int | None:
+    """When it was taken, where RTCP sender reports tell the camera's time (RFC 3550, 6.4.1). Unix nanoseconds."""
+    if not packet.has_sidedata("prft"):
+        return None
+    return 1000 * int.from_bytes(bytes(packet.get_sidedata("prft"))[:8], "little")
 
 
 def _open(url: str, *, open_s: float) -> Any:

@@ -22,7 +22,7 @@ from hvt_common.values import Fit, Frame, Image
 from hvt_edge.source.contract import BaseSize, Source
 from hvt_edge.source.resample import Resizer, base_frame_count, capture_time_ns, hold
 
-__all__ = ["VideoSource", "upright_bgr", "without_password"]
+__all__ = ["VideoSource", "open_video", "upright_bgr", "without_password"]
 
 _log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class VideoSource(Source):
     ) -> None:
         self._spec, self.fps = spec, fps
         self._override = None if source_fps is None else exact_rate(source_fps)
-        container, stream = _open(spec)
+        container, stream = open_video(spec)
         with container:
             self._rate = self._override or _rate(stream) or exact_rate(fps)
             duration_s = self._duration_s(container, stream)
@@ -87,7 +87,7 @@ class VideoSource(Source):
 
     def _play(self, start_ns: int) -> Generator[Frame, None, None]:
         base_rate = exact_rate(self.fps)
-        container, stream = _open(self._spec)
+        container, stream = open_video(self._spec)
         with container, closing(_decoded(container, stream, spec=self._spec)) as decoded:
             slack_s = Fraction(0) if self._override else Fraction(stream.time_base or 0)
             stamped = self._stamped(decoded)
@@ -145,7 +145,7 @@ def without_password(url: str) -> str:
     return urlunsplit(parts._replace(netloc=f"…@{host}"))
 
 
-def _open(spec: str) -> tuple[Any, Any]:
+def open_video(spec: str) -> tuple[Any, Any]:
     """Open a file or a URL and its first video stream. Raises `UserError` if there is none."""
     name = without_password(spec)
     if "://" not in spec and Path(spec).stat().st_size == 0:

@@ -18,6 +18,7 @@ from typing import Literal
 
 from hvt_common.values import Frame, Image, Still, View
 from hvt_common.video.base_crop import MAX_SIDE_PX, base_crop, coded_size
+from hvt_common.video.hevc import YuvPicture
 from hvt_common.video.still_codecs import (
     CodedCrop,
     JpegCodec,
@@ -40,6 +41,7 @@ _TRIES = 3
 """Of fitting payload and parameters into one admission: parameters hardly change in size."""
 _QUALITY_STEP_PCT = 5
 _LEAST_PCT, _MOST_PCT = 1, 95
+_READ_BY_ALL = JpegCodec()
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,8 @@ class StillMaker:
     """The most that is spent on being better than the base."""
     min_gain_db: float = 0.1
     """By how much the still must be closer than the base; covers how others round when they count."""
+    readable: Callable[[str], bool] = lambda _codec: True
+    """Whether every ground that listens reads stills of this codec; ``jpeg`` takes the place of any other."""
     padding: float = PADDING
     max_side_px: int = MAX_SIDE_PX
 
@@ -90,36 +94,45 @@ class StillMaker:
         )
 
     @property
+    def preferred(self) -> StillCodec:
+        """The codec of stills where the base is at hand."""
+        return self.codec if self.readable(self.codec.name) else self.without_base
+
+    @property
     def without_base(self) -> StillCodec:
         """The codec of stills that show the same whatever base frames the ground has."""
-        if not self.codec.needs_base:
-            return self.codec
-        assert self.fallback is not None, "checked at the start"
-        return self.fallback
+        codec = self.fallback if self.codec.needs_base else self.codec
+        assert codec is not None, "checked at the start"
+        return codec if self.readable(codec.name) else _READ_BY_ALL
+
+    @property
+    def codec_names(self) -> tuple[str, ...]:
+        """Of the codecs in use, without repetition."""
+        return tuple(dict.fromkeys((self.preferred.name, self.without_base.name)))
 
     def crop(
-        self, frame: Frame, request: Request, *, view: View, base_bgr: Image | None = None
+        self, frame: Frame, request: Request, *, view: View, base: Image | YuvPicture | None = None
     ) -> CropJob | NoStill:
         """Take the request's crop out of ``frame``, which is the frame the request was made at.
 
-        ``base_bgr`` is the decoded base frame of the same index; without it the second promise is not checked.
+        ``base`` is the decoded base frame of the same index; without it the second promise is not checked.
         """
         lead = request.candidate
         assert frame.index == lead.frame_index, "a still shows the frame that its box belongs to"
         crop_px = union_crop(request, padding=self.padding, source_size=view.source_size)
         size = coded_size(crop_px, max_side_px=self.max_side_px)
-        if base_bgr is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
+        if base is not None and size[0] < (crop_px[2] - crop_px[0]) * min(1.0, view.scale):
             return NoStill("base_good")  # shrunk below the base's own grid: the base has more pixels of it
         crop = crop_of(frame.source_bgr, crop_px, size)
         shown = alternative = None
-        if base_bgr is not None:
-            shown = base_crop(base_bgr, view=view, crop_source_px=crop_px, size=size)
+        if base is not None:
+            shown = base_crop(base, view=view, crop_source_px=crop_px, size=size)
             boxes = (one.box_source_px for one in (lead, *request.also))
             places = tuple(inner_box(box, crop_px, size) for box in boxes)
             alternative = Alternative.of(shown, crop=crop, places=places, min_gain_db=self.min_gain_db)
             if 0 < self.fidelity_db <= alternative.psnr_y_db:
                 return NoStill("base_good")
-        codec = self.without_base if shown is None else self.codec
+        codec = self.without_base if shown is None else self.preferred
         header = Still(
             sequence=0,
             frame_index=frame.index,
@@ -142,10 +155,11 @@ class StillMaker:
     def code(self, job: CropJob, *, sequence: int, allowance: Allowance) -> Still | NoStill:
         """Code a crop so that ``allowance``, called with the very still that comes out, holds its data."""
         header = replace(job.header, sequence=sequence)
-        if job.base_crop_bgr is None or not self.codec.needs_base:
+        codec = self.preferred
+        if job.base_crop_bgr is None or not codec.needs_base:
             made = self._fitted(self.without_base, job, header, allowance)
             return made if isinstance(made, NoStill) else made[0]
-        built = self._fitted(self.codec, job, header, allowance)
+        built = self._fitted(codec, job, header, allowance)
         if isinstance(built, NoStill):
             made = self._fitted(self.without_base, job, header, allowance) if job.base_far_off else built
             return made if isinstance(made, NoStill) else made[0]

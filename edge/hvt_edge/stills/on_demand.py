@@ -91,7 +91,9 @@ class OnDemand:
     settings: OnDemandSettings = OnDemandSettings()
 
     def __post_init__(self) -> None:
-        self._maker = replace(self.maker, codec=self.maker.without_base, fallback=None, fidelity_db=0.0)
+        self._maker = replace(
+            self.maker, fidelity_db=0.0
+        )  # of crops without a base: never one that builds on it
         self._lock = threading.Lock()
         self._refusals: OrderedDict[int, str] = OrderedDict()
         """Number → why it was given up, or nothing where it is pending or was sent; of the last ones."""

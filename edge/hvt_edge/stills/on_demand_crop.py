@@ -84,7 +84,7 @@ def crop_job_for(
         crop = _inside(request.box_xywh_px or (0, 0, width, height), (width, height))
         box, name, confidence = (*map(float, crop),), "", 0.0  # type: ignore[assignment]
     size = coded_size(crop, max_side_px=maker.max_side_px)
-    codec = maker.codec
+    codec = maker.without_base
     header = Still(
         sequence=0,
         frame_index=frame.frame_index,

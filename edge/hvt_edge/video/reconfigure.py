@@ -14,8 +14,8 @@ from hvt_edge.operating.point import Operating, base_rate_bps
 from hvt_edge.perception.candidates import Candidate
 from hvt_edge.stills.policy.base import Step
 from hvt_edge.video.encoder_settings import least_base_bps
+from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.share import FIRST_SHARE, Split
-from hvt_edge.video.x265 import BaseEncoder
 
 __all__ = ["EncoderReconfiguration", "OpenEncoder", "ReconfigurationSettings"]
 
@@ -40,9 +40,9 @@ class ReconfigurationSettings:
 
 
 class OpenEncoder(Protocol):
-    """Opens x265."""
+    """Opens the encoder."""
 
-    def __call__(self, *, total_bps: int, base_bps: int, decimation: int) -> BaseEncoder:
+    def __call__(self, *, total_bps: int, base_bps: int, decimation: int) -> Encoder:
         """Return an encoder for this rate."""
         ...
 
@@ -121,11 +121,11 @@ class EncoderReconfiguration:
         with self._lock:
             return self._moving and self.split is not None and self.split.wants_keyframe(now_ns)
 
-    def open_again(self) -> BaseEncoder:
+    def open_again(self) -> Encoder:
         """Return another encoder for what the last was opened for."""
         return self.open_encoder(**self._opened)
 
-    def __call__(self, decimation: int, now_ns: int) -> BaseEncoder | None:
+    def __call__(self, decimation: int, now_ns: int) -> Encoder | None:
         """Return the encoder to go on with from this keyframe, or None for the one there is."""
         changed = self._take_command()
         if self.pacer is not None:
@@ -136,9 +136,7 @@ class EncoderReconfiguration:
             return None
         return self._open(total_bps, base_bps, decimation, now_ns=now_ns, encoder_total_bps=total_bps)
 
-    def _at_links_rate(
-        self, pacer: Pacer, decimation: int, now_ns: int, *, changed: bool
-    ) -> BaseEncoder | None:
+    def _at_links_rate(self, pacer: Pacer, decimation: int, now_ns: int, *, changed: bool) -> Encoder | None:
         now = self.operating.now
         if changed:
             floor_bps = min(now.budget_bps, self.settings.min_budget_bps)
@@ -154,7 +152,7 @@ class EncoderReconfiguration:
 
     def _open(
         self, total_bps: int, base_bps: int, decimation: int, *, now_ns: int, encoder_total_bps: int
-    ) -> BaseEncoder:
+    ) -> Encoder:
         self.count += 1
         self._opened = {"total_bps": encoder_total_bps, "base_bps": base_bps, "decimation": decimation}
         self.operating.open(total_bps=total_bps, base_bps=base_bps, decimation=decimation)

@@ -13,12 +13,12 @@ from hvt_common.values import AccessUnit, Frame, Tracks
 from hvt_edge.backlog.stage import BacklogStage, State
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
+from hvt_edge.video.encoders.contract import Encoder
 from hvt_edge.video.frame_decision import FrameDecision, FrameInputs, decide
 from hvt_edge.video.frame_skip import FrameSkip
 from hvt_edge.video.keyframes import KeyframePlan
 from hvt_edge.video.local_copy import LocalCopy
 from hvt_edge.video.regions import TrackRegions
-from hvt_edge.video.x265 import BaseEncoder
 
 __all__ = ["BaseStage"]
 
@@ -37,18 +37,19 @@ class BaseStage:
     as in lockstep, the failure is raised.
     """
 
-    encoder: BaseEncoder
+    encoder: Encoder
     _: KW_ONLY
+    encoder_name: str = "x265"
     keyframes: KeyframeRequests
     transmitter: Transmitter
     local_copy: LocalCopy | None
     first_keyframe_bytes: int
     regions: TrackRegions | None = None
     frame_skip: FrameSkip | None = None
-    reconfigure: Callable[[int, int], BaseEncoder | None] | None = None
+    reconfigure: Callable[[int, int], Encoder | None] | None = None
     admits: Callable[[int], bool] = lambda _now_ns: True
     backlog: BacklogStage | None = None
-    open_again: Callable[[], BaseEncoder] | None = None
+    open_again: Callable[[], Encoder] | None = None
     failures: Failures | None = None
 
     def __post_init__(self) -> None:
@@ -57,15 +58,15 @@ class BaseStage:
         self._frame_skip = self.frame_skip or FrameSkip()
         self._failed_ns: deque[int] = deque(maxlen=_MOST_FAILURES)
         self._begins_anew = False
-        """x265 was opened again: its next frame is a keyframe."""
+        """The encoder was opened again: its next frame is a keyframe."""
 
-    def decide(self, index: int, *, now_ns: int) -> FrameDecision:
-        """Decide on the source frame of this index; once for each, in order."""
+    def decide(self, frame: Frame, *, now_ns: int) -> FrameDecision:
+        """Decide on this source frame; once for each, in order."""
         fits = self.transmitter.keyframe_fits(self._keyframe_bytes, now_ns=now_ns)
         backlog = self.backlog
         return decide(
             FrameInputs(
-                due=self._frame_skip.codes(index),
+                due=self._frame_skip.codes(frame.index),
                 keyframe_due=self._plan.now(now_ns, fits=fits) or self._begins_anew,
                 admitted=self.admits(now_ns),
                 link=State.LIVE if backlog is None else backlog.state,
@@ -93,7 +94,7 @@ class BaseStage:
                 raise
             self._recover(error, now_ns=now_ns)
             return None
-        assert unit.keyframe or not decision.keyframe, "x265 makes a keyframe of each frame that is to be one"
+        assert unit.keyframe or not decision.keyframe, "others than x265 are checked (encoders.checked)"
         if self._begins_anew and self.failures is not None:
             self.failures.works(_PART)
         self._begins_anew = False
@@ -125,12 +126,12 @@ class BaseStage:
         assert self.open_again is not None, "checked"
         assert self.failures is not None, "goes with it"
         while True:
-            self.failures.failed(_PART, f"x265 failed ({error})")
+            self.failures.failed(_PART, f"{self.encoder_name} failed ({error})")
             self._failed_ns.append(now_ns)
             if len(self._failed_ns) == _MOST_FAILURES and now_ns - self._failed_ns[0] <= _FAILURES_NS:
                 raise FlightError(
-                    f"x265 failed {_MOST_FAILURES} times within {_FAILURES_NS // SECOND_NS} s ({error}): there is no "
-                    "video without it, and another start may help"
+                    f"{self.encoder_name} failed {_MOST_FAILURES} times within {_FAILURES_NS // SECOND_NS} s "
+                    f"({error}): there is no video without it, and another start may help"
                 ) from error
             try:
                 self.encoder = self.open_again()

@@ -30,12 +30,12 @@ from av.video.frame import PictureType
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from hvt_common.errors import UserError
-from hvt_common.values import AccessUnit, Frame
+from hvt_common.values import AccessUnit, Frame, Image
 from hvt_common.video.hevc import UNBIASED
 from hvt_edge.video.encoder_settings import EncoderSettings
 from hvt_edge.video.regions import Region, RegionTagger
 
-__all__ = ["BaseEncoder", "EncoderSettings", "encoder_context"]
+__all__ = ["BaseEncoder", "EncoderSettings", "encoder_context", "mean_qp_of", "yuv_picture"]
 
 _QP_TO_LAMBDA = 118
 _WITHOUT_AQ = ("ultrafast", "superfast")
@@ -61,22 +61,14 @@ class BaseEncoder:
         ``regions`` need ``EncoderSettings.side_data``; where they overlap the deeper one counts.
         """
         assert self._tagger is not None or not regions, "regions need EncoderSettings.side_data"
-        picture = self._to_yuv.reformat(
-            av.VideoFrame.from_numpy_buffer(frame.base_bgr, format="bgr24"),
-            format="yuv420p",
-            dst_colorspace=Colorspace.ITU709,
-            src_color_range=ColorRange.JPEG,
-            dst_color_range=ColorRange.MPEG,
-            interpolation=UNBIASED,
-            threads=1,
-        )
+        picture = yuv_picture(self._to_yuv, frame.base_bgr)
         if self._tagger is not None:
             picture = self._tagger.tag(picture, regions)
         picture.pts = self._count
         picture.pict_type = PictureType.I if keyframe else PictureType.NONE
         self._count += 1
         (packet,) = self._context.encode(picture)  # zero latency: one in, one out
-        self.mean_qp = _mean_qp(packet)
+        self.mean_qp = mean_qp_of(packet)
         return AccessUnit(
             frame_index=frame.index,
             capture_ns=frame.capture_ns,
@@ -85,8 +77,23 @@ class BaseEncoder:
         )
 
 
-def _mean_qp(packet: av.Packet[Any]) -> float:
-    """What libx265 says of the packet: a little-endian 32-bit number in units of 1/118 (``FF_QP2LAMBDA``)."""
+def yuv_picture(
+    converter: VideoReformatter, base_bgr: Image, *, pixel_format: str = "yuv420p"
+) -> av.VideoFrame:
+    """A picture, uint8 (height, width, 3) BGR, as an encoder takes it: BT.709, limited range."""
+    return converter.reformat(
+        av.VideoFrame.from_numpy_buffer(base_bgr, format="bgr24"),
+        format=pixel_format,
+        dst_colorspace=Colorspace.ITU709,
+        src_color_range=ColorRange.JPEG,
+        dst_color_range=ColorRange.MPEG,
+        interpolation=UNBIASED,
+        threads=1,
+    )
+
+
+def mean_qp_of(packet: av.Packet[Any]) -> float:
+    """What the encoder says of it, or NaN: a little-endian 32-bit number in units of 1/118 (``FF_QP2LAMBDA``)."""
     if not packet.has_sidedata("quality_stats"):
         return math.nan
     stats = bytes(packet.get_sidedata("quality_stats"))

@@ -5,10 +5,18 @@ from hvt_edge.wiring.perception import make_detector, track_confidence, warm_up_
 from hvt_edge.wiring.stages import Stages, build_stages
 from hvt_edge.wiring.stills import check_codecs
 from hvt_edge.wiring.storing import check_files, check_store, store_folder
-from hvt_edge.wiring.video import base_size, default_size, first_decimation, make_encoder
+from hvt_edge.wiring.video import (
+    as_the_camera_is,
+    base_size,
+    default_size,
+    first_decimation,
+    make_encoder,
+    qualify_encoder,
+)
 
 __all__ = [
     "Stages",
+    "as_the_camera_is",
     "base_size",
     "build_stages",
     "check_codecs",
@@ -19,6 +27,7 @@ __all__ = [
     "make_detector",
     "make_encoder",
     "make_link_settings",
+    "qualify_encoder",
     "store_folder",
     "track_confidence",
     "warm_up_for",

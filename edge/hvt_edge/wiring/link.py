@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from hvt_common.protocol.channels import DELIVERIES, Channel, Direction
 from hvt_common.transport.zenoh_config import LinkSettings
 from hvt_common.units import SECOND_NS
 from hvt_edge.config import LEAST_FPS, EdgeConfig
@@ -32,6 +33,17 @@ def make_link_settings(config: EdgeConfig) -> LinkSettings:
         name=config.edge_id,
         links=2 if config.links == 2 else 1,
     )
+
+
+def channels_of(config: EdgeConfig, *, live: bool) -> tuple[Channel, ...]:
+    """Those on which the edge may send; ``live``: its source is."""
+    optional = {
+        Channel.TRACKS: config.send_tracks,
+        Channel.POSE: config.pose is not None,
+        Channel.BACKLOG: config.store_bytes(live=live) > 0,
+    }
+    sent = (one for one, delivery in DELIVERIES.items() if delivery.direction is Direction.EDGE_TO_GROUND)
+    return tuple(one for one in sent if optional.get(one, True))
 
 
 def make_budget(config: EdgeConfig, *, decimation: int) -> RollingBudget:

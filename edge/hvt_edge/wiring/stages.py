@@ -18,11 +18,14 @@ from hvt_edge.control.commands import Commands
 from hvt_edge.control.link_control import LinkControl
 from hvt_edge.link.feedback import FeedbackInbox
 from hvt_edge.link.publisher import EdgeLink
+from hvt_edge.link.still_readers import StillReaders
 from hvt_edge.link.tracks_channel import TrackReporter
 from hvt_edge.link.transmitter import Transmitter
 from hvt_edge.operating.keyframes import KeyframeRequests
 from hvt_edge.operating.point import LoopClock, Operating
 from hvt_edge.perception.analyzer import FailingDetector
+from hvt_edge.pose.contract import PoseSource
+from hvt_edge.pose.stage import PoseStage
 from hvt_edge.source.contract import Source
 from hvt_edge.source.demo import write_truth_of
 from hvt_edge.status import InfoReporter
@@ -31,9 +34,10 @@ from hvt_edge.stills.sending import StillSender
 from hvt_edge.stills.stage import StillStage
 from hvt_edge.video.frame_skip import LimitedFrameSkip
 from hvt_edge.video.local_copy import LocalCopy
+from hvt_edge.video.passthrough import PassthroughStage, VideoStage
 from hvt_edge.video.reconfigure import EncoderReconfiguration
 from hvt_edge.video.stage import BaseStage
-from hvt_edge.wiring.link import make_budget, make_levers, make_pacer, make_split
+from hvt_edge.wiring.link import channels_of, make_budget, make_levers, make_pacer, make_split
 from hvt_edge.wiring.perception import make_analyzer, make_shadow
 from hvt_edge.wiring.stills import make_chooser, make_on_demand, make_still_maker
 from hvt_edge.wiring.storing import make_backlog
@@ -51,7 +55,7 @@ from hvt_edge.wiring.video import (
 class Stages:
     """What a frame goes through, and what a ground reaches."""
 
-    base: BaseStage
+    base: VideoStage
     stills: StillStage
     transmitter: Transmitter
     link_control: LinkControl
@@ -61,6 +65,8 @@ class Stages:
     keyframes: KeyframeRequests
     backlog: BacklogStage | None
     info: InfoReporter
+    still_readers: StillReaders
+    pose: PoseStage | None
 
 
 def build_stages(
@@ -68,6 +74,7 @@ def build_stages(
     config: EdgeConfig,
     *,
     source: Source,
+    pose_source: PoseSource | None,
     detector: FailingDetector,
     link: EdgeLink,
     session_id: int,
@@ -77,10 +84,12 @@ def build_stages(
     clock: Callable[[], int],
     loop_clock: LoopClock,
     wait_until: Callable[[int], None],
+    headroom: float = 1.0,
 ) -> Stages:
     """Build every part once, each with all that it needs; files and threads end with ``stack``.
 
-    Raises `UserError` where x265 does not take the settings, or a file cannot be written.
+    ``headroom`` is what of its rate the encoder is asked for (`qualify_encoder`).
+    Raises `UserError` where the encoder does not take the settings, or a file cannot be written.
     """
     view, class_names = source.view, detector.class_names
     lockstep = config.pace == "lockstep"
@@ -92,8 +101,8 @@ def build_stages(
         method=config.method,
         decimation=decimation,
     )
-    keyframes, pacer = make_keyframes(config), make_pacer(config)
-    open_encoder = partial(make_encoder, config, size=view.base_size)
+    keyframes, pacer = make_keyframes(config, source), make_pacer(config)
+    open_encoder = partial(make_encoder, config, size=view.base_size, headroom=headroom)
     encoder = open_encoder(total_bps=config.budget_bps, base_bps=config.base_bps, decimation=decimation)
     budget = make_budget(config, decimation=decimation)
     # Files come after all that may be refused: a failed start leaves nothing behind.
@@ -121,12 +130,16 @@ def build_stages(
         split=make_split(config, view.base_size),
         pacer=pacer,
     )
+    still_readers = StillReaders(clock)
+    maker = make_still_maker(config, readable=still_readers.read)
     info = InfoReporter(
         config,
         session_id=session_id,
         operating=operating,
         view=view,
         class_names=fitted_class_names(class_names),
+        channels=channels_of(config, live=source.live),
+        still_codecs=lambda: maker.codec_names,
         clock=clock,
     )
     backlog = make_backlog(
@@ -144,9 +157,7 @@ def build_stages(
     )
     if backlog is not None:
         stack.enter_context(backlog)
-    still_sender = StillSender(
-        outbox, maker=make_still_maker(config), transmitter=transmitter, backlog=backlog
-    )
+    still_sender = StillSender(outbox, maker=maker, transmitter=transmitter, backlog=backlog)
     stack.callback(lambda: still_sender.close(clock()))
     link_control = LinkControl(
         has_ground=link.has_ground,
@@ -164,26 +175,51 @@ def build_stages(
         backlog=backlog,
         failures=failures,
     )
-    base = BaseStage(
-        encoder,
-        keyframes=keyframes,
-        transmitter=transmitter,
-        local_copy=local_copy,
-        first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
-        regions=make_regions(config, view.base_size),
-        frame_skip=LimitedFrameSkip(make_frame_skip(config, decimation), reconfiguration.least_decimation),
-        reconfigure=reconfiguration,
-        admits=link_control.admits,
-        backlog=backlog,
-        open_again=None if lockstep else reconfiguration.open_again,
-        failures=failures,
-    )
+    pose = None
+    if pose_source is not None:
+        pose = PoseStage(pose_source, session_id=session_id, sender=transmitter, failures=failures)
+    base: VideoStage
+    if config.passes_through:
+        base = PassthroughStage(
+            keyframes,
+            transmitter,
+            failures=failures,
+            local_copy=local_copy,
+            reconfigure=reconfiguration,
+            admits=link_control.admits,
+            pause=None if lockstep else partial(_paused, clock, wait_until),
+            backlog=backlog,
+        )
+    else:
+        base = BaseStage(
+            encoder,
+            encoder_name=config.encoder,
+            keyframes=keyframes,
+            transmitter=transmitter,
+            local_copy=local_copy,
+            first_keyframe_bytes=config.base_bps // 40,  # a fifth of a second: what the VBV lets through
+            regions=make_regions(config, view.base_size),
+            frame_skip=LimitedFrameSkip(
+                make_frame_skip(config, decimation), reconfiguration.least_decimation
+            ),
+            reconfigure=reconfiguration,
+            admits=link_control.admits,
+            backlog=backlog,
+            open_again=None if lockstep else reconfiguration.open_again,
+            failures=failures,
+        )
     on_demand = make_on_demand(
-        config, outbox=outbox, view=view, class_names=class_names, most_bytes=transmitter.most_still_bytes
+        config,
+        outbox=outbox,
+        maker=maker,
+        view=view,
+        class_names=class_names,
+        most_bytes=transmitter.most_still_bytes,
     )
     chooser = make_chooser(
         config,
         outbox=outbox,
+        maker=maker,
         view=view,
         class_names=class_names,
         most_bytes=transmitter.most_still_bytes(),
@@ -225,4 +261,12 @@ def build_stages(
         keyframes,
         backlog,
         info,
+        still_readers,
+        pose,
     )
+
+
+def _paused(clock: Callable[[], int], wait_until: Callable[[int], None], pause_ns: int) -> int:
+    """Sleep for so long, or until the run is to stop; return the time."""
+    wait_until(clock() + pause_ns)
+    return clock()

@@ -51,6 +51,7 @@ def make_chooser(
     config: EdgeConfig,
     *,
     outbox: Outbox,
+    maker: StillMaker,
     view: View,
     class_names: tuple[str, ...],
     most_bytes: int,
@@ -63,7 +64,7 @@ def make_chooser(
         method(config.method, **tuning(config.tune)),
         suppression=make_suppression(config),
         outbox=outbox,
-        maker=make_still_maker(config),
+        maker=maker,
         memory=TrackMemory(padding=config.padding),
         view=view,
         class_names=class_names,
@@ -84,6 +85,7 @@ def make_on_demand(
     config: EdgeConfig,
     *,
     outbox: Outbox,
+    maker: StillMaker,
     view: View,
     class_names: tuple[str, ...],
     most_bytes: Callable[[], int],
@@ -93,15 +95,15 @@ def make_on_demand(
     return OnDemand(
         ring,
         outbox=outbox,
-        maker=make_still_maker(config),
+        maker=maker,
         view=view,
         class_names=class_names,
         most_bytes=most_bytes,
     )
 
 
-def make_still_maker(config: EdgeConfig) -> StillMaker:
-    """Codec, quality and fallback of stills."""
+def make_still_maker(config: EdgeConfig, *, readable: Callable[[str], bool]) -> StillMaker:
+    """Codec, quality and fallback of stills; see `StillMaker.readable`."""
     codec = still_codec(config.still_codec)
     return StillMaker(
         codec=codec,
@@ -109,4 +111,5 @@ def make_still_maker(config: EdgeConfig) -> StillMaker:
         quality_pct=config.jpeg_quality,
         fidelity_db=config.fidelity,
         padding=config.padding,
+        readable=readable,
     )

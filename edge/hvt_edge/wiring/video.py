@@ -2,26 +2,41 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import cast
 
+from hvt_common.errors import UserError
+from hvt_common.runtime.log import START_LOGGER
 from hvt_common.units import SECOND_NS
-from hvt_common.values import Fit
+from hvt_common.values import Fit, Frame
 from hvt_edge.config import DEFAULT_SIZE, LEAST_FPS, EdgeConfig
 from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
-from hvt_edge.source.contract import BaseSize, size_within
+from hvt_edge.source.contract import BaseSize, Source, size_within
+from hvt_edge.source.opening import REENCODE, without_password
 from hvt_edge.video.encoder_settings import encoder_settings, payload_bps
+from hvt_edge.video.encoders.contract import Encoder
+from hvt_edge.video.encoders.passthrough import about_keyframes, check_camera
+from hvt_edge.video.encoders.qualification import allowed, headroom_of, run_frames
+from hvt_edge.video.encoders.registry import X265, open_encoder
 from hvt_edge.video.frame_skip import FrameSkip, MeasuredFrameSkip
 from hvt_edge.video.keyframes import keyframe_interval_s
 from hvt_edge.video.rate_model import choose_base, most_decimation
 from hvt_edge.video.reconfigure import ReconfigurationSettings
 from hvt_edge.video.regions import TrackRegions
-from hvt_edge.video.x265 import BaseEncoder
+
+_log = logging.getLogger(__name__)
 
 _MOST_ENCODER_THREADS = 4  # a 720p picture has twelve rows of blocks, each some steps behind the one above
 _AUTO_LEAST_FPS = 7.5
 """With ``--profile auto``: frames that are larger arrive later, and nobody asked for delay."""
+_MOST_SILENT_S = 10
+"""A live source that gives no frame for so many seconds has no scene to try an encoder on."""
+_SAME_RATE = 0.02
+"""What a camera's rate may differ from --fps: 29.97 is 30."""
 _REST_S = 10.0
 """How often ``--fps auto`` may think again."""
 
@@ -30,6 +45,8 @@ def base_size(config: EdgeConfig) -> BaseSize:
     """The base stream's size, or how it follows from the source's."""
     if config.fixed_size is not None:
         return config.fixed_size
+    if config.passes_through:
+        return lambda source_size: source_size
     if config.size is None:
         return lambda source_size: default_size(source_size, fit=cast("Fit", config.fit))
     return lambda source_size: _chosen(config, source_size, size=None)[0]
@@ -84,21 +101,121 @@ def make_frame_skip(config: EdgeConfig, decimation: int) -> FrameSkip:
 
 
 def make_encoder(
-    config: EdgeConfig, *, size: tuple[int, int], total_bps: int, base_bps: int, decimation: int
-) -> BaseEncoder:
-    """x265 at the rate that the budget leaves it; with several threads only where bytes need not repeat."""
+    config: EdgeConfig,
+    *,
+    size: tuple[int, int],
+    total_bps: int,
+    base_bps: int,
+    decimation: int,
+    headroom: float = 1.0,
+) -> Encoder:
+    """The encoder at the rate that the budget leaves it; with several threads only where bytes need not repeat.
+
+    It is asked for ``headroom`` (0…1) of that rate. Raises `UserError` where it does not take the settings.
+    """
     settings = encoder_settings(
         size=size,
         fps=config.nominal_fps / decimation,
         preset=config.preset,
         # What is kept for tracks may be the base's while none are sent.
-        total_bps=max(total_bps - config.metadata_bps, base_bps),
+        total_bps=_video_bps(config, total_bps=total_bps, base_bps=base_bps),
         base_bps=base_bps,
         edge_id=config.edge_id,
         side_data=config.roi_depth > 0,
     )
     threads = 1 if config.pace == "lockstep" else min(_MOST_ENCODER_THREADS, os.cpu_count() or 1)
-    return BaseEncoder(replace(settings, threads=threads))
+    bitrate_bps = max(1, round(settings.bitrate_bps * headroom))
+    return open_encoder(config.encoder, replace(settings, bitrate_bps=bitrate_bps, threads=threads))
+
+
+def _video_bps(config: EdgeConfig, *, total_bps: int, base_bps: int) -> int:
+    """What video and stills have in all."""
+    return max(total_bps - config.metadata_bps, base_bps)
+
+
+def qualify_encoder(
+    config: EdgeConfig, source: Source, *, clock: Callable[[], int], stop: threading.Event
+) -> float:
+    """What of its rate the encoder is to be asked for, from three seconds of the scene; 1 for x265, without them.
+
+    A camera that is passed through was looked at when it was opened.
+    Raises `UserError` with what was measured where it would not stay within the budget. A clip begins anew after it.
+    """
+    if config.encoder == X265:
+        return 1.0
+    if config.passes_through:
+        _qualify_camera(config, source)
+        return 1.0
+    size, decimation = source.view.base_size, first_decimation(config, source.view.base_size)
+    rates = {"total_bps": config.budget_bps, "base_bps": config.base_bps}
+    fps = config.nominal_fps / decimation
+    limit = allowed(
+        size=size,
+        fps=fps,
+        total_bps=_video_bps(config, **rates),
+        base_bps=config.base_bps,
+        window_s=config.window,
+    )
+    count = run_frames(fps, limit)
+
+    def scene() -> Iterator[Frame]:
+        silent = coded = 0
+        for frame in source.steps(start_ns=clock()):
+            silent += frame is None
+            if frame is not None and frame.index % decimation == 0:
+                coded += 1
+                yield frame
+            if stop.is_set() or coded == count or silent > _MOST_SILENT_S:
+                return
+
+    headroom = headroom_of(
+        config.encoder,
+        open_at=lambda share: make_encoder(config, size=size, decimation=decimation, headroom=share, **rates),
+        scene=scene,
+        frames=count,
+        limit=limit,
+        edge_id=config.edge_id,
+    )
+    if headroom < 1:
+        _log.warning(
+            "encoder %s overshoots: it is asked for %.0f %% of its rate", config.encoder, 100 * headroom
+        )
+    return headroom
+
+
+def as_the_camera_is(config: EdgeConfig, source: Source) -> EdgeConfig:
+    """The settings with the camera's frame rate, where its own units are sent; `UserError` where they cannot be."""
+    stream = source.camera_stream
+    if not config.passes_through:
+        return config
+    if stream is None:
+        raise UserError(
+            f"source {config.source} gives no video that is coded already, which --encoder passthrough takes: "
+            f"{REENCODE}"
+        )
+    if not config.auto_fps and abs(config.nominal_fps / stream.fps - 1) > _SAME_RATE:
+        raise UserError(
+            f"source {config.source} gives {stream.fps:g} frames a second, --fps is {config.nominal_fps:g}, and "
+            f"--encoder passthrough leaves none out: leave --fps out, or {REENCODE}"
+        )
+    return replace(config, fps=stream.fps)
+
+
+def _qualify_camera(config: EdgeConfig, source: Source) -> None:
+    """Say what the camera takes; `UserError` where that is more than the budget leaves it."""
+    stream, name = source.camera_stream, without_password(str(config.source))
+    assert stream is not None, "checked by as_the_camera_is"
+    limit = allowed(
+        size=source.view.base_size,
+        fps=config.nominal_fps,
+        total_bps=_video_bps(config, total_bps=config.budget_bps, base_bps=config.base_bps),
+        base_bps=config.base_bps,
+        window_s=config.window,
+    )
+    found = check_camera(name, stream, limit, budget_bps=config.budget_bps, edge_id=config.edge_id)
+    logging.getLogger(START_LOGGER).info("%s", found)
+    for warning in filter(None, (about_keyframes(name, stream), source.warning)):
+        _log.warning("%s", warning)
 
 
 def reconfiguration_settings(config: EdgeConfig, size: tuple[int, int]) -> ReconfigurationSettings:
@@ -118,8 +235,12 @@ def make_regions(config: EdgeConfig, size: tuple[int, int]) -> TrackRegions | No
     return TrackRegions(size, depth=config.roi_depth) if config.roi_depth else None
 
 
-def make_keyframes(config: EdgeConfig) -> KeyframeRequests:
-    """Where keyframes are requested, on a long schedule and on demand."""
+def make_keyframes(config: EdgeConfig, source: Source) -> KeyframeRequests:
+    """Where keyframes are requested, on a long schedule and on demand; a camera makes its own."""
+    if config.passes_through:
+        assert source.camera_stream is not None, "checked by as_the_camera_is"
+        every_s = source.camera_stream.keyframe_s
+        return KeyframeRequests(KeyframeSettings(interval_ns=0, camera_every_s=every_s))
     interval_s = config.keyframe_interval
     if isinstance(interval_s, str):
         interval_s = keyframe_interval_s(config.fixed_size or DEFAULT_SIZE, config.base_bps)

@@ -326,6 +326,18 @@ def test_the_demo_is_a_source_with_truth(tmp_path):
         assert source.frame_count == 250
 
 
+def test_the_demo_begins_anew_for_its_next_reader(tmp_path):
+    """A flight whose encoder was tried first would show a picture of the trial, or fail at its truth."""
+    with open_source("demo", size=(640, 360), fps=15, max_frames=4) as source:
+        assert isinstance(source, DemoSource)
+        first = [next(source.frames(start_ns=0)).base_bgr for _ in range(2)]
+        source.write_truth(tmp_path / "gt.txt", fps=15)
+        whole = [frame.base_bgr for frame in source.frames(start_ns=0)]
+    assert len(whole) == 4
+    assert all(np.array_equal(one, whole[0]) for one in first)
+    assert not np.array_equal(whole[0], whole[3])
+
+
 def test_the_demo_has_codes_and_4k_when_told():
     """Nobody could fly what the study reads, and a 4K flight would be one of an enlarged picture."""
     with open_source("demo:codes,4k", size=(640, 360), fps=15, seed=1, max_frames=1) as source:

@@ -73,7 +73,7 @@ def make(source, box, *, base=None, limit=100_000, maker=None, view=None, index=
     shape = (source.shape[1], source.shape[0])
     view = view or View.fitted(shape, SIZE, fit="letterbox")
     maker = maker or StillMaker()
-    job = maker.crop(frame_of(source, index=index), request_for(box, index=index), view=view, base_bgr=base)
+    job = maker.crop(frame_of(source, index=index), request_for(box, index=index), view=view, base=base)
     return job if isinstance(job, NoStill) else maker.code(job, sequence=9, allowance=lambda _: limit)
 
 
@@ -445,7 +445,7 @@ def test_parameters_take_their_part_of_the_admission():
     source = scene(*SIZE)
     base = blurred(source)
     view = View.fitted(SIZE, SIZE, fit="letterbox")
-    job = BASE_CODED.crop(frame_of(source), request_for(CAR), view=view, base_bgr=base)
+    job = BASE_CODED.crop(frame_of(source), request_for(CAR), view=view, base=base)
     whole = BASE_CODED.code(job, sequence=0, allowance=lambda _: 10**6)
     limit = len(whole.data) + 3
 
@@ -468,7 +468,7 @@ def test_one_still_of_several_beats_the_base_at_each_of_them():
     other = replace(request_for((440.0, 200.0, 560.0, 280.0)).candidate, track_id=7)
     both = replace(lead, also=(other,))
     view = View.fitted(SIZE, SIZE, fit="letterbox")
-    job = StillMaker().crop(frame_of(source), both, view=view, base_bgr=base)
+    job = StillMaker().crop(frame_of(source), both, view=view, base=base)
     still = StillMaker().code(job, sequence=0, allowance=lambda _: 10**6)
     assert still.also == ((7, other.box_source_px),)
     assert still.crop_source_px == (282, 188, 578, 292)

@@ -17,7 +17,7 @@ from hvt_common.runtime.failures import Failures
 from hvt_common.tracking.bytetrack import ByteTracker, TrackerSettings
 from hvt_common.values import Frame, View
 from hvt_common.video.base_crop import base_crop
-from hvt_common.video.hevc import BaseDecoder
+from hvt_common.video.hevc import BaseDecoder, YuvPicture
 from hvt_common.video.still_codecs import JpegCodec
 from hvt_edge.link.budget import BudgetSettings, RollingBudget
 from hvt_edge.link.transmitter import Transmitter
@@ -113,10 +113,10 @@ class Rig:
             self.stage.send(seen, now_ns=frame.capture_ns)
 
 
-def decoded_bases() -> list[np.ndarray]:
+def decoded_bases() -> list[YuvPicture]:
     """The base as the ground has it."""
     decoder = BaseDecoder()
-    return [decoder.decode(unit.data) for unit in UNITS]
+    return [decoder.decode_yuv(unit.data) for unit in UNITS]
 
 
 def answer(sequence: int, *, again: bool) -> StillResult:

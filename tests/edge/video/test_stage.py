@@ -93,7 +93,7 @@ class Rig:
         for frame in framed(pictures):
             if frame.index in asks:
                 self.keyframes.request(frame.capture_ns)
-            decision = self.stage.decide(frame.index, now_ns=frame.capture_ns)
+            decision = self.stage.decide(frame, now_ns=frame.capture_ns)
             unit = self.stage.encode(frame, decision, now_ns=frame.capture_ns, tracks=tracks)
             if unit is not None:
                 assert unit.frame_index == frame.index
@@ -189,7 +189,7 @@ def stepped(rig: Rig, frames) -> list[int]:
     """Indices of the frames that were coded."""
     coded = []
     for frame in frames:
-        decision = rig.stage.decide(frame.index, now_ns=frame.capture_ns)
+        decision = rig.stage.decide(frame, now_ns=frame.capture_ns)
         if (unit := rig.stage.encode(frame, decision, now_ns=frame.capture_ns)) is not None:
             rig.stage.send(unit, decision, now_ns=frame.capture_ns)
             coded.append(frame.index)

@@ -1,0 +1,29 @@
+"""What gives poses."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from hvt_common.values import Pose
+
+__all__ = ["PoseSource"]
+
+
+class PoseSource(Protocol):
+    """Opened once; closed with the edge."""
+
+    def at(self, media_ns: int, *, capture_ns: int) -> Pose | None:
+        """The pose of a frame; None where it is not known. Quick: called in the frame loop.
+
+        ``media_ns`` counts from the source's first frame, ``capture_ns`` is the frame's, and the pose's then.
+        """
+        ...
+
+    @property
+    def trouble(self) -> str:
+        """Why there is none now; empty where there is one, or nobody would expect one."""
+        ...
+
+    def close(self) -> None:
+        """Let go of what is open."""
+        ...

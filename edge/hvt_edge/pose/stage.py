@@ -1,0 +1,62 @@
+"""Tells the ground once a second where the camera is; less often where that takes more than 300 bits a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from typing import Final, Protocol
+
+from hvt_common.protocol.messages import PoseEncoder
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
+from hvt_edge.pose.contract import PoseSource
+
+__all__ = ["PoseSender", "PoseStage"]
+
+_MOST_BPS: Final = 300
+"""Payload bits a second."""
+_EARLY: Final = 0.97
+"""Frames come a little early or late: a report that is due nearly is due."""
+_PART: Final = "pose"
+
+
+class PoseSender(Protocol):
+    """Where reports go: `hvt_edge.link.transmitter.Transmitter`."""
+
+    def pose(self, make: Callable[[int], bytes], *, now_ns: int) -> None:
+        """Send ``make(at_ns)``, made for the moment at which the budget has room."""
+        ...
+
+
+@dataclass(eq=False)
+class PoseStage:
+    """One step a frame, in the frame loop."""
+
+    source: PoseSource
+    _: KW_ONLY
+    session_id: int
+    sender: PoseSender
+    failures: Failures
+
+    def __post_init__(self) -> None:
+        self._encoder = PoseEncoder(session_id=self.session_id)
+        self._due_ns: int | None = None
+
+    def step(self, media_ns: int, *, capture_ns: int, now_ns: int) -> None:
+        """Report the pose of a frame where one is due; ``media_ns`` counts from the source's first frame."""
+        if self._due_ns is not None and capture_ns < self._due_ns:
+            return
+        self._due_ns = capture_ns + round(_EARLY * SECOND_NS)
+        pose = self.source.at(media_ns, capture_ns=capture_ns)
+        try:
+            make = None if pose is None else self._encoder.encode(pose)
+        except ValueError as error:  # a number from outside that no place on earth has
+            self.failures.failed(_PART, str(error))
+            return
+        if make is None:
+            self.failures.failed(_PART, self.source.trouble)
+            return
+        self.failures.works(_PART)
+        pause_s = max(1.0, 8 * len(make(now_ns).pack()) / _MOST_BPS)
+        self._due_ns = capture_ns + round(_EARLY * pause_s * SECOND_NS)
+        self.sender.pose(lambda at_ns: make(at_ns).pack(), now_ns=now_ns)

@@ -1,0 +1,148 @@
+"""A camera's own HEVC stream: whether it can be the base stream, and its pictures as the ground will decode them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import av
+from av.video.reformatter import ColorRange
+
+from hvt_common.errors import UserError
+from hvt_common.values import CameraUnit
+from hvt_common.video.hevc import BaseDecoder, YuvPicture
+from hvt_edge.source.camera_units import CameraUnits
+from hvt_edge.source.contract import BaseSize, SeenUnit, check_shape
+
+__all__ = ["REENCODE", "CameraDecoder", "check_picture", "check_stream", "open_units", "rate_of"]
+
+REENCODE = "re-encode it with --encoder x265"
+_FORMATS = frozenset({"yuv420p", "yuvj420p"})
+"""4:2:0 in 8 bits; the second is FFmpeg's name for the same in full range."""
+_OTHER_MATRICES = frozenset({4, 5, 6, 7, 9})
+"""Of ITU-T H.273, table 4: BT.601 in its variants, SMPTE 240M and BT.2020. Who says nothing means BT.709."""
+
+
+def rate_of(name: str, units: Sequence[SeenUnit], *, said: float | None) -> float:
+    """Frames a second. What the container says counts where its time stamps bear it out within 2 %.
+
+    Raises `UserError` where they say nothing, or what no base stream can have.
+    """
+    gaps = [later.at_s - earlier.at_s for earlier, later in pairwise(units) if later.at_s > earlier.at_s]
+    fps = (len(units) - 1) / sum(gaps) if gaps else said or 0.0
+    if said and abs(fps / said - 1) < 0.02:
+        fps = said
+    if not 0.1 <= fps <= 240:
+        raise UserError(
+            f"source {name} gives {fps:.4g} frames a second by its time stamps, and a base stream has 0.1 to 240: "
+            f"{REENCODE}"
+        )
+    return round(fps, 3)
+
+
+class CameraDecoder:
+    """Takes packets in their order; gives each unit that can be sent with its picture. One thread.
+
+    What does not hold is left out up to the next keyframe, as a ground would have to. With ``size`` (width, height) a
+    picture of another is not taken either.
+    """
+
+    def __init__(self, units: CameraUnits, *, size: tuple[int, int] | None = None) -> None:
+        self._units = units
+        self._decoder = BaseDecoder(size=size)
+        self._size = size
+        self._whole = False
+        """Whether all since a keyframe was decoded."""
+        self.trouble = ""
+        """What was wrong with the newest unit that was left out, in a few words."""
+
+    def skip(self) -> None:
+        """Packets are missing before the next."""
+        self._whole = False
+
+    def decode(self, packet: bytes) -> tuple[CameraUnit, YuvPicture] | None:
+        """The unit and its picture; None where it cannot be sent."""
+        try:
+            unit = self._units.unit(packet)
+        except ValueError as error:
+            self._leave_out(str(error))
+            return None
+        if not unit.keyframe and not self._whole:
+            return None
+        if unit.keyframe and not self._whole:
+            self._decoder.reset()
+        picture = self._decoder.decode_yuv(unit.data)
+        if picture is None:
+            self._leave_out("a unit cannot be decoded by itself")
+            return None
+        if picture.frame.format.name not in _FORMATS:
+            self._leave_out(f"a picture has the format {picture.frame.format.name}")
+            return None
+        if self._size is not None and picture.size != self._size:
+            self._leave_out(f"a picture has {picture.size[0]}x{picture.size[1]} pixels")
+            return None
+        self._whole = True
+        return unit, picture
+
+    def _leave_out(self, why: str) -> None:
+        self._whole, self.trouble = False, why
+
+
+def open_units(name: str, stream: Any) -> CameraUnits:
+    """For the packets of an open stream. Raises `UserError` where its header is damaged."""
+    try:
+        return CameraUnits(stream.codec_context.extradata or b"")
+    except ValueError as error:
+        raise UserError(f"source {name} cannot be passed through ({error}): {REENCODE}") from error
+
+
+def check_stream(name: str, stream: Any) -> None:
+    """Raise `UserError` where an open stream cannot be the base stream, with what is accepted."""
+    codec = stream.codec_context
+    if codec is None or codec.name != "hevc":
+        said = "no codec that is known" if codec is None else codec.name
+        raise UserError(f"source {name} is {said}, and --encoder passthrough takes HEVC alone: {REENCODE}")
+    if codec.pix_fmt not in _FORMATS:
+        raise UserError(
+            f"source {name} is HEVC {codec.profile or ''} in {codec.pix_fmt}, and --encoder passthrough takes Main, "
+            f"4:2:0 in 8 bits: set the camera to Main, or {REENCODE}"
+        )
+    aspect = stream.sample_aspect_ratio or codec.sample_aspect_ratio
+    if aspect and not 0.99 < aspect < 1.01:
+        raise UserError(
+            f"source {name} has pixels that are {float(aspect):.2f} times as wide as high, which --encoder "
+            f"passthrough cannot mend: {REENCODE}"
+        )
+    if codec.has_b_frames:
+        raise UserError(
+            f"source {name} sends pictures in another order than they are shown (B-frames), which --encoder "
+            f"passthrough does not take: switch them off in the camera, or {REENCODE}"
+        )
+
+
+def check_picture(name: str, picture: av.VideoFrame, *, size: BaseSize) -> str:
+    """Raise `UserError` where a picture is not shown as it is coded, or has another size than is asked for.
+
+    Return what else will look different at the ground, as a sentence; empty for nothing.
+    """
+    has = (picture.width, picture.height)
+    wanted = size(has) if callable(size) else size
+    if has != wanted:
+        raise UserError(
+            f"source {name} is {has[0]}x{has[1]}, --size is {wanted[0]}x{wanted[1]}, and --encoder passthrough "
+            f"sends the camera's own size: leave --size out, or {REENCODE}"
+        )
+    try:
+        check_shape(size=has, fps=1)
+    except UserError as error:
+        raise UserError(f"source {name}: {error}; {REENCODE}") from error
+    quarters = round(picture.rotation / 90) % 4
+    if quarters:
+        raise UserError(
+            f"source {name} is to be shown turned by {90 * quarters} degrees, and --encoder passthrough sends it as "
+            f"it is coded: {REENCODE}"
+        )
+    if picture.color_range == ColorRange.JPEG or picture.colorspace in _OTHER_MATRICES:
+        return f"source {name} is not BT.709 in limited range: grounds show its colours a little off"
+    return ""

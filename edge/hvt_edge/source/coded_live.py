@@ -1,0 +1,179 @@
+"""An HEVC camera whose own units are the base stream: packets in a queue, in order, decoded as they are taken.
+
+Of pictures only the newest counts (`hvt_edge.source.live`); of units each builds on the one before. So none is left
+out while the queue holds, and where it does not, all up to the next keyframe.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
+from hvt_common.values import Fit, Frame, Image
+from hvt_edge.source.camera_stream import CameraDecoder, check_picture, check_stream, open_units, rate_of
+from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit
+from hvt_edge.source.live import SOURCE_PART, CameraPacket, Grabber, LiveSource, Shot, SignalLost
+from hvt_edge.source.stream import StreamGrabber, camera_time_ns
+
+__all__ = ["CodedLiveSource", "CodedStreamGrabber"]
+
+_LEAST_SURVEY_S, _MOST_SURVEY_S = 3.0, 10.0
+"""So long a camera is looked at before the flight: until its second keyframe, within these."""
+_QUEUE_S, _LEAST_QUEUED, _MOST_QUEUED_BYTES = 1.0, 8, 8 * 2**20
+_IDLE_S = 1.0
+
+
+class CodedStreamGrabber(StreamGrabber):
+    """The packets of an HEVC stream, not decoded."""
+
+    size: tuple[int, int] | None = None
+    """(width, height) of what is taken; None before the first picture."""
+    said_fps: float | None = None
+    """The rate that the stream's description says."""
+
+    def _read(self, container: Any, stream: Any) -> Iterator[Shot]:
+        check_stream(self.name, stream)
+        self.said_fps = float(stream.average_rate or 0) or None
+        return _packets(container, stream, CameraDecoder(open_units(self.name, stream), size=self.size))
+
+
+def _packets(container: Any, stream: Any, decoder: CameraDecoder) -> Iterator[Shot]:
+    for packet in container.demux(stream):
+        if packet.size:
+            at_s = None if packet.pts is None else float(packet.pts * packet.time_base)
+            taken = CameraPacket(bytes(packet), at_s, decoder)
+            yield Shot(partial(_picture, taken), camera_time_ns(packet), taken)
+
+
+def _picture(packet: CameraPacket) -> Image:
+    decoded = packet.decoder.decode(packet.data)
+    if decoded is None:
+        raise SignalLost(packet.decoder.trouble or "no keyframe has come")
+    return decoded[1].bgr()
+
+
+@dataclass(frozen=True, slots=True)
+class _Queued:
+    number: int
+    """Of the camera's packets; one that is missing was lost here."""
+    capture_ns: int
+    packet: CameraPacket
+
+
+class CodedLiveSource(LiveSource):
+    """Every unit of the camera with its picture. ``fps`` is what its time stamps say; see `LiveSource` for the rest.
+
+    Opening takes three to ten seconds, in which `camera_stream` is measured. Raises `UserError` where its units
+    cannot be the base stream.
+    """
+
+    def __init__(
+        self,
+        grabber: CodedStreamGrabber,
+        *,
+        size: BaseSize,
+        fit: Fit,
+        max_frames: int | None = None,
+        clock: Callable[[], int] | None = None,
+        failures: Failures | None = None,
+    ) -> None:
+        self.warning = ""
+        self._queue: deque[_Queued] = deque()
+        self._queued_bytes = self._number = 0
+        super().__init__(
+            grabber, size=size, fps=1.0, fit=fit, max_frames=max_frames, clock=clock, failures=failures
+        )
+
+    def steps(self, *, start_ns: int) -> Iterator[Frame | None]:  # noqa: ARG002 - a camera has its own time
+        """See `Source`. The first is a keyframe."""
+        first = newest = None
+        decoder: CameraDecoder | None = None
+        count = 0
+        while count != self._limit:
+            with self._news:
+                self._news.wait_for(lambda: self._queue or self._stop.is_set(), _IDLE_S)
+                item = self._queue.popleft() if self._queue else None
+                self._queued_bytes -= 0 if item is None else len(item.packet.data)
+            if self._failure is not None:
+                raise self._failure
+            if self._stop.is_set():
+                return
+            if item is None:
+                yield None
+                continue
+            if item.packet.decoder is not decoder or newest is None or item.number != newest + 1:
+                decoder = item.packet.decoder
+                decoder.skip()
+            newest = item.number
+            frame = self._frame(item, index=0 if first is None else item.number - first)
+            if frame is None:
+                yield None
+                continue
+            first = item.number if first is None else first
+            yield frame
+            count += 1
+
+    def _frame(self, item: _Queued, *, index: int) -> Frame | None:
+        """None where the unit cannot be sent, which counts as missed."""
+        decoder = item.packet.decoder
+        decoded = decoder.decode(item.packet.data)
+        if decoded is None:
+            with self._news:
+                self.missed += 1
+            if decoder.trouble:
+                self._failures.failed(
+                    SOURCE_PART, f"{self._grabber.name} sends what cannot be passed on ({decoder.trouble})"
+                )
+            return None
+        self._failures.works(SOURCE_PART)
+        unit, picture = decoded
+        return self._resizer.coded_frame(picture.bgr(), unit, index=index, capture_ns=item.capture_ns)
+
+    def _take(self, shot: Shot, capture_ns: int) -> None:
+        packet = shot.packet
+        assert packet is not None, "a CodedStreamGrabber gives no other"
+        with self._news:
+            self._number += 1
+            self._queue.append(_Queued(self._number, capture_ns, packet))
+            self._queued_bytes += len(packet.data)
+            most = max(_LEAST_QUEUED, round(_QUEUE_S * self.fps))
+            if len(self._queue) > most or self._queued_bytes > _MOST_QUEUED_BYTES:
+                self.missed += len(self._queue)
+                self._queue.clear()
+                self._queued_bytes = 0
+            self._news.notify_all()
+
+    def _first_size(self, grabber: Grabber, size: BaseSize) -> tuple[int, int]:
+        """Look at the camera until its second keyframe."""
+        assert isinstance(grabber, CodedStreamGrabber), "the constructor takes no other"
+        seen: list[SeenUnit] = []
+        began_s, trouble = time.monotonic(), "no keyframe came"
+        while (surveyed_s := time.monotonic() - began_s) < _MOST_SURVEY_S:
+            if surveyed_s > _LEAST_SURVEY_S and sum(unit.keyframe for unit in seen) > 1:
+                break
+            packet = grabber.grab().packet
+            assert packet is not None, "a CodedStreamGrabber gives no other"
+            decoded = packet.decoder.decode(packet.data)
+            if decoded is None:
+                trouble = packet.decoder.trouble or trouble
+                continue
+            unit, picture = decoded
+            if grabber.size is None:
+                self.warning = check_picture(grabber.name, picture.frame, size=size)
+                grabber.size = picture.size
+            at_s = time.monotonic() - began_s if packet.at_s is None else packet.at_s
+            seen.append(SeenUnit(at_s, len(unit.data), unit.keyframe))
+        if grabber.size is None or len(seen) < 2:
+            raise UserError(
+                f"source {grabber.name} gave no HEVC picture that can be passed on within {_MOST_SURVEY_S:g} s "
+                f"({trouble})"
+            )
+        self.fps = rate_of(grabber.name, seen, said=grabber.said_fps)
+        self.camera_stream = CameraStream(tuple(seen), self.fps)
+        return grabber.size

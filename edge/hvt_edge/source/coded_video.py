@@ -1,0 +1,152 @@
+"""An HEVC clip whose own units are the base stream: each frame once, with its unit, at its own time."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from typing import Any
+
+import av
+import av.error
+
+from hvt_common.errors import UserError
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Fit, Frame
+from hvt_edge.source.camera_stream import CameraDecoder, check_picture, check_stream, open_units, rate_of
+from hvt_edge.source.camera_units import CameraUnits
+from hvt_edge.source.contract import BaseSize, CameraStream, SeenUnit, Source
+from hvt_edge.source.resample import Resizer
+from hvt_edge.source.video import open_video, without_password
+
+__all__ = ["CodedVideoSource"]
+
+_log = logging.getLogger(__name__)
+
+_MOST_SURVEY_S, _MOST_SURVEYED = 600.0, 40_000
+"""So much of a clip is looked at before the flight."""
+
+
+class CodedVideoSource(Source):
+    """A clip by presentation time. Nothing is repeated or left out: its rate is the base rate.
+
+    Raises `UserError` where its units cannot be the base stream.
+    """
+
+    live = False
+
+    def __init__(
+        self,
+        spec: str,
+        *,
+        size: BaseSize,
+        fit: Fit,
+        max_frames: int | None = None,
+        source_fps: float | None = None,
+    ) -> None:
+        self._spec, self._name = spec, without_password(spec)
+        self._source_fps, self._limit = source_fps, max_frames
+        container, stream = open_video(spec)
+        with container:
+            check_stream(self._name, stream)
+            first = _first_picture(container, stream)
+        if first is None:
+            raise UserError(f"source {self._name!r} holds a video stream of which no frame can be decoded")
+        self.warning = check_picture(self._name, first, size=size)
+        self._size = (first.width, first.height)
+        self._resizer = Resizer(self._size, size, fit=fit)
+        self.view = self._resizer.view
+        container, stream = open_video(spec)
+        with container:
+            said = source_fps or float(stream.guessed_rate or stream.average_rate or 0) or None
+            seen = _seen(_timed(container, stream, fps=source_fps, said=said), open_units(self._name, stream))
+            if len(seen) < 2:
+                raise UserError(f"source {self._name!r} holds no keyframe that a ground could begin with")
+            self.fps = rate_of(self._name, seen, said=said)
+            self.frame_count = None if not stream.frames else min(stream.frames, max_frames or stream.frames)
+        self.camera_stream = CameraStream(tuple(seen), self.fps)
+        self._running: Generator[Frame, None, None] | None = None
+
+    def frames(self, *, start_ns: int) -> Iterator[Frame]:
+        """The clip from its first keyframe on."""
+        self.close()
+        self._running = self._play(start_ns)
+        return self._running
+
+    def close(self) -> None:
+        """Stop reading."""
+        if self._running is not None:
+            self._running.close()
+            self._running = None
+
+    def _play(self, start_ns: int) -> Generator[Frame, None, None]:
+        container, stream = open_video(self._spec)
+        left_out, before, count, zero_s, begun, last_ns = 0, 0, 0, 0.0, False, -1
+        decoder = CameraDecoder(open_units(self._name, stream), size=self._size)
+        packets = _timed(container, stream, fps=self._source_fps, said=self.fps)
+        with container, closing(packets):
+            for at_s, packet in packets:
+                if count == self._limit:
+                    return
+                decoded = decoder.decode(packet)
+                if decoded is None:
+                    left_out += 1
+                    continue
+                if not begun:
+                    begun, zero_s, before = True, at_s, left_out
+                unit, picture = decoded
+                # Two pictures of one time would be one to everybody.
+                last_ns = max(last_ns + 1, round((at_s - zero_s) * SECOND_NS))
+                yield self._resizer.coded_frame(
+                    picture.bgr(), unit, index=count + left_out - before, capture_ns=start_ns + last_ns
+                )
+                count += 1
+        if left_out:
+            why = f" ({decoder.trouble})" if decoder.trouble else ""
+            _log.warning("%s: %d units could not be passed on%s", self._name, left_out, why)
+
+
+def _timed(
+    container: Any, stream: Any, *, fps: float | None, said: float | None
+) -> Generator[tuple[float, bytes], None, None]:
+    """(seconds, packet) in order; ``fps`` overrides time stamps, ``said`` stands in where there are none."""
+    at_s, period_s = 0.0, 1 / (fps or said or 25.0)
+    packets = container.demux(stream)
+    count = 0
+    while True:
+        try:
+            packet = next(packets)
+        except (StopIteration, av.error.FFmpegError):  # what breaks off is played up to there
+            return
+        if not packet.size:
+            continue
+        if fps is None and packet.pts is not None:
+            at_s = float(packet.pts * packet.time_base)
+        elif count:
+            at_s += period_s
+        count += 1
+        yield at_s, bytes(packet)
+
+
+def _seen(packets: Iterator[tuple[float, bytes]], units: CameraUnits) -> list[SeenUnit]:
+    """What the clip takes, without decoding it."""
+    seen: list[SeenUnit] = []
+    for at_s, packet in packets:
+        try:
+            unit = units.unit(packet)
+        except ValueError:
+            continue  # as in flight, where it is counted
+        if seen or unit.keyframe:
+            seen.append(SeenUnit(at_s, len(unit.data), unit.keyframe))
+        if len(seen) == _MOST_SURVEYED or (seen and at_s - seen[0].at_s > _MOST_SURVEY_S):
+            break
+    return seen
+
+
+def _first_picture(container: Any, stream: Any) -> av.VideoFrame | None:
+    """As the container says that it is to be shown."""
+    try:
+        picture: av.VideoFrame | None = next(container.decode(stream), None)
+    except av.error.FFmpegError:
+        return None
+    return picture

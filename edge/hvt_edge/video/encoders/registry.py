@@ -1,0 +1,54 @@
+"""Every encoder by its name: x265, none (passthrough), those of hardware, and those that other packages install.
+
+A third party's is an entry point of the group ``hvt.encoders``: `contract.MakeEncoder`. Its package is imported when
+it is named.
+"""
+
+from __future__ import annotations
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.plug_ins import installed, loaded, the_one
+from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoders.checked import CheckedEncoder
+from hvt_edge.video.encoders.contract import Encoder
+from hvt_edge.video.encoders.hardware import HARDWARE, HardwareEncoder
+from hvt_edge.video.encoders.passthrough import Passthrough
+from hvt_edge.video.x265 import BaseEncoder
+
+__all__ = ["GROUP", "PASSTHROUGH", "X265", "check_encoder", "encoder_names", "open_encoder"]
+
+GROUP = "hvt.encoders"
+"""The entry points' group."""
+X265 = "x265"
+"""What HVT brings and has measured: the only one that takes regions and needs no qualification."""
+PASSTHROUGH = "passthrough"
+"""None at all: the units of a camera that makes HEVC itself."""
+_OWN = frozenset({X265, PASSTHROUGH}) | HARDWARE.keys()
+_WHAT = "encoder"
+
+
+def encoder_names() -> tuple[str, ...]:
+    """What ``--encoder`` takes here: HVT's own first, whether or not the device is there; none is loaded."""
+    return (X265, PASSTHROUGH, *HARDWARE, *sorted(installed(GROUP).keys() - _OWN))
+
+
+def check_encoder(name: str) -> None:
+    """Raise `UserError` where there is none of that name, or more than one; nothing is opened."""
+    built_in = name in _OWN
+    entry = the_one(GROUP, name, what=_WHAT, built_in=built_in)
+    if not built_in and entry is None:
+        raise UserError(f"--encoder {name!r} is not known: choose one of {', '.join(encoder_names())}")
+
+
+def open_encoder(name: str, settings: EncoderSettings) -> Encoder:
+    """Open it. Raises `UserError` where there is none, or it does not load or take the settings."""
+    if name == X265:
+        return BaseEncoder(settings)
+    if name == PASSTHROUGH:
+        return Passthrough()
+    check_encoder(name)
+    if name in HARDWARE:
+        return CheckedEncoder(HardwareEncoder(settings, row=HARDWARE[name]))
+    entry = the_one(GROUP, name, what=_WHAT, built_in=False)
+    assert entry is not None, "checked"
+    return CheckedEncoder(loaded(entry, lambda make: make(settings), what=_WHAT))

@@ -1,0 +1,67 @@
+"""Which codecs of stills all grounds read."""
+
+from __future__ import annotations
+
+import logging
+
+from hvt_common.protocol.messages import InfoRequest
+from hvt_edge.link.still_readers import StillReaders
+
+S = 1_000_000_000
+
+
+class Clock:
+    """Stands still until it is set."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10**18
+
+    def __call__(self) -> int:
+        """Now."""
+        return self.now_ns
+
+
+def request(requester: int, *codecs: str) -> InfoRequest:
+    """As a ground sends it."""
+    return InfoRequest(requester_id=requester, still_codecs=codecs)
+
+
+def read(readers: StillReaders, *codecs: str) -> list[str]:
+    """Those of them that all read."""
+    return [one for one in codecs if readers.read(one)]
+
+
+def test_all_grounds_have_to_read_a_codec():
+    """The second screen would stay without stills."""
+    readers = StillReaders(Clock())
+    assert read(readers, "residual", "anything") == ["residual", "anything"], "nobody has said anything"
+    readers.on_request(request(1, "jpeg", "residual", "avif"))
+    assert read(readers, "jpeg", "residual", "avif", "jxl") == ["jpeg", "residual", "avif"]
+    readers.on_request(request(2, "jpeg", "avif"))
+    assert read(readers, "jpeg", "residual", "avif", "jxl") == ["jpeg", "avif"]
+    readers.on_request(request(2, "jpeg", "residual"))
+    assert read(readers, "jpeg", "residual", "avif", "jxl") == ["jpeg", "residual"]
+
+
+def test_a_ground_that_has_gone_counts_for_a_minute():
+    """A look from a phone would cost the bits of all that follows."""
+    clock = Clock()
+    readers = StillReaders(clock)
+    readers.on_request(request(1, "jpeg"))
+    clock.now_ns += 60 * S
+    assert read(readers, "residual") == []
+    clock.now_ns += 1
+    assert read(readers, "residual") == ["residual"]
+
+
+def test_strangers_do_not_fill_the_edge(caplog):
+    """Numbers cost their sender nothing: each would take memory, and its codec a line of the log."""
+    caplog.set_level(logging.WARNING)
+    readers = StillReaders(Clock())
+    readers.on_request(request(0, "jpeg"))
+    for number in range(1, 1000):
+        readers.on_request(request(number, "jpeg", "residual"))
+    assert read(readers, "residual") == ["residual"], "the oldest has made its place free"
+    for number in range(100):
+        assert not readers.read(f"codec-{number}")
+    assert len(caplog.records) == 8

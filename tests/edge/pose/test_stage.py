@@ -1,0 +1,65 @@
+"""When a pose is told to the ground."""
+
+from __future__ import annotations
+
+from hvt_common.protocol.messages import PoseDecoder, PoseReport
+from hvt_common.runtime.failures import Failures
+from hvt_common.values import Pose
+from hvt_edge.pose.stage import PoseStage
+from hvt_edge.pose.table import PoseTable
+
+SECOND_NS = 1_000_000_000
+START_NS = 1_790_000_000_000_000_000
+
+
+class Sent:
+    """What would have left, with its time."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[int, bytes]] = []
+
+    def pose(self, make, *, now_ns):
+        """Take it at once."""
+        self.messages.append((now_ns, make(now_ns)))
+
+
+def fly(table: PoseTable, *, seconds: int, fps: int = 15) -> tuple[Sent, Failures]:
+    """Every frame of a flight."""
+    sent, failures = Sent(), Failures(lambda: START_NS)
+    stage = PoseStage(table, session_id=5, sender=sent, failures=failures)
+    for index in range(seconds * fps):
+        media_ns = index * SECOND_NS // fps
+        stage.step(media_ns, capture_ns=START_NS + media_ns, now_ns=START_NS + media_ns)
+    return sent, failures
+
+
+def test_it_is_told_once_a_second_and_within_300_bits():
+    """It would eat the stills of a thin link."""
+    ends = [Pose(0, 52.0, 13.0, height_m=80.0), Pose(60 * SECOND_NS, 52.01, 13.01, height_m=90.0)]
+    table = PoseTable(ends, most_gap_s=99)
+    sent, failures = fly(table, seconds=60)
+    bits = 8 * sum(len(data) for _, data in sent.messages)
+    assert 50 <= len(sent.messages) <= 60
+    assert bits / 60 <= 300
+    decoder = PoseDecoder()
+    poses = [decoder.decode(PoseReport.parse(data)) for _, data in sent.messages]
+    assert all(pose is not None for pose in poses)
+    assert [pose.capture_ns for pose in poses if pose] == [at for at, _ in sent.messages]
+    assert failures.parts == ()
+
+
+def test_where_there_is_none_it_says_so_and_goes_on():
+    """A flight would stop, or its map stay where it was without a word."""
+    sent, failures = fly(PoseTable([Pose(0, 52.0, 13.0), Pose(2 * SECOND_NS, 52.0, 13.0)]), seconds=8)
+    assert len(sent.messages) in (3, 4)
+    (part,) = failures.parts
+    assert (part.part, part.working) == ("pose", False)
+    assert "has nothing at" in part.reason
+
+
+def test_a_number_that_cannot_be_said_is_named():
+    """A broken sensor would end the flight."""
+    high = [Pose(0, 52.0, 13.0, height_m=1e9), Pose(9 * SECOND_NS, 52.0, 13.0, height_m=1e9)]
+    sent, failures = fly(PoseTable(high), seconds=3)
+    assert sent.messages == []
+    assert "height" in failures.parts[0].reason

@@ -1,0 +1,198 @@
+"""Sources whose frames come with the camera's own units: real files, and a real RTSP camera."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
+from hvt_common.video.annex_b import nal_kind, nal_units, parameter_sets
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.source.opening import open_source
+from media.clips import hard_pictures, smooth_pictures
+from media.hevc_camera import SIZE, packets_of, pictures_of, write_clip
+from programs.rtsp_camera import RtspCamera
+
+
+def coded(spec, *, size=None, **settings):
+    """Open it as ``--encoder passthrough`` does."""
+    chosen = size or (lambda source_size: source_size)
+    return open_source(str(spec), size=chosen, fps=15, coded=True, **settings)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.hevc", "a.ts"])
+def test_each_frame_of_a_clip_comes_with_its_unit(tmp_path, name):
+    """The picture that the edge analyzes would be another than the ground shows under the same number."""
+    clip = write_clip(tmp_path / name, fps=20)
+    with coded(clip) as source:
+        assert (source.fps, source.live, source.view.base_size) == (20, False, SIZE)
+        frames = list(source.frames(start_ns=SECOND_NS))
+        assert source.camera_stream.keyframe_s == pytest.approx(0.5, abs=0.01)
+        sizes = [len(one.camera_unit.data) for one in frames]
+        assert [unit.size_bytes for unit in source.camera_stream.units] == sizes
+    assert [frame.index for frame in frames] == list(range(45))
+    times = [frame.capture_ns - SECOND_NS for frame in frames]
+    assert times == pytest.approx([index * SECOND_NS / 20 for index in range(45)], abs=1e6)
+    decoder = BaseDecoder()
+    assert all(np.array_equal(decoder.decode(one.camera_unit.data), one.base_bgr) for one in frames)
+    slices = [[nal for nal in nal_units(one.camera_unit.data) if nal_kind(nal) < 32] for one in frames]
+    assert slices == pictures_of(clip)
+
+
+def test_a_clip_may_be_played_at_another_rate_and_again(tmp_path):
+    """A raw stream that says no rate would play at any, or a second reading begin in the middle."""
+    with coded(write_clip(tmp_path / "a.hevc"), source_fps=5, max_frames=12) as source:
+        first, again = (list(source.frames(start_ns=0)) for _ in range(2))
+    assert source.fps == 5
+    assert [frame.capture_ns for frame in first] == [index * SECOND_NS // 5 for index in range(12)]
+    assert [one.camera_unit for one in first] == [one.camera_unit for one in again]
+
+
+def test_what_is_damaged_is_left_out_up_to_the_next_keyframe(tmp_path, caplog):
+    """Garbage would be shown as if the camera had seen it."""
+    packets = packets_of(write_clip(tmp_path / "a.hevc"))
+    packets[13] = packets[13][:8]
+    clip = tmp_path / "damaged.hevc"
+    clip.write_bytes(b"".join(packets))
+    with coded(clip) as source:
+        frames = list(source.frames(start_ns=0))
+    played = [frame.index for frame in frames]
+    assert played[:13] == list(range(13))
+    (gap,) = ((one, two) for one, two in pairwise(frames) if two.index != one.index + 1)
+    assert gap[1].camera_unit.keyframe
+    assert len(frames) == 45 - 7
+    assert "units could not be passed on" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"bframes": 3}, r"in another order than they are shown \(B-frames\)"),
+        (
+            {"pixel_format": "yuv420p10le"},
+            "is HEVC Main 10 in yuv420p10le, and .* takes Main, 4:2:0 in 8 bits",
+        ),
+        ({"pixel_format": "yuv444p"}, "yuv444p, and .* takes Main"),
+        ({"codec": "libx264"}, "is h264, and --encoder passthrough takes HEVC alone"),
+        ({"more": "sar=10"}, "has pixels that are 1.64 times as wide as high"),
+    ],
+)
+def test_what_no_ground_could_show_is_refused(tmp_path, settings, says):
+    """A flight would begin that shows nothing, or another picture than the camera's."""
+    clip = write_clip(tmp_path / "a.mp4", **settings)
+    with pytest.raises(UserError, match=says) as caught:
+        coded(clip)
+    assert "re-encode it with --encoder x265" in str(caught.value)
+
+
+def test_another_size_is_refused(tmp_path):
+    """The base stream would have a size that nobody asked for."""
+    clip = write_clip(tmp_path / "a.mp4")
+    with pytest.raises(UserError, match=r"is 320x192, --size is 640x360, and .* sends the camera's own size"):
+        coded(clip, size=(640, 360))
+    with coded(clip, size=SIZE) as source:
+        assert source.view.base_size == SIZE
+
+
+@pytest.mark.parametrize(
+    ("spec", "kind"), [("demo", "the drawn demo"), ("/dev/video0", "a device"), (".", "a folder")]
+)
+def test_what_is_not_coded_is_refused(spec, kind):
+    """It would be a source without units, and an error in the middle of the code."""
+    with pytest.raises(
+        UserError, match=f"is {kind}, and --encoder passthrough takes a video file or a stream"
+    ):
+        coded(spec)
+
+
+def test_colours_that_grounds_show_a_little_off_are_told_of(tmp_path):
+    """Who sees grey for black would look for the fault in the camera."""
+    with coded(write_clip(tmp_path / "a.mp4", more="range=full:colormatrix=bt709")) as source:
+        assert "is not BT.709 in limited range" in source.warning
+    with coded(write_clip(tmp_path / "b.mp4", more="range=limited:colormatrix=bt709")) as source:
+        assert source.warning == ""
+
+
+@pytest.fixture(scope="module")
+def units(tmp_path_factory) -> list[bytes]:
+    """Two seconds of a camera at 25 fps."""
+    folder = tmp_path_factory.mktemp("units")
+    return packets_of(write_clip(folder / "a.hevc", smooth_pictures(50, size=SIZE), fps=25, keyint=25))
+
+
+@pytest.mark.timeout(60)
+def test_no_unit_of_a_live_camera_is_lost(free_port, units):
+    """Each one that is missing is a picture that stands still up to the next keyframe."""
+    with RtspCamera(free_port, units=units) as camera, coded(camera.url) as source:
+        assert source.live
+        assert source.fps == pytest.approx(25, rel=0.15)
+        assert source.camera_stream.keyframe_s == pytest.approx(1, rel=0.3)
+        frames = []
+        for frame in source.frames(start_ns=0):
+            frames.append(frame)
+            if len(frames) == 20:
+                time.sleep(0.6)  # as where a unit waits for its room
+            if len(frames) == 70:
+                break
+    assert [frame.index for frame in frames] == list(range(70))
+    assert frames[0].camera_unit.keyframe
+    assert all(later.capture_ns > earlier.capture_ns for earlier, later in pairwise(frames))
+    assert parameter_sets(frames[0].camera_unit.data), "the camera sends them in its description alone"
+    decoder = BaseDecoder(size=SIZE)
+    assert all(np.array_equal(decoder.decode(one.camera_unit.data), one.base_bgr) for one in frames)
+
+
+@pytest.mark.timeout(60)
+def test_a_reader_that_is_away_for_long_goes_on_with_a_keyframe(free_port, units):
+    """The queue would grow for ever, or what follows be garbage."""
+    with RtspCamera(free_port, units=units) as camera, coded(camera.url) as source:
+        frames = source.frames(start_ns=0)
+        before = next(frames)
+        time.sleep(4)
+        shown = [next(frames) for _ in range(60)]
+        (gap,) = (two for one, two in pairwise([before, *shown]) if two.index != one.index + 1)
+        assert gap.camera_unit.keyframe
+        assert source.missed >= 60
+        decoder = BaseDecoder(size=SIZE)
+        assert all(decoder.decode(one.camera_unit.data) is not None for one in shown[shown.index(gap) :])
+
+
+@pytest.mark.timeout(90)
+def test_a_camera_that_restarts_goes_on_with_a_keyframe_and_one_that_changed_is_told_of(
+    free_port, units, tmp_path
+):
+    """After a camera's reboot the picture would be garbage, or of a size that the ground does not take."""
+    larger = packets_of(write_clip(tmp_path / "a.hevc", hard_pictures(25, size=(384, 256)), fps=25))
+    failures = Failures(time.time_ns)
+    opened = partial(RtspCamera, free_port)
+    camera = opened(units=units)
+    try:
+        with coded(camera.url, failures=failures) as source:
+            frames, gaps, restarted = [], [], 0
+            for frame in source.steps(start_ns=0):
+                if frame is not None:
+                    frames.append(frame)
+                    if len(frames) > 1 and frame.index != frames[-2].index + 1:
+                        gaps.append(frame)
+                if len(frames) == 10 and not restarted:
+                    camera.close()
+                    camera, restarted = opened(units=larger), 1
+                said = [one.reason for one in failures.parts]
+                if restarted == 1 and any("384x256" in one or "cannot be decoded" in one for one in said):
+                    camera.close()
+                    camera, restarted = opened(units=units), 2
+                if restarted == 2 and gaps and len(frames) > 20:
+                    break
+        assert gaps
+        assert gaps[0].camera_unit.keyframe
+        assert {frame.base_bgr.shape for frame in frames} == {(SIZE[1], SIZE[0], 3)}
+        (part,) = failures.parts
+        assert (part.part, part.working) == ("source", True)
+    finally:
+        camera.close()

@@ -1,0 +1,134 @@
+"""Encoders that other packages install, and those of hardware: found by name, checked, refused in a sentence."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import pytest
+
+from hvt_common.errors import UserError
+from hvt_common.runtime import plug_ins
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.video.encoder_settings import EncoderSettings
+from hvt_edge.video.encoders.hardware import HARDWARE, HardwareEncoder, HardwareRow
+from hvt_edge.video.encoders.registry import check_encoder, encoder_names, open_encoder
+from hvt_edge.video.x265 import BaseEncoder
+from media.clips import framed, smooth_pictures
+from media.third_party import ENCODERS, install
+
+SIZE = (320, 192)
+SETTINGS = EncoderSettings(size=SIZE, fps=15.0, bitrate_bps=200_000, preset="ultrafast")
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """Installs encoders for one test, by their class."""
+
+    def put(*classes: str, module: str = "acme_encoders", **names: str) -> None:
+        parts = {f"acme-{one.lower()}": one for one in classes} | names
+        folder = install(tmp_path / "site", parts, module=module, source=ENCODERS, group="hvt.encoders")
+        if str(folder) not in sys.path:
+            monkeypatch.syspath_prepend(str(folder))
+        plug_ins.installed.cache_clear()
+
+    yield put
+    monkeypatch.undo()
+    plug_ins.installed.cache_clear()
+    for name in [name for name in sys.modules if name.startswith("acme_")]:
+        del sys.modules[name]
+
+
+def test_another_encoder_makes_the_base_stream(installed):
+    """The encoder of a board could not be used without changing HVT."""
+    installed("Obedient")
+    assert encoder_names() == ("x265", "passthrough", *HARDWARE, "acme-obedient")
+    encoder, decoder = open_encoder("acme-obedient", SETTINGS), BaseDecoder(size=SIZE)
+    frames = framed(smooth_pictures(6, size=SIZE))
+    units = [encoder.encode(frame, keyframe=frame.index in (0, 4)) for frame in frames]
+    assert [unit.keyframe for unit in units] == [True, False, False, False, True, False]
+    assert [unit.capture_ns for unit in units] == [frame.capture_ns for frame in frames]
+    assert all(decoder.decode(unit.data) is not None for unit in units)
+    assert math.isnan(encoder.mean_qp), "it does not say"
+    assert isinstance(open_encoder("x265", SETTINGS), BaseEncoder)
+
+
+def test_a_name_that_nobody_brings_is_answered_with_those_that_are_there(installed):
+    """A typing mistake would be searched for in the documents."""
+    installed("Obedient")
+    with pytest.raises(
+        UserError,
+        match=r"--encoder 'x266' is not known: choose one of x265, passthrough, hevc_nvenc, .*, acme-obedient$",
+    ):
+        check_encoder("x266")
+
+
+def test_names_that_mean_something_else_are_refused(installed):
+    """What --encoder x265 is would depend on what else is installed."""
+    installed(x265="Obedient")
+    with pytest.raises(UserError, match="encoder 'x265' is built in, and package acme_encoders"):
+        check_encoder("x265")
+    installed("Obedient", module="acme_one")
+    installed("Obedient", module="acme_two")
+    with pytest.raises(UserError, match="encoder 'acme-obedient' comes from both package acme_"):
+        check_encoder("acme-obedient")
+
+
+def test_one_that_does_not_open_is_named(installed):
+    """A traceback of somebody else's in place of the package to mend."""
+    installed("Absent")
+    with pytest.raises(
+        UserError, match=r"encoder 'acme-absent' of package acme_encoders .* OSError: no such device"
+    ):
+        open_encoder("acme-absent", SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("Late", "it gave no access unit for frame 0"),
+        ("WithoutKeyframes", "frame 2 was to be a keyframe, and is no IDR"),
+    ],
+)
+def test_what_no_ground_could_use_is_an_error(installed, name, says):
+    """A ground that joins would wait for a picture for ever."""
+    installed(name)
+    encoder, frames = open_encoder(f"acme-{name.lower()}", SETTINGS), framed(smooth_pictures(4, size=SIZE))
+    with pytest.raises(ValueError, match=says):
+        [encoder.encode(frame, keyframe=frame.index in (0, 2)) for frame in frames]
+
+
+@pytest.mark.parametrize("row", HARDWARE.values(), ids=lambda row: row.codec)
+def test_hardware_that_is_not_there_is_refused(row):
+    """An edge would end with FFmpeg's internals, or fly without video."""
+    try:
+        HardwareEncoder(SETTINGS, row=row)
+    except UserError as error:
+        text = str(error)
+    else:
+        pytest.skip(f"this machine has {row.needs}")
+    assert text.startswith(f"--encoder {row.codec} does not open on this machine (")
+    assert text.endswith(f": it takes {row.needs}; x265 takes none")
+
+
+def test_the_class_behind_the_rows_codes():
+    """Nothing of it would have run before the first flight with a GPU; here x265 stands behind a row of its own."""
+    options = {"preset": "ultrafast", "tune": "zerolatency", "forced-idr": "1"}
+    options["x265-params"] = "log-level=none:repeat-headers=1:open-gop=0:bframes=0:min-keyint=1"
+    row = HardwareRow("libx265", "yuv420p", "nothing", options)
+    encoder, decoder = HardwareEncoder(SETTINGS, row=row), BaseDecoder(size=SIZE)
+    for frame in framed(smooth_pictures(6, size=SIZE)):
+        unit = encoder.encode(frame, keyframe=frame.index in (0, 4))
+        assert unit.keyframe == (frame.index in (0, 4))
+        shown = decoder.decode(unit.data)
+        assert shown is not None
+        assert abs(shown.astype(int) - frame.base_bgr).mean() < 8
+        assert 0 < encoder.mean_qp < 51
+
+
+def test_a_row_of_hardware_that_delays_is_an_error():
+    """Pictures would be older than their times say."""
+    row = HardwareRow("libx265", "yuv420p", "nothing", {"x265-params": "log-level=none"})
+    encoder = HardwareEncoder(SETTINGS, row=row)
+    with pytest.raises(ValueError, match="libx265 gave 0 units for frame 0: it delays"):
+        encoder.encode(framed(smooth_pictures(1, size=SIZE))[0], keyframe=True)

@@ -1,0 +1,246 @@
+"""A camera's own units through the stage: real HEVC, real budget, real store; nothing follows what is missing."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from itertools import pairwise, product
+from pathlib import Path
+
+import av
+import pytest
+
+from hvt_common.protocol.ledger import Account, Ledger
+from hvt_common.protocol.messages import BaseHeader
+from hvt_common.runtime.failures import Failures
+from hvt_common.units import SECOND_NS
+from hvt_common.video.hevc import BaseDecoder
+from hvt_edge.backlog.stage import State
+from hvt_edge.link.budget import BudgetSettings, RollingBudget
+from hvt_edge.link.transmitter import Transmitter
+from hvt_edge.operating.keyframes import KeyframeRequests, KeyframeSettings
+from hvt_edge.source.opening import open_source
+from hvt_edge.video.frame_decision import Action, FrameDecision
+from hvt_edge.video.local_copy import LocalCopy
+from hvt_edge.video.passthrough import PassthroughStage, UnitInputs, decide_unit
+from media.clips import START_NS, hard_pictures, smooth_pictures
+from media.hevc_camera import SIZE, write_clip
+from rigs import keeping
+
+LIVE, OFFLINE, RETURNING = State.LIVE, State.OFFLINE, State.RETURNING
+LEFT_OUT = FrameDecision(Action.HOLD)
+ANY, NO, YES = (False, True), (False,), (True,)
+
+
+def to(keyframe, **where) -> FrameDecision:
+    """A unit that goes somewhere."""
+    return FrameDecision(Action.CODE, keyframe, **where)
+
+
+# link, keyframe, after sent, after stored, admitted, probe due: what is decided. ANY: it does not matter.
+TABLE = [
+    (LIVE, YES, ANY, ANY, YES, ANY, to(True, to_link=True)),
+    (LIVE, NO, YES, ANY, YES, ANY, to(False, to_link=True)),
+    (LIVE, NO, NO, ANY, YES, ANY, LEFT_OUT),
+    (LIVE, ANY, ANY, ANY, NO, ANY, LEFT_OUT),
+    (RETURNING, YES, ANY, ANY, YES, ANY, to(True, to_link=True, resumes=True)),
+    (RETURNING, YES, ANY, ANY, NO, ANY, to(True, to_store=True)),
+    (RETURNING, NO, ANY, YES, ANY, ANY, to(False, to_store=True)),
+    (RETURNING, NO, ANY, NO, ANY, ANY, LEFT_OUT),
+    (OFFLINE, YES, ANY, ANY, NO, ANY, to(True, to_store=True)),
+    (OFFLINE, YES, ANY, ANY, YES, NO, to(True, to_store=True)),
+    (OFFLINE, YES, ANY, ANY, YES, YES, to(True, to_store=True, to_link=True)),
+    (OFFLINE, NO, ANY, YES, NO, ANY, to(False, to_store=True)),
+    (OFFLINE, NO, ANY, YES, YES, NO, to(False, to_store=True)),
+    (OFFLINE, NO, ANY, YES, YES, YES, to(False, to_store=True, to_link=True)),
+    (OFFLINE, NO, ANY, NO, ANY, ANY, LEFT_OUT),
+]
+
+
+def test_the_decision_is_as_its_table_says():
+    """A unit would be sent that builds on one which nobody has, or one be left out that could have gone."""
+    decided = {}
+    for link, *columns, decision in TABLE:
+        for row in product(*columns):
+            assert decided.setdefault((link, row), decision) == decision, "two lines of the table contradict"
+    assert len(decided) == 3 * 2**5
+    for (link, row), decision in decided.items():
+        keyframe, sent, stored, admitted, probe = row
+        inputs = UnitInputs(keyframe, sent, stored, admitted, link=link, probe_due=probe)
+        assert decide_unit(inputs) == decision, inputs
+
+
+class Kept:
+    """Where bytes go."""
+
+    def __init__(self) -> None:
+        self.headers: list[BaseHeader] = []
+        self.units: list[bytes] = []
+
+    def put(self, channel, payload, *, attachment=None, encoding="") -> None:
+        """Keep it."""
+        self.headers.append(BaseHeader.parse(attachment, payload))
+        self.units.append(payload)
+
+
+class Rig:
+    """A stage with all that it needs, without a store; ``paused_ns`` counts what it has waited."""
+
+    def __init__(
+        self, *, budget_bps: int = 800_000, admits=lambda _now_ns: True, copy=None, waits=True
+    ) -> None:
+        self.kept, self.failures, self.ledger = Kept(), Failures(time.time_ns), Ledger()
+        self.now_ns = START_NS
+        self.keyframes = KeyframeRequests(KeyframeSettings(interval_ns=0, camera_every_s=2.0))
+        self.stage = PassthroughStage(
+            self.keyframes,
+            Transmitter(
+                self.kept,
+                ledger=self.ledger,
+                budget=RollingBudget(BudgetSettings(budget_bps, budget_bps, fps=15)),
+                edge_id="uav-1",
+                session_id=1,
+                lockstep=False,
+                wait_until=lambda at_ns: self.wait(at_ns - self.now_ns),
+            ),
+            failures=self.failures,
+            admits=admits,
+            local_copy=copy,
+            pause=self.wait if waits else None,
+        )
+
+    def wait(self, pause_ns: int) -> int:
+        """Time goes by."""
+        self.now_ns += max(0, pause_ns)
+        return self.now_ns
+
+    def play(self, frames) -> list[int]:
+        """Indices of the frames that were sent."""
+        sent = []
+        for frame in frames:
+            self.now_ns = max(self.now_ns, frame.capture_ns)
+            decision = self.stage.decide(frame, now_ns=self.now_ns)
+            unit = self.stage.encode(frame, decision, now_ns=self.now_ns)
+            if unit is not None:
+                self.stage.send(unit, decision, now_ns=self.now_ns)
+                sent.append(frame.index)
+        return sent
+
+    def worst_bps(self) -> int:
+        """The fullest second."""
+        return self.ledger.summary(6.0).worst_window_bps.total
+
+
+def frames_of(folder: Path, pictures, **settings):
+    """A camera's frames, and its stream."""
+    clip = write_clip(folder / "camera.mp4", pictures, **settings)
+    with open_source(str(clip), size=SIZE, fps=15, coded=True) as source:
+        return list(source.frames(start_ns=START_NS))
+
+
+@pytest.fixture(scope="module")
+def burst(tmp_path_factory):
+    """Six seconds, of which one is a scene that costs much more; a keyframe each second."""
+    pictures = smooth_pictures(90, size=SIZE)
+    pictures[35:50] = hard_pictures(15, size=SIZE)
+    return frames_of(tmp_path_factory.mktemp("burst"), pictures, keyint=15, more="qp=28")
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_what_breaks_the_budget_is_left_out_up_to_the_next_keyframe(burst, waits):
+    """A scene that suddenly costs more would break the budget, or every ground show garbage."""
+    rig = Rig(budget_bps=200_000, waits=waits)
+    sent = rig.play(burst)
+    assert rig.worst_bps() <= 200_000
+    assert 0 < rig.stage.left_out == 90 - len(sent) < 60
+    assert sent[-15:] == list(range(75, 90)), "it is back when the scene is"
+    keys = {frame.index for frame in burst if frame.camera_unit.keyframe}
+    assert all(two == one + 1 or two in keys for one, two in pairwise(sent))
+    decoder = BaseDecoder(size=SIZE)
+    assert all(decoder.decode(unit) is not None for unit in rig.kept.units)
+    assert [one.sequence for one in rig.kept.headers] == list(range(len(sent))), "no ground takes it for lost"
+    (part,) = rig.failures.parts
+    assert (part.part, part.working) == ("passthrough", True)
+    assert "the budget's window has no room for a " in part.reason
+    assert "nothing is sent up to the camera's next keyframe" in part.reason
+
+
+def test_a_unit_that_no_window_holds_costs_no_time(burst):
+    """The loop would wait for what never comes, and every frame behind it."""
+    rig = Rig(budget_bps=20_000)
+    large = [frame for frame in burst[35:50] if len(frame.camera_unit.data) > 3000]
+    began_ns = large[0].capture_ns
+    rig.now_ns = began_ns
+    keyed = [replace(one, camera_unit=replace(one.camera_unit, keyframe=True)) for one in large[:1]]
+    assert rig.play(keyed) == []
+    assert rig.now_ns == began_ns
+
+
+def test_a_link_that_is_busy_for_a_moment_costs_nothing(burst):
+    """Behind each large keyframe the picture would stand still up to the next."""
+    busy_until = START_NS + 3 * SECOND_NS // 10
+    rig = Rig(admits=lambda now_ns: now_ns >= busy_until)
+    assert rig.play(burst[:30]) == list(range(30))
+    assert rig.now_ns >= busy_until
+    busy = Rig(admits=lambda now_ns: not 0 < now_ns - START_NS - SECOND_NS // 2 < 2 * SECOND_NS)
+    sent = busy.play(burst)
+    assert sent[:5] == list(range(5))
+    assert 45 in sent
+    assert 20 not in sent
+    assert "the link has no room for" in busy.failures.parts[0].reason
+
+
+def test_a_frame_that_the_source_lost_is_waited_for_to_be_made_good(burst):
+    """What builds on it is garbage everywhere, and nobody would say so."""
+    rig = Rig()
+    sent = rig.play([frame for frame in burst if frame.index not in (20, 21)])
+    assert sent == [*range(20), *range(30, 90)]
+
+
+def test_the_local_copy_has_what_was_not_sent(burst, tmp_path):
+    """The only whole copy of the flight would have the holes of the link."""
+    failures = Failures(time.time_ns)
+    with LocalCopy(tmp_path / "copy.mkv", failures=failures, wait=True) as copy:
+        rig = Rig(budget_bps=200_000, copy=copy)
+        sent = rig.play([frame for frame in burst if frame.index != 5])
+    assert len(sent) < 80
+    with av.open(str(tmp_path / "copy.mkv")) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 90 - 10, (
+            "from the lost one up to the next keyframe"
+        )
+
+
+def test_a_ground_that_asks_for_a_keyframe_is_told_when_one_comes(burst):
+    """It would ask again and again, and stills be held for a keyframe that nobody makes."""
+    rig = Rig()
+    assert rig.keyframes.due(START_NS), "before the first"
+    rig.play(burst[:5])
+    refusal = rig.keyframes.request(rig.now_ns)
+    assert refusal is not None
+    assert "makes no keyframe on request: the next comes by itself, one each 2.0 s or so" in refusal
+    rig.keyframes.require(rig.now_ns)
+    assert not rig.keyframes.due(rig.now_ns)
+    assert rig.keyframes.sent == 1
+    assert rig.ledger.messages(Account.BASE) == 5
+
+
+def test_an_outage_is_stored_from_keyframe_to_keyframe(tmp_path):
+    """What is kept while the link is away could not be shown, or what follows be garbage at the ground."""
+    frames = frames_of(tmp_path, smooth_pictures(90, size=SIZE), keyint=15)
+    rig = keeping.Rig(tmp_path / "store")
+    rig.stage = PassthroughStage(
+        rig.keyframes, rig.sender, failures=rig.failures, admits=rig.admits, backlog=rig.backlog
+    )
+    for frame in frames:
+        rig.now_ns, rig.linked = frame.capture_ns, not 35 <= frame.index < 62
+        rig.link_control.before_frame(rig.now_ns)
+        rig.base(frame)
+    sent = [header.frame_index for header in rig.out.base]
+    assert sent == [*range(35), *range(75, 90)]
+    assert [header.sequence for header in rig.out.base] == list(range(50)), "no hole for what was kept"
+    kept = {unit.frame_index: unit for unit in rig.kept()}
+    assert kept.keys() == {*range(35), *range(45, 75)}, "what was on its way, and from the next keyframe on"
+    decoder = BaseDecoder(size=SIZE)
+    for index in range(45, 75):
+        assert kept[index].data == frames[index].camera_unit.data
+        assert decoder.decode(kept[index].data) is not None
