@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvt_common.values import Image, View
+from hvt_common.geodesy import moved
+from hvt_common.units import SECOND_NS
+from hvt_common.values import Image, Orientation, Pose, View
 from hvt_scene.appearance import Appearance
 from hvt_scene.drawing.cast import Cast
 from hvt_scene.drawing.foliage import Grove
@@ -33,6 +35,8 @@ from hvt_scene.world.traffic import set_in_motion
 
 __all__ = ["Scene"]
 
+_ORIGIN_DEG = (52.0, 13.0)
+_GROUND_M = 40.0
 _MARGIN_PX = 2
 _LONGEST_SHADOW_M = 4.0  # beyond a body's own reach, when deciding whether it may touch the frame
 
@@ -125,6 +129,37 @@ class Scene:
             for index, code, spots, share in zip(chosen.tolist(), codes, corners, visible, strict=True)
             if share > 0
         )
+
+    def pose(self, t_s: float) -> Pose:
+        """Where the camera is at ``t_s``; ``capture_ns`` counts from the scene's beginning.
+
+        The scene's origin lies at 52° N, 13° E, its upper edge to the north. The errors are about those of a good
+        gimbal: the picture shakes, and the pose does not say so.
+        """
+        place = self._camera.place(t_s)
+        latitude, longitude = self.geographic(place.x_m, place.y_m)
+        return Pose(
+            capture_ns=round(t_s * SECOND_NS),
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=place.height_m,
+            altitude_m=place.height_m + _GROUND_M,
+            camera=Orientation(place.yaw_deg, place.pitch_deg, 0.0),
+            platform=Orientation(place.yaw_deg, 0.0, 0.0),
+            hfov_deg=place.hfov_deg,
+            position_error_m=0.5,
+            height_error_m=0.5,
+            angle_error_deg=0.3,
+        )
+
+    def geographic(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Latitude and longitude of a place in the scene, degrees."""
+        return moved(*_ORIGIN_DEG, north_m=-y_m, east_m=x_m)
+
+    def places(self, t_s: float) -> dict[int, tuple[float, float]]:
+        """X and y in metres of the middle of each object that may be in the picture, by its id in `truth`."""
+        _, chosen, places, _ = self._view(t_s)
+        return dict(zip((chosen + 1).tolist(), map(tuple, places[:, :2].tolist()), strict=True))
 
     def write_truth(self, path: Path, *, fps: float, view: View) -> int:
         """See `hvt_scene.truth.write_truth`."""

@@ -54,6 +54,12 @@ def done(tmp_path, module, words, without):
         ("hvt_study.cli", ("score", "a.csv", "--truth", "gt.txt"), ("sklearn",), "hvt[study]"),
         ("hvt_ground.cli", ("--help",), ("rerun",), "hvt[ground]"),
         (
+            "hvt_ground.cli",
+            ("--cot", "udp://127.0.0.1:9", "--connect", "tcp/127.0.0.1:9"),
+            ("pytak",),
+            "hvt[cot]",
+        ),
+        (
             "hvt_edge.cli",
             ("--source", "demo", "--metrics", "127.0.0.1:1"),
             ("prometheus_client",),

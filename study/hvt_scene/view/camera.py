@@ -10,7 +10,10 @@ import numpy.typing as npt
 
 from hvt_scene.appearance import Appearance
 
-__all__ = ["Camera", "Matrix"]
+__all__ = ["Camera", "CameraPlace", "Matrix"]
+
+_FOCAL_WIDTHS = 1.2
+"""Focal length, picture widths."""
 
 Matrix = npt.NDArray[np.float64]
 """(3, 3) homography or affine map of homogeneous points."""
@@ -19,6 +22,18 @@ Matrix = npt.NDArray[np.float64]
 def _ease(share: float) -> float:
     """0…1 to 0…1 without a jerk at either end (smoothstep)."""
     return share * share * (3 - 2 * share)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPlace:
+    """Where a camera is and points: x to the east, y to the south; angles as those of aircraft."""
+
+    x_m: float
+    y_m: float
+    height_m: float
+    yaw_deg: float
+    pitch_deg: float
+    hfov_deg: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +70,26 @@ class Camera:
         shift = np.array([[1, 0, wide / 2 + shake[0]], [0, 1, high / 2 + shake[1]], [0, 0, 1.0]])
         return np.asarray(shift @ self._tilt() @ plane, np.float64)
 
+    def place(self, t_s: float) -> CameraPlace:
+        """Where the pinhole stands that `pose` is of, but for its shake, which is of the picture."""
+        share = min(1.0, max(0.0, t_s / self.duration_s))
+        eased = _ease(share)
+        centre = [a + (b - a) * eased for a, b in zip(self.start_m, self.end_m, strict=True)]
+        roll_deg = (
+            self.appearance.roll_deg[0] + (self.appearance.roll_deg[1] - self.appearance.roll_deg[0]) * eased
+        )
+        turn, tilt = math.radians(roll_deg), math.radians(self.appearance.tilt_deg)
+        range_m = _FOCAL_WIDTHS * self._width_m(share)  # along the optical axis
+        back_m = range_m * math.sin(tilt)
+        return CameraPlace(
+            x_m=centre[0] + back_m * math.sin(turn),
+            y_m=centre[1] + back_m * math.cos(turn),
+            height_m=range_m * math.cos(tilt),
+            yaw_deg=-roll_deg % 360,
+            pitch_deg=self.appearance.tilt_deg - 90,
+            hfov_deg=math.degrees(2 * math.atan(0.5 / _FOCAL_WIDTHS)),
+        )
+
     def _width_m(self, share: float) -> float:
         first, middle, last = self.appearance.width_m
         if share < 0.5:
@@ -62,8 +97,8 @@ class Camera:
         return middle + (last - middle) * _ease(share * 2 - 1)
 
     def _tilt(self) -> Matrix:
-        """A pinhole whose focal length is 1.2 picture widths, turned about the picture's horizontal axis."""
-        angle, focal = math.radians(self.appearance.tilt_deg), 1.2 * self.size[0]
+        """A pinhole turned about the picture's horizontal axis."""
+        angle, focal = math.radians(self.appearance.tilt_deg), _FOCAL_WIDTHS * self.size[0]
         return np.array([[1, 0, 0], [0, math.cos(angle), 0], [0, -math.sin(angle) / focal, 1]])
 
     def _shake(self, t_s: float) -> tuple[float, float]:

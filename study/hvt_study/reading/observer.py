@@ -96,7 +96,8 @@ class CodeObserver:
         exact = self._pictures.get(frame_index)
         base_bgr = None if exact is None else as_bgr(exact.picture)
         try:
-            image = decode_still(still, base_bgr=base_bgr, view=self._view)
+            base = None if exact is None else exact.picture
+            image = decode_still(still, base=base, view=self._view)
         except BaseMissingError:
             if len(self._pending) < _MOST_PENDING:  # it may have overtaken its frame
                 self._pending.append(still)

@@ -76,7 +76,16 @@ def clip(tmp_path_factory):
 def flown(clip, *flags, classifier=None):
     width, height = SIZE
     base = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}", "--detector", "motion"]
-    base += ["--budget", "400kbps", "--video-share", "0.15", "--preset", "ultrafast"]
+    base += [
+        "--budget",
+        "400kbps",
+        "--video-share",
+        "0.15",
+        "--preset",
+        "ultrafast",
+        "--still-codec",
+        "residual",
+    ]
     edge, _ = load(EdgeConfig, [*base, *flags], program="hvt-edge", description="")
     ground = check_ground(replace(GroundConfig(), classifier="detector", detect_every=1))
     plan = FlightPlan(clip, check_edge(edge), ground, 400_000)

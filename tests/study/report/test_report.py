@@ -342,6 +342,7 @@ def edge_config():
     width, height = SIZE
     flags = ["--source", "drawn", "--pace", "lockstep", "--size", f"{width}x{height}", "--detector", "motion"]
     flags += ["--budget", "200kbps", "--preset", "ultrafast", "--method", "M5", "--cooldown", "0s"]
+    flags += ["--still-codec", "residual"]
     return check_edge(load(EdgeConfig, flags, program="hvt-edge", description="")[0])
 
 
